@@ -1,0 +1,1 @@
+"""Priors: what one believes about motion."""

@@ -1,0 +1,61 @@
+"""Checks of what a caller hands in: each failure is one sentence with the argument's name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace
+
+__all__ = ["check_count", "check_finite", "check_positive", "check_shape"]
+
+
+def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> None:
+    """Raise ``ValueError`` unless the trailing axes of ``value`` are ``expected``.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    value : Array
+        The array to look at; extra axes may stand in front where ``expected`` begins with ``"…"``.
+    expected : tuple
+        Integers are compared; strings (``"L"``, ``"J"``) accept any size; a leading ``"…"``
+        accepts any batch axes.
+    """
+    batch = bool(expected) and expected[0] == "…"
+    axes = expected[1:] if batch else expected
+    shape = tuple(value.shape)
+    fits = len(shape) >= len(axes) if batch else len(shape) == len(axes)
+    trailing = shape[len(shape) - len(axes) :] if fits else ()
+    if not fits or any(
+        isinstance(want, int) and want != got for want, got in zip(axes, trailing, strict=True)
+    ):
+        wanted = ", ".join(str(axis) for axis in expected)
+        raise ValueError(f"{name} has shape {shape}, expected ({wanted})")
+
+
+def check_finite(name: str, value: Any) -> None:
+    """Raise ``ValueError`` if a NumPy, torch or JAX array holds NaN or infinite entries."""
+    xp = array_namespace(value)
+    bad = ~xp.isfinite(value)
+    if bool(xp.any(bad)):
+        where = tuple(int(i) for i in np.argwhere(np.asarray(bad))[0])
+        count = int(xp.sum(xp.astype(bad, xp.int64)))
+        raise ValueError(
+            f"{name} has {count} values that are NaN or infinite, the first at index {where}, "
+            "expected finite numbers"
+        )
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} is {value!r}, expected a finite number above 0")
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Raise ``ValueError`` unless ``value`` is an integer of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} is {value!r}, expected an integer of at least {least}")

@@ -1,0 +1,1 @@
+"""Every sampler on every problem, in one table."""

@@ -1,0 +1,1 @@
+"""Motions made by the project, and clips that a user points at."""

@@ -1,0 +1,34 @@
+"""Writing files so that a reader never meets half of one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["written_whole"]
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; rename it to ``path`` once the block succeeds.
+
+    Raises
+    ------
+    OSError
+        If the folder does not exist or cannot be written to; the message names it.
+    """
+    path = Path(path)
+    # The ending is kept last, because writers choose a format or append a suffix by it.
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OSError(
+            f"cannot write {path}: {reason}; expected a folder that is writable"
+        ) from error
+    finally:
+        unfinished.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""One file per question: how far are these draws from the truth?"""

@@ -1,0 +1,243 @@
+"""`Motion`: a skeleton's joints through time; `KeypointTrack`: their pictures in one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.skeleton import Skeleton
+
+__all__ = ["KeypointTrack", "Motion", "load_motion", "load_motions"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Joint positions of one clip.
+
+    Parameters
+    ----------
+    positions : ndarray, (L, J, 3)
+        Metres, world Y up, right-handed.
+    skeleton : Skeleton
+        Names and parents of the J joints.
+    fps : float
+        Frames per second.
+    rotations : ndarray, (L, J, 3, 3), optional
+        Local rotation matrices of the joints in their parents' frames, where the source had them.
+    rest_offsets : ndarray, (J, 3), optional
+        Offset of each joint from its parent in the rest pose, metres; given with ``rotations``.
+    name : str
+        What to call the clip in tables, the file's stem by default.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit the skeleton, a value is NaN or infinite, there is no frame, or
+        ``fps`` is not above zero.
+    """
+
+    positions: np.ndarray
+    skeleton: Skeleton
+    fps: float
+    rotations: np.ndarray | None = None
+    rest_offsets: np.ndarray | None = None
+    name: str = field(default="")
+
+    def __post_init__(self) -> None:
+        positions = np.asarray(self.positions, dtype=np.float64)
+        check_shape("positions", positions, ("L", self.skeleton.n_joints, 3))
+        if len(positions) == 0:
+            raise ValueError("positions has no frame, expected at least one")
+        check_finite("positions", positions)
+        check_positive("fps", self.fps)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "fps", float(self.fps))
+        if (self.rotations is None) != (self.rest_offsets is None):
+            raise ValueError("rotations and rest_offsets are given one without the other")
+        if self.rotations is not None and self.rest_offsets is not None:
+            check_shape("rotations", self.rotations, (*positions.shape[:2], 3, 3))
+            check_finite("rotations", self.rotations)
+            check_shape("rest_offsets", self.rest_offsets, (self.skeleton.n_joints, 3))
+            check_finite("rest_offsets", self.rest_offsets)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return len(self.positions)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.frames - 1) / self.fps
+
+    def window(self, start: int, frames: int) -> Motion:
+        """Return ``frames`` frames from frame ``start``."""
+        check_count("frames", frames)
+        if not 0 <= start <= self.frames - frames:
+            raise ValueError(
+                f"start is {start} with frames {frames}, expected a window inside the "
+                f"{self.frames} frames of {self.name or 'the motion'}"
+            )
+        stop = start + frames
+        rotations = None if self.rotations is None else self.rotations[start:stop]
+        return replace(self, positions=self.positions[start:stop], rotations=rotations)
+
+    def resample(self, fps: float) -> Motion:
+        """Return the clip at another frame rate.
+
+        Positions are interpolated linearly in time and local rotations along the geodesic, so
+        that a motion sampled below ``fps`` gains no overshoot.
+        """
+        from probmotion.resampling import resample_motion
+
+        return resample_motion(self, fps)
+
+    def centred(self) -> Motion:
+        """Return the motion with the first root's mean position over its frames at the origin."""
+        root = self.skeleton.roots[0]
+        positions = self.positions - self.positions[:, root].mean(axis=0)
+        return replace(self, positions=positions, rotations=None, rest_offsets=None)
+
+    def turned(self, yaw: float) -> Motion:
+        """Return the motion turned by ``yaw`` radians about the vertical axis."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return replace(self, positions=self.positions @ turn.T, rotations=None, rest_offsets=None)
+
+    def retarget(self, skeleton: Skeleton) -> Motion:
+        """Return the motion on another skeleton, joints matched by their (canonical) names.
+
+        Raises
+        ------
+        ValueError
+            If a joint of ``skeleton`` has no counterpart here; the message names it.
+        """
+        from probmotion.retargeting import retarget_motion
+
+        return retarget_motion(self, skeleton)
+
+    def save(self, path: str | Path) -> None:
+        """Write the motion to ``path``; the ending chooses the format: ``.npz`` or ``.bvh``."""
+        from probmotion.formats import save_motion
+
+        save_motion(self, path)
+
+    def __repr__(self) -> str:
+        return (
+            f"Motion({self.name or 'unnamed'}: {self.frames} frames at {self.fps:g} fps, "
+            f"{self.skeleton.n_joints} joints)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTrack:
+    """Keypoints of one camera through time.
+
+    Parameters
+    ----------
+    keypoints : ndarray, (L, J, 2)
+        Image coordinates, x right and y down, pixels or the camera's unit. Entries that were not
+        seen are NaN and have confidence 0.
+    confidence : ndarray, (L, J)
+        Between 0 (not seen) and 1.
+    skeleton : Skeleton
+        Names and parents of the J joints.
+    fps : float
+        Frames per second.
+    name : str
+        What to call the track.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, a confidence is negative or not finite, or a keypoint that has a
+        confidence above 0 is not finite.
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    skeleton: Skeleton
+    fps: float
+    name: str = field(default="")
+
+    def __post_init__(self) -> None:
+        keypoints = np.asarray(self.keypoints, dtype=np.float64)
+        confidence = np.asarray(self.confidence, dtype=np.float64)
+        check_shape("keypoints", keypoints, ("L", self.skeleton.n_joints, 2))
+        check_shape("confidence", confidence, keypoints.shape[:2])
+        if len(keypoints) == 0:
+            raise ValueError("keypoints has no frame, expected at least one")
+        check_finite("confidence", confidence)
+        if confidence.min() < 0:
+            raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
+        unseen = ~np.isfinite(keypoints).all(axis=-1)
+        if (unseen & (confidence > 0)).any():
+            frame, joint = np.argwhere(unseen & (confidence > 0))[0]
+            raise ValueError(
+                f"keypoints is not finite at frame {frame}, joint {joint}, where confidence is "
+                f"{confidence[frame, joint]:g}; expected confidence 0 there"
+            )
+        check_positive("fps", self.fps)
+        object.__setattr__(self, "keypoints", keypoints)
+        object.__setattr__(self, "confidence", confidence)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return len(self.keypoints)
+
+
+def load_motion(path: str | Path, fps: float | None = None) -> Motion:
+    """Read one motion from a ``.bvh`` or ``.npz`` file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    fps : float, optional
+        Resample to this rate; the file's own rate is kept by default.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no motion, or is damaged; the message says where.
+    FileNotFoundError
+        If there is no such file.
+    """
+    from probmotion.formats import read_motion
+
+    motion = read_motion(Path(path))
+    return motion if fps is None else motion.resample(fps)
+
+
+def load_motions(
+    paths: str | Path | Iterable[str | Path], fps: float | None = None
+) -> Sequence[Motion]:
+    """Read every motion that ``paths`` names, sorted by path.
+
+    Parameters
+    ----------
+    paths : str, Path or iterable of them
+        Files, or patterns such as ``"walks/*.bvh"``.
+    fps : float, optional
+        Resample every clip to this rate.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a pattern matches no file.
+    """
+    from glob import glob, has_magic
+
+    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    found: list[str] = []
+    for pattern in map(str, given):
+        matches = glob(pattern) if has_magic(pattern) else [pattern]
+        if not matches:
+            raise FileNotFoundError(f"paths has {pattern!r}, which matches no file")
+        found += matches
+    return [load_motion(path, fps) for path in sorted(found)]

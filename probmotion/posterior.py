@@ -1,0 +1,114 @@
+"""`MotionPosterior`: the one object that every sampler draws from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probmotion.arrays import Array, to_numpy
+from probmotion.checks import check_shape
+from probmotion.likelihoods import Likelihood
+from probmotion.priors import HasLogDensity, Marginalises, MotionPrior
+from probmotion.skeleton import Skeleton
+
+__all__ = ["MotionPosterior"]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPosterior:
+    """p(X | y) ∝ p(X) p(y | X); with no likelihood it is the prior: generation.
+
+    Parameters
+    ----------
+    prior : MotionPrior
+        What one believes about motion.
+    likelihood : Likelihood, optional
+        The evidence.
+
+    Raises
+    ------
+    ValueError
+        If the likelihood is of another number of frames or joints than the prior.
+    """
+
+    prior: MotionPrior
+    likelihood: Likelihood | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.prior, MotionPrior):
+            raise ValueError(
+                f"prior is {type(self.prior).__name__}, expected an object with skeleton, frames, "
+                "fps, dim and motion(theta)"
+            )
+        if self.likelihood is None:
+            return
+        if not isinstance(self.likelihood, Likelihood):
+            raise ValueError(
+                f"likelihood is {type(self.likelihood).__name__}, expected an object with "
+                "log_density(positions) and simulate(rng, positions)"
+            )
+        for name, want in (("frames", self.frames), ("n_joints", self.skeleton.n_joints)):
+            got = getattr(self.likelihood, name, want)
+            if got != want:
+                raise ValueError(f"likelihood has {name} {got}, expected the prior's {want}")
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The prior's skeleton."""
+        return self.prior.skeleton
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return self.prior.frames
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.prior.fps
+
+    @property
+    def dim(self) -> int:
+        """Length of θ."""
+        return self.prior.dim
+
+    def log_density(self, theta: Array) -> Array:
+        """Return log p(θ) + log p(y | θ), the posterior's up to a constant: ``(…, dim) → (…)``.
+
+        NumPy, torch and JAX arrays alike, as far as the prior and likelihood allow.
+        """
+        check_shape("theta", theta, ("…", self.dim))
+        if not isinstance(self.prior, HasLogDensity):
+            raise ValueError(f"prior {type(self.prior).__name__} has no log density")
+        log_prior = self.prior.log_density(theta)
+        if self.likelihood is None:
+            return log_prior
+        if isinstance(self.prior, Marginalises):
+            return log_prior + self.prior.log_likelihood(theta, self.likelihood)
+        return log_prior + self.likelihood.log_density(self.prior.motion(theta))
+
+    def motion(self, theta: Array) -> Array:
+        """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres.
+
+        Where the prior integrates variables out, use :meth:`complete`.
+        """
+        check_shape("theta", theta, ("…", self.dim))
+        return self.prior.motion(theta)
+
+    def complete(self, rng: np.random.Generator, theta: np.ndarray) -> np.ndarray:
+        """Return one motion per θ, ``(n, dim) → (n, L, J, 3)``.
+
+        Variables that the prior integrates out are drawn given θ and the evidence; where there
+        are none, ``rng`` is not used.
+        """
+        check_shape("theta", theta, ("n", self.dim))
+        if isinstance(self.prior, Marginalises):
+            return self.prior.complete(rng, theta, self.likelihood)
+        return to_numpy(self.prior.motion(theta))
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n starting points, draws of θ from the prior, (n, dim)."""
+        if not isinstance(self.prior, HasLogDensity):
+            raise ValueError(f"prior {type(self.prior).__name__} has no log density")
+        return self.prior.initial(rng, n)

@@ -1,0 +1,177 @@
+"""What a prior over motions can do, as small protocols.
+
+A sampler lists the protocols it requires; a prior implements those it can. Neither imports the
+other. Diffusion works in normalised units: a motion in metres divided by the prior's ``scale``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+
+from probmotion.arrays import Array
+from probmotion.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from probmotion.cameras import Cameras
+    from probmotion.likelihoods import Likelihood
+
+__all__ = [
+    "DenoiserCovariance2D",
+    "DenoiserCovariance3D",
+    "Denoises2D",
+    "Denoises3D",
+    "ExactPosterior",
+    "HasExactPosterior",
+    "HasLogDensity",
+    "Marginalises",
+    "MotionPrior",
+    "NotConjugate",
+    "Samplable",
+]
+
+
+class NotConjugate(ValueError):  # noqa: N818 (a condition, not a fault)
+    """The posterior has no closed form; the message says which part of the likelihood is why."""
+
+
+@runtime_checkable
+class MotionPrior(Protocol):
+    """A belief about motions of one skeleton, L frames long.
+
+    θ is a flat unconstrained vector of length ``dim``.
+    """
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The J joints."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+
+    @property
+    def dim(self) -> int:
+        """Length of θ."""
+
+    def motion(self, theta: Array) -> Array:
+        """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
+
+
+@runtime_checkable
+class Samplable(Protocol):
+    """Independent draws from the prior."""
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n motions, (n, L, J, 3), metres."""
+
+
+@runtime_checkable
+class HasLogDensity(Protocol):
+    """The prior's normalised log density in θ, and points to start a chain from."""
+
+    def log_density(self, theta: Array) -> Array:
+        """Return log p(θ): ``(…, dim) → (…)``."""
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n draws of θ from the prior, (n, dim)."""
+
+
+@runtime_checkable
+class Marginalises(Protocol):
+    """A prior whose θ leaves variables integrated out (a style, a yaw, small noise).
+
+    Its likelihood is then not a function of one motion, and a motion at θ is a draw.
+    """
+
+    def log_likelihood(self, theta: Array, likelihood: Likelihood) -> Array:
+        """Return log p(y | θ), everything else integrated out: ``(…, dim) → (…)``."""
+
+    def complete(
+        self, rng: np.random.Generator, theta: np.ndarray, likelihood: Likelihood | None
+    ) -> np.ndarray:
+        """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres."""
+
+
+@runtime_checkable
+class Denoises2D(Protocol):
+    """The posterior mean of clean 2D views, given noisy ones."""
+
+    @property
+    def scale(self) -> float:
+        """Metres per normalised unit."""
+
+    def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
+        """Return E[x₀ | x_t] view by view.
+
+        Parameters
+        ----------
+        x_t : ndarray, (B, V, L, J, 2)
+            √ᾱ x₀ + √(1−ᾱ) ε in normalised units.
+        alpha_bar : float
+            ᾱ, in (0, 1].
+        cameras : Cameras
+            The V views. The exact prior needs their elevation; a network trained on views of
+            unknown cameras ignores them.
+        """
+
+
+@runtime_checkable
+class Denoises3D(Protocol):
+    """The posterior mean of the clean motion, given a noisy one."""
+
+    @property
+    def scale(self) -> float:
+        """Metres per normalised unit."""
+
+    def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return E[X₀ | X_t]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
+
+
+@runtime_checkable
+class DenoiserCovariance2D(Protocol):
+    """Products with Cov[x₀ | x_t], which is the 2D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
+
+    def view_covariance_product(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
+    ) -> np.ndarray:
+        """Return Cov[x₀ | x_t] v for each view; all arrays (B, V, L, J, 2), normalised units."""
+
+
+@runtime_checkable
+class DenoiserCovariance3D(Protocol):
+    """Products with Cov[X₀ | X_t], which is the 3D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
+
+    def motion_covariance_product(
+        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
+    ) -> np.ndarray:
+        """Return Cov[X₀ | X_t] v; all arrays (B, L, J, 3), normalised units."""
+
+
+class ExactPosterior(Protocol):
+    """A distribution over motions in closed form."""
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n independent draws, (n, L, J, 3), metres."""
+
+    def log_density(self, positions: Array) -> Array:
+        """Return the normalised log density: ``(…, L, J, 3) → (…)``."""
+
+
+@runtime_checkable
+class HasExactPosterior(Protocol):
+    """The posterior in closed form, where the likelihood allows one."""
+
+    def exact_posterior(self, likelihood: Likelihood | None) -> ExactPosterior:
+        """Return p(X | y).
+
+        Raises
+        ------
+        NotConjugate
+            If the likelihood is not linear in the positions with Gaussian noise.
+        """

@@ -1,0 +1,157 @@
+"""What a sampler is, which samplers there are, and what to say when one does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+
+from probmotion.posterior import MotionPosterior
+
+if TYPE_CHECKING:
+    from probmotion.draws import MotionDraws
+
+__all__ = [
+    "Sampler",
+    "UnsupportedPosterior",
+    "load_sampler",
+    "missing",
+    "progress_bar",
+    "require",
+    "sampler_names",
+]
+
+
+@runtime_checkable
+class Sampler(Protocol):
+    """A frozen dataclass of settings that draws from a posterior.
+
+    ``name`` is what tables call it; ``requires`` lists the protocols of
+    :mod:`probmotion.priors` that the posterior's prior must implement.
+    """
+
+    name: ClassVar[str]
+    requires: ClassVar[tuple[type, ...]]
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``chains`` × ``draws`` draws.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the posterior is not one that this sampler can draw from.
+        """
+
+
+class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
+    """A sampler cannot draw from a posterior.
+
+    Parameters
+    ----------
+    sampler : str
+        The sampler's name.
+    reason : str
+        Why, as the rest of a sentence that begins with the sampler's name.
+    word : str
+        The same in one word, for tables.
+    others : iterable of str, optional
+        Samplers that would do.
+    """
+
+    def __init__(self, sampler: str, reason: str, word: str, others: Iterable[str] = ()) -> None:
+        would_do = ", ".join(others)
+        hint = f"; {would_do} would do" if would_do else ""
+        super().__init__(f"{sampler} {reason}{hint}")
+        self.word = word
+
+
+def missing(sampler: type | Sampler, posterior: MotionPosterior) -> list[type]:
+    """Return the protocols that ``sampler`` requires and the posterior's prior lacks."""
+    return [needed for needed in sampler.requires if not isinstance(posterior.prior, needed)]
+
+
+def require(sampler: Sampler, posterior: MotionPosterior) -> None:
+    """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires."""
+    lacking = missing(sampler, posterior)
+    if lacking:
+        names = " and ".join(protocol.__name__ for protocol in lacking)
+        raise UnsupportedPosterior(
+            sampler.name,
+            f"needs a prior with {names}, which {type(posterior.prior).__name__} is not",
+            word=lacking[0].__name__,
+            others=suited(posterior),
+        )
+
+
+def suited(posterior: MotionPosterior) -> list[str]:
+    """Return the names of registered samplers whose required protocols the prior implements."""
+    return [name for name in sampler_names() if not missing(load_sampler(name), posterior)]
+
+
+@cache
+def _registered() -> dict[str, EntryPoint]:
+    found = entry_points(group="probmotion.samplers")
+    return {point.name: point for point in found}
+
+
+def sampler_names() -> list[str]:
+    """Return the names of all registered samplers, ours and other packages'.
+
+    A package registers a sampler by an entry point of the group ``probmotion.samplers``.
+    """
+    return list(_registered())
+
+
+def load_sampler(name: str) -> type[Any]:
+    """Return the class of a registered sampler.
+
+    Raises
+    ------
+    ValueError
+        If no sampler has that name; the message lists the known ones.
+    """
+    known = _registered()
+    if name not in known:
+        raise ValueError(f"sampler is {name!r}, expected one of {', '.join(sorted(known))}")
+    return known[name].load()
+
+
+class _Silent:
+    """A progress bar that shows nothing."""
+
+    def update(self, n: int = 1) -> None:
+        """Count ``n`` more."""
+
+
+@contextmanager
+def progress_bar(total: int, label: str, show: bool) -> Iterator[Any]:
+    """Show a bar that counts to ``total`` on standard error; yields an object with ``update(n)``.
+
+    A bar never touches what is computed.
+    """
+    if not show:
+        yield _Silent()
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc=label, leave=False, dynamic_ncols=True) as bar:
+        yield bar
+
+
+def batches(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    """Yield ``items`` in order, at most ``size`` at a time."""
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
