@@ -274,7 +274,7 @@ class GaussianMixtureMotion:
         """
         out = np.empty_like(x_t)
         for view, mixture in enumerate(self._seen_by(cameras, x_t)):
-            flat = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), -1)
+            flat = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
             out[:, view] = mixture.denoise(flat, alpha_bar).reshape(out[:, view].shape)
         return out
 
@@ -284,8 +284,8 @@ class GaussianMixtureMotion:
         """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
         out = np.empty_like(vectors)
         for view, mixture in enumerate(self._seen_by(cameras, x_t)):
-            noisy = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), -1)
-            flat = np.ascontiguousarray(vectors[:, view]).reshape(len(x_t), -1)
+            noisy = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
+            flat = np.ascontiguousarray(vectors[:, view]).reshape(len(x_t), mixture.dim)
             product = mixture.covariance_product(noisy, alpha_bar, flat)
             out[:, view] = product.reshape(out[:, view].shape)
         return out
@@ -293,21 +293,26 @@ class GaussianMixtureMotion:
     def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[X₀ | X_t]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
         check_shape("x_t", x_t, ("B", *self.means.shape[1:]))
-        return self._normalised.denoise(x_t.reshape(len(x_t), -1), alpha_bar).reshape(x_t.shape)
+        flat = x_t.reshape(len(x_t), self._normalised.dim)
+        return self._normalised.denoise(flat, alpha_bar).reshape(x_t.shape)
 
     def motion_covariance_product(
         self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
     ) -> np.ndarray:
         """Return Cov[X₀ | X_t] v, all arrays (B, L, J, 3), normalised units."""
-        flat = vectors.reshape(len(x_t), -1)
-        product = self._normalised.covariance_product(x_t.reshape(len(x_t), -1), alpha_bar, flat)
+        check_shape("x_t", x_t, ("B", *self.means.shape[1:]))
+        check_shape("vectors", vectors, x_t.shape)
+        rows = (len(x_t), self._normalised.dim)
+        product = self._normalised.covariance_product(
+            x_t.reshape(rows), alpha_bar, vectors.reshape(rows)
+        )
         return product.reshape(x_t.shape)
 
     # What is known of a motion because the prior is a mixture.
 
     def style_responsibilities(self, positions: np.ndarray) -> np.ndarray:
         """Return the probability of each style given a motion: ``(n, L, J, 3) → (n, K)``."""
-        flat = np.asarray(positions).reshape(len(positions), -1)
+        flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
         return self._metres.condition(flat, 1.0).responsibilities.sum(axis=2).T
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
@@ -315,14 +320,16 @@ class GaussianMixtureMotion:
 
         1 in expectation for draws from the prior.
         """
-        flat = np.asarray(positions).reshape(len(positions), -1)
+        flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
         return self._metres.residual_variance(flat) / self.noise**2
 
     def log_prior(self, positions: Array) -> Array:
         """Return the normalised log density of positions: ``(…, L, J, 3) → (…)``."""
         xp = array_namespace(positions)
         check_shape("positions", positions, ("…", *self.means.shape[1:]))
-        return self._metres.log_density(xp.reshape(positions, (*positions.shape[:-3], -1)))
+        return self._metres.log_density(
+            xp.reshape(positions, (*positions.shape[:-3], self._metres.dim))
+        )
 
     def reduced(self) -> tuple[GaussianMixtureMotion, np.ndarray]:
         """Return the same prior on the span of its scalar fields, and that span's basis.

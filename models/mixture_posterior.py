@@ -88,6 +88,17 @@ class MixturePosterior:
         return np.linalg.solve(self._latent_precision, self._slope[..., None])[..., 0]
 
     @cached_property
+    def _latent_root(self) -> np.ndarray:
+        """C with C Cᵀ = Cov[z | y, k, a], (K, A, r, r): precision = L Lᵀ, so C = L⁻ᵀ."""
+        lower = np.linalg.cholesky(self._latent_precision)
+        return np.swapaxes(np.linalg.inv(lower), -1, -2)
+
+    @cached_property
+    def _noise_root(self) -> np.ndarray:
+        """Cholesky factor of S, the covariance of X / δ given m + W z and y, (F, 3, 3)."""
+        return np.linalg.cholesky(self._shrink)
+
+    @cached_property
     def _log_joint(self) -> np.ndarray:
         """log p(y, k, a), (K, A)."""
         log_det = np.linalg.slogdet(self._latent_precision)[1]
@@ -117,9 +128,7 @@ class MixturePosterior:
         chosen = rng.choice(probabilities.size, size=n, p=_normalised(probabilities.reshape(-1)))
         style, azimuth = np.divmod(chosen, probabilities.shape[1])
         unit = rng.standard_normal((n, self._slope.shape[-1]))
-        lower = np.linalg.cholesky(self._latent_precision)[style, azimuth]
-        # precision = L Lᵀ, so that L⁻ᵀ ξ has covariance precision⁻¹.
-        spread = np.linalg.solve(np.swapaxes(lower, -1, -2), unit[..., None])[..., 0]
+        spread = (self._latent_root[style, azimuth] @ unit[..., None])[..., 0]
         return self._motions(rng, style, azimuth, self._latent_mean[style, azimuth] + spread)
 
     def complete(self, rng: np.random.Generator, latent: np.ndarray) -> np.ndarray:
@@ -141,17 +150,16 @@ class MixturePosterior:
         xp = array_namespace(positions)
         K, width, _, F, _ = self._fields.shape
         A, rank = len(self._turns), width - 1
-        flat = xp.reshape(positions, (-1, F, 3))
+        n = math.prod(positions.shape[:-3])
+        flat = xp.reshape(positions, (n, F, 3))
         # Given (k, a), X is Gaussian with precision Q = Λ + I/δ² around the latent subspace.
         centred = flat - constant(self._given_clean(np.zeros((F, 3))), flat)
         precision = self._information + np.eye(3) / self.noise**2
         weighted = xp.sum(constant(precision, flat) * centred[:, :, None, :], axis=-1)
         square = xp.sum(weighted * centred, axis=(-2, -1))
-        shrunk = np.einsum("fij,kicfj->kicfi", self._shrink, self._fields)
-        products = xp.reshape(weighted, (-1, F * 3)) @ constant(
-            shrunk.reshape(-1, F * 3).T, flat
-        )
-        turned = xp.reshape(products, (-1, K, width, 3)) @ constant(self._turns.T, flat)
+        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields)
+        products = xp.reshape(weighted, (n, F * 3)) @ constant(shrunk.reshape(-1, F * 3).T, flat)
+        turned = xp.reshape(products, (n, K, width, 3)) @ constant(self._turns.T, flat)
         turned = xp.permute_dims(turned, (0, 1, 3, 2))
         gram = self._clean_gram
         slope = turned[..., 1:] - constant(gram[..., 0, 1:], flat)
@@ -163,7 +171,7 @@ class MixturePosterior:
         offset = self._offset - self.log_evidence - 0.5 * (log_det + gram[..., 0, 0])
         logits = turned[..., 0] + 0.5 * xp.sum(latent**2, axis=-1) + constant(offset, flat)
         norm = F * 3 * math.log(2 * math.pi) - np.linalg.slogdet(precision)[1].sum()
-        value = logsumexp(xp.reshape(logits, (-1, K * A))) - 0.5 * (square + float(norm))
+        value = logsumexp(xp.reshape(logits, (n, K * A))) - 0.5 * (square + float(norm))
         return xp.reshape(value, positions.shape[:-3])
 
     @cached_property
@@ -172,7 +180,7 @@ class MixturePosterior:
 
         S Q S = S / δ², because S Q = I/δ².
         """
-        moved = np.einsum("fij,kicfj->kicfi", self._shrink, self._fields) / self.noise**2
+        moved = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields) / self.noise**2
         gram = np.einsum("kicfx,kjdfx->kijcd", self._fields, moved, optimize=True)
         return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
 
@@ -181,10 +189,11 @@ class MixturePosterior:
         xp = array_namespace(latent)
         rank = self._slope.shape[-1]
         batch = latent.shape[:-1]
-        flat = xp.reshape(latent, (-1, rank))
+        n = math.prod(batch)
+        flat = xp.reshape(latent, (n, rank))
         slope = constant(self._slope.reshape(-1, rank).T, flat)
         curvature = constant(self._curvature.reshape(-1, rank * rank).T, flat)
-        square = xp.reshape(flat[:, :, None] * flat[:, None, :], (-1, rank * rank))
+        square = xp.reshape(flat[:, :, None] * flat[:, None, :], (n, rank * rank))
         offset = constant(self._offset.reshape(-1), flat)
         terms = offset + flat @ slope - 0.5 * (square @ curvature)
         return xp.reshape(terms, (*batch, terms.shape[-1]))
@@ -203,12 +212,12 @@ class MixturePosterior:
         """Draw X given style, azimuth and z, (n, L, J, 3)."""
         n = len(latent)
         out = np.empty((n, *self._fields.shape[3:]))
-        lower = np.linalg.cholesky(self._shrink)
         for row in range(n):
             weights = np.concatenate([[1.0], latent[row]])[:, None] * self._turns[azimuth[row]]
             out[row] = np.tensordot(weights, self._fields[style[row]], axes=2)
         noise = rng.standard_normal(out.shape)
-        out = self._given_clean(out) + self.noise * np.einsum("fij,nfj->nfi", lower, noise)
+        spread = np.einsum("fij,nfj->nfi", self._noise_root, noise)
+        out = self._given_clean(out) + self.noise * spread
         return out.reshape(n, *self.shape)
 
 

@@ -154,17 +154,18 @@ class TurnedMixture:
         signal, total, _ = self._levels(alpha_bar)
         K, A = self.shape
         batch = x.shape[:-1]
-        flat = xp.reshape(x, (-1, self.dim))
+        n = math.prod(batch)
+        flat = xp.reshape(x, (n, self.dim))
         fields = constant(self.fields.T, flat)
-        products = xp.reshape(flat @ fields, (-1, K, 1 + self.rank, 3))
+        products = xp.reshape(flat @ fields, (n, K, 1 + self.rank, 3))
         on_mean = products[:, :, 0, :] @ constant(self.turns.T, flat)
-        factors = xp.reshape(products[:, :, 1:, :], (-1, K, 1, 3 * self.rank))
-        latent = xp.reshape(factors @ constant(self.to_latent, flat), (-1, K, A, self.rank))
+        factors = xp.reshape(products[:, :, 1:, :], (n, K, 1, 3 * self.rank))
+        latent = xp.reshape(factors @ constant(self.to_latent, flat), (n, K, A, self.rank))
         centred = latent - constant(signal * self.mean_latent, flat)
         spread = 1 / (1 + (signal**2 / total) * self.eigenvalues)
         square = xp.sum(centred**2 * constant(spread, flat), axis=-1)
         logits = (signal / total) * on_mean + (0.5 * signal**2 / total**2) * square
-        logits = xp.reshape(logits + constant(self._offsets(signal, total), flat), (-1, K * A))
+        logits = xp.reshape(logits + constant(self._offsets(signal, total), flat), (n, K * A))
         norm = xp.sum(flat**2, axis=-1) / total + self.dim * math.log(2 * math.pi * total)
         return xp.reshape(logsumexp(logits) - 0.5 * norm, batch)
 
@@ -173,6 +174,7 @@ class TurnedMixture:
 
         The component is the one of highest responsibility at ᾱ = 1; the expected value is δ².
         """
+        K, A = self.shape
         out = np.empty(len(x))
         for start in range(0, len(x), _BLOCK):
             rows = slice(start, start + _BLOCK)
@@ -184,8 +186,8 @@ class TurnedMixture:
             square = (x[rows] ** 2).sum(axis=-1)[:, None] - 2 * on_mean
             square += self.square_mean[:, None] - inside
             n = square.shape[1]
-            likeliest = np.swapaxes(state.responsibilities, 0, 1).reshape(n, -1).argmax(axis=1)
-            flat = np.swapaxes(square, 0, 1).reshape(n, -1)
+            likeliest = np.swapaxes(state.responsibilities, 0, 1).reshape(n, K * A).argmax(axis=1)
+            flat = np.swapaxes(square, 0, 1).reshape(n, K * A)
             out[rows] = flat[np.arange(n), likeliest] / (self.dim - self.rank)
         return out
 
@@ -220,4 +222,4 @@ class TurnedMixture:
         base[..., :3] = (means @ self.turns).transpose(1, 0, 2)
         flat = latent.reshape(K, n, A * self.rank)
         base[..., 3:] = (flat @ self.from_latent).transpose(1, 0, 2)
-        return base.reshape(n, -1) @ self.fields
+        return base.reshape(n, len(self.fields)) @ self.fields
