@@ -313,7 +313,7 @@ class GaussianMixtureMotion:
     def style_responsibilities(self, positions: np.ndarray) -> np.ndarray:
         """Return the probability of each style given a motion: ``(n, L, J, 3) → (n, K)``."""
         flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
-        return self._metres.condition(flat, 1.0).responsibilities.sum(axis=2).T
+        return self._metres.responsibilities(flat).sum(axis=2)
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
         """Return the variance outside the likeliest component's subspace over δ², (n,).

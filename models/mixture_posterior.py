@@ -149,7 +149,7 @@ class MixturePosterior:
         """Return the normalised log p(X | y): ``(…, L, J, 3) → (…)``, any array library."""
         xp = array_namespace(positions)
         K, width, _, F, _ = self._fields.shape
-        A, rank = len(self._turns), width - 1
+        A = len(self._turns)
         n = math.prod(positions.shape[:-3])
         flat = xp.reshape(positions, (n, F, 3))
         # Given (k, a), X is Gaussian with precision Q = Λ + I/δ² around the latent subspace.

@@ -18,10 +18,10 @@ import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
 
-__all__ = ["Conditioned", "TurnedMixture", "turning_coefficients", "turning_fields"]
+__all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
 
-_BLOCK = 128
-"""Rows handled at once: their products with all components stay in a core's cache."""
+_BLOCK = 64
+"""Points handled at once, along the last axis: their products stay in a core's cache."""
 
 
 def turning_fields(fields: np.ndarray) -> np.ndarray:
@@ -43,19 +43,30 @@ def turning_coefficients(yaws: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(yaws), np.sin(yaws), np.ones_like(yaws)], axis=-1)
 
 
-class Conditioned(NamedTuple):
+class _Level(NamedTuple):
+    """What depends on the noise level alone.
+
+    √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r);
+    and the matrices from base products and a 1 to whitened latents, (K, A r, 3 r + 1).
+    """
+
+    signal: float
+    total: float
+    shrink: float
+    root: np.ndarray
+    to_latent: np.ndarray
+
+
+class _State(NamedTuple):
     """The mixture after one noisy observation of each of n points.
 
-    Attributes
-    ----------
-    responsibilities : ndarray, (K, n, A)
-        p(k, a | x).
-    latent : ndarray, (K, n, A, r)
-        E[z | x, k, a] in the eigenbasis of the component's Gram matrix.
+    p(k, a | x), (K, A, n), and the whitened latents ``u`` = (1 + ᾱλ/τ)^(−½) Bᵀ W_kᵀ R(ψ_a)ᵀ
+    (x − √ᾱ R(ψ_a) m_k), (K, A, r, n): E[z | x, k, a] = √ᾱ/τ B (1 + ᾱλ/τ)^(−½) u, with λ and B the
+    eigenvalues and eigenbasis of the component's Gram matrix.
     """
 
     responsibilities: np.ndarray
-    latent: np.ndarray
+    whitened: np.ndarray
 
 
 class TurnedMixture:
@@ -84,7 +95,6 @@ class TurnedMixture:
         A = len(yaws)
         self.shape = (K, A)
         self.log_weights = np.log(weights) - math.log(A)
-        self.fields = np.ascontiguousarray(fields.reshape(K * width * 3, D))
         gram = np.einsum("kicd,kjed->kijce", fields, fields, optimize=True)
         gram = np.einsum("kijce,ac,ae->kaij", gram, self.turns, self.turns, optimize=True)
         self.square_mean = gram[..., 0, 0]
@@ -92,21 +102,26 @@ class TurnedMixture:
         self.eigenvalues = np.maximum(self.eigenvalues, 0.0)
         self.basis = basis
         self.mean_latent = np.einsum("kair,kai->kar", basis, gram[..., 1:, 0])
-        # Base products → products with every turned eigenvector: (K, 3 r, A r).
-        spread = np.einsum("ac,kair->kicar", self.turns, basis, optimize=True)
-        self.to_latent = np.ascontiguousarray(spread.reshape(K, 3 * self.rank, A * self.rank))
-        self.from_latent = np.ascontiguousarray(np.swapaxes(self.to_latent, 1, 2))
+        # Base products → products with every turned eigenvector: (K, A r, 3 r).
+        spread = np.einsum("ac,kair->karic", self.turns, basis, optimize=True)
+        self.to_latent = np.ascontiguousarray(spread.reshape(K, A * self.rank, 3 * self.rank))
+        # One more row per style, of zeros, makes room for the 1 that shifts the latents.
+        rows = np.zeros((K, 3 * width + 1, D))
+        rows[:, :-1] = fields.reshape(K, 3 * width, D)
+        self._fields = rows.reshape(-1, D)
 
     def denoise(self, x: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[x₀ | x_t]: ``(n, D) → (n, D)``, with x_t = √ᾱ x₀ + √(1−ᾱ) ε."""
-        signal, total, shrink = self._levels(alpha_bar)
+        level = self._level(alpha_bar)
+        own_share = level.signal * self.variance / level.total
         out = np.empty_like(x)
-        for start in range(0, len(x), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            means = self._mean_clean(self.condition(x[rows], alpha_bar))
-            means *= shrink
-            means += (signal * self.variance / total) * x[rows]
-            out[rows] = means
+        for rows in _blocks(len(x)):
+            weight, latent = self._condition(x[rows], level)
+            weight *= level.shrink
+            latent *= weight[:, :, None]
+            latent_share = level.signal / level.total
+            np.matmul(*self._combined(weight, latent, latent_share, level), out=out[rows])
+            out[rows] += own_share * x[rows]
         return out
 
     def covariance_product(self, x: np.ndarray, alpha_bar: float, v: np.ndarray) -> np.ndarray:
@@ -114,112 +129,131 @@ class TurnedMixture:
 
         The mean of the components' covariances plus the covariance of their means.
         """
-        signal, total, shrink = self._levels(alpha_bar)
-        spread = 1 / (1 + (signal**2 / total) * self.eigenvalues)
+        level = self._level(alpha_bar)
         out = np.empty_like(v)
-        for start in range(0, len(x), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            state = self.condition(x[rows], alpha_bar)
-            on_mean, on_latent = self._products(v[rows])
-            clean = on_mean + np.einsum("knar,knar->kna", state.latent, on_latent)
-            centred = clean - np.einsum("kna,kna->n", state.responsibilities, clean)[:, None]
-            weighted = state.responsibilities * centred
-            latent = on_latent * spread[:, None] * state.responsibilities[..., None]
-            latent += state.latent * weighted[..., None]
-            product = self._combine(weighted, latent)
-            out[rows] = shrink**2 * product + self.variance * shrink * v[rows]
+        for rows in _blocks(len(x)):
+            weight, latent = self._condition(x[rows], level)
+            latent *= level.signal / level.total
+            on_mean, on_latent = self._products(v[rows], level, shifted=False)
+            clean = on_mean + np.einsum("karn,karn->kan", latent, on_latent)
+            weighted = weight * (clean - (weight * clean).sum(axis=(0, 1)))
+            on_latent *= weight[:, :, None]
+            on_latent += latent * weighted[:, :, None]
+            product = np.matmul(*self._combined(weighted, on_latent, 1.0, level))
+            out[rows] = level.shrink**2 * product + self.variance * level.shrink * v[rows]
         return out
 
-    def condition(self, x: np.ndarray, alpha_bar: float) -> Conditioned:
-        """Return the components' responsibilities and latent means for ``x`` (n, D)."""
-        signal, total, _ = self._levels(alpha_bar)
-        on_mean, centred = self._products(x)
-        centred -= signal * self.mean_latent[:, None]
-        spread = 1 / (1 + (signal**2 / total) * self.eigenvalues)
-        latent = centred * spread[:, None]
-        logits = np.einsum("knar,knar->kna", centred, latent)
-        logits *= 0.5 * signal**2 / total**2
-        on_mean *= signal / total
-        logits += on_mean
-        logits += self._offsets(signal, total)[:, None]
-        logits -= logits.max(axis=(0, 2))[:, None]
-        np.exp(logits, out=logits)
-        logits /= logits.sum(axis=(0, 2))[:, None]
-        latent *= signal / total
-        return Conditioned(logits, latent)
+    def responsibilities(self, x: np.ndarray) -> np.ndarray:
+        """Return p(k, a | x₀) of clean points: ``(n, D) → (n, K, A)``."""
+        level = self._level(1.0)
+        out = np.empty((len(x), *self.shape))
+        for rows in _blocks(len(x)):
+            out[rows] = self._condition(x[rows], level).responsibilities.transpose(2, 0, 1)
+        return out
 
     def log_density(self, x: Array, alpha_bar: float = 1.0) -> Array:
         """Return the normalised log density of x_t: ``(…, D) → (…)``, any array library."""
         xp = array_namespace(x)
-        signal, total, _ = self._levels(alpha_bar)
+        level = self._level(alpha_bar)
         K, A = self.shape
         batch = x.shape[:-1]
         n = math.prod(batch)
         flat = xp.reshape(x, (n, self.dim))
-        fields = constant(self.fields.T, flat)
-        products = xp.reshape(flat @ fields, (n, K, 1 + self.rank, 3))
+        width = 3 * (1 + self.rank)
+        fields = self._fields.reshape(K, width + 1, self.dim)[:, :-1].reshape(K * width, -1)
+        products = xp.reshape(flat @ constant(fields.T, flat), (n, K, 1 + self.rank, 3))
         on_mean = products[:, :, 0, :] @ constant(self.turns.T, flat)
         factors = xp.reshape(products[:, :, 1:, :], (n, K, 1, 3 * self.rank))
-        latent = xp.reshape(factors @ constant(self.to_latent, flat), (n, K, A, self.rank))
-        centred = latent - constant(signal * self.mean_latent, flat)
-        spread = 1 / (1 + (signal**2 / total) * self.eigenvalues)
-        square = xp.sum(centred**2 * constant(spread, flat), axis=-1)
-        logits = (signal / total) * on_mean + (0.5 * signal**2 / total**2) * square
-        logits = xp.reshape(logits + constant(self._offsets(signal, total), flat), (n, K * A))
-        norm = xp.sum(flat**2, axis=-1) / total + self.dim * math.log(2 * math.pi * total)
+        to_latent = np.swapaxes(level.to_latent, 1, 2)
+        whitened = factors @ constant(to_latent[:, :-1], flat)
+        whitened = whitened[:, :, 0, :] + constant(to_latent[:, -1], flat)
+        square = xp.sum(xp.reshape(whitened, (n, K, A, self.rank)) ** 2, axis=-1)
+        logits = (level.signal / level.total) * on_mean
+        logits = logits + (0.5 * level.signal**2 / level.total**2) * square
+        logits = xp.reshape(logits + constant(self._offsets(level), flat), (n, K * A))
+        norm = xp.sum(flat**2, axis=-1) / level.total
+        norm = norm + self.dim * math.log(2 * math.pi * level.total)
         return xp.reshape(logsumexp(logits) - 0.5 * norm, batch)
 
     def residual_variance(self, x: np.ndarray) -> np.ndarray:
         """Return the mean square of ``x`` outside its component's subspace: ``(n, D) → (n,)``.
 
-        The component is the one of highest responsibility at ᾱ = 1; the expected value is δ².
+        The component is the one of highest responsibility; the expected value is δ².
         """
-        K, A = self.shape
+        level = self._level(1.0)
+        # ‖x − m‖² less its part inside the subspace, Σ (Bᵀ Wᵀ (x − m))² / λ.
+        present = self.eigenvalues > 0
+        inverse = np.zeros_like(self.eigenvalues)
+        inverse[present] = 1 / (level.root**2 * self.eigenvalues)[present]
         out = np.empty(len(x))
-        for start in range(0, len(x), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            state = self.condition(x[rows], 1.0)
-            on_mean, centred = self._products(x[rows])
-            centred -= self.mean_latent[:, None]
-            safe = np.where(self.eigenvalues > 0, self.eigenvalues, np.inf)
-            inside = np.einsum("knar,knar,kar->kna", centred, centred, 1 / safe, optimize=True)
-            square = (x[rows] ** 2).sum(axis=-1)[:, None] - 2 * on_mean
-            square += self.square_mean[:, None] - inside
-            n = square.shape[1]
-            likeliest = np.swapaxes(state.responsibilities, 0, 1).reshape(n, K * A).argmax(axis=1)
-            flat = np.swapaxes(square, 0, 1).reshape(n, K * A)
-            out[rows] = flat[np.arange(n), likeliest] / (self.dim - self.rank)
+        for rows in _blocks(len(x)):
+            on_mean, whitened = self._products(x[rows], level, shifted=True)
+            inside = np.einsum("karn,karn,kar->kan", whitened, whitened, inverse, optimize=True)
+            square = self.square_mean[..., None] - inside - 2 * on_mean + (x[rows] ** 2).sum(axis=1)
+            weight = self._condition(x[rows], level).responsibilities
+            n = weight.shape[-1]
+            likeliest = weight.reshape(-1, n).argmax(axis=0)
+            out[rows] = square.reshape(-1, n)[likeliest, np.arange(n)] / (self.dim - self.rank)
         return out
 
-    def _levels(self, alpha_bar: float) -> tuple[float, float, float]:
-        """√ᾱ, the noise's variance τ = ᾱ δ² + 1 − ᾱ around the factors, and (1−ᾱ)/τ."""
+    def _level(self, alpha_bar: float) -> _Level:
         total = alpha_bar * self.variance + 1 - alpha_bar
-        return math.sqrt(alpha_bar), total, (1 - alpha_bar) / total
-
-    def _offsets(self, signal: float, total: float) -> np.ndarray:
-        """The part of log π p(x | k, a) that does not depend on x, (K, A)."""
-        log_det = np.log1p((signal**2 / total) * self.eigenvalues).sum(axis=-1)
-        energy = signal**2 * self.square_mean / total
-        return self.log_weights[:, None] - 0.5 * (log_det + energy)
-
-    def _products(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Products with every turned mean (K, n, A) and eigenvector (K, n, A, r)."""
+        signal = math.sqrt(alpha_bar)
+        root = 1 / np.sqrt(1 + (alpha_bar / total) * self.eigenvalues)
         K, A = self.shape
-        base = (x @ self.fields.T).reshape(len(x), K, 3 * (1 + self.rank)).transpose(1, 0, 2)
-        on_mean = base[..., :3] @ self.turns.T
-        on_latent = (base[..., 3:] @ self.to_latent).reshape(K, len(x), A, self.rank)
-        return on_mean, on_latent
+        flat_root = root.reshape(K, A * self.rank)
+        to_latent = np.empty((K, A * self.rank, 3 * self.rank + 1))
+        np.multiply(self.to_latent, flat_root[..., None], out=to_latent[..., :-1])
+        to_latent[..., -1] = -signal * self.mean_latent.reshape(K, A * self.rank) * flat_root
+        return _Level(signal, total, (1 - alpha_bar) / total, root, to_latent)
 
-    def _mean_clean(self, state: Conditioned) -> np.ndarray:
-        """Σ p(k, a | x) R(ψ_a)(m_k + W_k E[z | x, k, a]), (n, D)."""
-        latent = state.latent * state.responsibilities[..., None]
-        return self._combine(state.responsibilities, latent)
+    def _offsets(self, level: _Level) -> np.ndarray:
+        """The part of log π p(x | k, a) that does not depend on x, (K, A)."""
+        energy = level.signal**2 * self.square_mean / level.total
+        return self.log_weights[:, None] + np.log(level.root).sum(axis=-1) - 0.5 * energy
 
-    def _combine(self, means: np.ndarray, latent: np.ndarray) -> np.ndarray:
-        """Σ_ka (means_ka R m_k + R W_k latent_ka): ``(K, n, A), (K, n, A, r) → (n, D)``."""
-        K, n, A = means.shape
-        base = np.empty((n, K, 3 * (1 + self.rank)))
-        base[..., :3] = (means @ self.turns).transpose(1, 0, 2)
-        flat = latent.reshape(K, n, A * self.rank)
-        base[..., 3:] = (flat @ self.from_latent).transpose(1, 0, 2)
-        return base.reshape(n, len(self.fields)) @ self.fields
+    def _condition(self, x: np.ndarray, level: _Level) -> _State:
+        logits, whitened = self._products(x, level, shifted=True)
+        logits *= level.signal / level.total
+        square = np.einsum("karn,karn->kan", whitened, whitened)
+        square *= 0.5 * level.signal**2 / level.total**2
+        logits += square
+        logits += self._offsets(level)[..., None]
+        logits -= logits.max(axis=(0, 1))
+        np.exp(logits, out=logits)
+        logits /= logits.sum(axis=(0, 1))
+        return _State(logits, whitened)
+
+    def _products(
+        self, x: np.ndarray, level: _Level, *, shifted: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Products with every turned mean (K, A, n) and whitened eigenvector (K, A, r, n).
+
+        ``shifted``: the latter of x less the component's noisy mean.
+        """
+        K, A = self.shape
+        n = len(x)
+        base = (self._fields @ x.T).reshape(K, 3 * (1 + self.rank) + 1, n)
+        base[:, -1] = float(shifted)
+        on_latent = level.to_latent @ base[:, 3:]
+        return self.turns @ base[:, :3], on_latent.reshape(K, A, self.rank, n)
+
+    def _combined(
+        self, means: np.ndarray, latent: np.ndarray, latent_share: float, level: _Level
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Σ_ka R (means m_k + latent_share W_k B (1 + ᾱλ/τ)^(−½) latent) as two factors.
+
+        ``(K, A, n), (K, A, r, n)`` → ``(n, F), (F, D)``, whose product it is.
+        """
+        K, A, n = means.shape
+        base = np.empty((K, 3 * (1 + self.rank) + 1, n))
+        np.matmul(self.turns.T, means, out=base[:, :3])
+        back = np.swapaxes(level.to_latent, 1, 2)
+        np.matmul(back, latent.reshape(K, A * self.rank, n), out=base[:, 3:])
+        base[:, 3:] *= latent_share
+        # The last row meets a field of zeros.
+        return base.reshape(-1, n).T, self._fields
+
+
+def _blocks(n: int) -> list[slice]:
+    return [slice(start, start + _BLOCK) for start in range(0, n, _BLOCK)]

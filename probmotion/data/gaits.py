@@ -135,9 +135,10 @@ def _direction(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.zeros_like(angle), -np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _across(yaw: np.ndarray) -> np.ndarray:
-    """Unit vector to the body's left, turned by ``yaw``, (L,) → (L, 3)."""
-    return np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
+def _across(yaw: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """Unit vector to the left of a body that leans, turned by ``yaw`` about its spine."""
+    s = np.sin(yaw)
+    return np.stack([np.cos(yaw), s * np.sin(lean), -s * np.cos(lean)], axis=-1)
 
 
 def _flexion(phase: np.ndarray, peak: float) -> np.ndarray:
@@ -162,11 +163,11 @@ def _person(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict[st
     for side, sign, own in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
         hip = draw["stride"] * np.sin(own) + 0.25 * draw["lift"] * _flexion(own, 0.6) * 0.6
         knee = 0.12 + 0.75 * draw["lift"] * _flexion(own, -0.35)
-        joints[f"{side}_hip"] = pelvis + sign * 0.11 * _across(sway * np.sin(phase))
+        joints[f"{side}_hip"] = pelvis + sign * 0.11 * _across(sway * np.sin(phase), lean)
         joints[f"{side}_knee"] = joints[f"{side}_hip"] + 0.43 * _direction(hip)
         joints[f"{side}_ankle"] = joints[f"{side}_knee"] + 0.42 * _direction(hip - knee)
         arm = -draw["swing"] * np.sin(own) + 0.5 * lean
-        shoulder = joints["neck"] - 0.04 * up + sign * 0.17 * _across(-sway * np.sin(phase))
+        shoulder = joints["neck"] - 0.04 * up + sign * 0.17 * _across(-sway * np.sin(phase), lean)
         out = np.array([0.15 * sign, 0.0, 0.0])
         upper = _unit(_direction(arm) + out)
         fore = _unit(_direction(arm + draw["bend"] + 0.3 * draw["swing"] * np.cos(own)) + 0.3 * out)
@@ -185,15 +186,16 @@ def _quadruped(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict
     tail[:, 2] = -0.35
     slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase)
     back = np.stack([np.zeros(frames), np.sin(slope), np.cos(slope)], axis=-1)
-    neck = tail + 0.72 * back + np.array([0.0, 0.03, 0.0])
-    head = np.stack([np.zeros(frames), np.cos(nod + 0.6), np.sin(nod + 0.6)], axis=-1)
+    neck = tail + 0.72 * back
+    face = np.stack([np.zeros(frames), np.cos(nod + 0.8), np.sin(nod + 0.8)], axis=-1)
+    brow = np.stack([np.zeros(frames), np.sin(nod + 0.8), -np.cos(nod + 0.8)], axis=-1)
     joints["tail"], joints["neck"] = tail, neck
-    joints["nose"] = neck + 0.34 * head + np.array([0.0, -0.06, 0.06])
+    joints["nose"] = neck + 0.36 * face
     for side, sign, hind, fore in (
         ("left", 1.0, gait.footfall[0], gait.footfall[2]),
         ("right", -1.0, gait.footfall[1], gait.footfall[3]),
     ):
-        joints[f"{side}_eye"] = neck + 0.28 * head + np.array([0.035 * sign, 0.03, 0.0])
+        joints[f"{side}_eye"] = neck + 0.27 * face + 0.04 * brow + np.array([0.035 * sign, 0, 0])
         out = np.array([0.09 * sign, 0.0, 0.0])
         for root, first, second, third, offset, start in (
             (tail, "hip", "knee", "back_paw", hind, 0.1),

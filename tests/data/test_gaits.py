@@ -13,13 +13,8 @@ def test_bones_keep_their_lengths(style):
     clip = make_gait(style, 1, frames=60)
     joint, parent = np.array(clip.skeleton.bones).T
     lengths = np.linalg.norm(clip.positions[:, joint] - clip.positions[:, parent], axis=-1)
-    spread = lengths.std(axis=0) / lengths.mean(axis=0)
-    # Hips and shoulders hang from a point that sways; everything else is rigid.
-    names = [clip.skeleton.canonical_names[j] for j in joint]
-    for name, value in zip(names, spread, strict=True):
-        assert value < (0.05 if "hip" in name or "shoulder" in name or "eye" in name else 1e-9), (
-            f"{name}: {value:g}"
-        )
+    assert (lengths > 0.02).all()
+    np.testing.assert_allclose(lengths, lengths[[0]].repeat(60, axis=0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("style", list(GAITS))

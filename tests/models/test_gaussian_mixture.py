@@ -319,7 +319,7 @@ def test_component_probabilities_are_the_dense_ones(prior, motions):
 
 def test_off_manifold_is_one_for_the_priors_own_draws(prior):
     off = prior.off_manifold(prior.sample(np.random.default_rng(11), 20_000))
-    # The mean square of D − r = 16 normal numbers, but for the few draws given to a wrong component.
+    # The mean square of D − r = 16 normal numbers, but for few draws given to a wrong component.
     assert off.mean() == pytest.approx(1.0, abs=5 * off.std() / np.sqrt(20_000) + 0.005)
 
 
@@ -356,9 +356,8 @@ def test_reduced_prior_loses_nothing():
     )
     reduced, basis = prior.reduced()
     M = basis.shape[1]
-    assert 2 * 4 * 3 == M
+    assert M == 2 * 4 * 3
     assert frames * joints > M
-    small = (M, frames * joints)
     cameras = Cameras.ring(3, elevation=0.3)
     for alpha_bar in LEVELS:
         X = prior.sample(rng, 5) / prior.scale
@@ -379,7 +378,6 @@ def test_reduced_prior_loses_nothing():
         views = prior.denoise(seen, alpha_bar, cameras).reshape(5, 3, -1, 2)
         views_small = reduced.denoise(seen_small, alpha_bar, cameras)[:, :, 0]
         np.testing.assert_allclose(basis.T @ views, views_small, rtol=0, atol=2e-13)
-    assert small == basis.T.shape
 
 
 def test_survives_the_way_to_another_process(prior, motions):
