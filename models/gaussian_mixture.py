@@ -23,6 +23,7 @@ from probmotion.models.mixture_fit import fit_styles
 from probmotion.models.mixture_posterior import MixturePosterior
 from probmotion.models.turned_mixture import TurnedMixture, turning_fields
 from probmotion.motion import Motion
+from probmotion.seeds import RandomNumbers
 from probmotion.skeleton import Skeleton
 
 __all__ = ["GaussianMixtureMotion"]
@@ -237,7 +238,7 @@ class GaussianMixtureMotion:
         return likelihood.log_density(self.motion(theta))
 
     def complete(
-        self, rng: np.random.Generator, theta: np.ndarray, likelihood: Likelihood | None
+        self, rng: RandomNumbers, theta: np.ndarray, likelihood: Likelihood | None
     ) -> np.ndarray:
         """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres."""
         if self.coordinates == "latent":

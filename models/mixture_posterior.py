@@ -17,6 +17,7 @@ from probmotion.arrays import Array, array_namespace, constant, logsumexp
 from probmotion.likelihoods import Likelihood
 from probmotion.models.turned_mixture import turning_coefficients
 from probmotion.priors import NotConjugate
+from probmotion.seeds import RandomNumbers
 
 __all__ = ["MixturePosterior"]
 
@@ -131,7 +132,7 @@ class MixturePosterior:
         spread = (self._latent_root[style, azimuth] @ unit[..., None])[..., 0]
         return self._motions(rng, style, azimuth, self._latent_mean[style, azimuth] + spread)
 
-    def complete(self, rng: np.random.Generator, latent: np.ndarray) -> np.ndarray:
+    def complete(self, rng: RandomNumbers, latent: np.ndarray) -> np.ndarray:
         """Return one draw of p(X | z, y) per z: ``(n, r) → (n, L, J, 3)``, metres."""
         logits = np.asarray(self._log_terms(latent))
         logits = logits - logits.max(axis=-1, keepdims=True)
@@ -204,7 +205,7 @@ class MixturePosterior:
 
     def _motions(
         self,
-        rng: np.random.Generator,
+        rng: RandomNumbers,
         style: np.ndarray,
         azimuth: np.ndarray,
         latent: np.ndarray,

@@ -6,12 +6,21 @@ functions here are what that standard leaves out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, device, is_jax_array, is_torch_array
 
-__all__ = ["Array", "array_namespace", "constant", "dot", "logsumexp", "to_numpy"]
+__all__ = [
+    "Array",
+    "array_namespace",
+    "constant",
+    "dot",
+    "jax_from_torch",
+    "logsumexp",
+    "to_numpy",
+]
 
 Array = Any
 """An array of any library that follows the Python Array API standard."""
@@ -53,3 +62,30 @@ def logsumexp(x: Array, axis: int = -1) -> Array:
     top = xp.where(xp.isfinite(top), top, xp.zeros_like(top))
     total = xp.sum(xp.exp(x - top), axis=axis, keepdims=True)
     return xp.squeeze(xp.log(total) + top, axis=axis)
+
+
+def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Return a torch function of one point, ``(dim,) → ()``, as a JAX function.
+
+    It can be jitted and differentiated once: value and gradient come from one call of
+    ``function`` on a float64 tensor and torch's autograd, through ``jax.pure_callback``.
+    """
+    import jax
+    import torch
+
+    def value_and_gradient(theta: Array) -> tuple[np.ndarray, np.ndarray]:
+        point = torch.tensor(np.asarray(theta), dtype=torch.float64, requires_grad=True)
+        value = function(point)
+        (gradient,) = torch.autograd.grad(value, point)
+        return to_numpy(value), to_numpy(gradient)
+
+    def call(theta: Array) -> tuple[Array, Array]:
+        shapes = (
+            jax.ShapeDtypeStruct((), theta.dtype),
+            jax.ShapeDtypeStruct(theta.shape, theta.dtype),
+        )
+        return jax.pure_callback(value_and_gradient, shapes, theta, vmap_method="sequential")
+
+    bridged = jax.custom_vjp(lambda theta: call(theta)[0])
+    bridged.defvjp(call, lambda gradient, cotangent: (cotangent * gradient,))
+    return bridged

@@ -32,7 +32,7 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
     if not fits or any(
         isinstance(want, int) and want != got for want, got in zip(axes, trailing, strict=True)
     ):
-        wanted = ", ".join(str(axis) for axis in expected)
+        wanted = ", ".join(str(axis) for axis in expected) + ("," if len(expected) == 1 else "")
         raise ValueError(f"{name} has shape {shape}, expected ({wanted})")
 
 

@@ -20,7 +20,7 @@ from probmotion.skeleton import Skeleton
 if TYPE_CHECKING:
     from probmotion.posterior import MotionPosterior
 
-__all__ = ["MotionDraws"]
+__all__ = ["MotionDraws", "library_versions"]
 
 _VERSION = 1
 
@@ -129,7 +129,7 @@ class MotionDraws:
             "independent": int(independent),
             "fps": float(posterior.fps),
             "parents": np.asarray(skeleton.parents, dtype=np.int32),
-            "versions": json.dumps(_versions(), sort_keys=True),
+            "versions": json.dumps(library_versions(), sort_keys=True),
         }
         for name, count in (counts or {}).items():
             attributes[f"evaluations_{name}"] = int(count)
@@ -226,8 +226,14 @@ class MotionDraws:
 
     def save(self, path: str | Path) -> None:
         """Write the draws as netCDF; nothing is left at ``path`` if writing fails."""
+        # netCDF's integers have 32 bits; seeds and counts may need more.
+        wide = {
+            str(name): str(value)
+            for name, value in self.dataset.attrs.items()
+            if isinstance(value, int) and not -(2**31) <= value < 2**31
+        }
         with written_whole(Path(path)) as unfinished:
-            self.dataset.to_netcdf(unfinished, engine="scipy")
+            self.dataset.assign_attrs(wide).to_netcdf(unfinished, engine="scipy")
 
     @classmethod
     def load(cls, path: str | Path) -> MotionDraws:
@@ -250,7 +256,8 @@ class MotionDraws:
                 f"path is {str(path)!r} with format version "
                 f"{dataset.attrs.get('format_version')}, expected {_VERSION}"
             )
-        return cls(dataset)
+        counted = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
+        return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counted]}))
 
 
 def _settings(sampler: Any) -> dict[str, Any]:
@@ -259,6 +266,7 @@ def _settings(sampler: Any) -> dict[str, Any]:
     return json.loads(json.dumps(asdict(sampler), default=repr))
 
 
-def _versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
+    """Return the versions of the packages that draws depend on."""
     packages = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
     return {package: version(package) for package in packages}

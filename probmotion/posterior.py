@@ -10,6 +10,7 @@ from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_shape
 from probmotion.likelihoods import Likelihood
 from probmotion.priors import HasLogDensity, Marginalises, MotionPrior
+from probmotion.seeds import RandomNumbers
 from probmotion.skeleton import Skeleton
 
 __all__ = ["MotionPosterior"]
@@ -96,7 +97,7 @@ class MotionPosterior:
         check_shape("theta", theta, ("…", self.dim))
         return self.prior.motion(theta)
 
-    def complete(self, rng: np.random.Generator, theta: np.ndarray) -> np.ndarray:
+    def complete(self, rng: RandomNumbers, theta: np.ndarray) -> np.ndarray:
         """Return one motion per θ, ``(n, dim) → (n, L, J, 3)``.
 
         Variables that the prior integrates out are drawn given θ and the evidence; where there

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 
 from probmotion.arrays import Array
+from probmotion.seeds import RandomNumbers
 from probmotion.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -93,9 +94,12 @@ class Marginalises(Protocol):
         """Return log p(y | θ), everything else integrated out: ``(…, dim) → (…)``."""
 
     def complete(
-        self, rng: np.random.Generator, theta: np.ndarray, likelihood: Likelihood | None
+        self, rng: RandomNumbers, theta: np.ndarray, likelihood: Likelihood | None
     ) -> np.ndarray:
-        """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres."""
+        """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres.
+
+        The i-th draw must use the i-th rows of what ``rng`` gives, and nothing else.
+        """
 
 
 @runtime_checkable

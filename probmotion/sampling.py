@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from probmotion.draws import MotionDraws
 
 __all__ = [
+    "Interrupted",
     "Sampler",
     "UnsupportedPosterior",
     "load_sampler",
@@ -78,7 +79,25 @@ class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
         self.word = word
 
 
-def missing(sampler: type | Sampler, posterior: MotionPosterior) -> list[type]:
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C stopped a sampler; what it had finished is not lost.
+
+    It is a ``KeyboardInterrupt``, so that a program that does not know it stops as usual.
+
+    Parameters
+    ----------
+    draws : MotionDraws
+        The finished draws, the same number in every chain. A chain sampler goes on from them:
+        ``sampler.sample(posterior, …, initial=interrupted.draws)``.
+    """
+
+    def __init__(self, draws: MotionDraws) -> None:
+        finished = draws.dataset.sizes["draw"]
+        super().__init__(f"interrupted after {finished} draws per chain, kept in .draws")
+        self.draws = draws
+
+
+def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[type]:
     """Return the protocols that ``sampler`` requires and the posterior's prior lacks."""
     return [needed for needed in sampler.requires if not isinstance(posterior.prior, needed)]
 

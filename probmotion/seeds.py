@@ -8,16 +8,39 @@ cannot change what any one of them yields.
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["NormalStreams", "generator", "integer", "jax_key", "sequence", "torch_generator"]
+__all__ = [
+    "NormalStreams",
+    "RandomNumbers",
+    "generator",
+    "integer",
+    "jax_key",
+    "resumed_generator",
+    "sequence",
+    "state_words",
+    "torch_generator",
+]
 
 Name = str | int
+
+
+class RandomNumbers(Protocol):
+    """What a batch of n draws may ask for: arrays whose first axis is the draw.
+
+    A NumPy generator is one; so is :class:`NormalStreams`, where every draw has its own stream.
+    """
+
+    def random(self, size: tuple[int, ...]) -> np.ndarray:
+        """Return numbers uniform on [0, 1)."""
+
+    def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
+        """Return standard normal numbers."""
 
 
 def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
@@ -50,6 +73,32 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
 def generator(seed: int, *path: Name) -> np.random.Generator:
     """Return the NumPy generator at ``path`` below ``seed``."""
     return np.random.Generator(np.random.PCG64(sequence(seed, *path)))
+
+
+def state_words(rng: np.random.Generator) -> np.ndarray:
+    """Return where a generator of :func:`generator` is, as ten 32-bit words.
+
+    They are signed, because netCDF has no other integers.
+    """
+    held: Any = rng.bit_generator.state
+    numbers = held["state"]
+    bits = numbers["state"] | numbers["inc"] << 128
+    bits |= held["uinteger"] << 256 | held["has_uint32"] << 288
+    return np.frombuffer(bits.to_bytes(40, "little"), dtype="<i4").astype(np.int32)
+
+
+def resumed_generator(words: np.ndarray) -> np.random.Generator:
+    """Return the generator that goes on where :func:`state_words` was taken."""
+    bits = int.from_bytes(np.asarray(words).astype("<i4").tobytes(), "little")
+    low, word = (1 << 128) - 1, (1 << 32) - 1
+    source = np.random.PCG64()
+    source.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": bits & low, "inc": bits >> 128 & low},
+        "uinteger": bits >> 256 & word,
+        "has_uint32": bits >> 288,
+    }
+    return np.random.Generator(source)
 
 
 def integer(seed: int, *path: Name) -> int:
@@ -104,3 +153,18 @@ class NormalStreams:
         for row, rng in zip(out, self.generators, strict=True):
             rng.random(out=row)
         return out
+
+    def random(self, size: tuple[int, ...]) -> np.ndarray:
+        """Return :meth:`uniform`; ``size`` begins with the number of draws."""
+        return self.uniform(*self._row(size))
+
+    def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
+        """Return :meth:`normal`; ``size`` begins with the number of draws."""
+        return self.normal(*self._row(size))
+
+    def _row(self, size: tuple[int, ...]) -> tuple[int, ...]:
+        if size[:1] != (len(self.generators),):
+            raise ValueError(
+                f"size is {size}, expected {len(self.generators)} first, one row per draw"
+            )
+        return size[1:]

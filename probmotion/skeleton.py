@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from probmotion.joint_names import canonical_name, mirrored_name
+from probmotion.joint_names import canonical_names, mirrored_name
 
 __all__ = ["Skeleton"]
 
@@ -126,7 +126,7 @@ class Skeleton:
     @cached_property
     def canonical_names(self) -> tuple[str, ...]:
         """The field's common name of each joint (``left_knee``), or its own where unknown."""
-        return tuple(canonical_name(name) for name in self.joint_names)
+        return canonical_names(self.joint_names)
 
     def index(self, joint_name: str) -> int:
         """Return the index of a joint by its own or its canonical name.

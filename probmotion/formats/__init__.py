@@ -1,1 +1,112 @@
-"""Reading and writing motion files."""
+"""Reading and writing motion files: BVH, npz and keypoint JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from probmotion.formats.bvh import read_bvh
+from probmotion.formats.bvh_writing import write_bvh
+from probmotion.formats.errors import MotionFileError, MotionFileWarning
+from probmotion.formats.keypoint_json import read_keypoint_json
+from probmotion.formats.npz import read_keypoint_npz, read_npz, write_npz
+from probmotion.motion import KeypointTrack, Motion
+from probmotion.skeleton import Skeleton
+
+__all__ = [
+    "MotionFileError",
+    "MotionFileWarning",
+    "read_bvh",
+    "read_keypoints",
+    "read_motion",
+    "save_motion",
+    "write_bvh",
+]
+
+
+def read_motion(path: str | Path) -> Motion:
+    """Read a motion; the file's ending chooses the format: ``.bvh`` or ``.npz``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    motion : Motion
+        In metres, Y up, at the file's own rate. Where a unit had to be inferred or joints had to
+        be left out, a :class:`MotionFileWarning` says so in one sentence; see :func:`read_bvh`
+        and :func:`~probmotion.formats.npz.read_npz`.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no motion, or is damaged; the message names the line or key.
+    FileNotFoundError
+        If there is no such file.
+    """
+    path = Path(path)
+    readers = {".bvh": read_bvh, ".npz": read_npz}
+    if path.suffix.lower() not in readers:
+        if not path.exists():
+            raise FileNotFoundError(f"there is no file {path}")
+        raise MotionFileError(
+            f"{path} ends in {path.suffix!r}, expected a motion in .bvh or .npz (2D keypoints: "
+            "read_keypoints)"
+        )
+    return readers[path.suffix.lower()](path)
+
+
+def save_motion(motion: Motion, path: str | Path) -> None:
+    """Write a motion; the file's ending chooses the format: ``.bvh`` or ``.npz``.
+
+    Raises
+    ------
+    ValueError
+        If the ending is another one, or the format cannot hold the motion.
+    OSError
+        If the folder is missing or cannot be written to.
+    """
+    path = Path(path)
+    writers = {".bvh": write_bvh, ".npz": write_npz}
+    if path.suffix.lower() not in writers:
+        raise ValueError(f"path ends in {path.suffix!r}, expected .bvh or .npz")
+    writers[path.suffix.lower()](motion, path)
+
+
+def read_keypoints(
+    path: str | Path, fps: float | None = None, skeleton: Skeleton | str | None = None
+) -> list[KeypointTrack]:
+    """Read the 2D keypoint tracks of a file: one per person and camera.
+
+    Parameters
+    ----------
+    path : str or Path
+        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, or an ``.npz`` archive.
+    fps : float, optional
+        Frames per second. JSON files do not hold it: there it must be given.
+    skeleton : Skeleton or str, optional
+        The keypoints of a JSON file in their order; see
+        :func:`~probmotion.formats.keypoint_json.read_keypoint_json`.
+
+    Raises
+    ------
+    MotionFileError
+        If the file holds no keypoint track, or is damaged; the message says where.
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If ``fps`` is missing or not above 0, or ``skeleton`` is unknown or not to be given.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    if path.suffix.lower() == ".npz":
+        if skeleton is not None:
+            raise ValueError(f"skeleton was given with {path}, expected none: npz files hold it")
+        return read_keypoint_npz(path, fps)
+    if fps is None:
+        raise ValueError(
+            f"fps is missing, expected frames per second: {path} is JSON, which does not hold it"
+        )
+    return read_keypoint_json(path, fps, skeleton)

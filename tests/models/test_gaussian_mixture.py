@@ -281,6 +281,30 @@ def test_posterior_draws_have_its_moments_by_importance_sampling(prior, motions,
     assert (np.abs(exact.mean(axis=0) - posterior.mean().ravel()) < 5 * error).all()
 
 
+def test_posterior_draws_of_one_component_have_the_dense_covariance():
+    rng = np.random.default_rng(13)
+    rank, joints = 3, 3
+    prior = GaussianMixtureMotion(
+        skeleton=Skeleton(["a", "b", "c"], [-1, 0, 0]),
+        fps=30.0,
+        means=rng.normal(size=(1, 1, joints, 3)),
+        factors=rng.normal(size=(1, rank, 1, joints, 3)),
+        weights=np.ones(1),
+        noise=0.1,
+        azimuths=1,
+    )
+    evidence = Joints3D(rng.normal(size=(1, joints, 3)), 0.5, np.array([[1.0, 0.0, 0.3]]))
+    W = prior.factors.reshape(rank, -1).T
+    precision = np.repeat(evidence.confidence.ravel() / 0.5**2, 3)
+    covariance = np.linalg.inv(np.linalg.inv(W @ W.T + 0.1**2 * np.eye(9)) + np.diag(precision))
+    n = 40_000
+    X = prior.exact_posterior(evidence).sample(rng, n).reshape(n, -1)
+    # The standard error of entry (i, j) is √((C_ii C_jj + C_ij²) / n); 45 entries at 5 sigma.
+    spread = np.sqrt(np.diag(covariance))
+    error = np.sqrt((np.outer(spread, spread) ** 2 + covariance**2) / n)
+    assert (np.abs(np.cov(X.T) - covariance) < 5 * error).all()
+
+
 def test_draws_of_theta_completed_are_draws_of_the_posterior(prior, motions):
     """X drawn from p(X|z,y), z from p(z|y) by quadrature, has the exact posterior's mean."""
     rng = np.random.default_rng(10)

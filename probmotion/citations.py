@@ -1,0 +1,55 @@
+"""What to cite for draws: this program, the method, and the library that ran it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+__all__ = ["CITATIONS", "citations_of"]
+
+_OURS = "The probmotion authors. probmotion: one posterior over 3D skeletal motion, many samplers."
+_DDPM = "Ho, Jain, Abbeel (2020). Denoising diffusion probabilistic models. NeurIPS."
+_COSINE = "Nichol, Dhariwal (2021). Improved denoising diffusion probabilistic models. ICML."
+_MAS = (
+    "Kapon, Tevet, Cohen-Or, Bermano (2024). MAS: multi-view ancestral sampling for 3D motion "
+    "generation using 2D diffusion. CVPR."
+)
+
+CITATIONS: Mapping[str, tuple[str, ...]] = {
+    "exact": (
+        "Tipping, Bishop (1999). Mixtures of probabilistic principal component analysers. Neural "
+        "Computation 11.",
+    ),
+    "ancestral3d": (_DDPM, _COSINE),
+    "mas": (_MAS, _DDPM, _COSINE),
+    "mvpc": (
+        _MAS,
+        "Song et al. (2021). Score-based generative modeling through stochastic differential "
+        "equations. ICLR.",
+    ),
+    "sds": (
+        "Poole, Jain, Barron, Mildenhall (2023). DreamFusion: text-to-3D using 2D diffusion. ICLR.",
+        _MAS,
+    ),
+    "mh": (
+        "Metropolis et al. (1953). Equation of state calculations by fast computing machines. "
+        "J. Chem. Phys. 21.",
+        "Hastings (1970). Monte Carlo sampling methods using Markov chains and their applications. "
+        "Biometrika 57.",
+        "Haario, Saksman, Tamminen (2001). An adaptive Metropolis algorithm. Bernoulli 7.",
+    ),
+    "nuts": (
+        "Hoffman, Gelman (2014). The No-U-Turn sampler. JMLR 15.",
+        "Phan, Pradhan, Jankowiak (2019). Composable effects for flexible and accelerated "
+        "probabilistic programming in NumPyro. arXiv:1912.11554.",
+    ),
+    "ensemble": (
+        "Goodman, Weare (2010). Ensemble samplers with affine invariance. CAMCoS 5.",
+        "Foreman-Mackey, Hogg, Lang, Goodman (2013). emcee: the MCMC hammer. PASP 125.",
+    ),
+}
+"""By sampler, without this program itself."""
+
+
+def citations_of(sampler: str) -> list[str]:
+    """Return the works to cite for draws of a sampler, by its name; ours alone if it is unknown."""
+    return [*CITATIONS.get(sampler, ()), _OURS]

@@ -1,0 +1,323 @@
+"""The command line: ``probmotion compare | list | show | convert``.
+
+Each command is a dataclass whose fields are its options. Libraries are imported by the command
+that needs them, so that help and mistakes answer at once.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+if TYPE_CHECKING:
+    from probmotion.motion import Motion
+    from probmotion.problems import Problem
+
+__all__ = ["Clips", "Compare", "Convert", "List", "Show", "main"]
+
+_OVERVIEW = """usage: probmotion COMMAND [OPTIONS]
+
+One posterior over 3D motion, many samplers, and how wrong each of them is.
+
+commands:
+  compare   draw with several samplers from the same posteriors; print how far each is off
+  list      the problems, the samplers and the skeletons that are known by name
+  show      say what is in a file of motion, keypoints or draws; draw it
+  convert   write a motion to another format, frame rate or skeleton
+
+probmotion COMMAND --help lists the options of a command."""
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Clips of your own to compare on, and what is seen of the one that is held out."""
+
+    clips: tuple[str, ...] = ()
+    """Motion files, .npz or .bvh, or quoted patterns of them: the prior is fitted to all but one,
+    and the evidence is of that one."""
+
+    observe: str = "monocular"
+    """What is seen of the held-out clip: monocular, occluded, sparse or none."""
+
+    fps: float | None = None
+    """Resample every clip to this frame rate; needed where their own rates differ."""
+
+    frames: int = 30
+    """Frames per motion."""
+
+    rank: int = 10
+    """Latent dimensions of each style."""
+
+    styles: int = 3
+    """Number of styles, found by clustering."""
+
+    noise: float = 0.02
+    """Standard deviation of the keypoints, metres."""
+
+    held_out: str | None = None
+    """Name of the clip to hold out (its file's name without the ending); the last by default."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Draw with several samplers from the same posteriors; print how far each of them is off.
+
+    The folder --out keeps every finished cell (problem, sampler, seed): the same command run again
+    goes on where it was stopped.
+    """
+
+    problems: Positional[tuple[str, ...]] = ()
+    """Names of problems (see probmotion list)."""
+
+    samplers: tuple[str, ...] = ()
+    """Names of samplers or their presets (see probmotion list); all samplers by default."""
+
+    draws: int = 200
+    """Draws of each sampler in all."""
+
+    chains: int | None = None
+    """Chains that they are spread over; by default the most, up to 4, that divide the draws."""
+
+    seeds: int = 1
+    """Independent repeats, with seeds 0, 1, …"""
+
+    workers: int = 1
+    """Processes; they never change the draws."""
+
+    out: Path = Path("comparison")
+    """Folder for table.csv and all draws; made where it is missing."""
+
+    quick: bool = False
+    """Begin from settings that cost less, as a demonstration wants; the table names them."""
+
+    pictures: bool = False
+    """Also write quality-against-cost.png and one picture of skeletons per problem."""
+
+    own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
+
+    settings: ClassVar[Any] = None
+    """The samplers' settings: a field of the class that :func:`_parse` makes of this one."""
+
+    def run(self) -> None:
+        """Run the comparison, write ``table.csv``, print the table."""
+        from probmotion.comparison import compare
+
+        samplers = self._samplers()
+        problems = self._problems()
+        comparison = compare(
+            problems,
+            samplers,
+            draws=self.draws,
+            chains=self.chains or max(n for n in (1, 2, 3, 4) if self.draws % n == 0),
+            seeds=self.seeds,
+            workers=self.workers,
+            out=self.out,
+        )
+        comparison.write(self.out)
+        if self.pictures:
+            from probmotion.pictures.comparisons import draw_comparison
+
+            draw_comparison(comparison, problems, self.out)
+        print(comparison.table())
+        print(f"\ntable and draws are in {self.out}")
+
+    def _samplers(self) -> dict[str, Any]:
+        from probmotion.sampling import sampler_names
+        from probmotion.settings_options import sampler_called
+
+        names = self.samplers or sampler_names()
+        return {name: sampler_called(name, self.settings) for name in names}
+
+    def _problems(self) -> list[Problem]:
+        from probmotion.problems import load_problem
+
+        if not self.problems and not self.own.clips:
+            raise ValueError(
+                "no problem is given, expected names of problems (probmotion list shows them) or "
+                "clips of your own (--clips FILE…)"
+            )
+        problems = [load_problem(name) for name in self.problems]
+        return problems + ([problem_from(self.own)] if self.own.clips else [])
+
+
+def problem_from(own: Clips) -> Problem:
+    """Return the problem that a user's clips make."""
+    from probmotion.motion import load_motions
+    from probmotion.problems import clips_problem
+
+    return clips_problem(
+        load_motions(own.clips),
+        observe=own.observe,
+        fps=own.fps,
+        frames=own.frames,
+        rank=own.rank,
+        styles=own.styles,
+        noise=own.noise,
+        held_out=-1 if own.held_out is None else own.held_out,
+    )
+
+
+@dataclass(frozen=True)
+class List:
+    """List the problems, the samplers and the skeletons that are known by name."""
+
+    def run(self) -> None:
+        """Print three lists."""
+        from probmotion.problems import load_problem, problem_names
+        from probmotion.sampling import load_sampler, sampler_names
+        from probmotion.settings_options import presets_of
+        from probmotion.skeleton import Skeleton
+        from probmotion.skeleton_presets import PRESETS
+
+        _print_list("problems", {name: load_problem(name).description for name in problem_names()})
+        kinds = {name: load_sampler(name) for name in sampler_names()}
+        _print_list("samplers", {name: _first_line(kind) for name, kind in kinds.items()})
+        presets = {
+            f"{name}.{preset}": _first_line(getattr(kind, preset))
+            for name, kind in kinds.items()
+            for preset in presets_of(kind)
+        }
+        _print_list("presets of samplers", presets)
+        skeletons = {name: Skeleton.preset(name) for name in PRESETS}
+        _print_list(
+            "skeletons",
+            {name: f"{skeleton.n_joints} joints" for name, skeleton in skeletons.items()},
+        )
+
+
+def _print_list(title: str, entries: dict[str, str]) -> None:
+    width = max(map(len, entries))
+    print(f"{title}:")
+    for name, words in entries.items():
+        print(f"  {name:{width}}  {words}")
+
+
+def _first_line(kind: Any) -> str:
+    return (kind.__doc__ or "").strip().partition("\n")[0]
+
+
+@dataclass(frozen=True)
+class Show:
+    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz) or draws (.nc)."""
+
+    file: Positional[Path]
+    """The file."""
+
+    fps: float | None = None
+    """Frames per second of keypoints in JSON, which does not hold it."""
+
+    picture: Path | None = None
+    """Also draw the motion, or the first draws, to this .png."""
+
+    def run(self) -> None:
+        """Print a few lines about the file."""
+        from probmotion.summaries import summarise
+
+        summary = summarise(self.file, self.fps)
+        print(summary.text)
+        if self.picture is not None:
+            summary.draw(self.picture)
+            print(f"wrote {self.picture}")
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write a motion to another format, frame rate or skeleton."""
+
+    source: Annotated[Positional[Path], arg(name="IN")]
+    """The motion (.bvh, .npz) or draws (.nc)."""
+
+    target: Annotated[Positional[Path], arg(name="OUT")]
+    """What to write; the ending chooses the format: .bvh or .npz."""
+
+    fps: float | None = None
+    """Resample to this frame rate."""
+
+    skeleton: str | None = None
+    """Retarget to this skeleton (see probmotion list)."""
+
+    draw: int = 0
+    """Which draw of the first chain, where IN holds draws."""
+
+    def run(self) -> None:
+        """Read, change, write."""
+        motion = self._read()
+        if self.fps is not None:
+            motion = motion.resample(self.fps)
+        if self.skeleton is not None:
+            from probmotion.skeleton import Skeleton
+
+            motion = motion.retarget(Skeleton.preset(self.skeleton))
+        motion.save(self.target)
+        print(f"wrote {self.target}: {motion}")
+
+    def _read(self) -> Motion:
+        from probmotion.draws import MotionDraws
+        from probmotion.motion import load_motion
+
+        if self.source.suffix != ".nc":
+            return load_motion(self.source)
+        draws = MotionDraws.load(self.source)
+        count = draws.dataset.sizes["draw"]
+        if not 0 <= self.draw < count:
+            raise ValueError(f"draw is {self.draw}, expected 0 to {count - 1}")
+        return draws.motion(self.draw)
+
+
+_COMMANDS: dict[str, type[Any]] = {
+    "compare": Compare, "list": List, "show": Show, "convert": Convert,
+}  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status: 0, 2 for wrong input, 130 for Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(_OVERVIEW)
+        return 0 if words else 2
+    if words[0] not in _COMMANDS:
+        return _complain(f"command is {words[0]!r}, expected one of {', '.join(_COMMANDS)}", 2)
+    with warnings.catch_warnings():
+        warnings.showwarning = _note
+        try:
+            _parse(words[0], words[1:]).run()
+        except KeyboardInterrupt as error:
+            return _complain(str(error) or "interrupted; nothing was written", 130)
+        except OSError as error:
+            named = error.filename and error.strerror
+            return _complain(f"{error.filename}: {error.strerror}" if named else str(error), 2)
+        except ValueError as error:
+            return _complain(str(error), 2)
+    return 0
+
+
+def _parse(name: str, words: Sequence[str]) -> Any:
+    """Return the command with its options; a wrong option ends the process with status 2."""
+    import tyro
+
+    kind = _COMMANDS[name]
+    prog = f"probmotion {name}"
+    if kind is not Compare:
+        return tyro.cli(kind, prog=prog, args=words)
+    from probmotion.settings_options import objects_as_words, settings_of_samplers
+
+    settings = settings_of_samplers(quick="--quick" in words)
+    entry = ("settings", settings, field(default_factory=settings))
+    with_settings = make_dataclass("Compare", [entry], bases=(Compare,), frozen=True)
+    with_settings.__doc__ = Compare.__doc__
+    return tyro.cli(with_settings, prog=prog, args=words, registry=objects_as_words())
+
+
+def _note(message: Warning | str, *_: Any, **__: Any) -> None:
+    print(f"probmotion: note: {message}", file=sys.stderr)
+
+
+def _complain(sentence: str, status: int) -> int:
+    print(f"probmotion: {sentence}", file=sys.stderr)
+    return status

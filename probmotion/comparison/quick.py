@@ -1,0 +1,26 @@
+"""Settings that make a demonstration quick. They are never used unless asked for, and are printed
+under the table and stored with the draws like any others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from probmotion.sampling import Sampler, load_sampler, sampler_names
+
+__all__ = ["QUICK", "quick_samplers"]
+
+QUICK: Mapping[str, Mapping[str, Any]] = {}
+"""By sampler: the settings that differ from its own defaults."""
+
+
+def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:
+    """Return samplers with their quick settings, by name; all registered ones by default.
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown; the message lists the known ones.
+    """
+    chosen = sampler_names() if names is None else list(names)
+    return {name: load_sampler(name)(**QUICK.get(name, {})) for name in chosen}

@@ -1,0 +1,250 @@
+"""`Comparison`: a finished grid, in a folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import weakref
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probmotion.comparison.cells import CellResult, read_draws, read_result
+from probmotion.draws import MotionDraws
+from probmotion.files import written_whole
+from probmotion.problems import Problem, load_problem
+from probmotion.sampling import Sampler
+
+if TYPE_CHECKING:
+    from probmotion.comparison.table import ComparisonTable
+
+__all__ = ["Comparison", "Plan"]
+
+_PLAN, _TABLE, _FAILURES = "comparison.json", "table.csv", "failures.json"
+_PICTURE = "quality_against_cost.png"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The grid that was asked for.
+
+    Parameters
+    ----------
+    problems : dict of str
+        Descriptions by name.
+    samplers : dict of dict
+        By name: settings that differ from the class's defaults.
+    draws, chains, seeds : int
+        As given to :func:`~probmotion.comparison.compare`.
+    """
+
+    problems: dict[str, str]
+    samplers: dict[str, dict[str, str]]
+    draws: int
+    chains: int
+    seeds: int
+
+    @classmethod
+    def of(
+        cls,
+        problems: Mapping[str, str | Problem],
+        samplers: Mapping[str, Sampler],
+        draws: int,
+        chains: int,
+        seeds: int,
+    ) -> Plan:
+        """Return the plan of a grid of these objects."""
+        loaded = {
+            name: load_problem(source) if isinstance(source, str) else source
+            for name, source in problems.items()
+        }
+        return cls(
+            problems={name: problem.description for name, problem in loaded.items()},
+            samplers={name: _changed_settings(sampler) for name, sampler in samplers.items()},
+            draws=draws,
+            chains=chains,
+            seeds=seeds,
+        )
+
+    def cells(self) -> Iterator[tuple[str, str, int]]:
+        """Yield (problem, sampler, seed): all samplers of one problem and seed in a row."""
+        for problem in self.problems:
+            for seed in range(self.seeds):
+                for sampler in self.samplers:
+                    yield problem, sampler, seed
+
+    @staticmethod
+    def cell_folder(folder: Path, problem: str, sampler: str, seed: int) -> Path:
+        """Return where a cell is kept below ``folder``."""
+        return folder / "cells" / problem / sampler / str(seed)
+
+    def save(self, folder: Path) -> None:
+        """Write the plan into ``folder``."""
+        with written_whole(folder / _PLAN) as unfinished:
+            unfinished.write_text(json.dumps(asdict(self), indent=1), encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: Path) -> Plan:
+        """Read the plan in ``folder``."""
+        path = folder / _PLAN
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except OSError as error:
+            raise ValueError(
+                f"folder is {str(folder)!r}, which holds no {_PLAN}, expected one that compare() "
+                "wrote"
+            ) from error
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
+class Comparison:
+    """What every sampler drew on every problem, and what was measured of it.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the cells are.
+    plan : Plan
+        The grid; cells that are not finished are left out.
+    temporary : bool
+        Remove the folder with this object.
+    """
+
+    def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
+        self.folder = folder
+        self.plan = plan
+        found = [read_result(plan.cell_folder(folder, *address)) for address in plan.cells()]
+        self.results: list[CellResult] = [result for result in found if result is not None]
+        if temporary:
+            weakref.finalize(self, shutil.rmtree, folder, True)
+
+    @classmethod
+    def load(cls, folder: str | Path, temporary: bool = False) -> Comparison:
+        """Return the comparison in a folder, as far as it is finished.
+
+        Raises
+        ------
+        ValueError
+            If the folder is none that :func:`~probmotion.comparison.compare` wrote.
+        """
+        return cls(Path(folder), Plan.load(Path(folder)), temporary)
+
+    @property
+    def failures(self) -> list[CellResult]:
+        """The cells without draws: samplers that do not fit a problem, or that failed on it."""
+        return [result for result in self.results if result.failure is not None]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences to read with the table: settings that are not defaults, and failures."""
+        notes = []
+        for sampler, settings in self.plan.samplers.items():
+            if settings:
+                listed = ", ".join(f"{name}={value}" for name, value in settings.items())
+                notes.append(f"{sampler} ran with {listed}; its other settings are its defaults")
+        said = set()
+        for result in self.failures:
+            assert result.failure is not None
+            sentence = f"{result.sampler} on {result.problem}: {result.failure.message}"
+            if sentence not in said:
+                notes.append(sentence)
+            said.add(sentence)
+        return notes
+
+    def table(self) -> ComparisonTable:
+        """Return the tidy data frame: columns problem, sampler, seed, metric, value.
+
+        It prints as mean ± standard deviation over seeds, a block per problem. A cell without
+        draws has the one metric ``unsupported`` or ``failed``, 1.
+        """
+        from probmotion.comparison.table import ComparisonTable
+
+        rows: list[tuple[str, str, int, str, float]] = []
+        words: dict[tuple[str, str], str] = {}
+        for result in self.results:
+            metrics = result.metrics
+            if result.failure is not None:
+                words[result.problem, result.sampler] = result.failure.word
+                metrics = {"unsupported" if result.failure.unsupported else "failed": 1.0}
+            address = (result.problem, result.sampler, result.seed)
+            rows += [(*address, name, float(value)) for name, value in metrics.items()]
+        table = ComparisonTable(rows, columns=["problem", "sampler", "seed", "metric", "value"])
+        table.attrs = {
+            "problems": self.plan.problems,
+            "words": {f"{problem}/{sampler}": word for (problem, sampler), word in words.items()},
+            "notes": self.notes,
+        }
+        return table
+
+    def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
+        """Return the draws of one cell.
+
+        Raises
+        ------
+        ValueError
+            If there is no such cell, or it failed; the message says which there are, or why.
+        """
+        for result in self.results:
+            if (result.problem, result.sampler, result.seed) == (problem, sampler, seed):
+                if result.failure is not None:
+                    raise ValueError(
+                        f"{sampler} has no draws of {problem}: {result.failure.message}"
+                    )
+                return read_draws(self.plan.cell_folder(self.folder, problem, sampler, seed))
+        raise ValueError(
+            f"there is no cell of problem {problem!r}, sampler {sampler!r}, seed {seed!r}; "
+            f"expected one of {', '.join(self.plan.problems)}, of "
+            f"{', '.join(self.plan.samplers)}, and a seed below {self.plan.seeds}"
+        )
+
+    def plot(self, path: str | Path | None = None) -> Path:
+        """Draw quality against cost and return where; beside the cells by default."""
+        from probmotion.pictures import plot_quality_against_cost
+
+        target = self.folder / _PICTURE if path is None else Path(path)
+        plot_quality_against_cost(self.table(), target)
+        return target
+
+    def write(self, folder: str | Path) -> None:
+        """Write ``table.csv`` and ``failures.json``; into another folder, the cells as well."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if folder.resolve() != self.folder.resolve():
+            for result in self.results:
+                address = (result.problem, result.sampler, result.seed)
+                shutil.copytree(
+                    self.plan.cell_folder(self.folder, *address),
+                    self.plan.cell_folder(folder, *address),
+                    dirs_exist_ok=True,
+                )
+            self.plan.save(folder)
+        with written_whole(folder / _TABLE) as unfinished:
+            self.table().to_csv(unfinished, index=False)
+        failures = [
+            {"problem": result.problem, "sampler": result.sampler, "seed": result.seed}
+            | asdict(result.failure)
+            for result in self.failures
+            if result.failure is not None
+        ]
+        with written_whole(folder / _FAILURES) as unfinished:
+            unfinished.write_text(json.dumps(failures, indent=1), encoding="utf-8")
+
+    def __repr__(self) -> str:
+        return str(self.table())
+
+
+def _changed_settings(sampler: Any) -> dict[str, str]:
+    """The settings of a dataclass that differ from its class's defaults, as text."""
+    if not is_dataclass(sampler):
+        return {}
+    try:
+        usual = type(sampler)()
+    except (TypeError, ValueError):  # a setting without a default
+        usual = None
+    return {
+        field.name: repr(getattr(sampler, field.name))
+        for field in fields(sampler)
+        if usual is None or getattr(sampler, field.name) != getattr(usual, field.name)
+    }

@@ -1,0 +1,159 @@
+"""The table of a comparison: a tidy data frame that prints as mean ± standard deviation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+__all__ = ["ComparisonTable"]
+
+_BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
+    (
+        "against exact draws",
+        {
+            "seconds": "seconds",
+            "swd": "swd",
+            "tr": "tr",
+            "mean_error": "mean",
+            "off": "off",
+            "log_density_gap": "log p",
+            "share_error": "shares",
+            "precision": "P",
+            "recall": "R",
+        },
+    ),
+    (
+        "against the truth, mm",
+        {
+            "seconds": "seconds",
+            "mpjpe_mm": "MPJPE",
+            "mpjpe_mean_mm": "of mean",
+            "mpjpe_best_mm": "of best",
+            "mpjpe_visible_mm": "visible",
+            "mpjpe_hidden_mm": "hidden",
+            "g_mpjpe_mm": "G-MPJPE",
+            "pa_mpjpe_mm": "PA-MPJPE",
+        },
+    ),
+    (
+        "the run",
+        {
+            "seconds": "seconds",
+            "denoiser_evaluations": "denoiser",
+            "density_evaluations": "density",
+            "gradient_evaluations": "gradient",
+            "acceptance": "accepted",
+            "divergent": "divergent",
+            "rhat": "R-hat",
+            "ess_bulk": "ESS",
+            "ess_tail": "ESS tail",
+        },
+    ),
+)
+_LEGEND = (
+    "swd: sliced Wasserstein distance / that of two exact sets (1 is right); tr: trace of "
+    "covariance / exact (< 1: over-confident);\nmean: error of the mean / √tr (0); off: variance "
+    "off the prior's manifold / exact draws' (1); log p: mean log density less exact's, nats (0);\n"
+    "shares: styles' total variation from exact (0); P, R: precision and recall; evaluations: of "
+    "denoiser, log density and its gradient."
+)
+
+
+class ComparisonTable(pd.DataFrame):
+    """Columns problem, sampler, seed, metric, value; ``print`` shows mean ± sd over seeds.
+
+    ``attrs`` hold the problems' descriptions, the words for cells without draws, and notes.
+    Whatever is cut from it is a plain data frame.
+    """
+
+    @property
+    def _constructor(self) -> type[pd.DataFrame]:
+        return pd.DataFrame
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> None:
+        return None
+
+    def summary(self) -> str:
+        """Return the table as text, a block per problem."""
+        problems = list(dict.fromkeys(self["problem"]))
+        parts = [self._problem(problem) for problem in problems]
+        if any(self["metric"] == "swd"):
+            parts.append(_LEGEND)
+        parts += self.attrs.get("notes", [])
+        return "\n\n".join(parts) if parts else "no cell is finished"
+
+    def _problem(self, problem: str) -> str:
+        rows = pd.DataFrame(self[self["problem"] == problem])
+        samplers = list(dict.fromkeys(rows["sampler"]))
+        measured = set(rows["metric"])
+        description = self.attrs.get("problems", {}).get(problem, "")
+        lines = [f"{problem}: {description}"]
+        words = self.attrs.get("words", {})
+        grouped = {key: values for key, values in rows.groupby(["sampler", "metric"])["value"]}
+        for title, columns in _BLOCKS:
+            shown = {metric: head for metric, head in columns.items() if metric in measured}
+            if not set(shown) - {"seconds"}:
+                continue
+            body = []
+            for sampler in samplers:
+                word = words.get(f"{problem}/{sampler}")
+                if (sampler, "seconds") in grouped:
+                    cells = [_mean_and_sd(grouped.get((sampler, metric))) for metric in shown]
+                else:
+                    cells = [word or "", *[""] * (len(shown) - 1)]
+                body.append([sampler, *cells])
+            lines.append(_aligned([title, *shown.values()], body))
+        if len(lines) == 1:
+            failed = [[sampler, words.get(f"{problem}/{sampler}", "")] for sampler in samplers]
+            lines.append(_aligned(["no draws", ""], failed))
+        return "\n".join(lines)
+
+
+def _mean_and_sd(values: Any) -> str:
+    if values is None:
+        return ""
+    mean, sd = float(values.mean()), float(values.std())
+    if not math.isfinite(mean):
+        return "-"
+    size, letter = _unit(mean)
+    mean, sd = mean / size, sd / size
+    if len(values) == 1 or not math.isfinite(sd):
+        return f"{mean:.{_decimals(mean, 3)}f}{letter}"
+    # Two digits of the standard deviation, and the mean to the same place.
+    places = _decimals(sd, 2) if sd > 0 else _decimals(mean, 3)
+    return f"{mean:.{places}f} ± {sd:.{places}f}{letter}"
+
+
+def _unit(value: float) -> tuple[float, str]:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= 10 * size:
+            return size, letter
+    return 1.0, ""
+
+
+def _decimals(value: float, digits: int) -> int:
+    """Places after the point that show so many digits of a value, at most three."""
+    if value == 0 or (float(value).is_integer() and abs(value) >= 100):
+        return 0
+    return min(3, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
+
+
+def _aligned(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    rows = [heads, *body]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(heads))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )

@@ -1,0 +1,263 @@
+"""One vocabulary for joints, and the names that data sets and programs give them.
+
+The canonical names are ``pelvis lower_spine spine chest neck upper_neck head head_top nose tail``
+and, with ``left_`` or ``right_`` before them, ``eye ear collar shoulder elbow wrist palm hand
+fingers thumb hip_joint hip knee ankle heel foot big_toe small_toe toe front_paw back_paw``.
+``foot`` is the ball of the foot, as in SMPL, ``toe`` its tip.
+
+Schemes disagree about words. A BVH joint is named for the bone that begins there, so that
+``LeftLeg`` is a knee and ``LeftFoot`` an ankle; an ASF joint is where the bone of its name ends, so
+that ``ltibia`` is an ankle. ``left_foot`` is an ankle where no joint is called one, and the ball of
+the foot beside a ``left_ankle``. The joints of one skeleton are therefore named together.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+__all__ = ["canonical_name", "canonical_names", "mirrored_name"]
+
+# Each word, in lower case without separators, with what it may mean, likeliest first.
+_CENTRAL: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("pelvis", "hip", "hips", "midhip", "hipcentre", "hipcenter"), ("pelvis",)),
+    "root": ("pelvis", "root"),
+    "lowerback": ("lower_spine",),
+    "lowerspine": ("lower_spine",),
+    "thorax": ("neck", "chest"),
+    "neck": ("neck",),
+    "lowerneck": ("neck", "lower_neck"),
+    "upperneck": ("neck", "upper_neck"),
+    "neck1": ("upper_neck",),
+    "head": ("head",),
+    **dict.fromkeys(("headtop", "headtopend", "topofhead"), ("head_top",)),
+    **dict.fromkeys(("nose", "neck/nose"), ("nose",)),
+    **dict.fromkeys(("tail", "tail0", "tailbase", "tailroot", "rootoftail"), ("tail",)),
+}
+_SIDED: dict[str, tuple[str, ...]] = {
+    **{word: (word,) for word in ("eye", "ear", "elbow", "heel", "knee", "ankle", "thumb")},
+    **dict.fromkeys(("collar", "clavicle", "collarbone"), ("collar",)),
+    **dict.fromkeys(("arm", "uparm", "upperarm", "shldr"), ("shoulder",)),
+    "shoulder": ("shoulder", "collar"),
+    **dict.fromkeys(("forearm", "lowerarm"), ("elbow",)),
+    "wrist": ("wrist",),
+    "palm": ("palm",),
+    "hand": ("wrist", "hand"),
+    **dict.fromkeys(("fingers", "finger", "fingerbase", "mid1"), ("fingers",)),
+    **dict.fromkeys(("hip", "upleg", "upperleg", "thigh"), ("hip",)),
+    "hipjoint": ("hip", "hip_joint"),
+    "buttock": ("hip_joint",),
+    **dict.fromkeys(("leg", "lowerleg", "shin", "calf"), ("knee",)),
+    "foot": ("ankle", "foot"),
+    **dict.fromkeys(("toebase", "ball"), ("foot",)),
+    **dict.fromkeys(("toe", "toes"), ("foot", "toe")),
+    "bigtoe": ("big_toe",),
+    "smalltoe": ("small_toe",),
+    **dict.fromkeys(("frontpaw", "fpaw"), ("front_paw",)),
+    **dict.fromkeys(("backpaw", "hindpaw", "bpaw"), ("back_paw",)),
+}
+# What CMU's ASF files call the ends of their bones.
+_ASF_CENTRAL = {
+    "root": "pelvis",
+    "lowerback": "lower_spine",
+    "upperback": "spine",
+    "thorax": "chest",
+    "lowerneck": "neck",
+    "upperneck": "upper_neck",
+    "head": "head",
+}
+_ASF_SIDED = {
+    "hipjoint": "hip",
+    "femur": "knee",
+    "tibia": "ankle",
+    "foot": "foot",
+    "toes": "toe",
+    "clavicle": "shoulder",
+    "humerus": "elbow",
+    "radius": "wrist",
+    "wrist": "palm",
+    "hand": "hand",
+    "fingers": "fingers",
+    "thumb": "thumb",
+}
+_ASF_MARKS = frozenset(side + bone for side in "lr" for bone in ("femur", "tibia", "humerus"))
+# Where the bone that begins at a joint ends, for joints called ``…_end``.
+_END_OF = {
+    "ankle": "foot",
+    "foot": "toe",
+    "head": "head_top",
+    "fingers": "finger_tips",
+    "thumb": "thumb_tip",
+}
+_PAW_OF = {"fingers": "front_paw", "foot": "back_paw"}
+
+_PERSON = re.compile(r"^(?P<person>[^:]*):(?P<joint>.+)$")
+_MIXAMO = re.compile(r"^mixamorig\d*[:_]")
+_END = re.compile(r"^(?P<joint>.+?)[_ .]?(?:[_ .]end(?: ?site)?|End|Nub)$", re.IGNORECASE)
+_TRUNK = re.compile(r"^(?P<word>abdomen|spine|chest|upperchest)(?P<number>\d*)$")
+_SIDES = (
+    re.compile(r"^(?P<side>left|right)[_ .-]*(?P<part>.+)$", re.IGNORECASE),
+    re.compile(r"^(?P<part>.+)[_ .-](?P<side>left|right|l|r)$", re.IGNORECASE),
+    re.compile(r"^(?P<side>l|r)[_ .-](?P<part>.+)$", re.IGNORECASE),
+    re.compile(r"^(?P<side>[lLrR])(?P<part>[A-Z].*)$"),
+)
+_SHORT_SIDE = re.compile(r"^(?P<side>[lLrR])(?P<part>[a-z].*)$")
+_MIRRORED = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
+
+
+def canonical_name(name: str) -> str:
+    """Return the field's common name of a joint, or the name itself where none is known.
+
+    Parameters
+    ----------
+    name : str
+        A joint's name in any of the usual schemes: ``LeftUpLeg``, ``lThigh``, ``l_hip``,
+        ``mixamorig:LeftUpLeg`` and ``left_hip`` are all ``left_hip``.
+
+    See Also
+    --------
+    canonical_names : decides words of two meanings by the other joints of the skeleton.
+    """
+    return canonical_names([name])[0]
+
+
+def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the common names of the joints of one skeleton.
+
+    Parameters
+    ----------
+    names : sequence of str
+        All joints of the skeleton. Those of several people are called ``person:joint`` and keep
+        the person; what stands before every joint alike is a rig's name and is dropped.
+
+    Returns
+    -------
+    tuple of str
+        The canonical names; a joint of unknown meaning keeps its own.
+    """
+    people = [_person_of(name) for name in names]
+    several = len(set(people)) > 1
+    result = list(names)
+    for person in dict.fromkeys(people):
+        members = [index for index, found in enumerate(people) if found == person]
+        bare = [_without_person(names[index]) for index in members]
+        for index, canonical in zip(members, _names_of_one(bare), strict=True):
+            result[index] = f"{person}:{canonical}" if several and person else canonical
+    return tuple(result)
+
+
+def _person_of(name: str) -> str:
+    """Return ``person`` of a joint called ``person:joint``, and ``""`` of any other."""
+    match = _PERSON.match(_MIXAMO.sub("", name))
+    return match["person"] if match else ""
+
+
+def mirrored_name(name: str) -> str | None:
+    """Return the right counterpart of a left joint's name in its own scheme, or None.
+
+    ``left_knee`` gives ``right_knee``, ``lShin`` gives ``rShin``; ``lowerback`` gives None.
+    """
+    bare = _without_person(name)
+    match = _side(bare)
+    if match is None or match["side"] not in _MIRRORED:
+        return None
+    start = len(name) - len(bare) + match.start("side")
+    return name[:start] + _MIRRORED[match["side"]] + name[start + len(match["side"]) :]
+
+
+def _names_of_one(names: list[str]) -> list[str]:
+    """Return the canonical names of one person's joints."""
+    if _ASF_MARKS & set(names):
+        return [_asf_name(name) for name in names]
+    meanings = [_meanings(name) for name in names]
+    for index, meaning in _trunk(names).items():
+        meanings[index] = (meaning,)
+    result = list(names)
+    taken: set[str] = set()
+    # Words of one meaning first; then by name, so that the order of the joints does not matter.
+    for index in sorted(range(len(names)), key=lambda i: (len(meanings[i]), _word(names[i]))):
+        free = [meaning for meaning in meanings[index] if meaning not in taken]
+        if free:
+            result[index] = free[0]
+            taken.add(free[0])
+    known = dict(zip(names, result, strict=True))
+    for index, name in enumerate(names):
+        if result[index] == name and (match := _END.match(name)):
+            alone = _meanings(match["joint"]) or (match["joint"],)
+            end = _in_side(known.get(match["joint"], alone[0]), _END_OF)
+            if end is not None and end not in taken:
+                result[index] = end
+                taken.add(end)
+    if "tail" in taken:
+        result = [_in_side(name, _PAW_OF) or name for name in result]
+    return result
+
+
+def _meanings(name: str) -> tuple[str, ...]:
+    """Return what a name may mean on its own, likeliest first; nothing where it is unknown."""
+    if _word(name) in _CENTRAL:
+        return _CENTRAL[_word(name)]
+    match = _side(name)
+    if match is None:
+        return ()
+    side = "left_" if match["side"][0] in "lL" else "right_"
+    part = _word(match["part"])
+    if part in _SIDED:
+        return tuple(side + meaning for meaning in _SIDED[part])
+    return (side + _ASF_SIDED[part],) if part in _ASF_SIDED else ()
+
+
+def _trunk(names: list[str]) -> dict[int, str]:
+    """Return the meanings of the joints between pelvis and neck, which schemes only number."""
+    order = ("abdomen", "spine", "chest", "upperchest")
+    found = []
+    for index, name in enumerate(names):
+        if match := _TRUNK.match(_word(name)):
+            found.append((order.index(match["word"]), int(match["number"] or 0), index))
+    found.sort()
+    if len(found) == 1:
+        word = order[found[0][0]]
+        return {found[0][2]: "chest" if "chest" in word else "spine"}
+    middle = ["spine"] if len(found) == 2 else ["lower_spine", "spine"]
+    wanted = [*middle, *[""] * (len(found) - len(middle) - 1), "chest"]
+    return {index: name for (_, _, index), name in zip(found, wanted, strict=False) if name}
+
+
+def _asf_name(name: str) -> str:
+    if name in _ASF_CENTRAL:
+        return _ASF_CENTRAL[name]
+    if name[1:] in _ASF_SIDED and name[0] in "lr":
+        return ("left_" if name[0] == "l" else "right_") + _ASF_SIDED[name[1:]]
+    return name
+
+
+def _in_side(name: str, table: dict[str, str]) -> str | None:
+    """Look a canonical name up in ``table``, the side kept."""
+    for side in ("left_", "right_", ""):
+        if name.startswith(side):
+            meaning = table.get(name.removeprefix(side))
+            return None if meaning is None else side + meaning
+    return None
+
+
+def _side(name: str) -> re.Match[str] | None:
+    """Match a name with its side and part; ``lowerback`` and ``root`` have none."""
+    if _word(name) in _CENTRAL or _TRUNK.match(_word(name)):
+        return None
+    for pattern in _SIDES:
+        if match := pattern.match(name):
+            return match
+    match = _SHORT_SIDE.match(name)
+    if match and (_word(match["part"]) in _SIDED or _word(match["part"]) in _ASF_SIDED):
+        return match
+    return None
+
+
+def _without_person(name: str) -> str:
+    match = _PERSON.match(_MIXAMO.sub("", name))
+    return match["joint"] if match else _MIXAMO.sub("", name)
+
+
+def _word(name: str) -> str:
+    """Return a name in lower case without separators."""
+    return re.sub(r"[\s_.-]", "", name).lower()

@@ -1,0 +1,98 @@
+"""How far is a motion from the true one?
+
+Errors are distances per joint and frame, metres, averaged over those that ``mask`` keeps.
+"""
+
+from __future__ import annotations
+
+from probmotion.arrays import Array, array_namespace, constant
+from probmotion.checks import check_positive, check_shape
+
+__all__ = [
+    "acceleration_error",
+    "aligned_by_root",
+    "aligned_by_similarity",
+    "joint_errors",
+    "mean_over",
+]
+
+
+def joint_errors(motions: Array, truth: Array) -> Array:
+    """Return distances per frame and joint, ``(…, L, J, 3), (L, J, 3) → (…, L, J)``.
+
+    Their mean is G-MPJPE; after :func:`aligned_by_root` MPJPE; after
+    :func:`aligned_by_similarity` PA-MPJPE.
+    """
+    xp = array_namespace(motions, truth)
+    check_shape("motions", motions, ("…", *truth.shape))
+    return xp.sqrt(xp.sum((motions - truth) ** 2, axis=-1))
+
+
+def mean_over(errors: Array, mask: Array | None = None) -> Array:
+    """Return the mean error of each motion, ``(…, L, J) → (…)``.
+
+    Parameters
+    ----------
+    errors : Array, (…, L, J)
+        Distances.
+    mask : Array of bool, (L, J), optional
+        Frames and joints that count; all by default.
+
+    Raises
+    ------
+    ValueError
+        If the mask keeps nothing.
+    """
+    xp = array_namespace(errors)
+    if mask is None:
+        return xp.mean(errors, axis=(-2, -1))
+    check_shape("mask", mask, tuple(errors.shape[-2:]))
+    weights = constant(mask, errors)
+    total = float(xp.sum(weights))
+    if total == 0:
+        raise ValueError("mask keeps no joint in any frame, expected at least one")
+    return xp.sum(errors * weights, axis=(-2, -1)) / total
+
+
+def aligned_by_root(motions: Array, root: int = 0) -> Array:
+    """Return the motions with joint ``root`` at the origin in every frame, ``(…, L, J, 3)``."""
+    return motions - motions[..., root : root + 1, :]
+
+
+def aligned_by_similarity(motions: Array, truth: Array) -> Array:
+    """Return each frame moved, turned and scaled to be nearest the truth's (Umeyama 1991).
+
+    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. Never a reflection. A frame whose joints all
+    coincide is moved alone.
+    """
+    xp = array_namespace(motions, truth)
+    check_shape("motions", motions, ("…", *truth.shape))
+    centre = xp.mean(motions, axis=-2, keepdims=True)
+    target = xp.mean(truth, axis=-2, keepdims=True)
+    x, y = motions - centre, truth - target
+    left, size, right = xp.linalg.svd(xp.matmul(xp.matrix_transpose(x), y), full_matrices=False)
+    # x R ≈ y with R = U diag(1, 1, s) Vᵀ, s = det(U Vᵀ) so that R is a rotation.
+    sign = xp.linalg.det(xp.matmul(left, right))
+    ones = xp.ones_like(sign)
+    signs = xp.stack([ones, ones, sign], axis=-1)
+    turn = xp.matmul(left * signs[..., None, :], right)
+    square = xp.sum(x**2, axis=(-2, -1))
+    flat = square == 0
+    scale = xp.sum(size * signs, axis=-1) / xp.where(flat, ones, square)
+    scale = xp.where(flat, ones, scale)
+    return scale[..., None, None] * xp.matmul(x, turn) + target
+
+
+def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
+    """Return the mean distance of accelerations, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
+
+    Second differences; the motions need at least three frames.
+    """
+    xp = array_namespace(motions, truth)
+    check_positive("fps", fps)
+    check_shape("motions", motions, ("…", *truth.shape))
+    if truth.shape[-3] < 3:
+        raise ValueError(f"truth has {truth.shape[-3]} frames, expected at least 3")
+    apart = motions - truth
+    bend = apart[..., 2:, :, :] - 2 * apart[..., 1:-1, :, :] + apart[..., :-2, :, :]
+    return xp.mean(xp.sqrt(xp.sum(bend**2, axis=-1)), axis=(-2, -1)) * fps**2

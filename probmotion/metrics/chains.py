@@ -1,0 +1,63 @@
+"""Have the chains mixed, and how many independent draws are theirs worth?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probmotion.draws import MotionDraws
+
+__all__ = ["chain_diagnostics", "watched_coordinates"]
+
+_FEW = 32
+_PRINCIPAL = 10
+
+
+def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
+    """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
+
+    ``ess_bulk``, ``ess_tail``: the smallest over :func:`watched_coordinates`; ``rhat``: the
+    largest (Vehtari et al. 2021, by ArviZ). Walkers of an ensemble depend on each other, so that
+    neither holds for them: a run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from
+    that alone. ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
+    """
+    if draws.independent:
+        return {}
+    found: dict[str, float] = {}
+    data = draws.dataset
+    if "autocorrelation_time" in data:
+        slowest = float(np.max(data["autocorrelation_time"].values))
+        found["ess_bulk"] = data.sizes["chain"] * data.sizes["draw"] / slowest
+    else:
+        from arviz_stats.base import array_stats
+
+        values = watched_coordinates(draws)
+        axes = {"chain_axis": 0, "draw_axis": 1}
+        found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
+        tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
+        found["ess_tail"] = float(np.min(tails))
+        found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
+    if "acceptance" in data:
+        found["acceptance"] = float(data["acceptance"].mean())
+    if "divergent" in data:
+        found["divergent"] = float(data["divergent"].sum())
+    return found
+
+
+def watched_coordinates(draws: MotionDraws) -> np.ndarray:
+    """Return what diagnostics look at, (chain, draw, n).
+
+    θ (the positions where a run stores none), or its 10 leading principal coordinates over all
+    chains where there are more than 32: the worst of a thousand is bad for perfect chains too.
+    The log density, where stored, is one more.
+    """
+    data = draws.dataset
+    shape = (data.sizes["chain"], data.sizes["draw"])
+    values = (data["theta"] if "theta" in data else data["positions"]).values
+    values = values.reshape(*shape, -1)
+    if values.shape[-1] > _FEW:
+        flat = values.reshape(-1, values.shape[-1])
+        left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+        values = (left * size)[:, :_PRINCIPAL].reshape(*shape, -1)
+    if "log_density" in data:
+        values = np.concatenate([values, data["log_density"].values[..., None]], axis=-1)
+    return values

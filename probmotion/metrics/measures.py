@@ -1,0 +1,180 @@
+"""All measures that apply to one run on one problem, by name: the numbers of the table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.arrays import to_numpy
+from probmotion.draws import MotionDraws
+from probmotion.metrics import accuracy, distribution
+from probmotion.metrics.chains import chain_diagnostics
+from probmotion.metrics.cost import costs
+from probmotion.metrics.structure import HasManifold, HasStyles
+from probmotion.priors import HasExactPosterior
+
+if TYPE_CHECKING:
+    from probmotion.posterior import MotionPosterior
+    from probmotion.problems import Problem
+
+__all__ = ["measure"]
+
+_DIRECTIONS = 256
+# Exact draws to compare with: sets as large as the run's, as many as make about 4000.
+_ENOUGH, _MOST_SETS = 4000, 8
+_MILLIMETRES = 1000.0
+
+
+def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
+    """Return every measure that applies, by name.
+
+    Against exact draws, where the problem has them:
+
+    - ``swd``: sliced Wasserstein distance over that of two exact sets; 1 is right
+    - ``tr``: trace of covariance over the exact one; < 1 is over-confident
+    - ``mean_error``: distance of means over √tr of the exact covariance; 0 is right
+    - ``off``: variance off the prior's manifold over exact draws'; 1 is right
+    - ``log_density_gap``: mean log density less exact draws', nats; 0 is right
+    - ``share_<style>`` and ``share_error``: styles, and their total variation from exact draws'
+    - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
+
+    Against the truth, where it is known, millimetres: see :func:`accuracy_of`. Of chains: see
+    :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost: ``seconds`` and evaluations.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was drawn from.
+    draws : MotionDraws
+        The run.
+    seed : int
+        Seed of the exact draws and directions: the same for every sampler, so that samplers are
+        compared on common random numbers.
+    """
+    found: dict[str, float] = {}
+    positions = draws.flat()
+    if problem.has_reference:
+        found |= _against_reference(problem, positions, seed)
+    if problem.truth is not None:
+        found |= accuracy_of(positions, problem.truth, problem.posterior)
+    return found | chain_diagnostics(draws) | costs(draws)
+
+
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """Exact draws of one problem, and what is measured of them for every sampler alike."""
+
+    sets: list[np.ndarray]
+    flat: np.ndarray
+    directions: np.ndarray
+    off: float | None
+    log_density: float
+    shares: dict[str, float]
+
+
+@lru_cache(maxsize=2)
+def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
+    n_sets = min(_MOST_SETS, max(2, _ENOUGH // n))
+    reference = problem.reference(seed, n_sets * n)
+    flat = reference.reshape(len(reference), -1)
+    rng = seeds.generator(seed, "directions")
+    prior = problem.posterior.prior
+    return _Exact(
+        sets=np.split(flat, n_sets),
+        flat=flat,
+        directions=distribution.random_directions(rng, _DIRECTIONS, flat.shape[1]),
+        off=_off_manifold(prior, reference),
+        log_density=_log_density(problem, reference),
+        shares=_shares(prior, reference),
+    )
+
+
+def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
+    n = len(positions)
+    exact = _exact_draws(problem, seed, n)
+    flat = positions.reshape(n, -1)
+    prior = problem.posterior.prior
+    found = {
+        "swd": distribution.sliced_wasserstein_ratio(flat, exact.sets, exact.directions),
+        "tr": float(distribution.trace_ratio(flat, exact.flat)),
+        "mean_error": float(distribution.mean_error(flat, exact.flat)),
+    }
+    off = _off_manifold(prior, positions)
+    if off is not None and exact.off is not None:
+        found["off"] = off / exact.off
+    found["log_density_gap"] = _log_density(problem, positions) - exact.log_density
+    shares = _shares(prior, positions)
+    if shares:
+        found |= {f"share_{style}": share for style, share in shares.items()}
+        apart = [abs(share - exact.shares[style]) for style, share in shares.items()]
+        found["share_error"] = 0.5 * sum(apart)
+    found["precision"], found["recall"] = distribution.precision_recall(flat, exact.sets[0])
+    return found
+
+
+def _off_manifold(prior: object, positions: np.ndarray) -> float | None:
+    if not isinstance(prior, HasManifold):
+        return None
+    return float(prior.off_manifold(positions).mean())
+
+
+def _log_density(problem: Problem, positions: np.ndarray) -> float:
+    prior, likelihood = problem.posterior.prior, problem.posterior.likelihood
+    assert isinstance(prior, HasExactPosterior)
+    return float(np.mean(to_numpy(prior.exact_posterior(likelihood).log_density(positions))))
+
+
+def _shares(prior: object, positions: np.ndarray) -> dict[str, float]:
+    if not isinstance(prior, HasStyles):
+        return {}
+    shares = prior.style_responsibilities(positions).mean(axis=0)
+    return {style: float(share) for style, share in zip(prior.styles, shares, strict=True)}
+
+
+def accuracy_of(
+    positions: np.ndarray, truth: np.ndarray, posterior: MotionPosterior
+) -> dict[str, float]:
+    """Return errors against the truth, millimetres (accelerations: m/s²).
+
+    - ``mpjpe``: after aligning the root in every frame, mean over draws: what to expect of one
+    - ``mpjpe_mean``: of the mean of all draws; ``mpjpe_best``: of the best draw
+    - ``mpjpe_visible``, ``mpjpe_hidden``: like ``mpjpe``, where the evidence saw the joint or not
+    - ``g_mpjpe``: without alignment; ``pa_mpjpe``: after the best similarity per frame
+    - ``acceleration_error``: mean over draws
+    """
+    root = posterior.skeleton.roots[0]
+    target = accuracy.aligned_by_root(truth, root)
+    errors = accuracy.joint_errors(accuracy.aligned_by_root(positions, root), target)
+    middle = accuracy.aligned_by_root(positions.mean(axis=0), root)
+    per_draw = accuracy.mean_over(errors)
+    metres = {
+        "mpjpe": per_draw.mean(),
+        "mpjpe_mean": accuracy.joint_errors(middle, target).mean(),
+        "mpjpe_best": per_draw.min(),
+    }
+    seen = _visible(posterior)
+    if seen is not None and not seen.all() and seen.any():
+        metres["mpjpe_visible"] = accuracy.mean_over(errors, seen).mean()
+        metres["mpjpe_hidden"] = accuracy.mean_over(errors, ~seen).mean()
+    metres["g_mpjpe"] = accuracy.joint_errors(positions, truth).mean()
+    nearest = accuracy.aligned_by_similarity(positions, truth)
+    metres["pa_mpjpe"] = accuracy.joint_errors(nearest, truth).mean()
+    found = {f"{name}_mm": float(value) * _MILLIMETRES for name, value in metres.items()}
+    if len(truth) >= 3:
+        bend = accuracy.acceleration_error(positions, truth, posterior.fps)
+        found["acceleration_error"] = float(bend.mean())
+    return found
+
+
+def _visible(posterior: MotionPosterior) -> np.ndarray | None:
+    """Where any view saw the joint, (L, J); None where the likelihood does not say."""
+    entries = getattr(posterior.likelihood, "entries", None)
+    if entries is None:
+        return None
+    shape = (math.prod(entries.visible.shape[:-2]), *entries.visible.shape[-2:])
+    return entries.visible.reshape(shape).any(axis=0)

@@ -1,0 +1,49 @@
+"""Colours that every kind of eye can tell apart, and how a figure is saved.
+
+The palette is Okabe and Ito's (2008), its lighter colours darkened so that words in them can be
+read on white.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probmotion.files import written_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CYCLE", "GREY", "INK", "LEFT", "MARKERS", "RIGHT", "save_figure"]
+
+LEFT = "#0072B2"
+RIGHT = "#D55E00"
+INK = "#333333"
+GREY = "#C4C4C4"
+
+CYCLE = ("#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A")
+"""One colour per sampler, in the order in which they are first seen."""
+
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
+"""One shape per sampler, for prints without colour."""
+
+
+def save_figure(figure: Figure, path: str | Path, dots_per_inch: int = 150) -> None:
+    """Write a figure as PNG; nothing is left at ``path`` if writing fails.
+
+    Raises
+    ------
+    ValueError
+        If the path does not end in ``.png``.
+    OSError
+        If the folder cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"path is {str(path)!r}, expected a name that ends in .png")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with written_whole(path) as unfinished:
+        FigureCanvasAgg(figure).figure.savefig(
+            unfinished, format="png", dpi=dots_per_inch, facecolor="white"
+        )

@@ -1,0 +1,86 @@
+"""The pictures of a comparison: quality against cost, and every sampler's draws as skeletons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probmotion.pictures.skeletons import draw_skeletons
+
+if TYPE_CHECKING:
+    from probmotion.comparison import Comparison
+    from probmotion.problems import Problem
+
+__all__ = ["draw_comparison", "draw_problem"]
+
+_SHOWN = 4
+
+
+def draw_comparison(
+    comparison: Comparison, problems: Iterable[Problem], folder: str | Path
+) -> list[Path]:
+    """Write the plot and one picture of skeletons per problem; return their paths.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        What was drawn.
+    problems : iterable of Problem
+        Those of its problems to draw.
+    folder : str or Path
+        Where ``quality_against_cost.png`` and ``skeletons_<problem>.png`` go.
+    """
+    folder = Path(folder)
+    written = [comparison.plot(folder / "quality_against_cost.png")]
+    for problem in problems:
+        path = folder / f"skeletons_{problem.name}.png"
+        draw_problem(comparison, problem, path)
+        written.append(path)
+    return written
+
+
+def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> None:
+    """Write each sampler's draws of a problem below exact draws.
+
+    Where there is evidence, motions are seen from the side of the first camera, which is what it
+    does not show, and the truth stands behind them in grey. Where there is none, all motions are
+    turned to the same heading.
+
+    Raises
+    ------
+    ValueError
+        If there is neither a sampler's draw nor an exact one.
+    """
+    drawn = {}
+    for result in comparison.results:
+        if result.problem == problem.name and result.seed == 0 and result.failure is None:
+            motions = comparison.draws(problem.name, result.sampler).flat()
+            # Neighbours in a chain look alike: show draws that are far apart.
+            drawn[result.sampler] = motions[:: max(1, len(motions) // _SHOWN)]
+    rows = {}
+    if "exact" in drawn:
+        rows["exact"] = drawn.pop("exact")
+    elif problem.has_reference:
+        rows["exact draws"] = problem.reference(0, _SHOWN)
+    rows |= drawn
+    if not rows:
+        raise ValueError(f"problem is {problem.name!r}, which no sampler drew from")
+    posterior = problem.posterior
+    cameras = getattr(posterior.likelihood, "cameras", None)
+    if posterior.likelihood is None:
+        sided = bool(posterior.skeleton.mirrored_pairs)
+        heading = np.pi / 2 - 0.35 if sided else None
+        draw_skeletons(rows, posterior.skeleton, path, heading=heading, title=problem.name)
+        return
+    azimuth = 0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2
+    draw_skeletons(
+        rows,
+        posterior.skeleton,
+        path,
+        azimuth=azimuth,
+        truth=problem.truth,
+        title=problem.name + ("" if cameras is None else ", seen from the camera's side"),
+    )

@@ -1,0 +1,159 @@
+"""A problem made from a user's own clips: one is held out, the prior is fitted to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from probmotion.checks import check_count, check_positive
+from probmotion.models import GaussianMixtureMotion
+from probmotion.motion import Motion
+from probmotion.posterior import MotionPosterior
+from probmotion.problems.evidence import OBSERVATIONS, observe
+from probmotion.problems.problem import Problem
+from probmotion.threads import one_thread
+
+__all__ = ["clips_problem"]
+
+_WINDOWS = 1000
+
+
+def clips_problem(
+    motions: Sequence[Motion],
+    *,
+    frames: int = 30,
+    fps: float | None = None,
+    rank: int = 10,
+    styles: int = 3,
+    observe: str = "monocular",
+    noise: float = 0.02,
+    held_out: int | str = -1,
+    seed: int = 0,
+    name: str = "clips",
+) -> Problem:
+    """Return the problem of a held-out clip's motion, given noisy keypoints of one camera.
+
+    The prior is fitted to windows of all other clips, on the joints that all clips share: about
+    1000, evenly apart, or all there are. The truth is the middle window of the held-out clip, its
+    root centred.
+
+    Parameters
+    ----------
+    motions : sequence of Motion
+        At least two clips, of any skeletons.
+    frames : int
+        Frames L of the motions.
+    fps : float, optional
+        Resample every clip to this rate; needed where they differ.
+    rank : int
+        Latent dimensions of each style.
+    styles : int
+        Number of styles, found by clustering.
+    observe : str
+        What is seen of the held-out window: a name of
+        :data:`~probmotion.problems.evidence.OBSERVATIONS`; ``"none"`` for generation.
+    noise : float
+        Standard deviation of a keypoint, metres.
+    held_out : int or str
+        Index or name of the clip to hold out.
+    seed : int
+        Seed of the clustering and of the keypoints' noise.
+    name : str
+        What tables call the problem.
+
+    Raises
+    ------
+    ValueError
+        If there are too few clips or too short ones, frame rates differ and ``fps`` is not
+        given, no clip has the name ``held_out``, or a style has too few windows for ``rank``.
+    """
+    check_count("frames", frames, least=2)
+    check_positive("noise", noise)
+    if observe not in OBSERVATIONS:
+        raise ValueError(f"observe is {observe!r}, expected one of {', '.join(OBSERVATIONS)}")
+    if len(motions) < 2:
+        raise ValueError(
+            f"motions has {len(motions)} clip{'s' * (len(motions) != 1)}, expected at least 2: one "
+            "is held out and the prior is fitted to the others"
+        )
+    index = _index(motions, held_out)
+    with one_thread():
+        clips = _on_common_ground(motions, fps)
+        hidden = clips.pop(index)
+        if hidden.frames < frames:
+            raise ValueError(
+                f"held_out is {hidden}, expected a clip of at least frames={frames}; hold out "
+                "another or give fewer frames"
+            )
+        long = [clip for clip in clips if clip.frames >= frames]
+        if not long:
+            raise ValueError(
+                f"motions has at most {max(clip.frames for clip in clips)} frames in the clips "
+                f"that are not held out, expected at least frames={frames} in one"
+            )
+        starts = sum(clip.frames - frames + 1 for clip in long)
+        prior = GaussianMixtureMotion.fit(
+            long,
+            frames,
+            rank=rank,
+            styles=styles,
+            stride=min(frames, max(1, starts // _WINDOWS)),
+            seed=seed,
+        )
+        truth = hidden.window((hidden.frames - frames) // 2, frames).centred()
+        evidence = _observe(truth, observe, noise, seed)
+    return Problem(
+        name,
+        _description(long, len(clips) - len(long), hidden, frames, observe, noise),
+        MotionPosterior(prior, evidence),
+        None if evidence is None else truth.positions,
+    )
+
+
+_observe = observe  # the function, which the argument of the same name hides
+
+
+def _index(motions: Sequence[Motion], held_out: int | str) -> int:
+    names = [motion.name for motion in motions]
+    if isinstance(held_out, str):
+        if names.count(held_out) != 1:
+            raise ValueError(
+                f"held_out is {held_out!r}, which names {names.count(held_out)} clips, expected "
+                f"one of {', '.join(names)}"
+            )
+        return names.index(held_out)
+    if not -len(motions) <= held_out < len(motions):
+        raise ValueError(
+            f"held_out is {held_out}, expected an index into the {len(motions)} clips"
+        )
+    return held_out % len(motions)
+
+
+def _on_common_ground(motions: Sequence[Motion], fps: float | None) -> list[Motion]:
+    """The clips at one frame rate and with one skeleton."""
+    from probmotion.retargeting import common_skeleton
+
+    rates = sorted({motion.fps for motion in motions})
+    if fps is not None:
+        motions = [motion.resample(fps) for motion in motions]
+    elif len(rates) > 1:
+        listed = ", ".join(f"{rate:.6g}" for rate in rates)
+        raise ValueError(
+            f"motions has clips of {listed} frames per second, expected one rate; give fps= to "
+            "resample them"
+        )
+    skeleton = common_skeleton(motions)
+    return [motion.retarget(skeleton) for motion in motions]
+
+
+def _description(
+    fitted: Sequence[Motion], too_short: int, hidden: Motion, frames: int, how: str, noise: float
+) -> str:
+    clips = f"{len(fitted)} clip{'s' * (len(fitted) != 1)}"
+    left_out = f" ({too_short} shorter than {frames} frames left out)" if too_short else ""
+    prior = f"prior fitted to {clips} of {fitted[0].skeleton.n_joints} joints{left_out}"
+    if how == "none":
+        return f"{prior}, without {hidden.name or 'the one held out'}; no evidence"
+    return (
+        f"{prior}; {how} keypoints (σ {100 * noise:g} cm) of {hidden.name or 'the one held out'}, "
+        "which was held out"
+    )

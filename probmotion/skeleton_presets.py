@@ -1,0 +1,125 @@
+"""Skeletons by name: the joint sets that data sets and detectors use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from probmotion.skeleton import Skeleton
+
+__all__ = ["PRESETS"]
+
+
+def _tree(*bones: str) -> Skeleton:
+    """Return the skeleton of lines ``"joint parent"``; a line of one word is a root."""
+    names = [bone.split()[0] for bone in bones]
+    parents = [names.index(b.split()[1]) if " " in b else -1 for b in bones]
+    return Skeleton(names, parents)
+
+
+def _alphapose16() -> Skeleton:
+    """AlphaPose's model with 16 joints: those of MPII."""
+    return _tree(
+        "right_ankle right_knee", "right_knee right_hip", "right_hip pelvis", "left_hip pelvis",
+        "left_knee left_hip", "left_ankle left_knee", "pelvis", "thorax pelvis",
+        "upper_neck thorax", "head_top upper_neck", "right_wrist right_elbow",
+        "right_elbow right_shoulder", "right_shoulder thorax", "left_shoulder thorax",
+        "left_elbow left_shoulder", "left_wrist left_elbow",
+    )  # fmt: skip
+
+
+def _apt36k17() -> Skeleton:
+    """The quadrupeds of AP-10K and APT-36K."""
+    return _tree(
+        "left_eye nose", "right_eye nose", "nose neck", "neck tail", "tail",
+        "left_shoulder neck", "left_elbow left_shoulder", "left_front_paw left_elbow",
+        "right_shoulder neck", "right_elbow right_shoulder", "right_front_paw right_elbow",
+        "left_hip tail", "left_knee left_hip", "left_back_paw left_knee",
+        "right_hip tail", "right_knee right_hip", "right_back_paw right_knee",
+    )  # fmt: skip
+
+
+def _body25b() -> Skeleton:
+    """OpenPose's BODY_25B, which has no pelvis: the hips hang from the neck."""
+    return _tree(
+        "nose neck", "left_eye nose", "right_eye nose", "left_ear left_eye", "right_ear right_eye",
+        "left_shoulder neck", "right_shoulder neck", "left_elbow left_shoulder",
+        "right_elbow right_shoulder", "left_wrist left_elbow", "right_wrist right_elbow",
+        "left_hip neck", "right_hip neck", "left_knee left_hip", "right_knee right_hip",
+        "left_ankle left_knee", "right_ankle right_knee", "neck", "head_top neck",
+        "left_big_toe left_ankle", "left_small_toe left_ankle", "left_heel left_ankle",
+        "right_big_toe right_ankle", "right_small_toe right_ankle", "right_heel right_ankle",
+    )  # fmt: skip
+
+
+def _cmu31() -> Skeleton:
+    """CMU's ASF skeleton: a joint is where the bone of its name ends."""
+    return _tree(
+        "root", "lhipjoint root", "rhipjoint root", "lowerback root", "lfemur lhipjoint",
+        "ltibia lfemur", "lfoot ltibia", "ltoes lfoot", "rfemur rhipjoint", "rtibia rfemur",
+        "rfoot rtibia", "rtoes rfoot", "upperback lowerback", "thorax upperback",
+        "lowerneck thorax", "lclavicle thorax", "rclavicle thorax", "upperneck lowerneck",
+        "head upperneck", "lhumerus lclavicle", "lradius lhumerus", "lwrist lradius",
+        "lhand lwrist", "lthumb lwrist", "lfingers lhand", "rhumerus rclavicle",
+        "rradius rhumerus", "rwrist rradius", "rhand rwrist", "rthumb rwrist", "rfingers rhand",
+    )  # fmt: skip
+
+
+def _coco17() -> Skeleton:
+    """COCO's keypoints, which have neither pelvis nor neck: the shoulders hang from the nose."""
+    return _tree(
+        "nose", "left_eye nose", "right_eye nose", "left_ear left_eye", "right_ear right_eye",
+        "left_shoulder nose", "right_shoulder nose", "left_elbow left_shoulder",
+        "right_elbow right_shoulder", "left_wrist left_elbow", "right_wrist right_elbow",
+        "left_hip left_shoulder", "right_hip right_shoulder", "left_knee left_hip",
+        "right_knee right_hip", "left_ankle left_knee", "right_ankle right_knee",
+    )  # fmt: skip
+
+
+def _h36m17() -> Skeleton:
+    """Human3.6M's 17 joints; ``neck`` is between the shoulders, ``head`` the top of the head."""
+    return _tree(
+        "pelvis", "right_hip pelvis", "right_knee right_hip", "right_ankle right_knee",
+        "left_hip pelvis", "left_knee left_hip", "left_ankle left_knee", "spine pelvis",
+        "neck spine", "nose neck", "head nose", "left_shoulder neck", "left_elbow left_shoulder",
+        "left_wrist left_elbow", "right_shoulder neck", "right_elbow right_shoulder",
+        "right_wrist right_elbow",
+    )  # fmt: skip
+
+
+def _smpl22() -> Skeleton:
+    """The body of SMPL without its hands."""
+    return _tree(
+        "pelvis", "left_hip pelvis", "right_hip pelvis", "spine1 pelvis", "left_knee left_hip",
+        "right_knee right_hip", "spine2 spine1", "left_ankle left_knee", "right_ankle right_knee",
+        "spine3 spine2", "left_foot left_ankle", "right_foot right_ankle", "neck spine3",
+        "left_collar spine3", "right_collar spine3", "head neck", "left_shoulder left_collar",
+        "right_shoulder right_collar", "left_elbow left_shoulder", "right_elbow right_shoulder",
+        "left_wrist left_elbow", "right_wrist right_elbow",
+    )  # fmt: skip
+
+
+def _pair17() -> Skeleton:
+    """Two people of Human3.6M's 17 joints each."""
+    one = _h36m17()
+    names = [f"person{p}:{name}" for p in range(2) for name in one.joint_names]
+    return Skeleton(names, [*one.parents, *(q if q < 0 else q + 17 for q in one.parents)])
+
+
+def _gymnast_ball() -> Skeleton:
+    """A person of COCO's keypoints and a ball (MAS, section 5)."""
+    one = _coco17()
+    return Skeleton([*one.joint_names, "ball"], [*one.parents, -1])
+
+
+PRESETS: Mapping[str, Callable[[], Skeleton]] = {
+    "alphapose16": _alphapose16,
+    "apt36k17": _apt36k17,
+    "body25b": _body25b,
+    "cmu31": _cmu31,
+    "coco17": _coco17,
+    "gymnast-ball": _gymnast_ball,
+    "h36m17": _h36m17,
+    "pair17": _pair17,
+    "smpl22": _smpl22,
+}
+"""Functions that make each skeleton, by name."""

@@ -1,0 +1,152 @@
+"""What is in a file: a few lines of words, and a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.draws import MotionDraws
+from probmotion.motion import KeypointTrack, Motion
+from probmotion.skeleton import Skeleton
+
+__all__ = ["Summary", "summarise"]
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """A file's content in words, and motions of it to look at.
+
+    Parameters
+    ----------
+    text : str
+        A few lines.
+    skeleton : Skeleton
+        The J joints.
+    motions : ndarray, (n, L, J, 3)
+        What to draw, metres; n is 0 where there is no 3D motion.
+    label : str
+        What to call them.
+    """
+
+    text: str
+    skeleton: Skeleton
+    motions: np.ndarray
+    label: str
+
+    def draw(self, path: Path) -> None:
+        """Write a picture of the motions.
+
+        Raises
+        ------
+        ValueError
+            If there is no 3D motion to draw.
+        """
+        from probmotion.pictures import draw_skeletons
+
+        if not len(self.motions):
+            raise ValueError("picture is given for 2D keypoints, expected a file of 3D motion")
+        sided = bool(self.skeleton.mirrored_pairs)
+        draw_skeletons(
+            {self.label: self.motions},
+            self.skeleton,
+            path,
+            moments=8 if len(self.motions) == 1 else 5,
+            heading=np.pi / 3 if sided else None,
+        )
+
+
+def summarise(path: Path, fps: float | None = None) -> Summary:
+    """Return a summary of a file of motion, keypoints or draws.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    fps : float, optional
+        Frames per second of keypoints in JSON, which does not hold it.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is none of these, or is damaged.
+    FileNotFoundError
+        If there is no such file.
+    """
+    if path.suffix == ".nc":
+        return _of_draws(path, MotionDraws.load(path))
+    if _holds_keypoints(path):
+        from probmotion.formats import read_keypoints
+
+        return _of_tracks(path, read_keypoints(path, fps))
+    from probmotion.formats import read_motion
+
+    return _of_motion(path, read_motion(path))
+
+
+def _holds_keypoints(path: Path) -> bool:
+    if path.suffix == ".npz":
+        from zipfile import BadZipFile, ZipFile
+
+        try:
+            with ZipFile(path) as archive:
+                names = archive.namelist()
+        except BadZipFile:
+            return False
+        return "keypoints.npy" in names and "positions.npy" not in names
+    return path.suffix == ".json" or path.is_dir()
+
+
+def _of_motion(path: Path, motion: Motion) -> Summary:
+    size = motion.positions.reshape(-1, 3)
+    low, high = size.min(axis=0), size.max(axis=0)
+    root = motion.positions[:, motion.skeleton.roots[0]]
+    walked = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
+    text = [
+        f"{path}: a motion",
+        _length(motion.frames, motion.fps),
+        _joints(motion.skeleton),
+        f"  height {low[1]:.2f} to {high[1]:.2f} m; the root travels {walked:.2f} m over ground",
+        f"  local rotations: {'yes' if motion.rotations is not None else 'no'}",
+    ]
+    return Summary("\n".join(text), motion.skeleton, motion.positions[None], motion.name)
+
+
+def _of_tracks(path: Path, tracks: list[KeypointTrack]) -> Summary:
+    count = f"{len(tracks)} keypoint track{'s' if len(tracks) != 1 else ''}"
+    text = [f"{path}: {count}"]
+    for track in tracks:
+        seen = (track.confidence > 0).mean()
+        text += [f"  {track.name}:", _length(track.frames, track.fps), f"  {seen:.0%} seen"]
+    skeleton = tracks[0].skeleton
+    text.append(_joints(skeleton))
+    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+
+
+def _of_draws(path: Path, draws: MotionDraws) -> Summary:
+    attributes, sizes = draws.dataset.attrs, draws.dataset.sizes
+    sampler = str(attributes["sampler"])
+    evaluations = ", ".join(f"{n} {kind}" for kind, n in draws.counts.items()) or "none counted"
+    text = [
+        f"{path}: draws of {sampler}",
+        f"  {sizes['chain']} x {sizes['draw']} (chains x draws), seed {attributes['seed']}, "
+        f"{draws.seconds:.1f} s",
+        _length(sizes["frame"], draws.fps),
+        _joints(draws.skeleton),
+        f"  evaluations: {evaluations}",
+        f"  settings: {attributes['settings']}",
+    ]
+    return Summary("\n".join(text), draws.skeleton, draws.flat()[:4], sampler)
+
+
+def _length(frames: int, fps: float) -> str:
+    return f"  {frames} frames at {fps:g} fps, {(frames - 1) / fps:.2f} s"
+
+
+def _joints(skeleton: Skeleton) -> str:
+    roots = ", ".join(skeleton.joint_names[root] for root in skeleton.roots)
+    return (
+        f"  {skeleton.n_joints} joints below {roots}, "
+        f"{len(skeleton.mirrored_pairs)} left-right pairs"
+    )

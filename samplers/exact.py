@@ -1,0 +1,94 @@
+"""`ExactSampler`: independent draws from a posterior in closed form."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
+from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate
+from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
+
+__all__ = ["ExactSampler"]
+
+
+@dataclass(frozen=True)
+class ExactSampler:
+    """Independent draws from the posterior that the prior knows in closed form.
+
+    Draw i of chain k comes from its own random numbers, so that it is the same however many draws
+    and chains there are.
+    """
+
+    name: ClassVar[str] = "exact"
+    requires: ClassVar[tuple[type, ...]] = (HasExactPosterior,)
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``chains`` × ``draws`` independent draws.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the posterior has no closed form.
+        Interrupted
+            On Ctrl-C; it carries the draws that were finished.
+        """
+        exact = self._closed_form(posterior)
+        check_count("draws", draws)
+        check_count("chains", chains)
+        if initial is not None:
+            raise ValueError(
+                f"initial is {type(initial).__name__}, expected None: exact draws start nowhere"
+            )
+        start = time.perf_counter()
+        finished: list[np.ndarray] = []
+
+        def result() -> MotionDraws:
+            return MotionDraws.of(
+                posterior,
+                self,
+                np.stack(finished, axis=1),
+                seed=seed,
+                seconds=time.perf_counter() - start,
+                independent=True,
+            )
+
+        try:
+            with progress_bar(draws, self.name, progress) as bar:
+                for draw in range(draws):
+                    streams = [seeds.generator(seed, "draw", k, draw) for k in range(chains)]
+                    finished.append(np.concatenate([exact.sample(rng, 1) for rng in streams]))
+                    bar.update(1)
+        except KeyboardInterrupt as stop:
+            if not finished:
+                raise
+            raise Interrupted(result()) from stop
+        return result()
+
+    def _closed_form(self, posterior: MotionPosterior) -> ExactPosterior:
+        require(self, posterior)
+        assert isinstance(posterior.prior, HasExactPosterior)
+        try:
+            return posterior.prior.exact_posterior(posterior.likelihood)
+        except NotConjugate as error:
+            raise UnsupportedPosterior(
+                self.name,
+                f"needs a posterior in closed form, but {error}",
+                word="not-conjugate",
+                others=("mh", "nuts"),
+            ) from error

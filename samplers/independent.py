@@ -1,0 +1,99 @@
+"""Samplers whose draws are independent: batches, streams of random numbers, bars, provenance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
+from probmotion.sampling import Interrupted, Sampler, batches, progress_bar
+from probmotion.seeds import NormalStreams
+
+__all__ = ["DrawBatch", "draw_independently", "refuse_initial"]
+
+DrawBatch = Callable[[NormalStreams, Callable[[], Any]], np.ndarray]
+"""(streams, tick) → motions (B, L, J, 3) in normalised units; calls ``tick()`` once per step."""
+
+
+def draw_independently(
+    sampler: Sampler,
+    posterior: MotionPosterior,
+    draw_batch: DrawBatch,
+    *,
+    draws: int,
+    chains: int,
+    seed: int,
+    batch: int,
+    steps: int,
+    scale: float,
+    counts: Mapping[str, int],
+    progress: bool,
+) -> MotionDraws:
+    """Return ``chains`` × ``draws`` draws, at most ``batch`` at a time.
+
+    Parameters
+    ----------
+    sampler, posterior
+        For the result's provenance.
+    draw_batch : callable
+        Draws one batch.
+    draws, chains, seed, progress
+        As in :class:`~probmotion.sampling.Sampler`.
+    batch : int
+        Draws at a time; draw i of chain k uses its own random numbers whatever its batch.
+    steps : int
+        How often ``draw_batch`` ticks.
+    scale : float
+        Metres per normalised unit.
+    counts : mapping of int
+        Evaluations, read when the draws are done.
+
+    Raises
+    ------
+    Interrupted
+        At Ctrl-C, with the draws of the finished batches.
+    """
+    check_count("draws", draws)
+    check_count("chains", chains)
+    start = time.perf_counter()
+    # Draw by draw, so that an interrupted run has as many of every chain.
+    pairs = [(chain, draw) for draw in range(draws) for chain in range(chains)]
+    done: list[np.ndarray] = []
+
+    def result() -> MotionDraws:
+        motions = np.concatenate(done)
+        whole = motions[: len(motions) // chains * chains]
+        return MotionDraws.of(
+            posterior,
+            sampler,
+            whole.reshape(-1, chains, *whole.shape[1:]).swapaxes(0, 1),
+            seed=seed,
+            seconds=time.perf_counter() - start,
+            counts=counts,
+            independent=True,
+        )
+
+    try:
+        with progress_bar(steps * -(-len(pairs) // batch), sampler.name, progress) as bar:
+            for some in batches(pairs, batch):
+                streams = NormalStreams.of_draws(seed, list(some))
+                done.append(draw_batch(streams, lambda: bar.update(1)) * scale)
+    except KeyboardInterrupt as interrupt:
+        if sum(map(len, done)) < chains:
+            raise
+        raise Interrupted(result()) from interrupt
+    return result()
+
+
+def refuse_initial(sampler: Sampler, initial: object) -> None:
+    """Raise ``ValueError`` if starting points are given to a sampler that starts from noise."""
+    if initial is not None:
+        raise ValueError(
+            f"initial is {type(initial).__name__}, expected None: {sampler.name} starts every draw "
+            "from noise"
+        )

@@ -1,0 +1,213 @@
+"""`MetropolisHastings`: random walks with any proposal, all chains side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
+from probmotion.priors import HasLogDensity
+from probmotion.samplers.densities import Density, continued, motions, starting_points
+from probmotion.samplers.proposals import AdaptiveCovariance, Proposal, ProposalState
+from probmotion.sampling import Interrupted, progress_bar
+
+__all__ = ["MetropolisHastings"]
+
+
+@dataclass(frozen=True)
+class MetropolisHastings:
+    """Metropolis et al. (1953), Hastings (1970); one density evaluation per chain and step.
+
+    Parameters
+    ----------
+    proposal : Proposal
+        Where a chain might go next.
+    warmup : int
+        Steps before the first draw, in which the proposal learns.
+    thin : int
+        Steps from one draw to the next.
+    """
+
+    name: ClassVar[str] = "mh"
+    requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+
+    proposal: Proposal = field(default_factory=AdaptiveCovariance)
+    warmup: int = 5000
+    thin: int = 20
+
+    def __post_init__(self) -> None:
+        check_count("warmup", self.warmup, least=0)
+        check_count("thin", self.thin)
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``draws`` states of each of ``chains`` chains, ``thin`` steps apart.
+
+        Parameters
+        ----------
+        posterior, draws, chains, seed, progress
+            As in :class:`~probmotion.sampling.Sampler`.
+        initial : MotionDraws or ndarray, (chains, dim), optional
+            An earlier run, to go on from as if it had not stopped (without a warm-up); or points
+            to start from, such as any kept draw's θ. Draws from the prior by default.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the posterior has no density.
+        Interrupted
+            On Ctrl-C; it carries the draws that were finished.
+        """
+        check_count("draws", draws)
+        start = time.perf_counter()
+        density = Density(self, posterior)
+        earlier = continued(self, initial, chains, seed)
+        warmup = self.warmup if earlier is None else 0
+        kept = _Kept(chains, draws, posterior.dim)
+        try:
+            with progress_bar(warmup + draws * self.thin, self.name, progress) as bar:
+                if earlier is None:
+                    points = starting_points(posterior, initial, (chains, posterior.dim), seed)
+                    walk = _Walk.begin(self.proposal, density, points, seed)
+                    walk.warm_up(warmup, bar.update)
+                else:
+                    walk = _Walk.resume(self.proposal, density, earlier)
+                for _ in range(draws):
+                    kept.add(walk, walk.advance(self.thin))
+                    bar.update(self.thin)
+        except KeyboardInterrupt as stop:
+            if not kept.last[0]:
+                raise
+            result = self._result(posterior, kept, density, seed, start)
+            raise Interrupted(result) from stop
+        return self._result(posterior, kept, density, seed, start)
+
+    def _result(
+        self, posterior: MotionPosterior, kept: _Kept, density: Density, seed: int, start: float
+    ) -> MotionDraws:
+        n, state = kept.last
+        theta = kept.theta[:, :n]
+        positions = motions(posterior, theta, seed, first=int(state["draws"]) - n)
+        return MotionDraws.of(
+            posterior,
+            self,
+            positions,
+            seed=seed,
+            seconds=time.perf_counter() - start,
+            theta=theta,
+            log_density=kept.log_density[:, :n],
+            statistics={"acceptance": kept.acceptance[:, :n]},
+            counts={"density": density.evaluations},
+            state=state,
+        )
+
+
+class _Walk:
+    """Chains that walk side by side; nothing that one does depends on another."""
+
+    def __init__(
+        self,
+        proposal: Proposal,
+        density: Density,
+        theta: np.ndarray,
+        log_density: np.ndarray,
+        memory: ProposalState,
+        generators: list[np.random.Generator],
+        draws: int,
+    ) -> None:
+        self.proposal = proposal
+        self.density = density
+        self.theta = theta
+        self.log_density = log_density
+        self.memory = memory
+        self.generators = generators
+        self.draws = draws
+
+    @classmethod
+    def begin(cls, proposal: Proposal, density: Density, theta: np.ndarray, seed: int) -> _Walk:
+        generators = [seeds.generator(seed, "chain", chain) for chain in range(len(theta))]
+        memory = proposal.begin(theta)
+        return cls(proposal, density, theta, density.at_start(theta), memory, generators, draws=0)
+
+    @classmethod
+    def resume(cls, proposal: Proposal, density: Density, state: Mapping[str, np.ndarray]) -> _Walk:
+        memory = {
+            name.removeprefix(_MEMORY): values
+            for name, values in state.items()
+            if name.startswith(_MEMORY)
+        }
+        generators = [seeds.resumed_generator(words) for words in state["random"]]
+        where = (state["theta"], state["log_density"])
+        return cls(proposal, density, *where, memory, generators, draws=int(state["draws"]))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return all that :meth:`resume` needs."""
+        memory = self.proposal.settled(self.memory)
+        return {
+            "theta": self.theta,
+            "log_density": self.log_density,
+            "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
+            "draws": np.array(self.draws, dtype=np.int32),
+            **{_MEMORY + name: values for name, values in memory.items()},
+        }
+
+    def warm_up(self, steps: int, tick: Callable[[], Any]) -> None:
+        """Take steps from which the proposal learns."""
+        for _ in range(steps):
+            acceptance = self._step()
+            self.memory = self.proposal.learn(self.memory, self.theta, acceptance)
+            tick()
+
+    def advance(self, steps: int) -> np.ndarray:
+        """Take the steps to the next draw; return their mean acceptance, (chains,)."""
+        acceptance = np.mean([self._step() for _ in range(steps)], axis=0)
+        self.draws += 1
+        return acceptance
+
+    def _step(self) -> np.ndarray:
+        """Take one step; return its probability of acceptance, (chains,)."""
+        proposed, log_ratio = self.proposal.propose(self.generators, self.theta, self.memory)
+        log_density = self.density(proposed)
+        log_acceptance = np.minimum(0.0, log_density - self.log_density + log_ratio)
+        # −log of a number uniform on (0, 1].
+        level = np.array([rng.standard_exponential() for rng in self.generators])
+        accepted = -level < log_acceptance
+        self.theta = np.where(accepted[:, None], proposed, self.theta)
+        self.log_density = np.where(accepted, log_density, self.log_density)
+        return np.exp(log_acceptance)
+
+
+_MEMORY = "proposal_"
+
+
+class _Kept:
+    """The draws so far and the state after the last; an interrupt between two leaves it whole."""
+
+    def __init__(self, chains: int, draws: int, dim: int) -> None:
+        self.theta = np.empty((chains, draws, dim))
+        self.log_density = np.empty((chains, draws))
+        self.acceptance = np.empty((chains, draws))
+        self.last: tuple[int, dict[str, np.ndarray]] = (0, {})
+
+    def add(self, walk: _Walk, acceptance: np.ndarray) -> None:
+        """Keep where the chains are."""
+        draw, _ = self.last
+        self.theta[:, draw] = walk.theta
+        self.log_density[:, draw] = walk.log_density
+        self.acceptance[:, draw] = acceptance
+        self.last = (draw + 1, walk.state())

@@ -1,0 +1,197 @@
+"""`NUTS`: the No-U-Turn sampler of NumPyro on a posterior's log density."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
+from probmotion.priors import HasLogDensity
+from probmotion.samplers.densities import continued, motions, starting_points
+from probmotion.samplers.nuts_kernel import CHUNK, compiled
+from probmotion.sampling import Interrupted, progress_bar, require
+
+__all__ = ["NUTS"]
+
+
+@dataclass(frozen=True)
+class NUTS:
+    """The No-U-Turn sampler (Hoffman and Gelman 2014), NumPyro's (Phan et al. 2019).
+
+    Parameters
+    ----------
+    warmup : int
+        Iterations before the first draw, which adapt the step size and the diagonal mass matrix.
+    target_acceptance : float
+        Mean acceptance that the step size is adapted towards.
+    max_tree_depth : int
+        A trajectory has at most 2^max_tree_depth − 1 steps.
+
+    Notes
+    -----
+    Chains run one after the other with the same compiled code, so that chain k is the same to the
+    last bit however many there are. Everything runs in float64, whatever JAX is set to elsewhere.
+    """
+
+    name: ClassVar[str] = "nuts"
+    requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+
+    warmup: int = 500
+    target_acceptance: float = 0.8
+    max_tree_depth: int = 10
+
+    def __post_init__(self) -> None:
+        check_count("warmup", self.warmup)
+        check_count("max_tree_depth", self.max_tree_depth)
+        if not 0 < self.target_acceptance < 1:
+            raise ValueError(
+                f"target_acceptance is {self.target_acceptance!r}, expected a number between 0 "
+                "and 1"
+            )
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``draws`` states of each of ``chains`` chains.
+
+        Parameters
+        ----------
+        posterior, draws, chains, seed, progress
+            As in :class:`~probmotion.sampling.Sampler`.
+        initial : MotionDraws or ndarray, (chains, dim), optional
+            An earlier run, to go on from as if it had not stopped (without a warm-up); or points
+            to start from. Draws from the prior by default.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the posterior has no density, or one without a gradient.
+        Interrupted
+            On Ctrl-C; it carries the draws that were finished.
+        """
+        import jax
+
+        check_count("draws", draws)
+        start = time.perf_counter()
+        require(self, posterior)
+        earlier = continued(self, initial, chains, seed)
+        with jax.enable_x64(True):
+            if earlier is None:
+                points = starting_points(posterior, initial, (chains, posterior.dim), seed)
+            else:
+                points = earlier["theta"]
+            run = _Run(self, posterior, points, earlier, seed)
+            try:
+                run.sample(draws, progress)
+            except KeyboardInterrupt as stop:
+                if not run.finished:
+                    raise
+                raise Interrupted(self._result(posterior, run, seed, start)) from stop
+            return self._result(posterior, run, seed, start)
+
+    def _result(
+        self, posterior: MotionPosterior, run: _Run, seed: int, start: float
+    ) -> MotionDraws:
+        n = run.finished
+        kept = {name: values[:, :n] for name, values in run.kept.items()}
+        theta = kept.pop("theta")
+        log_density = kept.pop("log_density")
+        return MotionDraws.of(
+            posterior,
+            self,
+            motions(posterior, theta, seed, first=run.first),
+            seed=seed,
+            seconds=time.perf_counter() - start,
+            theta=theta,
+            log_density=log_density,
+            statistics=kept,
+            counts={"gradient": run.gradients},
+            state=run.state(),
+        )
+
+
+class _Run:
+    """The chains of one call: where each is, and the draws that all of them have finished."""
+
+    def __init__(
+        self,
+        sampler: NUTS,
+        posterior: MotionPosterior,
+        points: np.ndarray,
+        earlier: Mapping[str, np.ndarray] | None,
+        seed: int,
+    ) -> None:
+        self.sampler = sampler
+        self.kernel = compiled(sampler, posterior)
+        self.earlier = earlier
+        self.first = 0 if earlier is None else int(earlier["draws"])
+        self.finished = 0
+        self.gradients = 0
+        self.kept: dict[str, np.ndarray] = {}
+        self.points = points
+        self.seed = seed
+        self.chains: list[Any] = []
+
+    def sample(self, draws: int, progress: bool) -> None:
+        """Warm up all chains, unless they go on, then draw with each in turn, chunk by chunk."""
+        chains = len(self.points)
+        warmup = self.sampler.warmup if self.earlier is None else 0
+        with progress_bar(chains * (warmup + draws), self.sampler.name, progress) as bar:
+            states = [self._begin(chain) for chain in range(chains)]
+            for chain in range(chains):
+                for some in _chunks(warmup):
+                    states[chain], _ = self._advance(states[chain], some)
+                    bar.update(some)
+            for some in _chunks(draws):
+                rows = []
+                for chain in range(chains):
+                    states[chain], kept = self._advance(states[chain], some)
+                    rows.append(kept)
+                    bar.update(some)
+                self._keep(rows, list(states))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return all that going on needs, after the last draw that all chains have finished."""
+        leaves = [self.kernel.leaves(state) for state in self.chains]
+        stacked = {f"leaf_{i}": np.stack(rows) for i, rows in enumerate(zip(*leaves, strict=True))}
+        theta = np.stack([np.asarray(state.z) for state in self.chains])
+        draws = np.array(self.first + self.finished, dtype=np.int32)
+        return {"theta": theta, "draws": draws, **stacked}
+
+    def _begin(self, chain: int) -> Any:
+        if self.earlier is not None:
+            n = sum(name.startswith("leaf_") for name in self.earlier)
+            leaves = [self.earlier[f"leaf_{i}"][chain] for i in range(n)]
+            return self.kernel.restore(leaves, self.points[chain])
+        self.gradients += 1
+        return self.kernel.begin(seeds.jax_key(self.seed, "chain", chain), self.points[chain])
+
+    def _advance(self, state: Any, steps: int) -> tuple[Any, dict[str, np.ndarray]]:
+        state, kept, gradients = self.kernel.advance(state, steps)
+        self.gradients += int(gradients)
+        return state, {name: np.asarray(values)[:steps] for name, values in kept.items()}
+
+    def _keep(self, rows: list[dict[str, np.ndarray]], states: list[Any]) -> None:
+        """Take in one chunk of every chain."""
+        grown = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        if self.kept:
+            grown = {name: np.concatenate([self.kept[name], grown[name]], 1) for name in grown}
+        self.kept, self.chains, self.finished = grown, states, grown["log_density"].shape[1]
+
+
+def _chunks(n: int) -> list[int]:
+    return [min(CHUNK, n - start) for start in range(0, n, CHUNK)]

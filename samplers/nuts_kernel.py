@@ -1,0 +1,149 @@
+"""NumPyro's No-U-Turn kernel on a posterior's log density, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.arrays import jax_from_torch
+from probmotion.posterior import MotionPosterior
+from probmotion.priors import NotConjugate
+from probmotion.samplers.densities import not_conjugate
+from probmotion.sampling import UnsupportedPosterior
+
+if TYPE_CHECKING:
+    from probmotion.samplers.nuts import NUTS
+
+__all__ = ["CHUNK", "NutsKernel", "compiled"]
+
+CHUNK = 50
+"""Most iterations in one call, between two looks at the progress bar and at Ctrl-C."""
+
+
+@lru_cache(maxsize=8)
+def compiled(sampler: NUTS, posterior: MotionPosterior) -> NutsKernel:
+    """Return the compiled kernel; compiling takes seconds and serves every seed and restart."""
+    return NutsKernel(sampler, posterior)
+
+
+class NutsKernel:
+    """NumPyro's kernel on a posterior, compiled."""
+
+    def __init__(self, sampler: NUTS, posterior: MotionPosterior) -> None:
+        import jax
+        from numpyro.infer import NUTS as Kernel  # noqa: N811
+
+        log_density = _in_jax(sampler, posterior)
+        self.sampler = sampler
+        self.kernel = Kernel(
+            potential_fn=lambda theta: -log_density(theta),
+            target_accept_prob=sampler.target_acceptance,
+            max_tree_depth=sampler.max_tree_depth,
+        )
+        self.value_and_gradient = jax.jit(jax.value_and_grad(lambda theta: -log_density(theta)))
+        self.advance = jax.jit(self._advance)
+
+    def begin(self, key: Any, theta: np.ndarray) -> Any:
+        """Return NumPyro's state at ``theta``; one evaluation of the gradient."""
+        potential, gradient = self.value_and_gradient(theta)
+        if not np.isfinite(potential):
+            raise ValueError(
+                f"initial has log density {-float(potential)} at theta {theta}, expected starting "
+                "points of density above 0"
+            )
+        return self._init(key, theta, potential, gradient)
+
+    def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
+        """Return the state that :meth:`leaves` was taken of; no evaluation."""
+        import jax
+
+        like = self._init(jax.random.key(0), theta, 0.0, np.zeros_like(theta))
+        shapes, structure = jax.tree.flatten(like)
+        restored = []
+        for leaf, shape in zip(leaves, shapes, strict=True):
+            if jax.dtypes.issubdtype(shape.dtype, jax.dtypes.prng_key):
+                restored.append(jax.random.wrap_key_data(leaf.astype(np.uint32)))
+            else:
+                restored.append(jax.numpy.asarray(leaf.astype(shape.dtype)))
+        return jax.tree.unflatten(structure, restored)
+
+    def leaves(self, state: Any) -> list[np.ndarray]:
+        """Return a state as arrays that netCDF can hold."""
+        import jax
+
+        out = []
+        for leaf in jax.tree.leaves(state):
+            if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                out.append(np.asarray(jax.random.key_data(leaf)).view(np.int32))
+            else:
+                out.append(np.asarray(leaf))
+        return out
+
+    def _init(self, key: Any, theta: np.ndarray, potential: Any, gradient: Any) -> Any:
+        import jax.numpy as jnp
+        from numpyro.infer.util import ParamInfo
+
+        start = ParamInfo(jnp.asarray(theta), jnp.asarray(potential), jnp.asarray(gradient))
+        return self.kernel.init(key, self.sampler.warmup, start)
+
+    def _advance(self, state: Any, steps: int) -> tuple[Any, dict[str, Any], Any]:
+        """Take at most ``CHUNK`` iterations; return what each kept and the gradients of all."""
+        import jax
+        import jax.numpy as jnp
+
+        def kept(state: Any) -> dict[str, Any]:
+            return {
+                "theta": state.z,
+                "log_density": -state.potential_energy,
+                "acceptance": state.accept_prob,
+                "divergent": state.diverging,
+                "steps": state.num_steps,
+            }
+
+        def iteration(i: Any, carry: tuple[Any, dict[str, Any], Any]) -> Any:
+            state, rows, gradients = carry
+            state = self.kernel.sample(state, (), {})
+            rows = {name: rows[name].at[i].set(value) for name, value in kept(state).items()}
+            return state, rows, gradients + state.num_steps
+
+        empty = {
+            name: jnp.zeros((CHUNK, *value.shape), value.dtype)
+            for name, value in kept(state).items()
+        }
+        return jax.lax.fori_loop(0, steps, iteration, (state, empty, jnp.zeros((), jnp.int64)))
+
+
+def _in_jax(sampler: NUTS, posterior: MotionPosterior) -> Callable[[Any], Any]:
+    """Return the log density as a JAX function of one θ, through torch where it must be.
+
+    Raises
+    ------
+    UnsupportedPosterior
+        If neither library can differentiate it.
+    """
+    import jax
+
+    point = jax.ShapeDtypeStruct((posterior.dim,), np.float64)
+    try:
+        jax.eval_shape(jax.grad(posterior.log_density), point)
+    except NotConjugate as error:
+        raise not_conjugate(sampler, error) from error
+    except Exception as refused:
+        # A density that lets JAX not in may raise anything; whether torch is let in decides.
+        bridged = jax_from_torch(posterior.log_density)
+        try:
+            theta = posterior.initial(seeds.generator(0, "probe"), 1)[0]
+            jax.value_and_grad(bridged)(theta)
+        except Exception:
+            raise UnsupportedPosterior(
+                sampler.name,
+                "needs a gradient of the log density, by JAX or torch, but JAX met "
+                f"{type(refused).__name__}: {str(refused).splitlines()[0]}",
+                word="gradient",
+            ) from refused
+        return bridged
+    return posterior.log_density

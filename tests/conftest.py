@@ -1,0 +1,97 @@
+"""What tests of several rooms share: one array library after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+
+@dataclass(frozen=True)
+class Library:
+    """An array library at one precision, and the agreement to ask of it."""
+
+    name: str
+    dtype: str
+
+    @property
+    def tolerance(self) -> float:
+        return 1e-10 if self.dtype == "float64" else 1e-4
+
+    def array(self, values: Any) -> Any:
+        values = np.asarray(values, dtype=self.dtype)
+        if self.name == "torch":
+            import torch
+
+            return torch.tensor(values)
+        if self.name == "jax":
+            import jax.numpy as jnp
+
+            return jnp.asarray(values)
+        if self.name == "strict":
+            import array_api_strict
+
+            return array_api_strict.asarray(values)
+        return values
+
+    def compiled(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function under ``jax.jit`` with JAX, itself elsewhere."""
+        if self.name == "jax":
+            import jax
+
+            return jax.jit(function)
+        return function
+
+    def gradient(self, function: Callable[[Any], Any], at: np.ndarray) -> np.ndarray:
+        """Return the gradient of a scalar function, by torch or JAX."""
+        if self.name == "torch":
+            point = self.array(at).requires_grad_()
+            function(point).backward()
+            return point.grad.numpy()
+        import jax
+
+        return np.asarray(jax.jit(jax.grad(function))(self.array(at)))
+
+    def assert_close(self, got: Any, wanted: Any, tolerance: float | None = None) -> None:
+        assert str(got.dtype).endswith(self.dtype)
+        np.testing.assert_allclose(
+            np.asarray(got), wanted, rtol=0, atol=self.tolerance if tolerance is None else tolerance
+        )
+
+
+@pytest.fixture(
+    params=[(n, d) for n in ("numpy", "torch", "jax", "strict") for d in ("float64", "float32")],
+    ids="-".join,
+)
+def library(request: pytest.FixtureRequest) -> Iterator[Library]:
+    """NumPy, torch, JAX and the strict standard, in double and single precision."""
+    name, dtype = request.param
+    if name == "jax":
+        import jax
+
+        with jax.enable_x64(dtype == "float64"):
+            yield Library(name, dtype)
+    else:
+        yield Library(name, dtype)
+
+
+@pytest.fixture(params=["torch", "jax"])
+def differentiable(request: pytest.FixtureRequest) -> Iterator[Library]:
+    """The libraries that differentiate, in double precision."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield Library(request.param, "float64")
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real motions beside the repository; tests skip where it is missing."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the folder ../shared/data with real motions is not beside the repository")
+    return folder

@@ -1,0 +1,323 @@
+"""The command line: what it prints and writes, and what it says of wrong input."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probmotion import Motion, MotionDraws, Skeleton, load_motion
+from probmotion.cli import main
+from probmotion.data.gaits import make_gait
+from probmotion.settings_options import object_from_text, text_of_object
+
+PROGRAM = [sys.executable, "-c", "import sys; from probmotion.cli import main; sys.exit(main())"]
+ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def walks(folder: Path, n: int = 5, frames: int = 40) -> list[str]:
+    """Write n walks as BVH and npz in turn; return their paths."""
+    paths = []
+    for number in range(n):
+        path = folder / f"walk{number}.{'npz' if number % 2 else 'bvh'}"
+        make_gait("walk", number, frames=frames).save(path)
+        paths.append(str(path))
+    return paths
+
+
+def said(capsys) -> str:
+    """Return the last sentence on standard error."""
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+# Help and start-up.
+
+
+def test_help_is_there_within_a_second():
+    start = time.perf_counter()
+    done = subprocess.run([*PROGRAM, "--help"], capture_output=True, text=True, check=False)
+    assert time.perf_counter() - start < 1.0
+    assert done.returncode == 0
+    for command in ("compare", "list", "show", "convert"):
+        assert f"\n  {command} " in done.stdout
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from probmotion.cli import main; main(['--help']); main(['show', 'no.bvh']);"
+        "sys.exit(any(m in sys.modules for m in ('torch', 'jax', 'matplotlib.pyplot')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("command", ["compare", "list", "show", "convert"])
+def test_every_command_explains_every_option(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    help_text = capsys.readouterr().out
+    assert f"usage: probmotion {command}" in help_text
+    if command == "compare":
+        for option in ("--clips", "--observe", "--workers", "--settings.mas.n-views"):
+            assert option in help_text
+
+
+def test_list_names_everything(capsys):
+    assert main(["list"]) == 0
+    listed = capsys.readouterr().out
+    samplers = "exact ancestral3d mas mvpc sds mh nuts ensemble"
+    for name in (*samplers.split(), "gait", "gait-monocular", "mas.reference_code", "h36m17"):
+        assert f"\n  {name} " in listed
+
+
+# Comparing.
+
+
+def test_compare_writes_the_table(tmp_path, capsys):
+    words = "compare gait --samplers exact mas --draws 20 --seeds 2 --settings.mas.steps 5"
+    assert main([*words.split(), "--settings.mas.n-views", "3", "--out", str(tmp_path)]) == 0
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert list(table.columns) == ["problem", "sampler", "seed", "metric", "value"]
+    assert set(table["sampler"]) == {"exact", "mas"}
+    assert set(table["seed"]) == {0, 1}
+    assert {"swd", "seconds"} <= set(table["metric"])
+    printed = capsys.readouterr().out
+    assert "exact" in printed
+    assert "swd" in printed
+    # 20 draws of 3 views in 5 steps: the settings arrived.
+    calls = table[(table["sampler"] == "mas") & (table["metric"] == "denoiser_evaluations")]
+    assert set(calls["value"]) == {20 * 3 * 5}
+
+
+def test_compare_draws_pictures(tmp_path):
+    words = "compare gait-monocular --samplers exact --draws 12 --pictures --out"
+    assert main([*words.split(), str(tmp_path)]) == 0
+    for name in ("quality_against_cost.png", "skeletons_gait-monocular.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_preset_runs_beside_its_sampler(tmp_path):
+    words = "compare gait --samplers mas mas.reference_code --draws 10 --settings.mas.steps 2"
+    assert main([*words.split(), "--out", str(tmp_path)]) == 0
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert set(table["sampler"]) == {"mas", "mas.reference_code"}
+
+
+def test_own_clips_of_two_formats_make_a_problem(tmp_path):
+    walks(tmp_path, 6)
+    words = "--held-out walk2 --samplers exact --draws 12 --rank 2 --styles 1 --out"
+    pattern = str(tmp_path / "walk*")
+    assert main(["compare", "--clips", pattern, *words.split(), str(tmp_path / "out")]) == 0
+    table = pd.read_csv(tmp_path / "out" / "table.csv")
+    assert {"swd", "mpjpe"} <= set(table["metric"])
+
+
+# Showing and converting.
+
+
+def test_show_tells_what_a_motion_is(tmp_path, capsys):
+    (path,) = walks(tmp_path, 1)
+    picture = tmp_path / "walk.png"
+    assert main(["show", path, "--picture", str(picture)]) == 0
+    printed = capsys.readouterr().out
+    assert "40 frames at 30 fps, 1.30 s" in printed
+    assert "17 joints below pelvis" in printed
+    assert picture.exists()
+
+
+def test_show_and_convert_read_draws(tmp_path, capsys):
+    words = "compare gait --samplers exact --draws 12 --out"
+    assert main([*words.split(), str(tmp_path)]) == 0
+    (path,) = tmp_path.rglob("draws.nc")
+    assert main(["show", str(path)]) == 0
+    assert "4 x 3 (chains x draws)" in capsys.readouterr().out
+    take = tmp_path / "take.bvh"
+    assert main(["convert", str(path), str(take), "--draw", "2"]) == 0
+    wanted = MotionDraws.load(path).motion(2).positions
+    np.testing.assert_allclose(load_motion(take).positions, wanted, atol=1e-4)
+
+
+def test_convert_resamples_and_retargets(tmp_path):
+    (path,) = walks(tmp_path, 1)
+    target = tmp_path / "walk.npz"
+    assert main(["convert", path, str(target), "--fps", "15", "--skeleton", "h36m17"]) == 0
+    motion = load_motion(target)
+    assert motion.fps == 15
+    assert motion.skeleton.joint_names == Skeleton.preset("h36m17").joint_names
+    assert motion.frames == 20
+
+
+# Wrong input: one sentence, status 2.
+
+
+def write(path: Path, content: str) -> str:
+    path.write_text(content)
+    return str(path)
+
+
+def truncated(folder: Path) -> str:
+    (path,) = walks(folder, 1)
+    whole = Path(path).read_text()
+    return write(folder / "half.bvh", whole[: int(0.7 * len(whole))])
+
+
+def one_frame(folder: Path) -> str:
+    skeleton = Skeleton.preset("h36m17")
+    path = folder / "still.npz"
+    Motion(np.zeros((1, 17, 3)) + np.arange(17)[:, None], skeleton, 30).save(path)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("compare gait --samplers mcmc", ("'mcmc'", "exact", "nuts")),
+        ("compare gait --samplers mas.best", ("'mas.best'", "mas.reference_code")),
+        ("compare jump", ("'jump'", "gait-monocular")),
+        ("compare", ("no problem is given", "--clips")),
+        ("compare gait --draws 3", ("draws is 3",)),
+        ("compare --clips no/such/*.bvh", ("no/such/*.bvh", "no file")),
+        ("compare --clips no/such.bvh", ("no/such.bvh",)),
+        ("show no/such.bvh", ("no/such.bvh",)),
+        ("convert no/such.bvh out.npz", ("no/such.bvh",)),
+        ("draw", ("'draw'", "compare, list, show, convert")),
+    ],
+)
+def test_wrong_words_get_one_sentence(words, expected, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert len(errors) == 1
+    for part in expected:
+        assert part in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda folder: write(folder / "shopping.bvh", "eggs\nmilk\n"), "shopping.bvh"),
+        (lambda folder: write(folder / "zip.npz", "PK\x03\x04"), "no npz archive"),
+        (lambda folder: write(folder / "notes.txt", "eggs"), "expected a motion in .bvh or .npz"),
+        (truncated, "half.bvh"),
+        (lambda folder: write(folder / "empty.bvh", ""), "empty.bvh"),
+    ],
+)
+@pytest.mark.parametrize("command", ["show", "compare --out out --clips", "convert"])
+def test_files_that_are_no_motion(make, expected, command, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [*command.split(), make(tmp_path)] + (["out.npz"] if command == "convert" else [])
+    assert main(words) == 2
+    assert expected in said(capsys)
+
+
+def test_clips_too_short_to_learn_from(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["compare", "--clips", one_frame(tmp_path), *walks(tmp_path, 2, frames=8)]) == 2
+    assert "frames" in said(capsys)
+
+
+def test_a_wrong_option_ends_with_status_2(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["compare", "gait", "--settings.mas.n-views", "1"])
+    assert end.value.code == 2
+    assert "n_views is 1, expected an integer of at least 2" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root can write into a read-only folder")
+def test_a_read_only_folder(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert main(["compare", "gait", "--samplers", "exact", "--out", str(tmp_path / "out")]) == 2
+    assert "out" in said(capsys)
+
+
+def test_a_folder_that_is_a_file(tmp_path, capsys):
+    taken = write(tmp_path / "taken", "here")
+    assert main(["compare", "gait", "--samplers", "exact", "--draws", "12", "--out", taken]) == 2
+    assert "taken" in said(capsys)
+
+
+# Ctrl-C.
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_an_interrupted_comparison_keeps_what_is_finished(workers, tmp_path):
+    words = ["compare", "gait", "--samplers", "exact", "mas", "--draws", "200", "--workers"]
+    words = [*words, workers, "--out", str(tmp_path)]
+    long = ["--settings.mas.steps", "100000"]
+    running = subprocess.Popen(
+        [*PROGRAM, *words, *long], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=ONE_THREAD, start_new_session=True,
+    )  # fmt: skip
+    kept = tmp_path / "cells" / "gait" / "exact" / "0"
+    deadline = time.monotonic() + 60
+    while not kept.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert kept.exists()
+    # As a terminal does: to the whole group of processes.
+    os.killpg(running.pid, signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+    assert running.returncode == 130
+    assert "Traceback" not in errors
+    sentence = errors.strip().splitlines()[-1]
+    assert "1 of 2 cells finished" in sentence
+    assert str(tmp_path) in sentence
+
+    before = {path: path.stat().st_mtime_ns for path in kept.iterdir()}
+    assert main([*words, "--settings.mas.steps", "3"]) == 0
+    assert {path: path.stat().st_mtime_ns for path in kept.iterdir()} == before
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert set(table["sampler"]) == {"exact", "mas"}
+
+
+# Settings that are objects.
+
+
+@dataclass(frozen=True)
+class Plain:
+    kind: str = field(default="plain", init=False)
+
+
+@dataclass(frozen=True)
+class Step:
+    size: float = 0.5
+    inner: Plain | None = None
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("Plain", Plain()),
+        ("Step(size=2)", Step(2)),
+        ("Step(0.25, inner=Plain())", Step(0.25, Plain())),
+        (" Step( inner = Plain ) ", Step(inner=Plain())),
+    ],
+)
+def test_objects_are_written_as_in_python(text, value):
+    read = object_from_text(text, [Plain, Step])
+    assert read == value
+    assert object_from_text(text_of_object(read), [Plain, Step]) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("Leap", "'Leap' is unknown, expected one of Plain, Step"),
+        ("Step(length=1)", "no setting 'length', expected one of size, inner"),
+        ("Plain(kind='x')", "no setting 'kind'"),
+        ("Step(", "is not an object"),
+        ("Step(size=__import__('os'))", "unknown"),
+        ("3", "is not an object"),
+        ("Step(size=open)", "unknown"),
+    ],
+)
+def test_what_is_no_object_is_refused(text, expected):
+    with pytest.raises(ValueError, match=expected.replace("(", r"\(")):
+        object_from_text(text, [Plain, Step])

@@ -1,0 +1,55 @@
+"""Every notebook runs from top to bottom, and what its prose claims is what it measures."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from probmotion import Comparison
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+def run(name: str, folder: Path, monkeypatch) -> str:
+    """Execute a notebook in ``folder``; return all that it printed."""
+    import jupytext
+    from nbclient import NotebookClient
+
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(variable, "1")
+    # A kernel of the running interpreter, whatever kernels the machine has.
+    monkeypatch.setenv("JUPYTER_PATH", str(Path(sys.prefix) / "share" / "jupyter"))
+    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
+    notebook = jupytext.read(NOTEBOOKS / name)
+    client = NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    )
+    client.execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 5
+    return "".join(
+        output.get("text", output.get("data", {}).get("text/plain", "")) for output in outputs
+    )
+
+
+# Jupyter's own libraries warn about themselves.
+@pytest.mark.filterwarnings("default")
+def test_one_posterior_many_samplers(tmp_path, monkeypatch):
+    printed = run("01_one_posterior_many_samplers.py", tmp_path, monkeypatch)
+    assert "120 clips" in printed
+    assert len(list((tmp_path / "walks").glob("*.bvh"))) == 120
+    assert (tmp_path / "take3.bvh").exists()
+
+    table = Comparison.load(tmp_path / "comparison").table()
+    assert "swd" in printed
+    wide = table.pivot_table(index="sampler", columns="metric", values="value")
+    assert set(wide.index) == {"exact", "ancestral3d", "mas", "mvpc", "mh"}
+    assert wide.loc["ancestral3d", "off"] < 0.6
+    assert wide.loc["mas", "tr"] > 1.5
+    assert wide.loc["mvpc", "swd"] < wide.loc["mas", "swd"]
+    evaluations = wide["denoiser_evaluations"]
+    assert evaluations["mvpc"] == pytest.approx(evaluations["mas"], rel=0.1)
+    assert wide.loc["mh", "swd"] < 1.5
+    assert wide.loc["mh", "rhat"] > 1.05

@@ -1,0 +1,234 @@
+"""Triangulation against SciPy's minimiser, in every library, and what it says of bad input."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from probmotion import Cameras, triangulate
+
+RINGS = {
+    "orthographic": Cameras.ring(5, elevation=0.3),
+    "perspective": Cameras.ring(5, elevation=0.3, perspective=True),
+    "pixels": Cameras(
+        rotation=Cameras.ring(3, elevation=0.3).rotation,
+        translation=np.array([[0.1, -0.2, 4.0], [0.3, 0.0, 6.0], [-0.2, 0.1, 5.0]]),
+        focal=np.array([900.0, 1100.0, 1000.0]),
+        centre=np.array([[640.0, 360.0], [500.0, 300.0], [0.0, 10.0]]),
+        orthographic=False,
+    ),
+}
+
+
+def motion(*shape, seed=0):
+    return 0.4 * np.random.default_rng(seed).normal(size=(*shape, 3))
+
+
+@pytest.fixture(params=RINGS)
+def cameras(request):
+    return RINGS[request.param]
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (2, 1, 4, 3), (1, 1)])
+def test_consistent_pictures_give_the_motion_back(cameras, library, shape):
+    points = motion(*shape)
+    if library.dtype == "float32" and cameras.focal[0] > 100:
+        pytest.skip("pixels of a thousandth of a millimetre are beyond single precision")
+    found = triangulate(library.array(cameras.project(points)), cameras)
+    library.assert_close(found, points)
+
+
+def test_libraries_agree_on_noisy_weighted_pictures(cameras, library):
+    points = motion(6, 4)
+    rng = np.random.default_rng(1)
+    noise = 0.05 * cameras.focal[0] / (1 if cameras.orthographic else 7)
+    seen = cameras.project(points) + noise * rng.normal(size=(cameras.n_views, 6, 4, 2))
+    weights = rng.uniform(0.2, 2, size=seen.shape[:-1])
+    start = points + 0.05 * rng.normal(size=points.shape)
+    expected = triangulate(seen, cameras, weights, start, iterations=3)
+
+    def run(pictures, weight, initial):
+        return triangulate(pictures, cameras, weight, initial, iterations=3)
+
+    found = library.compiled(run)(*(library.array(x) for x in (seen, weights, start)))
+    # Single precision: metres out of hundreds of pixels.
+    tolerance = 1e-3 if library.dtype == "float32" and noise > 1 else library.tolerance
+    library.assert_close(found, expected, tolerance)
+
+
+def minimiser(seen, cameras, weights):
+    """One joint of one frame by SciPy: argmin Σ w ‖p(X, v) − x_v‖²."""
+    root = np.sqrt(weights)[:, None]
+
+    def residual(x):
+        return (root * (cameras.project(x.reshape(1, 1, 3))[:, 0, 0] - seen)).ravel()
+
+    return least_squares(residual, np.zeros(3), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+
+
+def test_it_is_the_least_squares_solution(cameras):
+    rng = np.random.default_rng(2)
+    points = motion(3, 2)
+    noise = 0.05 * cameras.focal[0] / (1 if cameras.orthographic else 5)
+    seen = cameras.project(points) + noise * rng.normal(size=(cameras.n_views, 3, 2, 2))
+    weights = rng.uniform(0.2, 2, size=seen.shape[:-1])
+    found = triangulate(seen, cameras, weights, iterations=30)
+    for frame, joint in np.ndindex(3, 2):
+        expected = minimiser(seen[:, frame, joint], cameras, weights[:, frame, joint])
+        np.testing.assert_allclose(found[frame, joint], expected, atol=2e-7)
+        # The views do disagree: the minimum is not where the motion was.
+        assert np.linalg.norm(expected - points[frame, joint]) > 1e-3
+
+
+@pytest.mark.parametrize("given", ["last", "none"])
+def test_two_linearisations_are_enough(given):
+    """From 5 cm away, as from one denoising step to the next: within 7e-5 of the minimiser."""
+    rng = np.random.default_rng(3)
+    cameras = Cameras.ring(5, elevation=0.2, perspective=True)
+    points = motion(180, 16)
+    seen = cameras.project(points) + 0.02 * rng.normal(size=(5, 180, 16, 2))
+    start = points + 0.05 * rng.normal(size=points.shape) if given == "last" else None
+    best = triangulate(seen, cameras, initial=start, iterations=50)
+    gaps = [
+        np.sqrt(((triangulate(seen, cameras, initial=start, iterations=n) - best) ** 2).mean())
+        for n in (1, 2)
+    ]
+    assert gaps[1] < 7e-6
+    assert gaps[1] < gaps[0] / 20
+
+
+def test_weights_count_views(cameras):
+    rng = np.random.default_rng(4)
+    seen = cameras.project(motion(3, 2)) * (1 + 0.01 * rng.normal(size=(cameras.n_views, 3, 2, 1)))
+    twice = [0, *range(cameras.n_views)]
+    doubled = Cameras(
+        cameras.rotation[twice],
+        cameras.translation[twice],
+        cameras.focal[twice],
+        cameras.centre[twice],
+        cameras.orthographic,
+    )
+    weights = np.ones(cameras.n_views)
+    weights[0] = 2
+    expected = triangulate(seen[twice], doubled, iterations=20)
+    got = triangulate(seen, cameras, weights, iterations=20)
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+    # The same weights in every shape they may have; one motion or a batch.
+    full = np.broadcast_to(weights[:, None, None], seen.shape[:-1])
+    batch = np.stack([seen, seen + 0.01])
+    for shaped in (weights, np.stack([weights] * 2), np.stack([full] * 2)):
+        np.testing.assert_allclose(
+            triangulate(batch, cameras, shaped, iterations=20)[0], expected, atol=1e-9
+        )
+
+
+def test_unseen_keypoints_are_not_read(cameras, library):
+    if library.dtype == "float32":
+        pytest.skip("the rounding of pixels is tested elsewhere")
+    points = motion(3, 2)
+    seen = cameras.project(points)
+    weights = np.ones(seen.shape[:-1])
+    weights[0, 1, 1] = 0
+    seen[0, 1, 1] = np.nan
+    found = triangulate(library.array(seen), cameras, library.array(weights))
+    library.assert_close(found, points, 1e-9)
+
+
+def test_gradients_pass_through(differentiable):
+    cameras = Cameras.ring(4, elevation=0.4, perspective=True)
+    seen = cameras.project(motion(1, 2))
+    direction = np.random.default_rng(5).normal(size=seen.shape)
+
+    def total(pictures):
+        found = triangulate(pictures, cameras, iterations=8)
+        return (found * found).sum()
+
+    slope = (differentiable.gradient(total, seen) * direction).sum()
+    step = 1e-6
+    numerical = (total(seen + step * direction) - total(seen - step * direction)) / (2 * step)
+    assert slope == pytest.approx(numerical, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 3), (4, 0), (0, 3)])
+def test_empty_batches(cameras, library, shape):
+    *batch, L, J = shape
+    found = triangulate(library.array(np.zeros((*batch, cameras.n_views, L, J, 2))), cameras)
+    assert tuple(found.shape) == (*shape, 3)
+    assert str(found.dtype).endswith(library.dtype)
+
+
+def test_one_view_is_not_enough():
+    with pytest.raises(ValueError, match=r"cameras has 1 view, expected at least two"):
+        triangulate(np.zeros((1, 2, 3, 2)), Cameras.ring(1))
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_nearly_parallel_views_are_warned_of_with_their_condition(perspective):
+    def pair(angle):
+        return Cameras.around(np.array([0.0, angle]), np.zeros(2), perspective=perspective)
+
+    points = motion(2, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        triangulate(pair(0.1).project(points), pair(0.1))
+    cameras = pair(0.02)
+    with pytest.warns(UserWarning, match=r"nearly parallel: the condition number is") as caught:
+        found = triangulate(cameras.project(points), cameras)
+    np.testing.assert_allclose(found, points, atol=1e-9)
+    number = float(str(caught[0].message).split("number is ")[1].split(" at")[0])
+    if not perspective:
+        normal = np.einsum("vcx,vcy->xy", cameras.image_axes, cameras.image_axes)
+        assert number == pytest.approx(np.linalg.cond(normal), rel=1e-2)
+    else:
+        assert 5e3 < number < 5e4
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_parallel_views_determine_nothing(angle, dtype):
+    cameras = Cameras.around(np.array([0.4, 0.4 + angle]), np.array([0.2, -0.2 if angle else 0.2]))
+    seen = cameras.project(motion(2, 2)).astype(dtype)
+    with pytest.raises(ValueError, match=r"keypoints of joint \d in frame \d determine no point"):
+        triangulate(seen, cameras)
+
+
+def test_a_joint_that_one_view_sees_is_named(cameras):
+    weights = np.ones((cameras.n_views, 3, 4))
+    weights[1:, 2, 3] = 0
+    with pytest.raises(ValueError, match=r"joint 3 in frame 2 determine no point .* two views"):
+        triangulate(cameras.project(motion(3, 4)), cameras, weights)
+
+
+def test_a_camera_behind_the_motion_is_named():
+    cameras = Cameras.ring(3, perspective=True, distance=2.0)
+    points = motion(2, 2)
+    seen = cameras.project(points)
+    with pytest.raises(ValueError, match=r"joint 1 of frame 1 behind camera 0, expected every"):
+        start = points.copy()
+        start[1, 1] = 5 * (-cameras.rotation[0, 2])
+        triangulate(seen, cameras, initial=start, iterations=1)
+
+
+@pytest.mark.parametrize("initial", [False, True])
+def test_bad_input_is_refused_in_a_sentence(cameras, initial):
+    V = cameras.n_views
+    points = motion(3, 4)
+    seen = cameras.project(points)
+    start = points if initial else None
+    broken = seen.copy()
+    broken[1, 2, 3, 0] = np.nan
+    with pytest.raises(ValueError, match=r"keypoints has 1 values that are NaN .* \(1, 2, 3, 0\)"):
+        triangulate(broken, cameras, initial=start)
+    with pytest.raises(ValueError, match=rf"keypoints has shape .* expected \(…, {V}, L, J, 2\)"):
+        triangulate(seen[:-1], cameras)
+    with pytest.raises(ValueError, match=r"weights has shape \(7,\), expected"):
+        triangulate(seen, cameras, np.ones(7))
+    with pytest.raises(ValueError, match=r"weights is -1 at its least, expected 0 or more"):
+        triangulate(seen, cameras, -np.ones(V))
+    with pytest.raises(ValueError, match=r"initial has shape \(2, 4, 3\), expected \(3, 4, 3\)"):
+        triangulate(seen, cameras, initial=points[:2])
+    with pytest.raises(ValueError, match=r"iterations is 0, expected an integer of at least 1"):
+        triangulate(seen, cameras, iterations=0)
