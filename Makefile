@@ -12,10 +12,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: install
-	$(BIN)/probmotion compare gait gait-monocular --out demo --pictures
+	$(BIN)/probmotion compare gait gait-monocular --quick --workers 2 --out demo --pictures
 
 test: install
-	$(BIN)/python -m pytest -m 'not slow' -n 2 tests
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 tests
 
 slow: install
 	$(BIN)/python -m pytest -m slow tests

@@ -87,8 +87,8 @@ Image("prior.png")
 # ## 3. Evidence: what one camera saw
 #
 # The camera stands 15° above the horizon. A detector reports each joint's place in the picture with
-# an error of 3 cm, but of hips, shoulders and knees only, and only in every tenth frame. So a lot is
-# left open.
+# an error of 3 cm, but of hips, shoulders and knees only, and only in every tenth frame. So a lot
+# is left open.
 
 # %%
 truth = hidden.window(0, 30).centred()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.arrays import Array, array_namespace
+from probmotion.arrays import Array, array_namespace, to_numpy
 
 __all__ = ["check_count", "check_finite", "check_positive", "check_shape"]
 
@@ -32,19 +32,18 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
     if not fits or any(
         isinstance(want, int) and want != got for want, got in zip(axes, trailing, strict=True)
     ):
-        wanted = ", ".join(str(axis) for axis in expected) + ("," if len(expected) == 1 else "")
+        wanted = ", ".join(str(axis) for axis in expected)
         raise ValueError(f"{name} has shape {shape}, expected ({wanted})")
 
 
 def check_finite(name: str, value: Any) -> None:
     """Raise ``ValueError`` if a NumPy, torch or JAX array holds NaN or infinite entries."""
     xp = array_namespace(value)
-    bad = ~xp.isfinite(value)
-    if bool(xp.any(bad)):
-        where = tuple(int(i) for i in np.argwhere(np.asarray(bad))[0])
-        count = int(xp.sum(xp.astype(bad, xp.int64)))
+    bad = to_numpy(~xp.isfinite(value))
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name} has {count} values that are NaN or infinite, the first at index {where}, "
+            f"{name} has {bad.sum()} values that are NaN or infinite, the first at index {where}, "
             "expected finite numbers"
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 __all__ = ["written_whole"]
@@ -31,4 +31,6 @@ def written_whole(path: Path) -> Iterator[Path]:
             f"cannot write {path}: {reason}; expected a folder that is writable"
         ) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        # Where the folder is none, this fails as the writing did, and must not hide its message.
+        with suppress(OSError):
+            unfinished.unlink()

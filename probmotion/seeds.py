@@ -28,6 +28,7 @@ __all__ = [
 ]
 
 Name = str | int
+_INTEGERS = (int, np.integer)
 
 
 class RandomNumbers(Protocol):
@@ -58,16 +59,16 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
     ValueError
         If ``seed`` is not an integer of at least 0.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+    if isinstance(seed, bool) or not isinstance(seed, _INTEGERS) or seed < 0:
         raise ValueError(f"seed is {seed!r}, expected an integer of at least 0")
     # A string and an integer must never address the same node: each carries a tag of its kind.
-    key: list[int] = []
+    key: tuple[int, ...] = ()
     for name in path:
         if isinstance(name, str):
-            key += [1, zlib.crc32(name.encode())]
+            key += (1, zlib.crc32(name.encode()))
         else:
-            key += [0, int(name)]
-    return np.random.SeedSequence(int(seed), spawn_key=tuple(key))
+            key += (0, int(name))
+    return np.random.SeedSequence(int(seed), spawn_key=key)
 
 
 def generator(seed: int, *path: Name) -> np.random.Generator:

@@ -170,7 +170,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     if name.id not in known:
         raise ValueError(f"{name.id!r} is unknown, expected one of {', '.join(known)}")
     kind: Any = known[name.id]
-    if isinstance(tree, ast.Name):
+    if not isinstance(tree, ast.Call):
         return kind()
     settings = [entry.name for entry in fields(kind) if entry.init]
     for keyword in tree.keywords:

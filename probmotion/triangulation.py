@@ -93,7 +93,8 @@ def triangulate(
     seen = _views_first(keypoints, 1)
     weight = None
     if weights is not None:
-        weight = _views_first(_full_weights(weights, keypoints), 0)
+        weights = _full_weights(weights, keypoints)
+        weight = _views_first(weights, 0)
         seen = xp.where(weight > 0, seen, xp.zeros_like(seen))
     equations = _equations(cameras, keypoints)
     ones = xp.ones_like(seen[0, :1, :])
@@ -117,8 +118,8 @@ def triangulate(
             pull = _pull(xp, equations, inverse_depth, image, seen, weight)
             dx, dy, dz = _solve(factors, pull)
             found = xp.stack([x + dx, y + dy, z + dz])
-    if not type(found).__name__.endswith("Tracer"):
-        _refuse_unfit(xp, keypoints, weights, points, found, normal, factors, inverse_depth)
+        if not type(found).__name__.endswith("Tracer"):
+            _refuse_unfit(xp, keypoints, weights, points, found, normal, factors, inverse_depth)
     return xp.reshape(xp.permute_dims(found, (1, 0)), (*points, 3))
 
 
@@ -272,20 +273,28 @@ def _refuse_unfit(
     inverse_depth: Array | None,
 ) -> None:
     """Warn of poor conditions; raise where there is no solution."""
-    if weights is None and not bool(xp.isfinite(xp.sum(found))):
+    if weights is None and not np.isfinite(_number(xp.sum(found))):
         check_finite("keypoints", keypoints)
+    if weights is not None and not _number(xp.min(weights)) >= 0:
+        raise ValueError(
+            f"weights is {_number(xp.min(weights)):g} at its least, expected 0 or more"
+        )
     # trace³/determinant is never below the condition number, and cheap.
     trace = normal[0, ...] + normal[3, ...] + normal[5, ...]
     bound = trace * trace * trace * (factors[0] * factors[1] * factors[2])
-    if not float(xp.max(bound)) < _POOR or not float(xp.min(bound)) > 0:
+    if not (_number(xp.max(bound)) < _POOR and _number(xp.min(bound)) > 0):
         _report_condition(to_numpy(normal), points)
-    if inverse_depth is not None and not float(xp.min(inverse_depth)) > 0:
+    if inverse_depth is not None and not _number(xp.min(inverse_depth)) > 0:
         view, point = np.argwhere(~(to_numpy(inverse_depth) > 0))[0]
         *_, frame, joint = np.unravel_index(point, points)
         raise ValueError(
             f"keypoints put joint {joint} of frame {frame} behind camera {view}, expected every "
             "joint in front of every camera; check the cameras, or give an initial motion"
         )
+
+
+def _number(value: Array) -> float:
+    return float(to_numpy(value))
 
 
 def _report_condition(normal: np.ndarray, points: tuple[int, ...]) -> None:

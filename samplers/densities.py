@@ -60,7 +60,8 @@ class Density:
             value = np.asarray(self.posterior.log_density(theta))
         except NotConjugate as error:
             raise not_conjugate(self.sampler, error) from error
-        if not (value < np.inf).all():
+        # NaN compares as false: one look finds both.
+        if not value.max() < np.inf:
             bad = int(np.flatnonzero(~(value < np.inf))[0])
             raise ValueError(
                 f"log_density is {value[bad]} at theta {theta[bad]}, expected a finite number or "

@@ -103,11 +103,9 @@ class Ensemble:
         try:
             with progress_bar(warmup + iterations * self.thin, self.name, progress) as bar:
                 for _ in range(warmup):
-                    run.advance(1)
+                    run.warm_up()
                     bar.update(1)
-                run.forget()
                 for _ in range(iterations):
-                    run.advance(self.thin)
                     run.keep()
                     bar.update(self.thin)
         except KeyboardInterrupt as stop:
@@ -206,33 +204,30 @@ class _Run:
                     state, iterations=None, store=False, skip_initial_state_check=unchecked
                 )
             )
-        self.coordinates = start.coordinates
-        self.forget()
+        self.trace: list[list[np.ndarray]] = []
+        self.first_coordinates: list[list[np.ndarray]] = []
 
-    def forget(self) -> None:
-        """Begin the statistics anew, after the warm-up."""
-        self.moved = np.zeros(len(self.chains))
-        self.iterations = 0
-        self.trace: list[np.ndarray] = []
-
-    def advance(self, iterations: int) -> None:
-        """Move every ensemble that many times."""
-        for _ in range(iterations):
-            self.states = [next(chain) for chain in self.chains]
-            coordinates = np.stack([state.coords for state in self.states])
-            # A stretch is never by a factor of exactly 1: a walker that moved has changed.
-            self.moved += (coordinates[..., 0] != self.coordinates[..., 0]).mean(axis=-1)
-            self.coordinates = coordinates
-            if self.iterations % self._stride == 0:
-                self.trace.append(coordinates)
-            self.iterations += 1
+    def warm_up(self) -> None:
+        """Move every ensemble once and remember nothing."""
+        for chain in self.chains:
+            next(chain)
 
     def keep(self) -> None:
-        """Keep where the walkers are; an interrupt between two kept iterations loses neither."""
-        log_density = np.stack([state.log_prob for state in self.states])
-        random = np.stack([_words(state.random_state) for state in self.states])
-        self.kept.append((self.coordinates, log_density))
-        self.last = _Rest(self.coordinates, log_density, random, 0, len(self.kept))
+        """Move every ensemble ``thin`` times and keep where its walkers are then.
+
+        An interrupt between two kept iterations loses neither.
+        """
+        for iteration in range(self.thin):
+            states = [next(chain) for chain in self.chains]
+            # emcee moves walkers in place: what is remembered is a copy.
+            self.first_coordinates.append([state.coords[:, 0].copy() for state in states])
+            if iteration % self._stride == 0:
+                self.trace.append([state.coords.copy() for state in states])
+        coordinates = np.stack([state.coords for state in states])
+        log_density = np.stack([state.log_prob for state in states])
+        random = np.stack([_words(state.random_state) for state in states])
+        self.kept.append((coordinates, log_density))
+        self.last = _Rest(coordinates, log_density, random, 0, len(self.kept))
 
     def draws(self, wanted: int) -> tuple[np.ndarray, np.ndarray, _Rest]:
         """Return θ, log densities and what is left, once all or some iterations are kept."""
@@ -255,10 +250,12 @@ class _Run:
         """
         if len(self.trace) < 4:
             return {}
-        trace = np.stack(self.trace, axis=1)
-        slowest = [autocorrelation_time(walkers).max() for walkers in trace]
+        # A stretch is never by a factor of exactly 1: a walker that moved has changed.
+        moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
+        traces = zip(*self.trace, strict=True)
+        slowest = [autocorrelation_time(np.array(trace)).max() for trace in traces]
         times = np.maximum(np.array(slowest) * self._stride / self.thin, 1.0)
-        return {"acceptance": self.moved / self.iterations, "autocorrelation_time": times}
+        return {"acceptance": moved.mean(axis=(0, 2)), "autocorrelation_time": times}
 
     @property
     def _stride(self) -> int:

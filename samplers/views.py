@@ -47,7 +47,7 @@ class Views:
         return (flat[:, None] @ self.axes.swapaxes(1, 2)).reshape(B, self.n_views, L, J, 2)
 
     def combine(self, views: np.ndarray) -> np.ndarray:
-        """Return M⁻¹ Σ_v w_v P_vᵀ x_v, the least-squares motion: ``(B, V, L, J, 2) → (B, L, J, 3)``."""
+        """Return M⁻¹ Σ_v w_v P_vᵀ x_v, the least-squares motion, (B, L, J, 3)."""
         return self._sum(views, self._combine_axes)
 
     def scatter(self, views: np.ndarray) -> np.ndarray:

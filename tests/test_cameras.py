@@ -216,7 +216,7 @@ def test_wrong_cameras_are_refused_in_one_sentence() -> None:
         Cameras(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
     with pytest.raises(ValueError, match=r"translation has shape \(2, 3\), expected \(1, 3\)"):
         Cameras(eye, np.zeros((2, 3)), one)
-    with pytest.raises(ValueError, match=r"focal has shape \(2,\), expected \(1,\)"):
+    with pytest.raises(ValueError, match=r"focal has shape \(2,\), expected \(1\)"):
         Cameras(eye, zero, np.ones(2))
     with pytest.raises(ValueError, match=r"centre has shape \(1, 3\), expected \(1, 2\)"):
         Cameras(eye, zero, one, np.zeros((1, 3)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -41,10 +42,12 @@ def said(capsys) -> str:
 # Help and start-up.
 
 
-def test_help_is_there_within_a_second():
-    start = time.perf_counter()
+def test_help_takes_less_than_a_second():
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([*PROGRAM, "--help"], capture_output=True, text=True, check=False)
-    assert time.perf_counter() - start < 1.0
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    # Of the processor's time, which a busy machine does not lengthen.
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
     assert done.returncode == 0
     for command in ("compare", "list", "show", "convert"):
         assert f"\n  {command} " in done.stdout
@@ -117,7 +120,7 @@ def test_own_clips_of_two_formats_make_a_problem(tmp_path):
     pattern = str(tmp_path / "walk*")
     assert main(["compare", "--clips", pattern, *words.split(), str(tmp_path / "out")]) == 0
     table = pd.read_csv(tmp_path / "out" / "table.csv")
-    assert {"swd", "mpjpe"} <= set(table["metric"])
+    assert {"swd", "mpjpe_mm"} <= set(table["metric"])
 
 
 # Showing and converting.
@@ -231,17 +234,17 @@ def test_a_wrong_option_ends_with_status_2(capsys):
     assert "n_views is 1, expected an integer of at least 2" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root can write into a read-only folder")
-def test_a_read_only_folder(tmp_path, capsys):
-    tmp_path.chmod(0o500)
-    assert main(["compare", "gait", "--samplers", "exact", "--out", str(tmp_path / "out")]) == 2
-    assert "out" in said(capsys)
-
-
-def test_a_folder_that_is_a_file(tmp_path, capsys):
-    taken = write(tmp_path / "taken", "here")
-    assert main(["compare", "gait", "--samplers", "exact", "--draws", "12", "--out", taken]) == 2
-    assert "taken" in said(capsys)
+@pytest.mark.parametrize("out", ["taken", "locked/out", "/proc/no-folder-can-be-made-here"])
+def test_a_folder_that_cannot_be_written_to(out, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("taken").write_text("a file stands here")
+    Path("locked").mkdir(mode=0o500)
+    if out == "locked/out" and os.geteuid() == 0:
+        pytest.skip("root can write into a read-only folder")
+    assert main(["compare", "gait", "--samplers", "exact", "--draws", "12", "--out", out]) == 2
+    sentence = said(capsys)
+    assert out in sentence
+    assert "Traceback" not in sentence
 
 
 # Ctrl-C.

@@ -32,13 +32,18 @@ def cameras(request):
     return RINGS[request.param]
 
 
-@pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (2, 1, 4, 3), (1, 1)])
-def test_consistent_pictures_give_the_motion_back(cameras, library, shape):
-    points = motion(*shape)
+def test_consistent_pictures_give_the_motion_back(cameras, library):
+    points = motion(2, 1, 4, 3)
     if library.dtype == "float32" and cameras.focal[0] > 100:
         pytest.skip("pixels of a thousandth of a millimetre are beyond single precision")
     found = triangulate(library.array(cameras.project(points)), cameras)
     library.assert_close(found, points)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (1, 1), (3, 1, 1, 2)])
+def test_any_batch_shape(cameras, shape):
+    points = motion(*shape)
+    np.testing.assert_allclose(triangulate(cameras.project(points), cameras), points, atol=1e-10)
 
 
 def test_libraries_agree_on_noisy_weighted_pictures(cameras, library):
@@ -125,16 +130,15 @@ def test_weights_count_views(cameras):
         )
 
 
-def test_unseen_keypoints_are_not_read(cameras, library):
-    if library.dtype == "float32":
-        pytest.skip("the rounding of pixels is tested elsewhere")
+def test_unseen_keypoints_are_not_read(library):
+    cameras = RINGS["perspective"]
     points = motion(3, 2)
     seen = cameras.project(points)
     weights = np.ones(seen.shape[:-1])
     weights[0, 1, 1] = 0
     seen[0, 1, 1] = np.nan
     found = triangulate(library.array(seen), cameras, library.array(weights))
-    library.assert_close(found, points, 1e-9)
+    library.assert_close(found, points)
 
 
 def test_gradients_pass_through(differentiable):
@@ -152,12 +156,11 @@ def test_gradients_pass_through(differentiable):
     assert slope == pytest.approx(numerical, rel=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(0, 4, 3), (4, 0), (0, 3)])
-def test_empty_batches(cameras, library, shape):
-    *batch, L, J = shape
-    found = triangulate(library.array(np.zeros((*batch, cameras.n_views, L, J, 2))), cameras)
-    assert tuple(found.shape) == (*shape, 3)
-    assert str(found.dtype).endswith(library.dtype)
+def test_empty_batches(cameras, library):
+    for *batch, L, J in [(0, 4, 3), (4, 0), (0, 3)]:
+        found = triangulate(library.array(np.zeros((*batch, cameras.n_views, L, J, 2))), cameras)
+        assert tuple(found.shape) == (*batch, L, J, 3)
+        assert str(found.dtype).endswith(library.dtype)
 
 
 def test_one_view_is_not_enough():
@@ -206,9 +209,9 @@ def test_a_camera_behind_the_motion_is_named():
     cameras = Cameras.ring(3, perspective=True, distance=2.0)
     points = motion(2, 2)
     seen = cameras.project(points)
+    start = points.copy()
+    start[1, 1] = -5 * cameras.rotation[0, 2]
     with pytest.raises(ValueError, match=r"joint 1 of frame 1 behind camera 0, expected every"):
-        start = points.copy()
-        start[1, 1] = 5 * (-cameras.rotation[0, 2])
         triangulate(seen, cameras, initial=start, iterations=1)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -51,13 +53,17 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         array = np.ascontiguousarray(to_numpy(value))
         digest.update(f"{array.dtype.str}{array.shape}".encode())
         digest.update(array.tobytes())
+    elif isinstance(value, PurePath):
+        digest.update(str(value).encode())
+    elif isinstance(value, partial):
+        parts += [value.func, value.args, value.keywords]
     elif isinstance(value, type) or hasattr(value, "__qualname__"):
         digest.update(f"{value.__module__}.{value.__qualname__}".encode())
     elif is_dataclass(value):
         for field in fields(value):
             if field.init:
                 parts += [field.name, getattr(value, field.name)]
-    elif vars(value) if hasattr(value, "__dict__") else False:
+    elif getattr(value, "__dict__", None):
         parts.append(vars(value))
     elif not _plain(kind):
         raise ValueError(

@@ -144,13 +144,15 @@ class Comparison:
             if settings:
                 listed = ", ".join(f"{name}={value}" for name, value in settings.items())
                 notes.append(f"{sampler} ran with {listed}; its other settings are its defaults")
-        said = set()
+        seeds: dict[str, list[int]] = {}
         for result in self.failures:
             assert result.failure is not None
-            sentence = f"{result.sampler} on {result.problem}: {result.failure.message}"
-            if sentence not in said:
-                notes.append(sentence)
-            said.add(sentence)
+            where = f"{result.sampler} on {result.problem}"
+            seeds.setdefault(f"{where}: {result.failure.message}", []).append(result.seed)
+        for sentence, failed in seeds.items():
+            # Where some seeds worked, the table shows a mean of fewer than it seems.
+            some = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
+            notes.append(sentence + (some if len(failed) < self.plan.seeds else ""))
         return notes
 
     def table(self) -> ComparisonTable:

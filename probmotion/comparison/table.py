@@ -57,8 +57,8 @@ _LEGEND = (
     "swd: sliced Wasserstein distance / that of two exact sets (1 is right); tr: trace of "
     "covariance / exact (< 1: over-confident);\nmean: error of the mean / √tr (0); off: variance "
     "off the prior's manifold / exact draws' (1); log p: mean log density less exact's, nats (0);\n"
-    "shares: styles' total variation from exact (0); P, R: precision and recall; evaluations: of "
-    "denoiser, log density and its gradient."
+    "shares: styles' total variation from exact (0); P, R: precision and recall; denoiser, density, "
+    "gradient: evaluations. The frame holds more measures."
 )
 
 
@@ -88,28 +88,26 @@ class ComparisonTable(pd.DataFrame):
         parts = [self._problem(problem) for problem in problems]
         if any(self["metric"] == "swd"):
             parts.append(_LEGEND)
-        parts += self.attrs.get("notes", [])
+        if notes := self.attrs.get("notes"):
+            parts.append("\n".join(notes))
         return "\n\n".join(parts) if parts else "no cell is finished"
 
     def _problem(self, problem: str) -> str:
+        """The blocks of one problem, each a measure per column and a sampler per row."""
         rows = pd.DataFrame(self[self["problem"] == problem])
         samplers = list(dict.fromkeys(rows["sampler"]))
-        measured = set(rows["metric"])
-        description = self.attrs.get("problems", {}).get(problem, "")
-        lines = [f"{problem}: {description}"]
         words = self.attrs.get("words", {})
-        grouped = {key: values for key, values in rows.groupby(["sampler", "metric"])["value"]}
+        values = dict(iter(rows.groupby(["sampler", "metric"])["value"]))
+        lines = [f"{problem}: {self.attrs.get('problems', {}).get(problem, '')}"]
         for title, columns in _BLOCKS:
-            shown = {metric: head for metric, head in columns.items() if metric in measured}
+            shown = {key: head for key, head in columns.items() if key in set(rows["metric"])}
             if not set(shown) - {"seconds"}:
                 continue
             body = []
             for sampler in samplers:
-                word = words.get(f"{problem}/{sampler}")
-                if (sampler, "seconds") in grouped:
-                    cells = [_mean_and_sd(grouped.get((sampler, metric))) for metric in shown]
-                else:
-                    cells = [word or "", *[""] * (len(shown) - 1)]
+                cells = [_mean_and_sd(values.get((sampler, metric))) for metric in shown]
+                if not any(cells) and (sampler, "seconds") not in values:
+                    cells[0] = words.get(f"{problem}/{sampler}", "")
                 body.append([sampler, *cells])
             lines.append(_aligned([title, *shown.values()], body))
         if len(lines) == 1:

@@ -36,6 +36,8 @@ class Gait:
     bend: tuple[float, float]
     bounce: tuple[float, float]
     turning: tuple[float, float] = (0.0, 0.25)
+    wander: float = 0.09
+    """Root mean square of what every joint angle adds of its own: no two steps are alike."""
     footfall: tuple[float, float, float, float] = (0.0, 0.5, 0.75, 0.25)
     """Phase of left hind, right hind, left fore and right fore leg, cycles; quadrupeds only."""
 
@@ -48,10 +50,10 @@ GAITS: Mapping[str, Gait] = {
     "march": Gait("person", (0.85, 0.05), (0.55, 0.05), (1.5, 0.12), (-0.03, 0.02), (0.85, 0.10),
                   (0.1, 0.04), (0.02, 0.004)),
     "quadruped-walk": Gait("quadruped", (0.9, 0.07), (0.35, 0.04), (0.6, 0.08), (0.0, 0.03),
-                           (0.25, 0.05), (0.2, 0.04), (0.01, 0.003)),
+                           (0.25, 0.05), (0.2, 0.04), (0.01, 0.003), wander=0.06),
     "quadruped-trot": Gait("quadruped", (1.6, 0.1), (0.50, 0.05), (1.0, 0.1), (0.0, 0.03),
                            (0.15, 0.04), (0.35, 0.05), (0.03, 0.005),
-                           footfall=(0.0, 0.5, 0.5, 0.0)),
+                           wander=0.06, footfall=(0.0, 0.5, 0.5, 0.0)),
 }  # fmt: skip
 """Styles by name."""
 
@@ -118,7 +120,7 @@ def make_gait(
     }
     phase = 2 * np.pi * (rng.random() + draw["cadence"] * time)
     body, leg = _BODIES[gait.body]
-    joints = body(phase, draw, gait)
+    joints = body(phase, draw, gait, lambda: gait.wander * _wander(rng, time))
     heading = draw["turning"] * time
     speed = 4 * leg * np.sin(draw["stride"]) * draw["cadence"]
     c, s = np.cos(heading), np.sin(heading)
@@ -141,15 +143,25 @@ def _across(yaw: np.ndarray, lean: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(yaw), s * np.sin(lean), -s * np.cos(lean)], axis=-1)
 
 
+def _wander(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    """A smooth random function of time with mean square 1: half a cycle to two cycles a second."""
+    frequency = np.array([0.5, 1.0, 1.5, 2.0])
+    amplitude = rng.normal(size=(2, 4)) / 2
+    angle = 2 * np.pi * np.outer(time, frequency)
+    return np.cos(angle) @ amplitude[0] + np.sin(angle) @ amplitude[1]
+
+
 def _flexion(phase: np.ndarray, peak: float) -> np.ndarray:
     """A smooth bump in [0, 1] around ``peak``: how far a knee is bent in its swing."""
     return np.exp(2.0 * (np.cos(phase - peak) - 1.0))
 
 
-def _person(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict[str, np.ndarray]:
+def _person(
+    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, stray: Callable[[], np.ndarray]
+) -> dict[str, np.ndarray]:
     joints: dict[str, np.ndarray] = {}
     frames = len(phase)
-    lean = np.full(frames, draw["lean"])
+    lean = draw["lean"] + 0.5 * stray()
     up = np.stack([np.zeros(frames), np.cos(lean), np.sin(lean)], axis=-1)
     pelvis = np.zeros((frames, 3))
     pelvis[:, 1] = 0.9 + draw["bounce"] * np.cos(2 * phase)
@@ -157,34 +169,39 @@ def _person(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict[st
     joints["pelvis"] = pelvis
     joints["spine"] = pelvis + 0.24 * up
     joints["neck"] = joints["spine"] + 0.26 * up
-    nod = np.stack([np.zeros(frames), np.cos(0.4 * lean), np.sin(0.4 * lean)], axis=-1)
-    joints["nose"] = joints["neck"] + 0.12 * nod + np.array([0.0, 0.0, 0.06])
-    joints["head"] = joints["nose"] + 0.13 * nod - np.array([0.0, 0.0, 0.06])
+    tilt = 0.4 * lean + stray()
+    nod = np.stack([np.zeros(frames), np.cos(tilt), np.sin(tilt)], axis=-1)
+    face = np.stack([np.zeros(frames), -np.sin(tilt), np.cos(tilt)], axis=-1)
+    joints["nose"] = joints["neck"] + 0.12 * nod + 0.06 * face
+    joints["head"] = joints["nose"] + 0.13 * nod - 0.06 * face
     for side, sign, own in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
-        hip = draw["stride"] * np.sin(own) + 0.25 * draw["lift"] * _flexion(own, 0.6) * 0.6
-        knee = 0.12 + 0.75 * draw["lift"] * _flexion(own, -0.35)
+        hip = draw["stride"] * np.sin(own) + 0.15 * draw["lift"] * _flexion(own, 0.6) + stray()
+        knee = 0.12 + 0.75 * draw["lift"] * _flexion(own, -0.35) + stray()
         joints[f"{side}_hip"] = pelvis + sign * 0.11 * _across(sway * np.sin(phase), lean)
         joints[f"{side}_knee"] = joints[f"{side}_hip"] + 0.43 * _direction(hip)
         joints[f"{side}_ankle"] = joints[f"{side}_knee"] + 0.42 * _direction(hip - knee)
-        arm = -draw["swing"] * np.sin(own) + 0.5 * lean
+        arm = -draw["swing"] * np.sin(own) + 0.5 * lean + stray()
         shoulder = joints["neck"] - 0.04 * up + sign * 0.17 * _across(-sway * np.sin(phase), lean)
         out = np.array([0.15 * sign, 0.0, 0.0])
         upper = _unit(_direction(arm) + out)
-        fore = _unit(_direction(arm + draw["bend"] + 0.3 * draw["swing"] * np.cos(own)) + 0.3 * out)
+        elbow = draw["bend"] + 0.3 * draw["swing"] * np.cos(own) + stray()
+        fore = _unit(_direction(arm + elbow) + 0.3 * out)
         joints[f"{side}_shoulder"] = shoulder
         joints[f"{side}_elbow"] = shoulder + 0.29 * upper
         joints[f"{side}_wrist"] = joints[f"{side}_elbow"] + 0.25 * fore
     return joints
 
 
-def _quadruped(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict[str, np.ndarray]:
+def _quadruped(
+    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, stray: Callable[[], np.ndarray]
+) -> dict[str, np.ndarray]:
     joints: dict[str, np.ndarray] = {}
     frames = len(phase)
-    nod = draw["bend"] + 0.15 * draw["swing"] * np.cos(2 * phase)
+    nod = draw["bend"] + 0.15 * draw["swing"] * np.cos(2 * phase) + stray()
     tail = np.zeros((frames, 3))
     tail[:, 1] = 0.62 + draw["bounce"] * np.cos(2 * phase)
     tail[:, 2] = -0.35
-    slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase)
+    slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase) + 0.5 * stray()
     back = np.stack([np.zeros(frames), np.sin(slope), np.cos(slope)], axis=-1)
     neck = tail + 0.72 * back
     face = np.stack([np.zeros(frames), np.cos(nod + 0.8), np.sin(nod + 0.8)], axis=-1)
@@ -202,8 +219,9 @@ def _quadruped(phase: np.ndarray, draw: Mapping[str, float], gait: Gait) -> dict
             (neck, "shoulder", "elbow", "front_paw", fore, -0.1),
         ):
             own = phase + 2 * np.pi * offset
-            upper = draw["stride"] * np.sin(own) + 3.0 * start * draw["bend"]
-            lower = upper - 0.55 * draw["lift"] * _flexion(own, -0.35) - 4.0 * start * draw["bend"]
+            upper = draw["stride"] * np.sin(own) + 3.0 * start * draw["bend"] + stray()
+            knee = 0.55 * draw["lift"] * _flexion(own, -0.35) + 4.0 * start * draw["bend"]
+            lower = upper - knee + stray()
             joints[f"{side}_{first}"] = root + out - np.array([0.0, 0.1, 0.4 * start])
             joints[f"{side}_{second}"] = joints[f"{side}_{first}"] + 0.25 * _direction(upper)
             joints[f"{side}_{third}"] = joints[f"{side}_{second}"] + 0.27 * _direction(lower)
@@ -214,7 +232,9 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-Body = Callable[[np.ndarray, Mapping[str, float], Gait], dict[str, np.ndarray]]
+Body = Callable[
+    [np.ndarray, Mapping[str, float], Gait, Callable[[], np.ndarray]], dict[str, np.ndarray]
+]
 _BODIES: Mapping[str, tuple[Body, float]] = {
     "person": (_person, 0.85),
     "quadruped": (_quadruped, 0.52),

@@ -77,7 +77,7 @@ def _channels(motion: Motion) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndar
     rotations, offsets = motion.rotations, motion.rest_offsets
     if rotations is None or offsets is None:
         rotations, offsets = fit_rotations(skeleton, motion.positions)
-    angles: np.ndarray = np.round(np.rad2deg(matrix_to_euler(rotations, _ORDER)), _DECIMALS)
+    angles = np.rad2deg(matrix_to_euler(rotations, _ORDER)).round(_DECIMALS)
     # A root's offset is 0: programs disagree whether its channels replace it or add to it.
     offsets = np.round(offsets, _DECIMALS)
     offsets[list(skeleton.roots)] = 0.0

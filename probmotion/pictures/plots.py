@@ -168,7 +168,7 @@ def _label_points(axes: Axes, points: Mapping[str, Point], styles: Mapping[str, 
 
     boxes = {name: _marked(axes, point) for name, point in points.items()}
     taken = list(boxes.values())
-    room = tuple(axes.bbox.extents)
+    room = (axes.bbox.x0, axes.bbox.y0, axes.bbox.x1, axes.bbox.y1)
     to_data = axes.transData.inverted()
     for name, box in boxes.items():
         text = axes.text(0, 0, name, size=9, color=styles[name][0], ha="center", va="center")
@@ -181,7 +181,8 @@ def _label_points(axes: Axes, points: Mapping[str, Point], styles: Mapping[str, 
         ]
         best = min(places, key=lambda place: _covered(place, taken, room))
         taken.append(best)
-        text.set_position(to_data.transform(_middle(best)))
+        x, y = to_data.transform(_middle(best))
+        text.set_position((x, y))
         if places.index(best) >= len(_AROUND):
             ends = to_data.transform([_middle(box), _nearest(best, _middle(box))])
             axes.plot(*ends.T, color=GREY, linewidth=0.8, zorder=1)

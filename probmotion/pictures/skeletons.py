@@ -206,5 +206,5 @@ def _write_key(figure: Figure, title: str, with_truth: bool, width: float, heigh
     right = 1 - 0.12 / width
     for words, colour in reversed(entries):
         text = figure.text(right, top, words, ha="right", va="top", size=10, color=colour)
-        text.set_weight("bold")
+        text.set_fontweight("bold")
         right -= (text.get_window_extent().width / figure.dpi + 0.16) / width

@@ -122,9 +122,7 @@ def _index(motions: Sequence[Motion], held_out: int | str) -> int:
             )
         return names.index(held_out)
     if not -len(motions) <= held_out < len(motions):
-        raise ValueError(
-            f"held_out is {held_out}, expected an index into the {len(motions)} clips"
-        )
+        raise ValueError(f"held_out is {held_out}, expected an index into the {len(motions)} clips")
     return held_out % len(motions)
 
 

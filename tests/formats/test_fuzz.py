@@ -188,7 +188,7 @@ def test_damaged_bvh(content: bytes) -> None:
     read_damaged(content, ".bvh", read_with_end_sites)
 
 
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(derandomize=True, max_examples=150, deadline=None)
 @given(damaged(ARCHIVES))
 def test_damaged_npz(content: bytes) -> None:
     read_damaged(content, ".npz", read_motion)
@@ -227,7 +227,7 @@ KEYS = st.sampled_from(
 )
 
 
-@settings(derandomize=True, max_examples=400, deadline=None)
+@settings(derandomize=True, max_examples=200, deadline=None)
 @given(
     st.recursive(
         st.one_of(SCALARS, st.lists(st.floats(0, 9), min_size=51, max_size=51)),

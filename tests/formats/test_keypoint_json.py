@@ -111,10 +111,16 @@ def test_openpose_folder_list_and_single_frame(tmp_path: Path) -> None:
     listed = written(tmp_path, frames)
     for path in (folder, listed):
         (track,) = read_keypoints(path, fps=60)
-        assert track.frames == 4
+        assert (track.frames, track.name) == (4, path.stem)
         assert_holds(track, FIRST, [0, 3])
     (single,) = read_keypoints(written(tmp_path, frames[0], "one.json"), fps=60)
     assert_holds(single, FIRST, [0])
+
+
+def test_openpose_people_without_an_identity_are_not_told_apart(tmp_path: Path) -> None:
+    strangers = [openpose(FIRST[0], SECOND[0], person_id=[-1])]
+    with pytest.raises(MotionFileError, match="two people without a track id"):
+        read_keypoints(written(tmp_path, strangers), fps=60)
 
 
 def test_openpose_frames_are_numbered_evenly(tmp_path: Path) -> None:
@@ -278,6 +284,11 @@ def test_a_defect_is_one_sentence(tmp_path: Path, content: Any, message: str) ->
     assert str(path) in str(caught.value)
     assert "expected" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_printed_is_escaped(tmp_path: Path) -> None:
+    with pytest.raises(MotionFileError, match=r"holds the keys \\u2028\\x00\\ud800, expected"):
+        read_keypoints(written(tmp_path, {"\u2028\0\ud800": []}), fps=25)
 
 
 def test_arguments_and_files_that_do_not_fit(tmp_path: Path) -> None:

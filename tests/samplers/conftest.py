@@ -1,13 +1,15 @@
-"""A prior for the samplers' tests: one Gaussian over tiny motions, everything in dense algebra."""
+"""Priors for the samplers' tests, everything in dense algebra: a Gaussian, two bumps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
+from probmotion.arrays import array_namespace, constant, dot, logsumexp
 from probmotion.cameras import Cameras
 from probmotion.likelihoods import Likelihood
 from probmotion.skeleton import Skeleton
@@ -133,3 +135,58 @@ def assert_covariance(draws: np.ndarray, covariance: np.ndarray, deviations: flo
 def covariance_is() -> Callable[..., None]:
     """The function above."""
     return assert_covariance
+
+
+@dataclass(frozen=True, eq=False)
+class TwoBumps:
+    """A prior for chains: θ is one joint's position, a mixture of two Gaussians in closed form."""
+
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+    frames: int = 1
+    fps: float = 20.0
+    dim: int = 3
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return Skeleton(["point"], [-1])
+
+    def motion(self, theta: Any) -> Any:
+        return theta.reshape(*theta.shape[:-1], 1, 1, 3)
+
+    def log_density(self, theta: Any) -> Any:
+        terms = []
+        for weight, mean, covariance in zip(
+            self.weights, self.means, self.covariances, strict=True
+        ):
+            white = (theta - constant(mean, theta)) @ constant(
+                np.linalg.inv(np.linalg.cholesky(covariance)).T, theta
+            )
+            norm = np.log(weight) - 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+            terms.append(norm - 0.5 * dot(white, white))
+        return logsumexp(array_namespace(theta).stack(terms, axis=-1))
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        chosen = rng.choice(2, size=n, p=self.weights)
+        roots = np.linalg.cholesky(self.covariances)[chosen]
+        return self.means[chosen] + (roots @ rng.standard_normal((n, 3, 1)))[..., 0]
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self.weights @ self.means
+
+    @property
+    def variance(self) -> np.ndarray:
+        square = np.diagonal(self.covariances, axis1=1, axis2=2) + self.means**2
+        return self.weights @ square - self.mean**2
+
+
+@pytest.fixture(scope="session")
+def two_bumps() -> TwoBumps:
+    """Two Gaussians of unlike shape whose overlap lets any chain cross."""
+    return TwoBumps(
+        weights=np.array([0.3, 0.7]),
+        means=np.array([[-1.0, 0.0, 0.5], [1.0, 0.3, 0.0]]),
+        covariances=np.array([0.6 * np.eye(3), np.diag([0.5, 0.1, 0.3]) + 0.08]),
+    )

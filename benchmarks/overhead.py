@@ -1,0 +1,132 @@
+"""What going through this package costs over calling NumPyro and emcee directly.
+
+``nuts_ratio`` and ``ensemble_ratio``: seconds of our sampler over those of the library called by
+hand on the same density, from the same start with the same random numbers; both end with motions,
+and the script stops unless both made the same draws. NUTS is compiled anew by both every time.
+Medians over interleaved repeats in one process. ``import_seconds``: the statement ``import
+probmotion`` in a fresh process, the best of several. Float64, one thread.
+"""
+
+from __future__ import annotations
+
+import os
+
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[threads] = "1"
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import emcee
+import jax
+import numpy as np
+from numpyro.infer import MCMC
+from numpyro.infer import NUTS as Kernel  # noqa: N811
+
+from probmotion import MotionPosterior, seeds
+from probmotion.problems import load_problem
+from probmotion.samplers import NUTS, Ensemble
+from probmotion.samplers.nuts_kernel import compiled
+
+SEED = 0
+
+
+def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
+    """Return θ of one chain, as a user of NumPyro would draw it, and make the motions."""
+    start = posterior.initial(seeds.generator(SEED, "initial", 0), 1)[0]
+    with jax.enable_x64(True):
+        chain = MCMC(
+            Kernel(potential_fn=lambda theta: -posterior.log_density(theta)),
+            num_warmup=warmup,
+            num_samples=draws,
+            progress_bar=False,
+        )
+        chain.run(
+            seeds.jax_key(SEED, "chain", 0),
+            init_params=jax.numpy.asarray(start),
+            extra_fields=("potential_energy", "accept_prob", "diverging", "num_steps"),
+        )
+        theta = np.asarray(chain.get_samples())
+    posterior.complete(seeds.generator(SEED, "motions"), theta)
+    return theta
+
+
+def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
+    """Return θ of one chain by our sampler."""
+    compiled.cache_clear()
+    result = NUTS(warmup=warmup).sample(posterior, draws=draws, seed=SEED, progress=False)
+    return result.dataset["theta"].values[0]
+
+
+def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
+    """Return θ of one ensemble, as a user of emcee would draw it, and make the motions."""
+    walkers = 4 * posterior.dim
+    start = posterior.initial(seeds.generator(SEED, "initial", 0), walkers)
+    source = np.random.RandomState(np.random.MT19937(seeds.sequence(SEED, "chain", 0)))
+    sampler = emcee.EnsembleSampler(walkers, posterior.dim, posterior.log_density, vectorize=True)
+    state = emcee.State(start, random_state=source.get_state())
+    state = sampler.run_mcmc(state, warmup)
+    sampler.reset()
+    sampler.run_mcmc(state, draws // walkers, thin_by=thin)
+    theta = sampler.get_chain(flat=True)
+    posterior.complete(seeds.generator(SEED, "motions"), theta)
+    return theta
+
+
+def ensemble(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
+    """Return θ of one ensemble by our sampler."""
+    sampler = Ensemble(warmup=warmup, thin=thin)
+    result = sampler.sample(posterior, draws=draws, seed=SEED, progress=False)
+    return result.dataset["theta"].values[0]
+
+
+def ratio(ours: Callable[[], np.ndarray], theirs: Callable[[], np.ndarray], repeats: int) -> float:
+    """Return the median over repeats of seconds of ``ours`` over those of ``theirs``."""
+    ratios = []
+    for repeat in range(repeats):
+        seconds, draws = {}, {}
+        # Who goes first alternates, so that a machine that speeds up favours neither.
+        for function in (ours, theirs) if repeat % 2 else (theirs, ours):
+            start = time.perf_counter()
+            draws[function] = function()
+            seconds[function] = time.perf_counter() - start
+        if not np.array_equal(draws[ours], draws[theirs]):
+            raise SystemExit("the two did not make the same draws, expected them to")
+        ratios.append(seconds[ours] / seconds[theirs])
+    return float(np.median(ratios))
+
+
+def import_seconds(repeats: int = 7) -> float:
+    """Return the time that ``import probmotion`` takes in a fresh process."""
+
+    code = "import time; t = time.perf_counter(); import probmotion; print(time.perf_counter() - t)"
+    runs = [subprocess.check_output([sys.executable, "-c", code]) for _ in range(repeats)]
+    return min(float(run) for run in runs)
+
+
+def main() -> None:
+    """Print the figures; those of MAS follow from ``mas_overhead.py``."""
+    print(f"import_seconds: {import_seconds():.3f}")
+    posterior = load_problem("gait-monocular").posterior
+    of_nuts = ratio(
+        lambda: nuts(posterior, warmup=500, draws=2000),
+        lambda: nuts_directly(posterior, warmup=500, draws=2000),
+        repeats=5,
+    )
+    print(f"nuts_ratio: {of_nuts:.3f}")
+    of_ensemble = ratio(
+        lambda: ensemble(posterior, warmup=1000, draws=1600, thin=50),
+        lambda: ensemble_directly(posterior, warmup=1000, draws=1600, thin=50),
+        repeats=7,
+    )
+    print(f"ensemble_ratio: {of_ensemble:.3f}")
+    mas = Path(__file__).with_name("mas_overhead.py")
+    if mas.exists():
+        subprocess.run([sys.executable, str(mas)], check=True)
+
+
+if __name__ == "__main__":
+    main()

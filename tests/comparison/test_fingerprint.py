@@ -1,0 +1,141 @@
+"""A fingerprint tells two questions apart and knows one question again."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_info
+from toy_samplers import PriorDraws, generation, monocular
+
+from probmotion.comparison.fingerprint import fingerprint
+from probmotion.threads import one_thread
+
+
+@dataclass(frozen=True)
+class Holder:
+    value: object
+    cache: dict = field(init=False, default_factory=dict)
+
+
+class Plain:
+    def __init__(self, value):
+        self.value = value
+
+
+class Slotted:
+    __slots__ = ("value",)
+
+
+class Network(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 2)
+
+
+DIFFERENT = [
+    None,
+    True,
+    1,
+    1.0,
+    "1",
+    b"1",
+    [1],
+    (1,),
+    [[1], []],
+    [[], [1]],
+    {"a": 1},
+    {"a": 2},
+    {1, 2},
+    np.array([1.0]),
+    np.array([[1.0]]),
+    np.array([1.0], dtype=np.float32),
+    torch.tensor([1.0]),
+    np.float64(1.0),
+    Holder(1),
+    Holder(2),
+    Holder(Holder(1)),
+    Plain(1),
+    Plain(2),
+    Plain,
+    len,
+    partial(int, "1"),
+    partial(int, "2"),
+    Path("a"),
+    Path("b"),
+]
+
+
+def test_different_things_have_different_fingerprints():
+    assert len({fingerprint(value) for value in DIFFERENT}) == len(DIFFERENT)
+
+
+@pytest.mark.parametrize("value", DIFFERENT, ids=repr)
+def test_a_copy_has_the_same_fingerprint(value):
+    assert fingerprint(copy.deepcopy(value)) == fingerprint(value)
+    assert fingerprint(pickle.loads(pickle.dumps(value))) == fingerprint(value)
+
+
+def test_caches_and_order_do_not_count():
+    holder = Holder(1)
+    before = fingerprint(holder)
+    holder.cache["filled"] = 1
+    assert fingerprint(holder) == before
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    problem = monocular()
+    fresh = fingerprint(problem)
+    problem.reference(0, 3)
+    assert fingerprint(problem) == fresh == fingerprint(monocular())
+
+
+def test_problems_and_samplers_are_told_apart_by_all_that_matters():
+    problem = monocular()
+    louder = replace(problem.posterior.likelihood, noise=0.06)
+    moved = replace(problem, truth=problem.truth + 1e-9)
+    other = replace(problem, posterior=replace(problem.posterior, likelihood=louder))
+    found = {fingerprint(each) for each in (problem, moved, other, generation())}
+    assert len(found) == 4
+    assert fingerprint(PriorDraws()) != fingerprint(PriorDraws(spread=1.1))
+
+
+def test_a_network_is_its_weights():
+    torch.manual_seed(0)
+    one, two = Network(), Network()
+    assert fingerprint(one) != fingerprint(two)
+    two.load_state_dict(one.state_dict())
+    assert fingerprint(one) == fingerprint(two)
+
+
+def test_an_object_that_holds_itself_ends():
+    knot = Plain(1)
+    knot.value = [knot]
+    assert fingerprint(knot) != fingerprint(Plain([1]))
+
+
+@pytest.mark.parametrize("value", [Slotted(), np.random.default_rng(0), object()])
+def test_what_cannot_be_told_apart_is_refused(value):
+    with pytest.raises(ValueError, match="which cannot be told from another"):
+        fingerprint([value])
+
+
+def test_one_thread_is_one_thread_and_then_what_it_was(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    before, torch_before = threadpool_info(), torch.get_num_threads()
+    with one_thread():
+        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
+        assert torch.get_num_threads() == 1
+        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    assert [pool["num_threads"] for pool in threadpool_info()][: len(before)] == [
+        pool["num_threads"] for pool in before
+    ]
+    assert torch.get_num_threads() == torch_before
+    assert os.environ["OMP_NUM_THREADS"] == "3"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ

@@ -1,0 +1,118 @@
+"""What the table prints, and that it survives the way to a folder and back."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from toy_samplers import PriorDraws, generation, monocular
+
+from probmotion.citations import CITATIONS, citations_of
+from probmotion.comparison import QUICK, Comparison, compare, quick_samplers
+from probmotion.comparison.table import ComparisonTable, _mean_and_sd
+from probmotion.samplers import ExactSampler, ScoreDistillation
+from probmotion.sampling import sampler_names
+
+SMALL = {"draws": 20, "chains": 2, "progress": False}
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([1.2345], "1.23"),
+        ([0.00012], "0.000"),
+        ([123.4], "123"),
+        ([200000.0], "200k"),
+        ([2.5e6], "2500k"),
+        ([1.0, 2.0, 3.0], "2.0 ± 1.0"),
+        ([0.991, 1.009], "1.000 ± 0.013"),
+        ([250.0, 350.0], "300 ± 71"),
+        ([-12000.0, -14000.0], "-13.0 ± 1.4k"),
+        ([5.0, 5.0], "5.00 ± 0.00"),
+        ([math.nan], "-"),
+    ],
+)
+def test_numbers_show_what_they_are_worth(values, text):
+    assert _mean_and_sd(pd.Series(values)) == text
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("comparison")
+    samplers = {"exact": ExactSampler(), "wide": PriorDraws(2.0)}
+    compare([generation(), monocular()], samplers, seeds=2, out=out, **SMALL)
+    return out
+
+
+def test_it_prints_means_and_deviations_with_cost_beside_quality(folder):
+    comparison = Comparison.load(folder)
+    table = comparison.table()
+    text = str(table)
+    assert repr(comparison) == text == repr(table)
+    swd = table.query("problem == 'generation' and sampler == 'wide' and metric == 'swd'")["value"]
+    assert f"{swd.mean():.2f} ± " in text or f"{swd.mean():.1f} ± " in text
+    heads = next(line for line in text.splitlines() if line.startswith("against exact"))
+    assert heads.split()[3:6] == ["seconds", "swd", "tr"]
+    assert text.index("generation: no evidence") < text.index("monocular: one camera")
+    assert ["wide", "evidence"] in [line.split() for line in text.splitlines()]
+    assert "wide ran with spread=2.0; its other settings are its defaults" in text
+    assert max(map(len, text.splitlines())) < 160
+
+
+def test_what_is_cut_from_it_is_a_plain_frame(folder):
+    table = Comparison.load(folder).table()
+    assert isinstance(table, ComparisonTable)
+    assert type(table[table["seed"] == 0]) is pd.DataFrame
+    assert type(table.groupby("metric").mean(numeric_only=True)) is pd.DataFrame
+
+
+def test_the_files_hold_the_table_and_the_failures(folder):
+    kept = pd.read_csv(folder / "table.csv")
+    table = Comparison.load(folder).table()
+    assert list(kept.columns) == ["problem", "sampler", "seed", "metric", "value"]
+    np.testing.assert_array_equal(kept["value"], table["value"])
+    failures = json.loads((folder / "failures.json").read_text())
+    assert [(each["sampler"], each["word"]) for each in failures] == [("wide", "evidence")] * 2
+
+
+def test_a_comparison_can_be_written_elsewhere_and_read_back(folder, tmp_path):
+    comparison = Comparison.load(folder)
+    comparison.write(tmp_path / "copy")
+    copy = Comparison.load(tmp_path / "copy")
+    pd.testing.assert_frame_equal(
+        pd.DataFrame(copy.table()), pd.DataFrame(comparison.table()), check_exact=True
+    )
+    np.testing.assert_array_equal(
+        copy.draws("generation", "wide", 1).flat(), comparison.draws("generation", "wide", 1).flat()
+    )
+
+
+def test_a_temporary_comparison_takes_its_folder_with_it():
+    comparison = compare(generation(), PriorDraws(), **SMALL)
+    folder = comparison.folder
+    assert (folder / "table.csv").exists()
+    del comparison
+    assert not folder.exists()
+
+
+def test_quick_settings_are_shown_and_stored():
+    quick = quick_samplers()
+    assert list(quick) == sampler_names()
+    assert quick["sds"] == ScoreDistillation(**QUICK["sds"])
+    assert quick["sds"] != ScoreDistillation()
+    comparison = compare(
+        generation(), {"sds": ScoreDistillation(iterations=3)}, draws=10, chains=1, progress=False
+    )
+    assert "sds ran with iterations=3; its other settings are its defaults" in str(comparison)
+    settings = json.loads(comparison.draws("generation", "sds").dataset.attrs["settings"])
+    assert settings["iterations"] == 3
+
+
+def test_every_sampler_says_what_to_cite():
+    for name in sampler_names():
+        assert len(citations_of(name)) >= 2
+    assert set(CITATIONS) == set(sampler_names())
+    assert len(citations_of("someone's own")) == 1

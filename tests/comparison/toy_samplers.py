@@ -1,0 +1,129 @@
+"""Small samplers and problems for the tests of the comparison, importable by its workers."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from probmotion import Motion, MotionDraws, MotionPosterior, Skeleton, UnsupportedPosterior, seeds
+from probmotion.models import GaussianMixtureMotion
+from probmotion.priors import Samplable
+from probmotion.problems import Problem
+from probmotion.problems.evidence import observe
+
+
+def small_prior() -> GaussianMixtureMotion:
+    rng = np.random.default_rng(0)
+    return GaussianMixtureMotion(
+        skeleton=Skeleton(["root", "a", "b"], [-1, 0, 1]),
+        fps=30.0,
+        means=rng.normal(size=(2, 4, 3, 3)),
+        factors=0.4 * rng.normal(size=(2, 2, 4, 3, 3)),
+        weights=np.array([0.6, 0.4]),
+        noise=0.1,
+        azimuths=5,
+        styles=("calm", "wild"),
+    )
+
+
+def generation() -> Problem:
+    return Problem("generation", "no evidence", MotionPosterior(small_prior()))
+
+
+def monocular() -> Problem:
+    prior = small_prior()
+    truth = Motion(prior.sample(np.random.default_rng(1), 1)[0], prior.skeleton, 30.0)
+    evidence = observe(truth, "monocular", 0.05, 0)
+    return Problem("monocular", "one camera", MotionPosterior(prior, evidence), truth.positions)
+
+
+@dataclass(frozen=True)
+class PriorDraws:
+    """Draws from the prior, stretched; takes no evidence. Notes every run in a file."""
+
+    name: ClassVar[str] = "prior-draws"
+    requires: ClassVar[tuple[type, ...]] = (Samplable,)
+
+    spread: float = 1.0
+    nap: float = 0.0
+    diary: str = ""
+
+    def sample(self, posterior, *, draws=1000, chains=1, seed=0, initial=None, progress=True):
+        start = time.perf_counter()
+        if self.diary:
+            with open(self.diary, "a") as file:
+                file.write(f"{seed}\n")
+        if posterior.likelihood is not None:
+            raise UnsupportedPosterior(self.name, "takes no evidence", "evidence", ["exact"])
+        time.sleep(self.nap)
+        rng = seeds.generator(seed, "toy")
+        x = self.spread * posterior.prior.sample(rng, draws * chains)
+        # A product whose last bits depend on the number of threads.
+        x = x + 1e-12 * float(np.tile(x.ravel(), 50) @ np.tile(x.ravel(), 50))
+        return MotionDraws.of(
+            posterior,
+            self,
+            x.reshape(chains, draws, *x.shape[1:]),
+            seed=seed,
+            seconds=time.perf_counter() - start,
+            counts={"denoiser": 5 * draws * chains},
+            independent=True,
+        )
+
+
+@dataclass(frozen=True)
+class Crashing(PriorDraws):
+    name: ClassVar[str] = "crashing"
+
+    def sample(self, posterior, **settings):
+        super().sample(posterior, **settings)
+        raise RuntimeError("the floor gave\nway")
+
+
+@dataclass(frozen=True)
+class CrashingOnce(PriorDraws):
+    """Fails until a file exists."""
+
+    name: ClassVar[str] = "crashing-once"
+    mended: str = ""
+
+    def sample(self, posterior, **settings):
+        if not Path(self.mended).exists():
+            raise RuntimeError("not yet")
+        return super().sample(posterior, **settings)
+
+
+@dataclass(frozen=True)
+class Dying(PriorDraws):
+    """Takes its process with it."""
+
+    name: ClassVar[str] = "dying"
+
+    def sample(self, posterior, **settings):
+        os._exit(9)
+
+
+@dataclass(frozen=True)
+class TooFew(PriorDraws):
+    name: ClassVar[str] = "too-few"
+
+    def sample(self, posterior, *, draws=1000, **settings):
+        return super().sample(posterior, draws=draws - 1, **settings)
+
+
+@dataclass(frozen=True)
+class Interrupting(PriorDraws):
+    """Ctrl-C arrives in the middle of its second cell."""
+
+    name: ClassVar[str] = "interrupting"
+
+    def sample(self, posterior, **settings):
+        draws = super().sample(posterior, **settings)
+        if len(Path(self.diary).read_text().split()) == 2:
+            raise KeyboardInterrupt
+        return draws

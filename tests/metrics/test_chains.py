@@ -1,0 +1,110 @@
+"""Chain diagnostics on chains whose mixing is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from probmotion import MotionDraws, Skeleton
+from probmotion.metrics.chains import chain_diagnostics, watched_coordinates
+from probmotion.metrics.cost import costs
+
+CHAINS, DRAWS = 4, 500
+
+
+@dataclass(frozen=True)
+class Named:
+    name: ClassVar[str] = "named"
+
+
+class Posterior:
+    skeleton = Skeleton(["a"], [-1])
+    frames, fps = 1, 30.0
+
+    def __init__(self, dim):
+        self.dim = dim
+
+
+def run(theta, statistics=None, independent=False):
+    theta = np.asarray(theta)
+    return MotionDraws.of(
+        Posterior(theta.shape[2]),
+        Named(),
+        np.zeros((*theta.shape[:2], 1, 1, 3)),
+        seed=0,
+        seconds=2.5,
+        theta=theta,
+        statistics=statistics,
+        counts={"density": 7},
+        independent=independent,
+    )
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_independent_draws_have_no_diagnostics(rng):
+    assert chain_diagnostics(run(rng.normal(size=(CHAINS, DRAWS, 2)), independent=True)) == {}
+
+
+def test_white_noise_is_worth_all_its_draws(rng):
+    found = chain_diagnostics(run(rng.normal(size=(CHAINS, DRAWS, 2))))
+    assert found["rhat"] < 1.01
+    assert found["ess_bulk"] == pytest.approx(CHAINS * DRAWS, rel=0.15)
+    assert set(found) == {"rhat", "ess_bulk", "ess_tail"}
+
+
+def test_an_autoregression_is_worth_what_theory_says(rng):
+    phi, draws = 0.8, 4000
+    theta = np.empty((CHAINS, draws, 1))
+    theta[:, 0] = rng.normal(size=(CHAINS, 1))
+    for t in range(1, draws):
+        step = rng.normal(size=(CHAINS, 1))
+        theta[:, t] = phi * theta[:, t - 1] + math.sqrt(1 - phi**2) * step
+    expected = CHAINS * draws * (1 - phi) / (1 + phi)
+    assert chain_diagnostics(run(theta))["ess_bulk"] == pytest.approx(expected, rel=0.15)
+
+
+def test_stuck_chains_are_seen_in_few_and_in_many_coordinates(rng):
+    for dim in (3, 200):
+        stuck = rng.normal(size=(CHAINS, DRAWS, dim))
+        assert chain_diagnostics(run(stuck))["rhat"] < 1.02
+        stuck[0] += 5
+        found = chain_diagnostics(run(stuck))
+        assert found["rhat"] > 1.5
+        assert found["ess_bulk"] < 10
+
+
+def test_many_coordinates_are_watched_through_the_leading_ones(rng):
+    theta = rng.normal(size=(2, 50, 40)) * np.r_[10.0, np.ones(39)]
+    watched = watched_coordinates(run(theta))
+    assert watched.shape == (2, 50, 10)
+    assert abs(np.corrcoef(watched[..., 0].ravel(), theta[..., 0].ravel())[0, 1]) > 0.99
+
+
+def test_an_ensemble_is_judged_by_its_autocorrelation_time(rng):
+    theta = rng.normal(size=(CHAINS, DRAWS, 2))
+    times = np.array([2.0, 5.0, 1.0, 4.0])
+    found = chain_diagnostics(run(theta, {"autocorrelation_time": times}))
+    assert found == {"ess_bulk": CHAINS * DRAWS / 5}
+
+
+def test_acceptance_is_averaged_and_divergences_are_counted(rng):
+    theta = rng.normal(size=(CHAINS, DRAWS, 1))
+    divergent = np.zeros((CHAINS, DRAWS), dtype=bool)
+    divergent[1, 3:6] = True
+    acceptance = np.array([0.2, 0.4, 0.2, 0.4])
+    found = chain_diagnostics(run(theta, {"divergent": divergent, "acceptance": acceptance}))
+    assert found["divergent"] == 3
+    assert found["acceptance"] == pytest.approx(0.3)
+
+
+def test_costs_are_the_runs(rng):
+    found = costs(run(rng.normal(size=(1, 10, 1))))
+    assert found == {"seconds": 2.5, "density_evaluations": 7}

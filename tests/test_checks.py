@@ -1,0 +1,73 @@
+"""What checks accept and what they say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probmotion.checks import check_count, check_finite, check_positive, check_shape
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        ((4, 3), ("L", 3)),
+        ((0, 3), ("L", 3)),
+        ((4, 3), ("…", 3)),
+        ((3,), ("…", 3)),
+        ((2, 5, 4, 3), ("…", "L", 3)),
+        ((), ()),
+        ((7,), ("n",)),
+    ],
+)
+def test_shapes_that_fit(shape: tuple[int, ...], expected: tuple[Any, ...]) -> None:
+    check_shape("x", np.zeros(shape), expected)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected", "message"),
+    [
+        ((4, 2), ("L", 3), r"x has shape \(4, 2\), expected \(L, 3\)"),
+        ((2, 4, 3), ("L", 3), r"x has shape \(2, 4, 3\), expected \(L, 3\)"),
+        ((3,), ("…", "L", 3), r"x has shape \(3,\), expected \(…, L, 3\)"),
+        ((), ("…", 3), r"x has shape \(\), expected \(…, 3\)"),
+        ((2, 2), ("…", 2, 3), r"x has shape \(2, 2\), expected \(…, 2, 3\)"),
+    ],
+)
+def test_shapes_that_do_not_fit(
+    shape: tuple[int, ...], expected: tuple[Any, ...], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_shape("x", np.zeros(shape), expected)
+
+
+def test_numbers_that_are_not_finite_are_counted_and_found(library: Any) -> None:
+    check_finite("x", library.array(np.zeros((2, 3))))
+    check_finite("x", library.array(np.zeros((0, 3))))
+    values = np.zeros((2, 3))
+    values[1, 1:] = [np.nan, -np.inf]
+    wanted = (
+        r"x has 2 values that are NaN or infinite, the first at index \(1, 1\), expected finite"
+    )
+    with pytest.raises(ValueError, match=wanted):
+        check_finite("x", library.array(values))
+
+
+def test_positive_numbers() -> None:
+    check_positive("x", 1e-300)
+    for bad in (0, -1, np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match=r"x is .*, expected a finite number above 0"):
+            check_positive("x", bad)
+
+
+def test_counts() -> None:
+    check_count("n", 1)
+    check_count("n", np.int64(3), least=3)
+    check_count("n", 0, least=0)
+    for bad in (0, -1, 1.0, True, "3", None):
+        with pytest.raises(ValueError, match=r"n is .*, expected an integer of at least 1"):
+            check_count("n", bad)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="n is 2, expected an integer of at least 3"):
+        check_count("n", 2, least=3)

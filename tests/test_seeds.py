@@ -1,0 +1,115 @@
+"""One integer, many independent generators, addressed by name."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from probmotion import seeds
+
+ADDRESSES: list[tuple[Any, ...]] = [
+    (),
+    (0,),
+    (1,),
+    ("0",),
+    ("1",),
+    ("chain",),
+    ("draw",),
+    ("chain", 0),
+    ("chain", 1),
+    (0, "chain"),
+    ("draw", 0),
+    ("draw", 0, 0),
+    ("draw", 0, 1),
+    ("draw", 1, 0),
+    ("draw", 10),
+    ("draw", "10"),
+    (1, 0),
+    (0, 1),
+    (0, 0),
+    # A string must not be its own checksum, nor a tag a name.
+    (__import__("zlib").crc32(b"chain"),),
+    (1, __import__("zlib").crc32(b"chain")),
+]
+
+
+def test_the_same_address_gives_the_same_numbers() -> None:
+    for address in ADDRESSES:
+        a = seeds.generator(3, *address).standard_normal(5)
+        np.testing.assert_array_equal(a, seeds.generator(3, *address).standard_normal(5))
+
+
+def test_different_addresses_and_seeds_give_different_numbers() -> None:
+    streams = {(seed, a): seeds.generator(seed, *a).random() for seed in (0, 1) for a in ADDRESSES}
+    assert len(set(streams.values())) == len(streams)
+
+
+def test_streams_are_uncorrelated() -> None:
+    """Every pair of 21 streams: |r| √n is a standard normal; the largest of 210 is below 5."""
+    n = 2000
+    numbers = [seeds.generator(0, *address).standard_normal(n) for address in ADDRESSES]
+    worst = max(abs(stats.pearsonr(a, b)[0]) for a, b in combinations(numbers, 2))
+    assert worst * np.sqrt(n) < 5
+    neighbours = [seeds.generator(0, "draw", 0, draw).standard_normal() for draw in range(n)]
+    assert stats.kstest(neighbours, stats.norm.cdf).pvalue > 1e-4
+
+
+def test_an_address_does_not_depend_on_who_asked_before() -> None:
+    alone = seeds.integer(5, "chain", 3)
+    for chain in range(3):
+        seeds.generator(5, "chain", chain).random(1000)
+    assert seeds.integer(5, "chain", 3) == alone
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, True, "0", None, np.float64(2)])
+def test_what_is_no_seed_is_refused(seed: Any) -> None:
+    with pytest.raises(ValueError, match=r"seed is .*, expected an integer of at least 0"):
+        seeds.generator(seed)
+
+
+def test_any_integer_is_a_seed() -> None:
+    assert seeds.integer(np.int64(4), "a") == seeds.integer(4, "a")
+    assert 0 <= seeds.integer(2**100, "a") < 2**63
+
+
+def test_every_library_has_its_generator() -> None:
+    import jax
+    import torch
+
+    a = torch.randn(3, generator=seeds.torch_generator(0, "chain", 1))
+    b = torch.randn(3, generator=seeds.torch_generator(0, "chain", 1))
+    c = torch.randn(3, generator=seeds.torch_generator(0, "chain", 2))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+    keys = [jax.random.key_data(seeds.jax_key(0, "chain", k)) for k in (1, 1, 2)]
+    assert (keys[0] == keys[1]).all()
+    assert not (keys[0] == keys[2]).all()
+
+
+def test_a_draw_does_not_depend_on_its_batch() -> None:
+    """Row i of every array is draw i's own, whichever draws share the batch, in any order."""
+    draws = [(chain, draw) for chain in range(2) for draw in range(4)]
+    together = seeds.NormalStreams.of_draws(9, draws)
+    first, uniform, second = together.normal(3, 2), together.uniform(5), together.normal(4)
+    assert (first.shape, uniform.shape, second.shape) == ((8, 3, 2), (8, 5), (8, 4))
+    assert uniform.min() >= 0
+    assert uniform.max() < 1
+    for batch in ([(1, 2)], [(1, 3), (0, 0), (1, 2)], draws[::-1]):
+        apart = seeds.NormalStreams.of_draws(9, batch)
+        rows = [draws.index(draw) for draw in batch]
+        np.testing.assert_array_equal(apart.normal(3, 2), first[rows])
+        np.testing.assert_array_equal(apart.uniform(5), uniform[rows])
+        np.testing.assert_array_equal(apart.normal(4), second[rows])
+
+
+def test_streams_are_standard_normal() -> None:
+    streams = seeds.NormalStreams.of_draws(1, [(0, draw) for draw in range(100)])
+    numbers = streams.normal(100)
+    assert stats.kstest(numbers.ravel(), stats.norm.cdf).pvalue > 1e-4
+    assert stats.kstest(numbers[:, 0], stats.norm.cdf).pvalue > 1e-4
+    assert len(np.unique(numbers)) == numbers.size
+    assert seeds.NormalStreams([]).normal(3).shape == (0, 3)
