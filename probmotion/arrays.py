@@ -61,30 +61,39 @@ def logsumexp(x: Array, axis: int = -1) -> Array:
     top = xp.max(x, axis=axis, keepdims=True)
     top = xp.where(xp.isfinite(top), top, xp.zeros_like(top))
     total = xp.sum(xp.exp(x - top), axis=axis, keepdims=True)
-    return xp.squeeze(xp.log(total) + top, axis=axis)
+    none = total == 0
+    log_total = xp.log(xp.where(none, xp.ones_like(total), total))
+    # A sum of nothing is log 0, which NumPy would warn of.
+    log_total = xp.where(none, xp.full_like(total, -float("inf")), log_total)
+    return xp.squeeze(log_total + top, axis=axis)
 
 
 def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """Return a torch function of one point, ``(dim,) → ()``, as a JAX function.
+    """Return a torch function of one float64 point, ``(dim,) → ()``, as a JAX function.
 
-    It can be jitted and differentiated once: value and gradient come from one call of
-    ``function`` on a float64 tensor and torch's autograd, through ``jax.pure_callback``.
+    It can be jitted, mapped and differentiated once: value and gradient come from one call of
+    ``function`` and torch's autograd, through ``jax.pure_callback``.
     """
     import jax
     import torch
 
+    # XLA calls back on a thread of its own, where ``jax.enable_x64`` of the caller does not hold
+    # and JAX would round to float32. So numbers cross as pairs of 32-bit words.
+    words, real = jax.numpy.uint32, np.float64
+
     def value_and_gradient(theta: Array) -> tuple[np.ndarray, np.ndarray]:
-        point = torch.tensor(np.asarray(theta), dtype=torch.float64, requires_grad=True)
+        at = np.asarray(theta).view(real)[:, 0]
+        point = torch.tensor(at, requires_grad=True)
         value = function(point)
         (gradient,) = torch.autograd.grad(value, point)
-        return to_numpy(value), to_numpy(gradient)
+        rows = (to_numpy(value).reshape(1), to_numpy(gradient)[:, None])
+        return tuple(row.astype(real, copy=False).view(words) for row in rows)
 
     def call(theta: Array) -> tuple[Array, Array]:
-        shapes = (
-            jax.ShapeDtypeStruct((), theta.dtype),
-            jax.ShapeDtypeStruct(theta.shape, theta.dtype),
-        )
-        return jax.pure_callback(value_and_gradient, shapes, theta, vmap_method="sequential")
+        shapes = [jax.ShapeDtypeStruct((*shape, 2), words) for shape in ((), theta.shape)]
+        sent = jax.lax.bitcast_convert_type(theta, words)
+        came = jax.pure_callback(value_and_gradient, shapes, sent, vmap_method="sequential")
+        return tuple(jax.lax.bitcast_convert_type(number, real) for number in came)
 
     bridged = jax.custom_vjp(lambda theta: call(theta)[0])
     bridged.defvjp(call, lambda gradient, cotangent: (cotangent * gradient,))

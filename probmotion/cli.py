@@ -6,6 +6,7 @@ that needs them, so that help and mistakes answer at once.
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -97,7 +98,7 @@ class Compare:
     """Begin from settings that cost less, as a demonstration wants; the table names them."""
 
     pictures: bool = False
-    """Also write quality-against-cost.png and one picture of skeletons per problem."""
+    """Also write quality_against_cost.png and one picture of skeletons per problem."""
 
     own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 
@@ -289,6 +290,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _parse(words[0], words[1:]).run()
         except KeyboardInterrupt as error:
             return _complain(str(error) or "interrupted; nothing was written", 130)
+        except BrokenPipeError:
+            # Whoever read the output has had enough: `probmotion list | head`.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
         except OSError as error:
             named = error.filename and error.strerror
             return _complain(f"{error.filename}: {error.strerror}" if named else str(error), 2)

@@ -174,8 +174,12 @@ def _names_of_one(names: list[str]) -> list[str]:
         meanings[index] = (meaning,)
     result = list(names)
     taken: set[str] = set()
-    # Words of one meaning first; then by name, so that the order of the joints does not matter.
-    for index in sorted(range(len(names)), key=lambda i: (len(meanings[i]), _word(names[i]))):
+    # Words of one meaning first, and canonical ones before others; then by name, so that the order
+    # of the joints does not matter.
+    for index in sorted(
+        range(len(names)),
+        key=lambda i: (len(meanings[i]), meanings[i][:1] != (names[i],), _word(names[i])),
+    ):
         free = [meaning for meaning in meanings[index] if meaning not in taken]
         if free:
             result[index] = free[0]

@@ -144,15 +144,15 @@ class NormalStreams:
     def normal(self, *shape: int) -> np.ndarray:
         """Return the next standard normal numbers, shape ``(B, *shape)``, float64."""
         out = np.empty((len(self.generators), *shape))
-        for row, rng in zip(out, self.generators, strict=True):
-            rng.standard_normal(out=row)
+        for row, rng in enumerate(self.generators):
+            rng.standard_normal(out=out[row, ...])
         return out
 
     def uniform(self, *shape: int) -> np.ndarray:
         """Return the next numbers uniform on [0, 1), shape ``(B, *shape)``, float64."""
         out = np.empty((len(self.generators), *shape))
-        for row, rng in zip(out, self.generators, strict=True):
-            rng.random(out=row)
+        for row, rng in enumerate(self.generators):
+            rng.random(out=out[row, ...])
         return out
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:

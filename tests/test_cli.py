@@ -81,6 +81,13 @@ def test_list_names_everything(capsys):
         assert f"\n  {name} " in listed
 
 
+def test_a_reader_that_stops_early_is_no_error():
+    code = f"{sys.executable} -c '{PROGRAM[2]}' compare --help | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
 # Comparing.
 
 
@@ -252,9 +259,9 @@ def test_a_folder_that_cannot_be_written_to(out, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_an_interrupted_comparison_keeps_what_is_finished(workers, tmp_path):
-    words = ["compare", "gait", "--samplers", "exact", "mas", "--draws", "200", "--workers"]
-    words = [*words, workers, "--out", str(tmp_path)]
-    long = ["--settings.mas.steps", "100000"]
+    words = ["compare", "gait", "--samplers", "exact", "mas", "--draws", "40"]
+    words = [*words, "--out", str(tmp_path)]
+    long = ["--settings.mas.steps", "1000000", "--workers", workers]
     running = subprocess.Popen(
         [*PROGRAM, *words, *long], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=ONE_THREAD, start_new_session=True,

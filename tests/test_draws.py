@@ -102,6 +102,13 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path, full: bool) -> None:
     )
 
 
+def test_large_seeds_survive(tmp_path: Path) -> None:
+    """netCDF's integers have 32 bits, Python's do not."""
+    for seed in (0, 2**31, 2**63 - 1, 2**100):
+        some_draws(seed=seed).save(tmp_path / "draws.nc")
+        assert MotionDraws.load(tmp_path / "draws.nc").dataset.attrs["seed"] == seed
+
+
 def test_skeletons_of_one_joint_and_of_other_alphabets_survive(tmp_path: Path) -> None:
     class Ball(Flat):
         skeleton = Skeleton(["Hüfte・腰"], [-1])

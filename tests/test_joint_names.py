@@ -64,6 +64,20 @@ SCHEMES = {
         "pelvis right_hip right_knee right_ankle left_hip left_knee left_ankle spine neck nose "
         "head",
     ),
+    "MPII": (
+        "pelvis thorax upper_neck head_top",
+        "pelvis neck upper_neck head_top",
+    ),
+    "three joints of a foot": (
+        "left_ankle left_foot left_toe",
+        "left_ankle left_foot left_toe",
+    ),
+    "dog": (
+        "root spine0 spine1 left_forearm left_hand left_finger left_upper_leg left_leg left_foot "
+        "left_toe tail0 tail1",
+        "pelvis spine chest left_elbow left_wrist left_front_paw left_hip left_knee left_ankle "
+        "left_back_paw tail tail1",
+    ),
     "Unreal": (
         "pelvis clavicle_l upperarm_l lowerarm_l hand_l thigh_l calf_l foot_l ball_l",
         "pelvis left_collar left_shoulder left_elbow left_wrist left_hip left_knee left_ankle "
@@ -108,6 +122,11 @@ def test_words_of_two_meanings_alone() -> None:
 def test_unknown_names_stay() -> None:
     for name in ("ball", "lIndex1", "lumbar", "prop", "Ribs", ""):
         assert canonical_name(name) == name
+
+
+def test_two_joints_of_one_meaning_do_not_share_it() -> None:
+    assert canonical_names(["hip", "pelvis"]) == ("hip", "pelvis")
+    assert canonical_names(["LWrist", "LHand", "l_wrist"])[1] == "left_hand"
 
 
 def test_people_keep_their_joints_apart() -> None:

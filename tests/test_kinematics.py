@@ -169,12 +169,12 @@ def test_a_chain_is_not_twisted() -> None:
 
 def test_half_a_turn_is_found() -> None:
     bone = Skeleton(["a", "b"], [-1, 0])
-    start = np.array([0.6, 0.0, 0.8])
+    start, aside = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0][:2]
     for gap in (0.0, 1e-13, 1e-9, 1e-7, 1e-4):
-        end = -start + gap * np.array([0.0, 1.0, 0.0])
+        end = -start + gap * aside
         end /= np.linalg.norm(end)
         positions = np.array([[np.zeros(3), start], [np.zeros(3), end]])
-        assert errors_of(bone, positions).max() < 1e-15
+        assert errors_of(bone, positions).max() < 1e-12
 
 
 def test_bones_of_no_length_turn_with_their_parents() -> None:
@@ -196,6 +196,39 @@ def test_a_bone_that_changes_its_length_keeps_its_direction_and_mean() -> None:
     np.testing.assert_allclose(
         errors_of(bone, positions)[:, 1], np.abs(lengths - lengths.mean()), atol=1e-12
     )
+
+
+def test_an_error_is_not_passed_on() -> None:
+    """A bone that is 0.1 too long ends off; the next one, at a right angle, still meets its end."""
+    chain = Skeleton(["a", "b", "c"], [-1, 0, 1])
+    positions = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1.2, 0, 0], [1.2, 1, 0]]])
+    errors = errors_of(chain, positions)
+    np.testing.assert_allclose(errors[:, 1], 0.1, atol=1e-12)
+    np.testing.assert_allclose(errors[:, 2], np.sqrt(1 + 0.1**2) - 1, atol=1e-12)
+
+
+def test_children_in_line_are_not_twisted() -> None:
+    """Two children on one line leave the turn about it open: the least one is taken."""
+    skeleton = Skeleton(["a", "b", "c"], [-1, 0, 0])
+    ends = Rotation.random(20, rng=4).as_matrix()[:, 0]
+    positions = np.stack([np.zeros((20, 3)), ends, -0.5 * ends], axis=1)
+    rotations, offsets = fit_rotations(skeleton, positions)
+    assert errors_of(skeleton, positions).max() < 1e-9
+    axis = Rotation.from_matrix(rotations[:, 0]).as_rotvec()
+    np.testing.assert_allclose(axis @ offsets[1], 0, atol=1e-2)
+
+
+def test_the_rest_pose_serves_all_frames_not_the_first_alone() -> None:
+    hub = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
+    rng = np.random.default_rng(7)
+    bones = rng.standard_normal((1, 3, 3)) + 0.2 * rng.standard_normal((30, 3, 3))
+    bones /= np.linalg.norm(bones, axis=-1, keepdims=True)
+    bones[0] += [[0, 0, 0.4], [0, 0, -0.4], [0, 0, 0]]  # an odd first frame
+    bones /= np.linalg.norm(bones, axis=-1, keepdims=True)
+    positions = np.concatenate([np.zeros((30, 1, 3)), bones], axis=1)
+    fitted = (errors_of(hub, positions) ** 2).sum()
+    first = sum(Rotation.align_vectors(now, bones[0])[1] ** 2 for now in bones)
+    assert fitted < 0.8 * first
 
 
 def test_siblings_that_move_against_each_other_lose_no_more_than_they_must() -> None:

@@ -55,8 +55,16 @@ def test_the_error_names_the_joint_without_counterpart() -> None:
         ValueError, match=r"skeleton has the joint 'spine', which has no counterpar"
     ):
         motion_of(BVH).retarget(Skeleton.preset("h36m17").subset([0, 1, 7]))
-    twice = Skeleton(["hip", "Hips", "neck"], [-1, 0, 1])
-    assert twice.canonical_names == ("pelvis", "Hips", "neck")
+
+
+def test_the_error_names_the_joint_with_several_counterparts() -> None:
+    """A ball of the foot beside an ankle, and a word that could only have been either of them."""
+    feet = Skeleton(["left_ankle", "LeftToeBase", "left_foot"], [-1, 0, 0])
+    assert feet.canonical_names == ("left_ankle", "left_foot", "left_foot")
+    with pytest.raises(
+        ValueError, match=r"skeleton has the joint 'lfoot', which is several joints"
+    ):
+        motion_of(feet).retarget(Skeleton(["lfoot", "ltibia"], [-1, 0]))
 
 
 def test_the_same_skeleton_gives_the_same_motion() -> None:

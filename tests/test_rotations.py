@@ -63,6 +63,14 @@ def test_every_form_agrees_with_scipy(library: Any) -> None:
         assert np.linalg.norm(np.asarray(got), axis=-1).max() <= np.pi * (1 + 1e-6)
 
 
+def test_small_angles_lose_no_digit() -> None:
+    """The series and the formulas meet: double precision to its end on both sides."""
+    np.testing.assert_allclose(r.vector_to_matrix(VECTORS), ORACLE.as_matrix(), rtol=0, atol=2e-15)
+    there = r.quaternion_to_vector(r.vector_to_quaternion(VECTORS))
+    short = np.linalg.norm(VECTORS, axis=-1) < 3.1
+    np.testing.assert_allclose(there[short], VECTORS[short], rtol=1e-14, atol=0)
+
+
 @pytest.mark.parametrize("order", ORDERS)
 def test_euler_angles_agree_with_scipy(library: Any, order: str) -> None:
     rng = np.random.default_rng(5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from itertools import combinations
 from typing import Any
 
@@ -32,8 +33,9 @@ ADDRESSES: list[tuple[Any, ...]] = [
     (0, 1),
     (0, 0),
     # A string must not be its own checksum, nor a tag a name.
-    (__import__("zlib").crc32(b"chain"),),
-    (1, __import__("zlib").crc32(b"chain")),
+    (zlib.crc32(b"chain"),),
+    (1, zlib.crc32(b"chain")),
+    ("", "chain"),
 ]
 
 
@@ -49,7 +51,7 @@ def test_different_addresses_and_seeds_give_different_numbers() -> None:
 
 
 def test_streams_are_uncorrelated() -> None:
-    """Every pair of 21 streams: |r| √n is a standard normal; the largest of 210 is below 5."""
+    """|r| √n is a standard normal for each of the 231 pairs; none is above 5."""
     n = 2000
     numbers = [seeds.generator(0, *address).standard_normal(n) for address in ADDRESSES]
     worst = max(abs(stats.pearsonr(a, b)[0]) for a, b in combinations(numbers, 2))
@@ -104,6 +106,32 @@ def test_a_draw_does_not_depend_on_its_batch() -> None:
         np.testing.assert_array_equal(apart.normal(3, 2), first[rows])
         np.testing.assert_array_equal(apart.uniform(5), uniform[rows])
         np.testing.assert_array_equal(apart.normal(4), second[rows])
+
+
+def test_sizes_begin_with_the_number_of_draws() -> None:
+    """Streams stand in for a generator, whose arrays hold one draw per row."""
+    draws = [(0, 0), (0, 1)]
+    a, b = (seeds.NormalStreams.of_draws(2, draws) for _ in range(2))
+    np.testing.assert_array_equal(a.standard_normal((2, 3)), b.normal(3))
+    np.testing.assert_array_equal(a.random((2,)), b.uniform())
+    with pytest.raises(ValueError, match=r"size is \(3, 2\), expected 2 first, one row per draw"):
+        a.standard_normal((3, 2))
+
+
+def test_a_generator_goes_on_where_it_was() -> None:
+    rng = seeds.generator(3, "chain", 1)
+    rng.random(5)
+    rng.integers(0, 10, dtype=np.uint32)  # leaves half of a 64-bit word behind
+    words = seeds.state_words(rng)
+    assert (words.shape, words.dtype) == ((10,), np.int32)
+    again = seeds.resumed_generator(words)
+    for draw in ("random", "standard_normal"):
+        np.testing.assert_array_equal(getattr(again, draw)(50), getattr(rng, draw)(50))
+    rng.integers(0, 10, dtype=np.uint32)
+    again = seeds.resumed_generator(seeds.state_words(rng).astype(np.int64))
+    np.testing.assert_array_equal(
+        again.integers(0, 2**32, 9, dtype=np.uint32), rng.integers(0, 2**32, 9, dtype=np.uint32)
+    )
 
 
 def test_streams_are_standard_normal() -> None:

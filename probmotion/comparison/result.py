@@ -241,8 +241,9 @@ def _changed_settings(sampler: Any) -> dict[str, str]:
     """The settings of a dataclass that differ from its class's defaults, as text."""
     if not is_dataclass(sampler):
         return {}
+    kind: Any = type(sampler)
     try:
-        usual = type(sampler)()
+        usual = kind()
     except (TypeError, ValueError):  # a setting without a default
         usual = None
     return {

@@ -53,13 +53,12 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         },
     ),
 )
-_LEGEND = (
-    "swd: sliced Wasserstein distance / that of two exact sets (1 is right); tr: trace of "
-    "covariance / exact (< 1: over-confident);\nmean: error of the mean / √tr (0); off: variance "
-    "off the prior's manifold / exact draws' (1); log p: mean log density less exact's, nats (0);\n"
-    "shares: styles' total variation from exact (0); P, R: precision and recall; denoiser, density, "
-    "gradient: evaluations. The frame holds more measures."
-)
+_LEGEND = """\
+swd: sliced Wasserstein distance / that of two exact sets (1 is right); tr: trace of covariance /
+exact (1; below: over-confident); mean: error of the mean / √tr (0); off: variance off the prior's
+manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
+styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
+The frame and table.csv hold more measures."""
 
 
 class ComparisonTable(pd.DataFrame):

@@ -77,9 +77,7 @@ def aligned_by_similarity(motions: Array, truth: Array) -> Array:
     signs = xp.stack([ones, ones, sign], axis=-1)
     turn = xp.matmul(left * signs[..., None, :], right)
     square = xp.sum(x**2, axis=(-2, -1))
-    flat = square == 0
-    scale = xp.sum(size * signs, axis=-1) / xp.where(flat, ones, square)
-    scale = xp.where(flat, ones, scale)
+    scale = xp.sum(size * signs, axis=-1) / xp.where(square == 0, ones, square)
     return scale[..., None, None] * xp.matmul(x, turn) + target
 
 

@@ -126,7 +126,7 @@ def precision_recall(
                 f"{name} has {len(points)} points, expected more than neighbours={neighbours}"
             )
     apart = _distances(draws, reference)
-    precision = (apart <= _radii(draws, neighbours)[:, None]).any(axis=1).mean()
+    precision = (apart <= _radii(reference, neighbours)[None, :]).any(axis=1).mean()
     recall = (apart <= _radii(draws, neighbours)[:, None]).any(axis=0).mean()
     return float(precision), float(recall)
 

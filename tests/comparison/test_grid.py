@@ -74,6 +74,16 @@ def test_a_cell_does_not_depend_on_the_rest_of_the_grid(grid):
             assert theirs["monocular", "exact", 0, row.metric] == row.value
 
 
+def test_every_cell_has_random_numbers_of_its_own():
+    problems = {"a": generation(), "b": generation()}
+    found = compare(problems, {"a": PriorDraws(), "b": PriorDraws()}, seeds=2, **SMALL)
+    first = [
+        found.draws(problem, sampler, seed).flat()[0].tobytes()
+        for problem, sampler, seed in found.plan.cells()
+    ]
+    assert len(set(first)) == len(first) == 8
+
+
 @pytest.mark.parametrize("where", ["processes", "threads", "foreign processes", "bars"])
 def test_the_bits_are_the_same_wherever_cells_run(grid, where, capsys):
     samplers = {"exact": ExactSampler(), "wide": PriorDraws(2.0)}

@@ -148,16 +148,22 @@ def test_other_settings_are_another_run(tmp_path):
 
 
 def test_failures_are_tried_again_and_unfit_samplers_are_not(tmp_path):
-    out, mended, diary = tmp_path / "out", tmp_path / "mended", tmp_path / "diary"
+    mended, diary = tmp_path / "mended", tmp_path / "diary"
     samplers = [CrashingOnce(mended=str(mended)), PriorDraws(diary=str(diary))]
-    first = compare(monocular(), samplers, out=out, **SMALL)
-    assert [result.failure.word for result in first.results] == ["RuntimeError", "evidence"]
+
+    def run():
+        comparison = compare([generation(), monocular()], samplers, out=tmp_path / "out", **SMALL)
+        return {(each.problem, each.sampler): each.failure for each in comparison.results}
+
+    first = run()
+    assert first["generation", "crashing-once"].word == "RuntimeError"
+    assert first["monocular", "prior-draws"].word == "evidence"
+    assert runs(diary) == 2
     mended.touch()
-    second = compare(generation(), samplers[0], out=out, **SMALL)
-    assert second.failures == []
-    assert runs(diary) == 1
-    compare(monocular(), samplers[1], out=out, **SMALL)
-    assert runs(diary) == 1
+    second = run()
+    assert second["generation", "crashing-once"] is None
+    assert second["monocular", "prior-draws"].word == "evidence"
+    assert runs(diary) == 2
 
 
 def test_damaged_and_half_written_cells_are_run_again(tmp_path):

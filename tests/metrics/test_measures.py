@@ -85,6 +85,15 @@ def test_exact_draws_are_found_right(generation):
     assert np.mean([each["mean_error"] for each in found]) < 2 / math.sqrt(N)
 
 
+def test_off_is_judged_by_exact_draws_where_evidence_moves_it(occluded, prior):
+    rough = occluded.truth + 0.2 * np.random.default_rng(3).normal(size=occluded.truth.shape)
+    evidence = observe(Motion(rough, prior.skeleton, 30.0), "monocular", 0.02, 0)
+    problem = Problem("rough", "evidence off the manifold", MotionPosterior(prior, evidence))
+    exact = problem.reference(5, N)
+    assert prior.off_manifold(exact).mean() > 2
+    assert measure(problem, run(problem, exact), 0)["off"] == pytest.approx(1, abs=0.03)
+
+
 def test_errors_are_found(generation, prior):
     exact = generation.reference(7, N)
     narrow = exact.mean(axis=0) + 0.5 * (exact - exact.mean(axis=0))

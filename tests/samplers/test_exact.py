@@ -1,0 +1,60 @@
+"""`ExactSampler`: the closed form, its addresses and its refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion import Joints3D, MotionPosterior
+from probmotion.models import GaussianMixtureMotion
+from probmotion.samplers import ExactSampler
+from probmotion.sampling import UnsupportedPosterior
+from probmotion.skeleton import Skeleton
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    rng = np.random.default_rng(0)
+    prior = GaussianMixtureMotion(
+        skeleton=Skeleton(["a", "b"], [-1, 0]),
+        fps=30.0,
+        means=rng.normal(size=(2, 2, 2, 3)),
+        factors=rng.normal(size=(2, 2, 2, 2, 3)),
+        weights=np.array([0.6, 0.4]),
+        noise=0.2,
+        azimuths=4,
+    )
+    return MotionPosterior(prior, Joints3D(prior.sample(rng, 1)[0], noise=0.5))
+
+
+def test_a_draw_is_the_same_however_many_others_there_are(posterior):
+    many = ExactSampler().sample(posterior, draws=7, chains=3, seed=5, progress=False)
+    few = ExactSampler().sample(posterior, draws=3, chains=2, seed=5, progress=True)
+    np.testing.assert_array_equal(many.positions.values[:2, :3], few.positions.values)
+    assert many.independent
+
+
+def test_seeds_and_chains_differ(posterior):
+    one = ExactSampler().sample(posterior, draws=2, chains=2, seed=0, progress=False)
+    two = ExactSampler().sample(posterior, draws=2, chains=2, seed=1, progress=False)
+    values = np.concatenate([one.flat(), two.flat()]).reshape(8, -1)
+    assert len(np.unique(values, axis=0)) == 8
+
+
+def test_a_prior_without_a_closed_form_is_refused(two_bumps):
+    with pytest.raises(UnsupportedPosterior, match=r"exact needs a prior with HasExactPosterior"):
+        ExactSampler().sample(MotionPosterior(two_bumps), draws=1, progress=False)
+
+
+def test_evidence_without_a_closed_form_is_refused(posterior):
+    outliers = Joints3D(np.zeros((2, 2, 3)), noise=0.5, degrees_of_freedom=4.0)
+    with pytest.raises(
+        UnsupportedPosterior, match=r"exact needs a posterior in closed form, but the noise is"
+    ) as refused:
+        ExactSampler().sample(MotionPosterior(posterior.prior, outliers), progress=False)
+    assert refused.value.word == "not-conjugate"
+
+
+def test_a_starting_point_means_nothing(posterior):
+    with pytest.raises(ValueError, match=r"initial is ndarray, expected None"):
+        ExactSampler().sample(posterior, initial=np.zeros((1, 2)), progress=False)
