@@ -269,7 +269,7 @@ def conjugate_gradients(
     residual: np.ndarray,
     steps: int,
 ) -> np.ndarray:
-    """Return S (I + Sᵀ… )⁻¹ r: ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``.
+    """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``.
 
     One system per row of the first axis, solved side by side; a row that has converged stays.
 

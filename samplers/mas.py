@@ -71,6 +71,11 @@ class MultiViewAncestral:
     ------
     ValueError
         If a number is out of range.
+
+    Notes
+    -----
+    Line 8 of Algorithm 1 also prints the factors of x_t and of the reprojected estimate the wrong
+    way round; here each has its own (Ho et al. 2020, equation 7).
     """
 
     name: ClassVar[str] = "mas"

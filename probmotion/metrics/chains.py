@@ -16,25 +16,30 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
 
     ``ess_bulk``, ``ess_tail``: the smallest over :func:`watched_coordinates`; ``rhat``: the
-    largest (Vehtari et al. 2021, by ArviZ). Walkers of an ensemble depend on each other, so that
-    neither holds for them: a run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from
-    that alone. ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
+    largest (Vehtari et al. 2021, by ArviZ). ``acceptance``: the mean; ``divergent``: the number of
+    divergent transitions.
+
+    Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
+    run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from that. It cannot see that
+    ensembles sit in different modes; their R-hat, each ensemble being one chain, can.
     """
     if draws.independent:
         return {}
-    found: dict[str, float] = {}
+    from arviz_stats.base import array_stats
+
     data = draws.dataset
+    n_chains, n_draws = data.sizes["chain"], data.sizes["draw"]
+    values = watched_coordinates(draws)
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    found: dict[str, float] = {}
     if "autocorrelation_time" in data:
         slowest = float(np.max(data["autocorrelation_time"].values))
-        found["ess_bulk"] = data.sizes["chain"] * data.sizes["draw"] / slowest
+        found["ess_bulk"] = n_chains * n_draws / slowest
     else:
-        from arviz_stats.base import array_stats
-
-        values = watched_coordinates(draws)
-        axes = {"chain_axis": 0, "draw_axis": 1}
         found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
         found["ess_tail"] = float(np.min(tails))
+    if n_chains > 1 or "autocorrelation_time" not in data:
         found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance" in data:
         found["acceptance"] = float(data["acceptance"].mean())

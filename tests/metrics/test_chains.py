@@ -92,7 +92,18 @@ def test_an_ensemble_is_judged_by_its_autocorrelation_time(rng):
     theta = rng.normal(size=(CHAINS, DRAWS, 2))
     times = np.array([2.0, 5.0, 1.0, 4.0])
     found = chain_diagnostics(run(theta, {"autocorrelation_time": times}))
-    assert found == {"ess_bulk": CHAINS * DRAWS / 5}
+    assert set(found) == {"ess_bulk", "rhat"}
+    assert found["ess_bulk"] == CHAINS * DRAWS / 5
+    assert found["rhat"] < 1.01
+    alone = chain_diagnostics(run(theta[:1], {"autocorrelation_time": times[:1]}))
+    assert alone == {"ess_bulk": DRAWS / 2}
+
+
+def test_ensembles_in_different_modes_are_seen(rng):
+    theta = rng.normal(size=(CHAINS, DRAWS, 2))
+    theta[0] += 5
+    found = chain_diagnostics(run(theta, {"autocorrelation_time": np.ones(CHAINS)}))
+    assert found["rhat"] > 1.5
 
 
 def test_acceptance_is_averaged_and_divergences_are_counted(rng):

@@ -27,7 +27,7 @@ PROBLEMS = ("prior", "monocular", "sparse")
 SAMPLERS = {
     "exact": (ExactSampler(), 2000, 2),
     "nuts": (NUTS(warmup=300), 1500, 2),
-    "ensemble": (Ensemble(walkers=12, warmup=300, thin=4), 12 * 200, 4),
+    "ensemble": (Ensemble(walkers=12, warmup=300, thin=10), 12 * 200, 4),
     "mh": (MetropolisHastings(warmup=1000, thin=6), 1500, 8),
 }
 DIRECTIONS, QUANTILES = 6, (0.1, 0.5, 0.9)

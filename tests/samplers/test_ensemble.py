@@ -38,8 +38,12 @@ def test_the_draws_are_emcees_own(two_bumps, posterior, long):
     state = sampler.run_mcmc(emcee.State(start, random_state=source.get_state()), 20)
     sampler.reset()
     sampler.run_mcmc(state, 65)
-    walkers = sampler.get_chain()[4::5].reshape(-1, 3)
-    np.testing.assert_array_equal(long.dataset["theta"][1], walkers[:100])
+    chain = sampler.get_chain()
+    kept = chain[4::5].reshape(-1, 3)
+    np.testing.assert_array_equal(long.dataset["theta"][1], kept[:100])
+    slowest = autocorrelation_time(chain).max() / 5
+    assert slowest > 1
+    np.testing.assert_allclose(long.dataset["autocorrelation_time"][1], slowest)
     # emcee counts 65 iterations' moves, we those between them.
     accepted = sampler.acceptance_fraction.mean()
     assert abs(long.dataset["acceptance"][1] - accepted) <= 1 / 64

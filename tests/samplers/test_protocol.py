@@ -1,9 +1,10 @@
-"""What every registered sampler is: a frozen dataclass, named, seeded, counted, refused in words."""
+"""What every registered sampler is: a frozen dataclass, named, seeded, counted, and polite."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -54,10 +55,16 @@ def prior():
 
 
 @pytest.fixture(scope="module")
-def posterior(prior):
+def observed(prior):
     truth = Motion(prior.sample(np.random.default_rng(2), 1)[0], prior.skeleton, prior.fps)
     camera = Cameras.ring(1, elevation=0.3)
     return MotionPosterior(prior, Keypoints2D.observe(truth, camera, 0.3, seed=0))
+
+
+@pytest.fixture
+def posterior(sampler, prior, observed):
+    """The observed one; the prior for `sds`, which has no place for evidence."""
+    return MotionPosterior(prior) if sampler.name == "sds" else observed
 
 
 def test_the_entry_points_name_all_eight():
@@ -89,7 +96,7 @@ def test_two_of_the_same_settings_are_equal(sampler):
 
 def test_settings_survive_json_and_words(sampler):
     plain = {
-        name: value
+        name: tuple(value) if isinstance(value, list) else value
         for name, value in json.loads(json.dumps(asdict(sampler))).items()
         if not isinstance(value, dict)
     }
@@ -124,6 +131,17 @@ def test_the_first_draws_do_not_depend_on_how_many_follow(sampler, posterior):
     np.testing.assert_allclose(
         few.positions.values, many.positions.values[:, :2], rtol=0, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("name", CHAINS_THAT_GO_ON)
+def test_a_chain_goes_on_with_the_motions_of_an_uninterrupted_one(name, observed):
+    """Also where a motion at θ is itself a draw."""
+    sampler = load_sampler(name)(**QUICK[name])
+    run = partial(sampler.sample, observed, chains=2, seed=9, progress=False)
+    first = run(draws=3)
+    second = run(draws=2, initial=first)
+    parts = np.concatenate([first.positions.values, second.positions.values], axis=1)
+    np.testing.assert_allclose(parts, run(draws=5).positions.values, rtol=0, atol=1e-12)
 
 
 def test_draws_are_saved_whole(sampler, posterior, tmp_path):
