@@ -57,7 +57,7 @@ def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.nda
 def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
     """Return θ of one chain by our sampler."""
     compiled.cache_clear()
-    result = NUTS(warmup=warmup).sample(posterior, draws=draws, seed=SEED, progress=False)
+    result = NUTS(warmup=warmup, candidates=1).sample(posterior, draws=draws, seed=SEED, progress=False)
     return result.dataset["theta"].values[0]
 
 
@@ -78,7 +78,7 @@ def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin:
 
 def ensemble(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
     """Return θ of one ensemble by our sampler."""
-    sampler = Ensemble(warmup=warmup, thin=thin)
+    sampler = Ensemble(warmup=warmup, thin=thin, candidates=1)
     result = sampler.sample(posterior, draws=draws, seed=SEED, progress=False)
     return result.dataset["theta"].values[0]
 

@@ -7,7 +7,7 @@ chain k is the same however many chains run and a continued run goes on as if it
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -92,22 +92,32 @@ def not_conjugate(sampler: Sampler, error: NotConjugate) -> UnsupportedPosterior
 
 def starting_points(
     posterior: MotionPosterior,
+    log_density: Callable[[np.ndarray], np.ndarray],
     initial: MotionDraws | np.ndarray | None,
     shape: tuple[int, ...],
     seed: int,
+    candidates: int,
 ) -> np.ndarray:
-    """Return where chains start, draws from the prior unless ``initial`` says otherwise.
+    """Return where chains start: the likeliest of some draws from the prior, unless told.
+
+    A posterior after much evidence has modes that a chain cannot leave; each chain looks at
+    ``candidates`` draws of its own, so that it seldom begins in a mode that holds no mass.
 
     Parameters
     ----------
     posterior : MotionPosterior
         What is drawn from.
+    log_density : callable
+        Its log density, ``(n, dim) → (n,)``.
     initial : ndarray, optional
         The starting points themselves.
     shape : tuple of int
         (chains, dim), or (chains, walkers, dim).
     seed : int
         The run's seed.
+    candidates : int
+        Draws from the prior per chain, of which it starts at the likeliest (an ensemble: at as
+        many of the likeliest as it has walkers); with no more than it needs, it starts at them.
     """
     if initial is not None:
         assert not isinstance(initial, MotionDraws), "a run to go on from has a state"
@@ -115,12 +125,16 @@ def starting_points(
         check_shape("initial", points, shape)
         check_finite("initial", points)
         return points
-    chains, *walkers, dim = shape
-    drawn = [
-        posterior.initial(seeds.generator(seed, "initial", chain), *(walkers or [1]))
-        for chain in range(chains)
-    ]
-    return np.stack(drawn).reshape(chains, *walkers, dim)
+    chains, *walkers, _ = shape
+    n = walkers[0] if walkers else 1
+    starts = []
+    for chain in range(chains):
+        drawn = posterior.initial(seeds.generator(seed, "initial", chain), max(candidates, n))
+        if len(drawn) > n:
+            likeliest = np.argsort(-log_density(drawn), kind="stable")
+            drawn = drawn[likeliest[:n]]
+        starts.append(drawn)
+    return np.stack(starts).reshape(shape)
 
 
 def continued(

@@ -40,6 +40,8 @@ class Ensemble:
     largest_dim : int
         A posterior of more dimensions is refused: there the stretch move hardly moves and its
         draws look right when they are not (Huijser et al. 2015).
+    candidates : int
+        Draws from the prior per ensemble, of which its walkers start at the likeliest.
     """
 
     name: ClassVar[str] = "ensemble"
@@ -49,6 +51,7 @@ class Ensemble:
     warmup: int = 1000
     thin: int = 50
     largest_dim: int = 20
+    candidates: int = 1000
 
     def __post_init__(self) -> None:
         if self.walkers is not None:
@@ -56,6 +59,7 @@ class Ensemble:
         check_count("warmup", self.warmup, least=0)
         check_count("thin", self.thin)
         check_count("largest_dim", self.largest_dim)
+        check_count("candidates", self.candidates)
 
     def sample(
         self,
@@ -75,7 +79,8 @@ class Ensemble:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, walkers, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or the
-            walkers' starting points. Draws from the prior by default.
+            walkers' starting points. The likeliest of ``candidates`` draws from the prior by
+            default.
 
         Raises
         ------
@@ -93,7 +98,7 @@ class Ensemble:
         earlier = continued(self, initial, chains, seed)
         if earlier is None:
             shape = (chains, walkers, posterior.dim)
-            points = starting_points(posterior, initial, shape, seed)
+            points = starting_points(posterior, density, initial, shape, seed, self.candidates)
             rest = _Rest.begin(density, points, seed)
         else:
             rest = _Rest.of_state(earlier)

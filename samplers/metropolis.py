@@ -33,6 +33,8 @@ class MetropolisHastings:
         Steps before the first draw, in which the proposal learns.
     thin : int
         Steps from one draw to the next.
+    candidates : int
+        Draws from the prior per chain, of which it starts at the likeliest.
     """
 
     name: ClassVar[str] = "mh"
@@ -41,8 +43,10 @@ class MetropolisHastings:
     proposal: Proposal = field(default_factory=AdaptiveCovariance)
     warmup: int = 5000
     thin: int = 20
+    candidates: int = 1000
 
     def __post_init__(self) -> None:
+        check_count("candidates", self.candidates)
         check_count("warmup", self.warmup, least=0)
         check_count("thin", self.thin)
 
@@ -64,7 +68,8 @@ class MetropolisHastings:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from, such as any kept draw's θ. Draws from the prior by default.
+            to start from, such as any kept draw's θ. The likeliest of ``candidates`` draws from
+            the prior by default.
 
         Raises
         ------
@@ -82,7 +87,10 @@ class MetropolisHastings:
         try:
             with progress_bar(warmup + draws * self.thin, self.name, progress) as bar:
                 if earlier is None:
-                    points = starting_points(posterior, initial, (chains, posterior.dim), seed)
+                    shape = (chains, posterior.dim)
+                    points = starting_points(
+                        posterior, density, initial, shape, seed, self.candidates
+                    )
                     walk = _Walk.begin(self.proposal, density, points, seed)
                     walk.warm_up(warmup, bar.update)
                 else:

@@ -10,8 +10,8 @@ MAS combines one-view estimates and goes on, so that views which disagree about 
 √ᾱ D(X) − X is (1−ᾱ) M⁻¹ ∇ Σ_v log p_v(P_v X), so with γ = 1 the corrector is Langevin dynamics,
 preconditioned by Λ, whose stationary density is the pool Π_v p_v(P_v X)^(1/V) of the noisy 2D
 marginals. The price: an isotropic Gaussian, which MAS draws exactly, is no longer exact. Hence
-γ = ½ at high noise, where the views choose a mode, and 0 below: mixtures fitted to real clips, whose
-small noise is large, are then drawn better than by MAS as well.
+γ = ½ at high noise, where the views choose a mode, and 0 below: mixtures fitted to real clips,
+whose small noise is large, are then drawn better than by MAS as well.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
 from probmotion.samplers.densities import continued, motions, starting_points
-from probmotion.samplers.nuts_kernel import CHUNK, compiled
+from probmotion.samplers.nuts_kernel import CHUNK, NutsKernel, compiled
 from probmotion.sampling import Interrupted, progress_bar, require
 
 __all__ = ["NUTS"]
@@ -33,6 +33,8 @@ class NUTS:
         Mean acceptance that the step size is adapted towards.
     max_tree_depth : int
         A trajectory has at most 2^max_tree_depth − 1 steps.
+    candidates : int
+        Draws from the prior per chain, of which it starts at the likeliest.
 
     Notes
     -----
@@ -46,8 +48,10 @@ class NUTS:
     warmup: int = 500
     target_acceptance: float = 0.8
     max_tree_depth: int = 10
+    candidates: int = 1000
 
     def __post_init__(self) -> None:
+        check_count("candidates", self.candidates)
         check_count("warmup", self.warmup)
         check_count("max_tree_depth", self.max_tree_depth)
         if not 0 < self.target_acceptance < 1:
@@ -74,7 +78,7 @@ class NUTS:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from. Draws from the prior by default.
+            to start from. The likeliest of ``candidates`` draws from the prior by default.
 
         Raises
         ------
@@ -90,11 +94,17 @@ class NUTS:
         require(self, posterior)
         earlier = continued(self, initial, chains, seed)
         with jax.enable_x64(True):
+            kernel = compiled(self, posterior)
+            densities = 0
             if earlier is None:
-                points = starting_points(posterior, initial, (chains, posterior.dim), seed)
+                shape = (chains, posterior.dim)
+                points = starting_points(
+                    posterior, kernel.log_densities, initial, shape, seed, self.candidates
+                )
+                densities = chains * self.candidates * (initial is None and self.candidates > 1)
             else:
                 points = earlier["theta"]
-            run = _Run(self, posterior, points, earlier, seed)
+            run = _Run(self, kernel, points, earlier, seed, densities)
             try:
                 run.sample(draws, progress)
             except KeyboardInterrupt as stop:
@@ -119,7 +129,7 @@ class NUTS:
             theta=theta,
             log_density=log_density,
             statistics=kept,
-            counts={"gradient": run.gradients},
+            counts={"gradient": run.gradients, "density": run.densities},
             state=run.state(),
         )
 
@@ -130,13 +140,15 @@ class _Run:
     def __init__(
         self,
         sampler: NUTS,
-        posterior: MotionPosterior,
+        kernel: NutsKernel,
         points: np.ndarray,
         earlier: Mapping[str, np.ndarray] | None,
         seed: int,
+        densities: int,
     ) -> None:
         self.sampler = sampler
-        self.kernel = compiled(sampler, posterior)
+        self.kernel = kernel
+        self.densities = densities
         self.earlier = earlier
         self.first = 0 if earlier is None else int(earlier["draws"])
         self.finished = 0

@@ -45,6 +45,7 @@ class NutsKernel:
             max_tree_depth=sampler.max_tree_depth,
         )
         self.value_and_gradient = jax.jit(jax.value_and_grad(lambda theta: -log_density(theta)))
+        self.log_density = jax.jit(log_density)
         self.advance = jax.jit(self._advance)
 
     def begin(self, key: Any, theta: np.ndarray) -> Any:
@@ -56,6 +57,10 @@ class NutsKernel:
                 "points of density above 0"
             )
         return self._init(key, theta, potential, gradient)
+
+    def log_densities(self, theta: np.ndarray) -> np.ndarray:
+        """Return the log density of points in a row: ``(n, dim) → (n,)``."""
+        return np.array([float(self.log_density(point)) for point in theta])
 
     def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
         """Return the state that :meth:`leaves` was taken of; no evaluation."""

@@ -10,7 +10,7 @@ from probmotion.sampling import Sampler, load_sampler, sampler_names
 
 __all__ = ["QUICK", "quick_samplers"]
 
-QUICK: Mapping[str, Mapping[str, Any]] = {"sds": {"iterations": 1000}}
+QUICK: Mapping[str, Mapping[str, Any]] = {"sds": {"iterations": 2000}}
 """By sampler: the settings that differ from its own defaults."""
 
 

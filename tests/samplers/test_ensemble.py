@@ -10,7 +10,7 @@ from probmotion.samplers import Ensemble
 from probmotion.samplers.autocorrelation import autocorrelation_time
 from probmotion.sampling import Interrupted, UnsupportedPosterior
 
-QUICK = Ensemble(walkers=8, warmup=20, thin=5)
+QUICK = Ensemble(walkers=8, warmup=20, thin=5, candidates=1)
 
 
 def run(posterior, draws, chains=2, seed=3, sampler=QUICK, **more):

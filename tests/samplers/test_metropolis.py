@@ -12,7 +12,7 @@ from probmotion.samplers import ExactSampler, MetropolisHastings
 from probmotion.samplers.proposals import Isotropic
 from probmotion.sampling import Interrupted
 
-QUICK = MetropolisHastings(warmup=60, thin=3)
+QUICK = MetropolisHastings(warmup=60, thin=3, candidates=1)
 
 
 def run(posterior, draws, chains=2, seed=3, sampler=QUICK, **more):

@@ -17,7 +17,7 @@ from probmotion.samplers import nuts as nuts_module
 from probmotion.sampling import Interrupted, UnsupportedPosterior
 from probmotion.skeleton import Skeleton
 
-QUICK = NUTS(warmup=60)
+QUICK = NUTS(warmup=60, candidates=1)
 
 
 def run(posterior, draws, chains=2, seed=3, sampler=QUICK, **more):
