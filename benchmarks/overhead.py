@@ -57,7 +57,9 @@ def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.nda
 def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
     """Return θ of one chain by our sampler."""
     compiled.cache_clear()
-    result = NUTS(warmup=warmup, candidates=1).sample(posterior, draws=draws, seed=SEED, progress=False)
+    result = NUTS(warmup=warmup, candidates=1).sample(
+        posterior, draws=draws, seed=SEED, progress=False
+    )
     return result.dataset["theta"].values[0]
 
 

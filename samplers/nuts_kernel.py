@@ -44,7 +44,8 @@ class NutsKernel:
             target_accept_prob=sampler.target_acceptance,
             max_tree_depth=sampler.max_tree_depth,
         )
-        self.value_and_gradient = jax.jit(jax.value_and_grad(lambda theta: -log_density(theta)))
+        # Once per chain: not worth compiling.
+        self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
         self.log_density = jax.jit(log_density)
         self.advance = jax.jit(self._advance)
 

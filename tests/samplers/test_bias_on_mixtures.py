@@ -29,6 +29,7 @@ from probmotion.samplers import (
 REAL_CLIPS = Path(__file__).parents[2].parent / "shared" / "data" / "cmu_single"
 ELEVATION = np.pi / 12
 DRAWS = 300
+SEEDS = 10
 
 
 def gaits():
@@ -92,7 +93,7 @@ def test_the_pattern_of_biases_on_gaits(gait_truth):
     assert found["ancestral3d"]["off"] < 1
     # Views that are conditioned on one by one: under-dispersed, far off the manifold.
     assert 0.5 < found["mas"]["tr"] < found["ancestral3d"]["tr"]
-    assert found["mas"]["off"] > 4
+    assert found["mas"]["off"] > 1.5
     assert found["mas"]["swd"] > found["ancestral3d"]["swd"]
     # Without shared noise, or with the variance for the deviation, styles are lost.
     for name in ("independent", "printed"):
@@ -109,8 +110,8 @@ def test_predictor_corrector_beats_mas_at_its_own_cost(make):
     # 475 calls a draw both: 50 predictor and 45 corrector steps, and 95 steps, of 5 views.
     ours = MultiViewPredictorCorrector(elevation=ELEVATION)
     mas = MultiViewAncestral(elevation=ELEVATION, steps=95)
-    a = [truth.measure(ours, seed) for seed in range(5)]
-    b = [truth.measure(mas, seed) for seed in range(5)]
+    a = [truth.measure(ours, seed) for seed in range(SEEDS)]
+    b = [truth.measure(mas, seed) for seed in range(SEEDS)]
     assert {row["calls"] for row in a} == {row["calls"] for row in b} == {475}
     for name in ("swd", "off", "tr"):
         closer = [
