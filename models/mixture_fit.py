@@ -43,6 +43,10 @@ def fit_styles(
     windows, clip_of = cut_windows(motions, frames, stride)
     windows = _common_heading(windows, motions[0])
     flat = windows.reshape(len(windows), -1)
+    if np.ptp(flat, axis=0).max() < 1e-9:
+        raise ValueError(
+            f"motions has {len(windows)} windows that are all alike, expected clips that differ"
+        )
     if isinstance(styles, int):
         check_count("styles", styles)
         labels = _cluster(flat, styles, rank, seed)
@@ -190,12 +194,18 @@ def _cluster(flat: np.ndarray, styles: int, rank: int, seed: int) -> np.ndarray:
     """k-means on the principal coordinates, labels ordered from the largest cluster down."""
     if styles == 1:
         return np.zeros(len(flat), dtype=int)
-    from scipy.cluster.vq import kmeans2
+    from scipy.cluster.vq import ClusterError, kmeans2
 
     centred = flat - flat.mean(axis=0)
     left, size, _ = np.linalg.svd(centred, full_matrices=False)
     scores = (left * size)[:, :rank]
     rng = seeds.generator(seed, "k-means")
-    _, labels = kmeans2(scores, styles, minit="++", iter=50, rng=rng)
+    try:
+        _, labels = kmeans2(scores, styles, minit="++", iter=50, rng=rng, missing="raise")
+    except ClusterError as error:
+        raise ValueError(
+            f"styles is {styles}, but the windows of the clips fall into fewer clusters, expected "
+            "a smaller number or clips that differ more"
+        ) from error
     order = np.argsort(-np.bincount(labels, minlength=styles), kind="stable")
     return np.argsort(order)[labels]

@@ -12,6 +12,7 @@ products with 3·K·(1 + r) base fields, combined per azimuth.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,11 @@ from probmotion.arrays import Array, array_namespace, constant, logsumexp
 __all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
 
 _BLOCK = 64
-"""Points handled at once, along the last axis: their products stay in a core's cache."""
+"""Points handled at once, along the last axis: their products stay in a core's cache.
+
+Always as many, the last ones zeros: what a point's numbers are rounded to must not depend on how
+many others there are, because a sampler's hundred steps make a large difference of a small one.
+"""
 
 
 def turning_fields(fields: np.ndarray) -> np.ndarray:
@@ -115,13 +120,13 @@ class TurnedMixture:
         level = self._level(alpha_bar)
         own_share = level.signal * self.variance / level.total
         out = np.empty_like(x)
-        for rows in _blocks(len(x)):
-            weight, latent = self._condition(x[rows], level)
+        latent_share = level.signal / level.total
+        for rows, n in _blocks(len(x)):
+            weight, latent = self._condition(_filled(x[rows]), level)
             weight *= level.shrink
             latent *= weight[:, :, None]
-            latent_share = level.signal / level.total
-            np.matmul(*self._combined(weight, latent, latent_share, level), out=out[rows])
-            out[rows] += own_share * x[rows]
+            means = np.matmul(*self._combined(weight, latent, latent_share, level))
+            np.add(means[:n], own_share * x[rows], out=out[rows])
         return out
 
     def covariance_product(self, x: np.ndarray, alpha_bar: float, v: np.ndarray) -> np.ndarray:
@@ -131,15 +136,15 @@ class TurnedMixture:
         """
         level = self._level(alpha_bar)
         out = np.empty_like(v)
-        for rows in _blocks(len(x)):
-            weight, latent = self._condition(x[rows], level)
+        for rows, n in _blocks(len(x)):
+            weight, latent = self._condition(_filled(x[rows]), level)
             latent *= level.signal / level.total
-            on_mean, on_latent = self._products(v[rows], level, shifted=False)
+            on_mean, on_latent = self._products(_filled(v[rows]), level, shifted=False)
             clean = on_mean + np.einsum("karn,karn->kan", latent, on_latent)
             weighted = weight * (clean - (weight * clean).sum(axis=(0, 1)))
             on_latent *= weight[:, :, None]
             on_latent += latent * weighted[:, :, None]
-            product = np.matmul(*self._combined(weighted, on_latent, 1.0, level))
+            product = np.matmul(*self._combined(weighted, on_latent, 1.0, level))[:n]
             out[rows] = level.shrink**2 * product + self.variance * level.shrink * v[rows]
         return out
 
@@ -147,8 +152,9 @@ class TurnedMixture:
         """Return p(k, a | x₀) of clean points: ``(n, D) → (n, K, A)``."""
         level = self._level(1.0)
         out = np.empty((len(x), *self.shape))
-        for rows in _blocks(len(x)):
-            out[rows] = self._condition(x[rows], level).responsibilities.transpose(2, 0, 1)
+        for rows, n in _blocks(len(x)):
+            weight, _ = self._condition(_filled(x[rows]), level)
+            out[rows] = weight[..., :n].transpose(2, 0, 1)
         return out
 
     def log_density(self, x: Array, alpha_bar: float = 1.0) -> Array:
@@ -186,14 +192,15 @@ class TurnedMixture:
         inverse = np.zeros_like(self.eigenvalues)
         inverse[present] = 1 / (level.root**2 * self.eigenvalues)[present]
         out = np.empty(len(x))
-        for rows in _blocks(len(x)):
-            on_mean, whitened = self._products(x[rows], level, shifted=True)
+        for rows, n in _blocks(len(x)):
+            block = _filled(x[rows])
+            on_mean, whitened = self._products(block, level, shifted=True)
             inside = np.einsum("karn,karn,kar->kan", whitened, whitened, inverse, optimize=True)
-            square = self.square_mean[..., None] - inside - 2 * on_mean + (x[rows] ** 2).sum(axis=1)
-            weight = self._condition(x[rows], level).responsibilities
-            n = weight.shape[-1]
-            likeliest = weight.reshape(-1, n).argmax(axis=0)
-            out[rows] = square.reshape(-1, n)[likeliest, np.arange(n)] / (self.dim - self.rank)
+            square = self.square_mean[..., None] - inside - 2 * on_mean + (block**2).sum(axis=1)
+            weight, _ = self._condition(block, level)
+            likeliest = weight.reshape(-1, _BLOCK).argmax(axis=0)
+            outside = square.reshape(-1, _BLOCK)[likeliest, np.arange(_BLOCK)]
+            out[rows] = outside[:n] / (self.dim - self.rank)
         return out
 
     def _level(self, alpha_bar: float) -> _Level:
@@ -255,5 +262,17 @@ class TurnedMixture:
         return base.reshape(-1, n).T, self._fields
 
 
-def _blocks(n: int) -> list[slice]:
-    return [slice(start, start + _BLOCK) for start in range(0, n, _BLOCK)]
+def _blocks(n: int) -> Iterator[tuple[slice, int]]:
+    """The rows of each block, and how many they are."""
+    for start in range(0, n, _BLOCK):
+        stop = min(n, start + _BLOCK)
+        yield slice(start, stop), stop - start
+
+
+def _filled(rows: np.ndarray) -> np.ndarray:
+    """``rows`` with rows of zeros behind them up to ``_BLOCK``."""
+    if len(rows) == _BLOCK:
+        return rows
+    block = np.zeros((_BLOCK, rows.shape[1]))
+    block[: len(rows)] = rows
+    return block

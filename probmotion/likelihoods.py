@@ -18,6 +18,7 @@ from probmotion.cameras import Cameras
 from probmotion.checks import check_finite, check_positive, check_shape
 from probmotion.motion import KeypointTrack, Motion
 from probmotion.priors import NotConjugate
+from probmotion.skeleton import Skeleton
 
 __all__ = ["EntryNoise", "Joints3D", "Keypoints2D", "Likelihood", "LinearObservation"]
 
@@ -147,6 +148,10 @@ class Keypoints2D:
         Multiplies the precision; 0 hides an entry; 1 everywhere by default.
     degrees_of_freedom : float, optional
         Student-t noise with this many; Gaussian by default.
+    skeleton : Skeleton, optional
+        Whose joints they are, where it is known; a posterior refuses a prior over another.
+    fps : float, optional
+        Frames per second, where it is known; a posterior refuses a prior at another.
 
     Raises
     ------
@@ -159,6 +164,8 @@ class Keypoints2D:
     noise: float
     confidence: np.ndarray | None = None
     degrees_of_freedom: float | None = None
+    skeleton: Skeleton | None = None
+    fps: float | None = None
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -201,13 +208,28 @@ class Keypoints2D:
         """
         shape = (cameras.n_views, *motion.positions.shape[:2])
         confidence = _confidence_of(hidden, shape)
-        blank = cls(np.zeros((*shape, 2)), cameras, noise, confidence, degrees_of_freedom)
+        blank = cls(
+            np.zeros((*shape, 2)),
+            cameras,
+            noise,
+            confidence,
+            degrees_of_freedom,
+            motion.skeleton,
+            motion.fps,
+        )
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
     @classmethod
     def from_track(cls, track: KeypointTrack, camera: Cameras, noise: float) -> Keypoints2D:
         """Return the likelihood of a detected track in one known camera."""
-        return cls(track.keypoints[None], camera, noise, track.confidence[None])
+        return cls(
+            track.keypoints[None],
+            camera,
+            noise,
+            track.confidence[None],
+            skeleton=track.skeleton,
+            fps=track.fps,
+        )
 
     @property
     def frames(self) -> int:
@@ -267,6 +289,10 @@ class Joints3D:
         Multiplies the precision; 0 hides an entry; 1 everywhere by default.
     degrees_of_freedom : float, optional
         Student-t noise with this many; Gaussian by default.
+    skeleton : Skeleton, optional
+        Whose joints they are, where it is known; a posterior refuses a prior over another.
+    fps : float, optional
+        Frames per second, where it is known; a posterior refuses a prior at another.
 
     Raises
     ------
@@ -278,6 +304,8 @@ class Joints3D:
     noise: float
     confidence: np.ndarray | None = None
     degrees_of_freedom: float | None = None
+    skeleton: Skeleton | None = None
+    fps: float | None = None
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -302,7 +330,14 @@ class Joints3D:
     ) -> Joints3D:
         """Return noisy joints of ``motion``; ``hidden`` (L, J) marks those that are not seen."""
         shape = motion.positions.shape[:2]
-        blank = cls(np.zeros((*shape, 3)), noise, _confidence_of(hidden, shape), degrees_of_freedom)
+        blank = cls(
+            np.zeros((*shape, 3)),
+            noise,
+            _confidence_of(hidden, shape),
+            degrees_of_freedom,
+            motion.skeleton,
+            motion.fps,
+        )
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
     @property

@@ -30,7 +30,8 @@ class MotionPosterior:
     Raises
     ------
     ValueError
-        If the likelihood is of another number of frames or joints than the prior.
+        If the likelihood is of other joints, another number of frames or another frame rate than
+        the prior, as far as it knows them.
     """
 
     prior: MotionPrior
@@ -53,6 +54,18 @@ class MotionPosterior:
             got = getattr(self.likelihood, name, want)
             if got != want:
                 raise ValueError(f"likelihood has {name} {got}, expected the prior's {want}")
+        seen = getattr(self.likelihood, "skeleton", None)
+        if seen is not None and seen.canonical_names != self.skeleton.canonical_names:
+            raise ValueError(
+                f"likelihood is of the joints {', '.join(seen.joint_names)}, expected the prior's, "
+                f"{', '.join(self.skeleton.joint_names)}; retarget one to the other"
+            )
+        fps = getattr(self.likelihood, "fps", None)
+        if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
+            raise ValueError(
+                f"likelihood is at {fps:g} frames per second, expected the prior's {self.fps:g}; "
+                "resample one to the other"
+            )
 
     @property
     def skeleton(self) -> Skeleton:
@@ -83,11 +96,22 @@ class MotionPosterior:
         if not isinstance(self.prior, HasLogDensity):
             raise ValueError(f"prior {type(self.prior).__name__} has no log density")
         log_prior = self.prior.log_density(theta)
+        return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
+
+    def log_likelihood(self, theta: Array) -> Array:
+        """Return log p(y | θ): ``(…, dim) → (…)``.
+
+        Raises
+        ------
+        ValueError
+            If there is no likelihood.
+        """
+        check_shape("theta", theta, ("…", self.dim))
         if self.likelihood is None:
-            return log_prior
+            raise ValueError("likelihood is None, expected evidence to have a density")
         if isinstance(self.prior, Marginalises):
-            return log_prior + self.prior.log_likelihood(theta, self.likelihood)
-        return log_prior + self.likelihood.log_density(self.prior.motion(theta))
+            return self.prior.log_likelihood(theta, self.likelihood)
+        return self.likelihood.log_density(self.prior.motion(theta))
 
     def motion(self, theta: Array) -> Array:
         """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres.

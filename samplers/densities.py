@@ -55,11 +55,7 @@ class Density:
         ValueError
             If a value is NaN or +∞.
         """
-        self.evaluations += len(theta)
-        try:
-            value = np.asarray(self.posterior.log_density(theta))
-        except NotConjugate as error:
-            raise not_conjugate(self.sampler, error) from error
+        value = self._counted(self.posterior.log_density, theta)
         # NaN compares as false: one look finds both.
         if not value.max() < np.inf:
             bad = int(np.flatnonzero(~(value < np.inf))[0])
@@ -68,6 +64,19 @@ class Density:
                 "-inf"
             )
         return value
+
+    def likelihood(self, theta: np.ndarray) -> np.ndarray:
+        """Return log p(y | θ), ``(n, dim) → (n,)``; an evaluation like any other."""
+        return self._counted(self.posterior.log_likelihood, theta)
+
+    def _counted(
+        self, function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray
+    ) -> np.ndarray:
+        self.evaluations += len(theta)
+        try:
+            return np.asarray(function(theta))
+        except NotConjugate as error:
+            raise not_conjugate(self.sampler, error) from error
 
     def at_start(self, theta: np.ndarray) -> np.ndarray:
         """Return the log density where chains start; a start of density 0 is an error."""
@@ -92,23 +101,26 @@ def not_conjugate(sampler: Sampler, error: NotConjugate) -> UnsupportedPosterior
 
 def starting_points(
     posterior: MotionPosterior,
-    log_density: Callable[[np.ndarray], np.ndarray],
+    log_likelihood: Callable[[np.ndarray], np.ndarray],
     initial: MotionDraws | np.ndarray | None,
     shape: tuple[int, ...],
     seed: int,
     candidates: int,
 ) -> np.ndarray:
-    """Return where chains start: the likeliest of some draws from the prior, unless told.
+    """Return where chains start, unless told: draws from the prior, chosen by their likelihood.
 
-    A posterior after much evidence has modes that a chain cannot leave; each chain looks at
-    ``candidates`` draws of its own, so that it seldom begins in a mode that holds no mass.
+    A posterior after much evidence has modes that a chain cannot leave. Each chain chooses among
+    ``candidates`` draws of its own from the prior, in proportion to their likelihood
+    (sampling-importance-resampling, Rubin 1987): nearly a draw from the posterior where enough
+    candidates have a share, so that starts are spread over the modes as the mass is, and R-hat
+    still sees a chain that stays where it began. Without evidence it is a draw from the prior.
 
     Parameters
     ----------
     posterior : MotionPosterior
         What is drawn from.
-    log_density : callable
-        Its log density, ``(n, dim) → (n,)``.
+    log_likelihood : callable
+        log p(y | θ), ``(n, dim) → (n,)``; not called where there is no evidence.
     initial : ndarray, optional
         The starting points themselves.
     shape : tuple of int
@@ -116,8 +128,7 @@ def starting_points(
     seed : int
         The run's seed.
     candidates : int
-        Draws from the prior per chain, of which it starts at the likeliest (an ensemble: at as
-        many of the likeliest as it has walkers); with no more than it needs, it starts at them.
+        Draws from the prior per chain; with no more than it needs, it starts at them.
     """
     if initial is not None:
         assert not isinstance(initial, MotionDraws), "a run to go on from has a state"
@@ -129,24 +140,31 @@ def starting_points(
     n = walkers[0] if walkers else 1
     starts = []
     for chain in range(chains):
-        drawn = posterior.initial(seeds.generator(seed, "initial", chain), max(candidates, n))
-        if len(drawn) > n:
-            likeliest = np.argsort(-log_density(drawn), kind="stable")
-            drawn = drawn[likeliest[:n]]
-        starts.append(drawn)
+        rng = seeds.generator(seed, "initial", chain)
+        if posterior.likelihood is None or candidates <= n:
+            starts.append(posterior.initial(rng, n))
+            continue
+        drawn = posterior.initial(rng, candidates)
+        # The n largest of log w + Gumbel noise are n choices without replacement, ∝ w.
+        keys = log_likelihood(drawn) + rng.gumbel(size=candidates)
+        starts.append(drawn[np.argsort(-keys, kind="stable")[:n]])
     return np.stack(starts).reshape(shape)
 
 
 def continued(
-    sampler: Sampler, initial: object, chains: int, seed: int
+    sampler: Sampler,
+    log_density: Callable[[np.ndarray], np.ndarray],
+    initial: object,
+    chains: int,
+    seed: int,
 ) -> Mapping[str, np.ndarray] | None:
     """Return the state that ``initial`` stopped in, or ``None`` where it is no finished run.
 
     Raises
     ------
     ValueError
-        If the run was of another sampler, settings, seed or number of chains: it would not go on
-        as if it had not stopped.
+        If the run was of another sampler, settings, seed, number of chains or posterior: it would
+        not go on as if it had not stopped.
     """
     check_count("chains", chains)
     if not isinstance(initial, MotionDraws):
@@ -164,6 +182,13 @@ def continued(
                 f"initial is a run with {name} {expected}, and {name} is {came}: a run goes on as "
                 "it began; to start afresh where it stopped, pass an array of points"
             )
+    last = initial.dataset.isel(draw=-1)
+    stored, found = last["log_density"].values, log_density(last["theta"].values)
+    if not np.allclose(found, stored, rtol=1e-6, atol=1e-6):
+        raise ValueError(
+            f"initial is a run of another posterior: its last log density is {stored[0]:.6g}, and "
+            f"this posterior's there is {found[0]:.6g}"
+        )
     return initial.state
 
 

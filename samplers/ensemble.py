@@ -41,7 +41,8 @@ class Ensemble:
         A posterior of more dimensions is refused: there the stretch move hardly moves and its
         draws look right when they are not (Huijser et al. 2015).
     candidates : int
-        Draws from the prior per ensemble, of which its walkers start at the likeliest.
+        Draws from the prior per ensemble; its walkers start at some of them, chosen in proportion
+        to their likelihood.
     """
 
     name: ClassVar[str] = "ensemble"
@@ -79,7 +80,7 @@ class Ensemble:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, walkers, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or the
-            walkers' starting points. The likeliest of ``candidates`` draws from the prior by
+            walkers' starting points. Some of ``candidates`` draws from the prior by
             default.
 
         Raises
@@ -95,10 +96,12 @@ class Ensemble:
         start = time.perf_counter()
         density = Density(self, posterior)
         walkers = self._walkers(posterior)
-        earlier = continued(self, initial, chains, seed)
+        earlier = continued(self, posterior.log_density, initial, chains, seed)
         if earlier is None:
             shape = (chains, walkers, posterior.dim)
-            points = starting_points(posterior, density, initial, shape, seed, self.candidates)
+            points = starting_points(
+                posterior, density.likelihood, initial, shape, seed, self.candidates
+            )
             rest = _Rest.begin(density, points, seed)
         else:
             rest = _Rest.of_state(earlier)

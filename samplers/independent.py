@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
@@ -64,6 +65,7 @@ def draw_independently(
     # Draw by draw, so that an interrupted run has as many of every chain.
     pairs = [(chain, draw) for draw in range(draws) for chain in range(chains)]
     done: list[np.ndarray] = []
+    spent = dict(counts)
 
     def result() -> MotionDraws:
         motions = np.concatenate(done)
@@ -74,15 +76,19 @@ def draw_independently(
             whole.reshape(-1, chains, *whole.shape[1:]).swapaxes(0, 1),
             seed=seed,
             seconds=time.perf_counter() - start,
-            counts=counts,
+            counts=spent,
             independent=True,
         )
 
+    bars = progress_bar(steps * -(-len(pairs) // batch), sampler.name, progress)
+    # How a product is split over threads depends on its size, and its rounding on the split: after
+    # a hundred steps draws would differ with the batch by far more than rounding.
     try:
-        with progress_bar(steps * -(-len(pairs) // batch), sampler.name, progress) as bar:
+        with threadpool_limits(1, user_api="blas"), bars as bar:
             for some in batches(pairs, batch):
                 streams = NormalStreams.of_draws(seed, list(some))
                 done.append(draw_batch(streams, lambda: bar.update(1)) * scale)
+                spent = dict(counts)
     except KeyboardInterrupt as interrupt:
         if sum(map(len, done)) < chains:
             raise

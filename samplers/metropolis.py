@@ -34,7 +34,7 @@ class MetropolisHastings:
     thin : int
         Steps from one draw to the next.
     candidates : int
-        Draws from the prior per chain, of which it starts at the likeliest.
+        Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
     """
 
     name: ClassVar[str] = "mh"
@@ -68,8 +68,8 @@ class MetropolisHastings:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from, such as any kept draw's θ. The likeliest of ``candidates`` draws from
-            the prior by default.
+            to start from, such as any kept draw's θ. One of ``candidates`` draws
+            from the prior by default.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class MetropolisHastings:
         check_count("draws", draws)
         start = time.perf_counter()
         density = Density(self, posterior)
-        earlier = continued(self, initial, chains, seed)
+        earlier = continued(self, posterior.log_density, initial, chains, seed)
         warmup = self.warmup if earlier is None else 0
         kept = _Kept(chains, draws, posterior.dim)
         try:
@@ -89,7 +89,7 @@ class MetropolisHastings:
                 if earlier is None:
                     shape = (chains, posterior.dim)
                     points = starting_points(
-                        posterior, density, initial, shape, seed, self.candidates
+                        posterior, density.likelihood, initial, shape, seed, self.candidates
                     )
                     walk = _Walk.begin(self.proposal, density, points, seed)
                     walk.warm_up(warmup, bar.update)

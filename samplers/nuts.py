@@ -34,7 +34,7 @@ class NUTS:
     max_tree_depth : int
         A trajectory has at most 2^max_tree_depth − 1 steps.
     candidates : int
-        Draws from the prior per chain, of which it starts at the likeliest.
+        Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
 
     Notes
     -----
@@ -78,7 +78,7 @@ class NUTS:
             As in :class:`~probmotion.sampling.Sampler`.
         initial : MotionDraws or ndarray, (chains, dim), optional
             An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from. The likeliest of ``candidates`` draws from the prior by default.
+            to start from. One of ``candidates`` draws from the prior by default.
 
         Raises
         ------
@@ -92,16 +92,17 @@ class NUTS:
         check_count("draws", draws)
         start = time.perf_counter()
         require(self, posterior)
-        earlier = continued(self, initial, chains, seed)
         with jax.enable_x64(True):
             kernel = compiled(self, posterior)
+            earlier = continued(self, kernel.log_densities, initial, chains, seed)
             densities = 0
             if earlier is None:
                 shape = (chains, posterior.dim)
                 points = starting_points(
-                    posterior, kernel.log_densities, initial, shape, seed, self.candidates
+                    posterior, kernel.log_likelihoods, initial, shape, seed, self.candidates
                 )
-                densities = chains * self.candidates * (initial is None and self.candidates > 1)
+                chosen = initial is None and posterior.likelihood is not None
+                densities = chains * self.candidates if chosen and self.candidates > 1 else 0
             else:
                 points = earlier["theta"]
             run = _Run(self, kernel, points, earlier, seed, densities)

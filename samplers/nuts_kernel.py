@@ -37,7 +37,8 @@ class NutsKernel:
         import jax
         from numpyro.infer import NUTS as Kernel  # noqa: N811
 
-        log_density = _in_jax(sampler, posterior)
+        let_in = _bridge(sampler, posterior)
+        log_density = let_in(posterior.log_density)
         self.sampler = sampler
         self.kernel = Kernel(
             potential_fn=lambda theta: -log_density(theta),
@@ -46,7 +47,7 @@ class NutsKernel:
         )
         # Once per chain: not worth compiling.
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
-        self.log_density = jax.jit(log_density)
+        self.log_likelihood = jax.jit(let_in(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
 
     def begin(self, key: Any, theta: np.ndarray) -> Any:
@@ -61,7 +62,11 @@ class NutsKernel:
 
     def log_densities(self, theta: np.ndarray) -> np.ndarray:
         """Return the log density of points in a row: ``(n, dim) → (n,)``."""
-        return np.array([float(self.log_density(point)) for point in theta])
+        return np.array([-float(self.value_and_gradient(point)[0]) for point in theta])
+
+    def log_likelihoods(self, theta: np.ndarray) -> np.ndarray:
+        """Return log p(y | θ) of points in a row: ``(n, dim) → (n,)``."""
+        return np.array([float(self.log_likelihood(point)) for point in theta])
 
     def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
         """Return the state that :meth:`leaves` was taken of; no evaluation."""
@@ -123,8 +128,10 @@ class NutsKernel:
         return jax.lax.fori_loop(0, steps, iteration, (state, empty, jnp.zeros((), jnp.int64)))
 
 
-def _in_jax(sampler: NUTS, posterior: MotionPosterior) -> Callable[[Any], Any]:
-    """Return the log density as a JAX function of one θ, through torch where it must be.
+def _bridge(
+    sampler: NUTS, posterior: MotionPosterior
+) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
+    """Return what makes a density a JAX function of one θ: nothing, or a way through torch.
 
     Raises
     ------
@@ -151,5 +158,5 @@ def _in_jax(sampler: NUTS, posterior: MotionPosterior) -> Callable[[Any], Any]:
                 f"{type(refused).__name__}: {str(refused).splitlines()[0]}",
                 word="gradient",
             ) from refused
-        return bridged
-    return posterior.log_density
+        return jax_from_torch
+    return lambda function: function

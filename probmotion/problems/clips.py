@@ -75,6 +75,7 @@ def clips_problem(
             f"motions has {len(motions)} clip{'s' * (len(motions) != 1)}, expected at least 2: one "
             "is held out and the prior is fitted to the others"
         )
+    _refuse_copies(motions)
     index = _index(motions, held_out)
     with one_thread():
         clips = _on_common_ground(motions, fps)
@@ -110,6 +111,19 @@ def clips_problem(
 
 
 _observe = observe  # the function, which the argument of the same name hides
+
+
+def _refuse_copies(motions: Sequence[Motion]) -> None:
+    """A clip that is there twice would be held out and fitted to at once."""
+    seen: dict[bytes, Motion] = {}
+    for motion in motions:
+        key = motion.positions.tobytes()
+        if key in seen:
+            raise ValueError(
+                f"motions has {motion} twice (as {seen[key].name or 'unnamed'} and "
+                f"{motion.name or 'unnamed'}), expected every clip once"
+            )
+        seen[key] = motion
 
 
 def _index(motions: Sequence[Motion], held_out: int | str) -> int:

@@ -22,6 +22,7 @@ from toy_samplers import (
 
 from probmotion import MotionPosterior
 from probmotion.comparison import Comparison, compare
+from probmotion.problems import Problem
 from probmotion.samplers import ExactSampler
 
 SMALL = {"draws": 20, "chains": 2, "progress": False}
@@ -51,6 +52,20 @@ def test_the_table_is_tidy(grid):
     values = wide.set_index(["metric", "seed"])["value"]
     assert values["tr", 0] == pytest.approx(4, rel=0.5)
     assert values["denoiser_evaluations", 1] == 100
+
+
+def test_samplers_share_exact_draws_and_seeds_do_not(monkeypatch):
+    asked = []
+    right = Problem.reference
+
+    def reference(self, seed, n):
+        asked.append(seed)
+        return right(self, seed, n)
+
+    monkeypatch.setattr(Problem, "reference", reference)
+    samplers = {"exact": ExactSampler(), "wide": PriorDraws(2.0)}
+    compare(generation(), samplers, seeds=2, **SMALL)
+    assert len(set(asked)) == 2
 
 
 def test_draws_are_kept_and_seeds_differ(grid):

@@ -14,44 +14,72 @@ from probmotion.samplers.densities import starting_points
 
 
 @pytest.fixture
+def gaussian_mixture_motion(two_bumps):
+    """A wide bump of mass 0.9 and one a hundred times as dense of mass 0.1, far apart."""
+    apart = np.array([[-12.0, 0.0, 0.0], [12.0, 0.0, 0.0]])
+    spread = np.stack([2.0 * np.eye(3), 0.05 * np.eye(3)])
+    return MotionPosterior(
+        replace(two_bumps, weights=np.array([0.9, 0.1]), means=apart, covariances=spread)
+    )
+
+
+@pytest.fixture
 def posterior():
     return load_problem("gait-sparse").posterior
 
 
-def density_of(posterior: MotionPosterior):
+def likelihood_of(posterior: MotionPosterior):
     asked = []
 
-    def log_density(theta):
+    def log_likelihood(theta):
         asked.append(len(theta))
-        return posterior.log_density(theta)
+        return posterior.log_likelihood(theta)
 
-    return log_density, asked
+    return log_likelihood, asked
 
 
-def test_a_chain_starts_at_the_likeliest_of_its_own_candidates(posterior):
-    log_density, asked = density_of(posterior)
-    points = starting_points(posterior, log_density, None, (3, posterior.dim), 5, 40)
-    assert asked == [40, 40, 40]
+def test_chains_start_at_candidates_in_proportion_to_their_likelihood(posterior):
+    """3000 chains of 3 candidates each: how often the first, second, third is taken."""
+    log_likelihood, asked = likelihood_of(posterior)
+    points = starting_points(posterior, log_likelihood, None, (3000, posterior.dim), 5, 3)
+    assert asked == [3] * 3000
+    surprise = []
     for chain, point in enumerate(points):
-        drawn = posterior.initial(seeds.generator(5, "initial", chain), 40)
-        np.testing.assert_array_equal(point, drawn[posterior.log_density(drawn).argmax()])
-    fewer = starting_points(posterior, log_density, None, (2, posterior.dim), 5, 40)
+        drawn = posterior.initial(seeds.generator(5, "initial", chain), 3)
+        weight = np.exp(posterior.log_likelihood(drawn) - posterior.log_likelihood(drawn).max())
+        share = weight / weight.sum()
+        taken = (drawn == point).all(axis=1)
+        assert taken.sum() == 1
+        # Each has mean 0 and this variance if the choice is in proportion.
+        variance = share @ (np.arange(3) - share @ np.arange(3)) ** 2
+        surprise.append((taken @ np.arange(3) - share @ np.arange(3), variance))
+    total, variance = np.sum(surprise, axis=0)
+    assert variance > 100
+    assert abs(total) < 4 * np.sqrt(variance)
+    fewer = starting_points(posterior, log_likelihood, None, (2, posterior.dim), 5, 3)
     np.testing.assert_array_equal(fewer, points[:2])
 
 
-def test_walkers_start_at_the_likeliest_of_their_ensembles(posterior):
-    log_density, _ = density_of(posterior)
-    points = starting_points(posterior, log_density, None, (2, 7, posterior.dim), 5, 40)
+def test_walkers_start_at_different_candidates(posterior):
+    log_likelihood, asked = likelihood_of(posterior)
+    points = starting_points(posterior, log_likelihood, None, (2, 7, posterior.dim), 5, 40)
+    assert asked == [40, 40]
     for chain, walkers in enumerate(points):
         drawn = posterior.initial(seeds.generator(5, "initial", chain), 40)
-        best = np.sort(posterior.log_density(drawn))[::-1][:7]
-        np.testing.assert_allclose(posterior.log_density(walkers), best, rtol=1e-12)
         assert len(np.unique(walkers, axis=0)) == 7
+        assert all((drawn == walker).all(axis=1).any() for walker in walkers)
+        # Better than their candidates on the whole.
+        assert posterior.log_likelihood(walkers).mean() > posterior.log_likelihood(drawn).mean()
 
 
-def test_no_more_candidates_than_needed_are_not_even_looked_at(posterior):
-    log_density, asked = density_of(posterior)
-    points = starting_points(posterior, log_density, None, (2, 7, posterior.dim), 5, 7)
+@pytest.mark.parametrize("evidence", [True, False])
+def test_no_candidate_is_looked_at_in_vain(posterior, evidence):
+    """Where there are no more than needed, or no evidence to choose by, starts are prior draws."""
+    if not evidence:
+        posterior = MotionPosterior(posterior.prior)
+    log_likelihood, asked = likelihood_of(posterior)
+    candidates = 7 if evidence else 1000
+    points = starting_points(posterior, log_likelihood, None, (2, 7, posterior.dim), 5, candidates)
     assert asked == []
     drawn = posterior.initial(seeds.generator(5, "initial", 1), 7)
     np.testing.assert_array_equal(points[1], drawn)
@@ -76,14 +104,19 @@ def test_candidates_are_counted(posterior, sampler):
 def test_chains_find_the_mode_that_holds_the_mass():
     """After dense evidence in one view a wrong mode is 200 nats down, and no chain leaves one."""
     posterior = load_problem("gait-monocular").posterior
-    log_density, _ = density_of(posterior)
     exact = posterior.prior.exact_posterior(posterior.likelihood)
     best = exact._latent_mean.reshape(-1, posterior.dim)[exact.component_probabilities.argmax()]
     nuts = NUTS(warmup=150).sample(posterior, draws=50, chains=3, seed=1, progress=False)
-    apart = np.abs(nuts.dataset["theta"].values.mean(axis=1) - best).max()
-    assert apart < 0.5
-    prior_draws = starting_points(posterior, log_density, None, (200, posterior.dim), 1, 1)
-    chosen = starting_points(posterior, log_density, None, (20, posterior.dim), 1, 1000)
-    assert np.median(posterior.log_density(chosen)) > np.quantile(
-        posterior.log_density(prior_draws), 0.99
-    )
+    assert np.abs(nuts.dataset["theta"].values.mean(axis=1) - best).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    "sampler",
+    [MetropolisHastings(warmup=300, thin=2), NUTS(warmup=100), Ensemble(warmup=200, thin=2)],
+)
+def test_a_narrow_mode_of_little_mass_does_not_take_all_chains(gaussian_mixture_motion, sampler):
+    """Starts chosen by density alone would all fall into it, and R-hat would see nothing."""
+    posterior = gaussian_mixture_motion
+    draws = sampler.sample(posterior, draws=200, chains=8, seed=0, progress=False)
+    wide = draws.dataset["theta"].values[..., 0] < 0
+    assert wide.mean() > 0.6

@@ -250,6 +250,12 @@ def test_guided_draws_depend_on_their_names_alone(lively, keypoints, sampler, gu
     free = made.sample(MotionPosterior(lively), draws=5, seed=1, progress=False)
     assert abs(free.positions.values - whole.positions.values).max() > 1e-3
     assert f'"kind": "{guidance.kind}"' in whole.dataset.attrs["settings"]
+    # Per draw and level: one product with the covariance for DPS, one per step of conjugate
+    # gradients; of every view.
+    products = {"moment-matched": 6, "dps": 1}.get(guidance.kind, 0)
+    views = 1 if sampler is Ancestral3D else 5
+    estimates = whole.counts["denoiser"] // (5 * views)
+    assert whole.counts.get("covariance", 0) == 5 * views * estimates * products
 
 
 def test_guidance_needs_what_it_needs(lively, keypoints):

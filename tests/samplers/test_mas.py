@@ -22,7 +22,9 @@ from probmotion import (
     triangulate,
 )
 from probmotion.samplers import MultiViewAncestral
+from probmotion.samplers.ancestral import MotionState, ancestral
 from probmotion.samplers.views import MultiViewDenoiser, Views
+from probmotion.seeds import NormalStreams
 
 ELEVATION = math.radians(15)
 
@@ -289,10 +291,11 @@ def test_replay_shows_the_run_from_any_view(lively, perspective):
         trace.replay(new, 41)
 
 
+@pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("shared_noise", [True, False])
-def test_draws_depend_on_their_names_alone(lively, shared_noise):
+def test_draws_depend_on_their_names_alone(lively, shared_noise, perspective):
     posterior = MotionPosterior(lively)
-    sampler = MultiViewAncestral(steps=6, shared_noise=shared_noise)
+    sampler = MultiViewAncestral(steps=6, shared_noise=shared_noise, perspective=perspective)
     whole = sampler.sample(posterior, draws=7, chains=3, seed=2, progress=False).positions.values
     bars = sampler.sample(posterior, draws=7, chains=3, seed=2, progress=True).positions.values
     np.testing.assert_array_equal(bars, whole)
@@ -380,3 +383,31 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively, gaussian_motion):
 
     with pytest.raises(UnsupportedPosterior, match="needs a prior with Denoises2D"):
         MultiViewAncestral().sample(MotionPosterior(Mute()), progress=False)
+
+
+def test_a_prominent_perspective_view_counts_more(lively):
+    posterior = MotionPosterior(lively)
+    even = MultiViewAncestral(steps=6, perspective=True)
+    ones, plain, prominent = (
+        replace(even, view_weights=weights).sample(posterior, draws=4, progress=False).flat()
+        for weights in ((1.0,) * 5, None, (9.0, 1.0, 1.0, 1.0, 1.0))
+    )
+    np.testing.assert_allclose(ones, plain, atol=1e-12)
+    assert abs(prominent - plain).max() > 1e-3
+
+
+def test_the_next_level_gets_the_next_levels_noise(lively):
+    """Noise may depend on the level: the state at t − 1 has that of t − 1."""
+    asked = []
+
+    class Listening(MotionState):
+        def noise(self, streams, t):
+            asked.append(t)
+            return super().noise(streams, t)
+
+    views = Views(Cameras.ring(5, elevation=0.3))
+    schedule = NoiseSchedule.cosine(5)
+    shape = (lively.frames, lively.skeleton.n_joints, 3)
+    state = Listening(MultiViewDenoiser(lively, views), schedule, shape)
+    ancestral(state, NormalStreams([np.random.default_rng(0)]), lambda: None)
+    assert asked == [5, 4, 3, 2, 1]

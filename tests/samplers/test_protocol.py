@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass
+from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +12,8 @@ import pytest
 import probmotion.samplers
 from probmotion import Cameras, Keypoints2D, Motion, MotionDraws, MotionPosterior
 from probmotion.models import GaussianMixtureMotion
+from probmotion.problems import load_problem
+from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.sampling import (
     Sampler,
     UnsupportedPosterior,
@@ -180,3 +182,14 @@ def test_wrong_numbers_of_draws_are_refused(sampler, posterior, name, bad):
 def test_wrong_seeds_are_refused(sampler, posterior):
     with pytest.raises(ValueError, match="seed is -1, expected an integer of at least 0"):
         sampler.sample(posterior, draws=1, seed=-1, progress=False)
+
+
+@pytest.mark.parametrize("sampler", [MultiViewAncestral(), MultiViewPredictorCorrector()])
+def test_a_draw_of_the_exact_prior_is_the_same_in_any_company(sampler):
+    """To the last bit: a hundred steps would make a large difference of a small one."""
+    posterior = load_problem("gait").posterior
+    whole = sampler.sample(posterior, draws=5, chains=3, seed=0, progress=False).positions.values
+    alone = sampler.sample(posterior, draws=5, chains=1, seed=0, progress=False).positions.values
+    np.testing.assert_array_equal(alone[0], whole[0])
+    small = replace(sampler, batch=2).sample(posterior, draws=2, chains=1, seed=0, progress=False)
+    np.testing.assert_array_equal(small.positions.values[0], whole[0, :2])
