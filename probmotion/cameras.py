@@ -64,11 +64,12 @@ class Cameras:
         for value in focal:
             check_positive("focal", float(value))
         gap = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
-        if gap > 1e-6 or (np.linalg.det(rotation) < 0).any():
+        if gap > 1e-6:
             raise ValueError(
-                f"rotation is off a rotation matrix by {gap:.2g}, expected orthonormal rows and "
-                "determinant 1"
+                f"rotation is off an orthonormal matrix by {gap:.2g}, expected at most 1e-6"
             )
+        if (np.linalg.det(rotation) < 0).any():
+            raise ValueError("rotation has a reflection (determinant -1), expected determinant 1")
         for name, value in (
             ("rotation", rotation),
             ("translation", translation),
@@ -122,6 +123,8 @@ class Cameras:
         """Return cameras at the given azimuths and elevations (V,), radians, facing the origin."""
         check_positive("distance", distance)
         azimuth = np.atleast_1d(np.asarray(azimuth, dtype=np.float64))
+        check_finite("azimuth", azimuth)
+        check_finite("elevation", np.atleast_1d(np.asarray(elevation, dtype=np.float64)))
         elevation = np.broadcast_to(np.asarray(elevation, dtype=np.float64), azimuth.shape)
         ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
         zero = np.zeros_like(ca)

@@ -50,7 +50,8 @@ def check_finite(name: str, value: Any) -> None:
 
 def check_positive(name: str, value: float) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
-    if not (np.isfinite(value) and value > 0):
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and np.isfinite(value) and value > 0):
         raise ValueError(f"{name} is {value!r}, expected a finite number above 0")
 
 

@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -111,11 +111,13 @@ class Compare:
 
         samplers = self._samplers()
         problems = self._problems()
+        fitting = max(n for n in (1, 2, 3, 4) if self.draws % n == 0)
+        chains = fitting if self.chains is None else self.chains
         comparison = compare(
             problems,
             samplers,
             draws=self.draws,
-            chains=self.chains or max(n for n in (1, 2, 3, 4) if self.draws % n == 0),
+            chains=chains,
             seeds=self.seeds,
             workers=self.workers,
             out=self.out,
@@ -143,8 +145,16 @@ class Compare:
                 "no problem is given, expected names of problems (probmotion list shows them) or "
                 "clips of your own (--clips FILE…)"
             )
+        if not self.own.clips and self.own != Clips():
+            changed = [entry.name for entry in fields(Clips) if self._differs(entry.name)]
+            raise ValueError(
+                f"{', '.join(changed)} is given without clips, expected --clips FILE… beside it"
+            )
         problems = [load_problem(name) for name in self.problems]
         return problems + ([problem_from(self.own)] if self.own.clips else [])
+
+    def _differs(self, option: str) -> bool:
+        return getattr(self.own, option) != getattr(Clips(), option)
 
 
 def problem_from(own: Clips) -> Problem:
@@ -213,6 +223,9 @@ class Show:
     fps: float | None = None
     """Frames per second of keypoints in JSON, which does not hold it."""
 
+    skeleton: str | None = None
+    """What keypoints in JSON are of (see probmotion list), where their number does not tell."""
+
     picture: Path | None = None
     """Also draw the motion, or the first draws, to this .png."""
 
@@ -220,7 +233,7 @@ class Show:
         """Print a few lines about the file."""
         from probmotion.summaries import summarise
 
-        summary = summarise(self.file, self.fps)
+        summary = summarise(self.file, self.fps, self.skeleton)
         print(summary.text)
         if self.picture is not None:
             summary.draw(self.picture)
@@ -243,8 +256,8 @@ class Convert:
     skeleton: str | None = None
     """Retarget to this skeleton (see probmotion list)."""
 
-    draw: int = 0
-    """Which draw of the first chain, where IN holds draws."""
+    draw: int | None = None
+    """Which draw of the first chain, where IN holds draws; the first by default."""
 
     def run(self) -> None:
         """Read, change, write."""
@@ -263,12 +276,15 @@ class Convert:
         from probmotion.motion import load_motion
 
         if self.source.suffix != ".nc":
+            if self.draw is not None:
+                raise ValueError(f"draw is {self.draw}, but {self.source} holds no draws (.nc)")
             return load_motion(self.source)
         draws = MotionDraws.load(self.source)
         count = draws.dataset.sizes["draw"]
-        if not 0 <= self.draw < count:
-            raise ValueError(f"draw is {self.draw}, expected 0 to {count - 1}")
-        return draws.motion(self.draw)
+        draw = 0 if self.draw is None else self.draw
+        if not 0 <= draw < count:
+            raise ValueError(f"draw is {draw}, expected 0 to {count - 1}")
+        return draws.motion(draw)
 
 
 _COMMANDS: dict[str, type[Any]] = {
@@ -299,6 +315,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _complain(f"{error.filename}: {error.strerror}" if named else str(error), 2)
         except ValueError as error:
             return _complain(str(error), 2)
+        except MemoryError as error:
+            return _complain(f"there is not enough memory for this: {error}", 2)
     return 0
 
 

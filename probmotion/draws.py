@@ -131,6 +131,8 @@ class MotionDraws:
             "parents": np.asarray(skeleton.parents, dtype=np.int32),
             "versions": json.dumps(library_versions(), sort_keys=True),
         }
+        if skeleton.radii is not None:
+            attributes["radii"] = np.asarray(skeleton.radii)
         for name, count in (counts or {}).items():
             attributes[f"evaluations_{name}"] = int(count)
         coordinates = {
@@ -149,8 +151,10 @@ class MotionDraws:
     @property
     def skeleton(self) -> Skeleton:
         """The skeleton of every draw."""
-        parents = np.atleast_1d(self.dataset.attrs["parents"])
-        return Skeleton([str(name) for name in self.dataset["joint"].values], parents.tolist())
+        names = [str(name) for name in self.dataset["joint"].values]
+        parents = np.atleast_1d(self.dataset.attrs["parents"]).tolist()
+        radii = self.dataset.attrs.get("radii")
+        return Skeleton(names, parents, None if radii is None else np.atleast_1d(radii).tolist())
 
     @property
     def fps(self) -> float:
@@ -225,7 +229,15 @@ class MotionDraws:
         return citations_of(self.dataset.attrs["sampler"])
 
     def save(self, path: str | Path) -> None:
-        """Write the draws as netCDF; nothing is left at ``path`` if writing fails."""
+        """Write the draws as netCDF, ``.nc``; nothing is left at ``path`` if writing fails.
+
+        Raises
+        ------
+        ValueError
+            If ``path`` has another ending.
+        """
+        if Path(path).suffix != ".nc":
+            raise ValueError(f"path is {str(path)!r}, expected a name that ends in .nc")
         # netCDF's integers have 32 bits; seeds and counts may need more.
         wide = {
             str(name): str(value)
@@ -250,7 +262,9 @@ class MotionDraws:
         except FileNotFoundError:
             raise
         except Exception as error:
-            raise ValueError(f"path is {str(path)!r}, which is no netCDF file: {error}") from error
+            raise ValueError(
+                f"path is {str(path)!r}, which is no netCDF file, expected one that save() wrote"
+            ) from error
         if dataset.attrs.get("format_version") != _VERSION:
             raise ValueError(
                 f"path is {str(path)!r} with format version "

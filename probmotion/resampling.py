@@ -14,6 +14,7 @@ __all__ = ["resample_motion"]
 
 # New frames by which a clip may miss a whole number and still get its last one: files round their
 # frame times (0.0083333 s), which would cost the last frame of every clip.
+_HIGHEST_FPS = 10_000
 _ROUNDING = 1e-3
 
 
@@ -36,9 +37,11 @@ def resample_motion(motion: Motion, fps: float) -> Motion:
     Raises
     ------
     ValueError
-        If ``fps`` is not a finite number above 0.
+        If ``fps`` is not a number above 0 and at most 10 000.
     """
     check_positive("fps", fps)
+    if fps > _HIGHEST_FPS:
+        raise ValueError(f"fps is {fps:g}, expected at most {_HIGHEST_FPS} frames per second")
     if fps == motion.fps:
         return motion
     frames = int(np.floor(motion.duration * fps + _ROUNDING)) + 1

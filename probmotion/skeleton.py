@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
+from probmotion.checks import check_positive
 from probmotion.joint_names import canonical_names, mirrored_name
 
 __all__ = ["Skeleton"]
@@ -44,6 +47,11 @@ class Skeleton:
         radii: Sequence[float] | None = None,
     ) -> None:
         names = tuple(str(name) for name in joint_names)
+        for joint, parent in enumerate(parents):
+            if isinstance(parent, bool) or not isinstance(parent, int | np.integer):
+                raise ValueError(
+                    f"parents[{joint}] is {parent!r}, expected an integer, -1 for a root"
+                )
         links = tuple(int(parent) for parent in parents)
         if not names:
             raise ValueError("joint_names is empty, expected at least one joint")
@@ -65,6 +73,8 @@ class Skeleton:
             raise ValueError(
                 f"radii has {len(radii)} entries, expected {len(names)}, one per joint"
             )
+        for joint, radius in enumerate(radii or ()):
+            check_positive(f"radii[{joint}]", radius)
         object.__setattr__(self, "joint_names", names)
         object.__setattr__(self, "parents", links)
         object.__setattr__(self, "radii", None if radii is None else tuple(map(float, radii)))
@@ -161,6 +171,11 @@ class Skeleton:
         becomes a root.
         """
         kept = list(joints)
+        for joint in kept:
+            if not 0 <= joint < self.n_joints:
+                raise ValueError(
+                    f"joints has {joint}, expected indices from 0 to {self.n_joints - 1}"
+                )
         parents = []
         for joint in kept:
             above = [kept.index(a) for a in self.ancestors(joint) if a in kept]

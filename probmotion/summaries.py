@@ -57,7 +57,7 @@ class Summary:
         )
 
 
-def summarise(path: Path, fps: float | None = None) -> Summary:
+def summarise(path: Path, fps: float | None = None, skeleton: str | None = None) -> Summary:
     """Return a summary of a file of motion, keypoints or draws.
 
     Parameters
@@ -66,6 +66,8 @@ def summarise(path: Path, fps: float | None = None) -> Summary:
         The file.
     fps : float, optional
         Frames per second of keypoints in JSON, which does not hold it.
+    skeleton : str, optional
+        Preset that keypoints in JSON are of, where their number does not tell.
 
     Raises
     ------
@@ -79,7 +81,7 @@ def summarise(path: Path, fps: float | None = None) -> Summary:
     if _holds_keypoints(path):
         from probmotion.formats import read_keypoints
 
-        return _of_tracks(path, read_keypoints(path, fps))
+        return _of_tracks(path, read_keypoints(path, fps, skeleton))
     from probmotion.formats import read_motion
 
     return _of_motion(path, read_motion(path))

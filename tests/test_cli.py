@@ -194,6 +194,8 @@ def one_frame(folder: Path) -> str:
         ("compare jump", ("'jump'", "gait-monocular")),
         ("compare", ("no problem is given", "--clips")),
         ("compare gait --draws 3", ("draws is 3",)),
+        ("compare gait --chains 0", ("chains is 0",)),
+        ("compare gait --observe sparse", ("observe is given without clips", "--clips")),
         ("compare --clips no/such/*.bvh", ("no/such/*.bvh", "no file")),
         ("compare --clips no/such.bvh", ("no/such.bvh",)),
         ("show no/such.bvh", ("no/such.bvh",)),

@@ -225,3 +225,22 @@ def test_wrong_shapes_and_values_are_refused() -> None:
         some_draws(log_density=np.zeros((DRAWS, CHAINS)))
     with pytest.raises(ValueError, match=r"acceptance has shape \(3, 5\), expected \(2, 5\)"):
         some_draws(statistics={"acceptance": np.zeros((3, DRAWS))})
+
+
+def test_only_netcdf_is_written_and_radii_are_kept(tmp_path):
+    from dataclasses import replace
+
+    from probmotion.problems import load_problem
+    from probmotion.samplers import ExactSampler
+
+    posterior = load_problem("gait").posterior
+    prior = posterior.prior
+    skeleton = Skeleton(
+        prior.skeleton.joint_names, prior.skeleton.parents, [0.05] * prior.skeleton.n_joints
+    )
+    thick = MotionPosterior(replace(prior, skeleton=skeleton))
+    draws = ExactSampler().sample(thick, draws=2, progress=False)
+    with pytest.raises(ValueError, match=r"expected a name that ends in \.nc"):
+        draws.save(tmp_path / "draws.zarr")
+    draws.save(tmp_path / "draws.nc")
+    assert MotionDraws.load(tmp_path / "draws.nc").motion(0).skeleton.radii == skeleton.radii

@@ -7,8 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probmotion import Cameras, Joints3D, Keypoints2D, MotionPosterior, Skeleton
+from probmotion import (
+    Cameras,
+    Joints3D,
+    Keypoints2D,
+    KeypointTrack,
+    Motion,
+    MotionPosterior,
+    Skeleton,
+)
 from probmotion.arrays import array_namespace, constant, dot
+from probmotion.problems import load_problem
 
 FRAMES, CHAIN = 2, Skeleton(["hip", "knee"], [-1, 0])
 DIM = FRAMES * 2 * 3
@@ -121,3 +130,22 @@ def test_wrong_coordinates_are_refused() -> None:
             call(np.zeros((3, 5)))
     with pytest.raises(ValueError, match=r"theta has shape \(12,\), expected \(n, 12\)"):
         posterior.complete(np.random.default_rng(0), np.zeros(DIM))
+
+
+def test_evidence_of_another_skeleton_or_frame_rate_is_refused() -> None:
+    prior = load_problem("gait").posterior.prior
+    positions = prior.sample(np.random.default_rng(0), 1)[0]
+    camera = Cameras.ring(1)
+    other = Motion(positions, Skeleton.preset("coco17"), prior.fps)
+    with pytest.raises(ValueError, match=r"likelihood is of the joints nose, left_eye.*retarget"):
+        MotionPosterior(prior, Keypoints2D.observe(other, camera, 0.02, 0))
+    fast = Motion(positions, prior.skeleton, 2 * prior.fps)
+    with pytest.raises(ValueError, match=r"likelihood is at 60 frames per second, expected .* 30"):
+        MotionPosterior(prior, Joints3D.observe(fast, 0.02, 0))
+    track = KeypointTrack(
+        np.zeros((30, 17, 2)), np.ones((30, 17)), Skeleton.preset("coco17"), prior.fps
+    )
+    with pytest.raises(ValueError, match="likelihood is of the joints"):
+        MotionPosterior(prior, Keypoints2D.from_track(track, camera, 0.02))
+    right = Motion(positions, prior.skeleton, prior.fps)
+    assert MotionPosterior(prior, Keypoints2D.observe(right, camera, 0.02, 0)).frames == 30

@@ -115,3 +115,16 @@ def test_real_bvh_files_make_a_problem():
     draws = problem.reference(0, 50)
     image = problem.posterior.likelihood.cameras.project(draws)
     assert np.abs(image - problem.posterior.likelihood.keypoints).mean() < 0.1
+
+
+def test_a_clip_that_is_there_twice_is_refused():
+    clips = [make_gait("walk", number, frames=40) for number in range(4)]
+    with pytest.raises(ValueError, match=r"twice \(as walk-3 and walk-3\), expected"):
+        clips_problem([*clips, clips[-1]])
+
+
+def test_clips_that_do_not_move_are_refused_in_one_sentence():
+    clip = make_gait("walk", 0, frames=200)
+    still = replace(clip, positions=np.repeat(clip.positions[:1], 200, axis=0))
+    with pytest.raises(ValueError, match="windows that are all alike, expected clips that differ"):
+        clips_problem([still, clip])

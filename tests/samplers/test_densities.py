@@ -120,3 +120,13 @@ def test_a_narrow_mode_of_little_mass_does_not_take_all_chains(gaussian_mixture_
     draws = sampler.sample(posterior, draws=200, chains=8, seed=0, progress=False)
     wide = draws.dataset["theta"].values[..., 0] < 0
     assert wide.mean() > 0.6
+
+
+@pytest.mark.parametrize(
+    "sampler", [MetropolisHastings(warmup=5), NUTS(warmup=5), Ensemble(warmup=5, thin=1)]
+)
+def test_a_run_does_not_go_on_with_another_posterior(posterior, sampler):
+    run = sampler.sample(posterior, draws=5, seed=0, progress=False)
+    other = load_problem("gait").posterior
+    with pytest.raises(ValueError, match="initial is a run of another posterior: its last log"):
+        sampler.sample(other, draws=5, seed=0, initial=run, progress=False)
