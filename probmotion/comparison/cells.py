@@ -87,6 +87,13 @@ class Cell:
             return False
         return result.failure is None or result.failure.unsupported
 
+    def taken(self) -> bool:
+        """Whether its folder holds draws made with other settings, which it must not replace."""
+        result = read_result(self.folder)
+        return (
+            result is not None and result.failure is None and result.fingerprint != self.fingerprint
+        )
+
     def fail(self, error: BaseException) -> None:
         """Keep an error as the cell's result."""
         self._keep({}, None, _failure(error))

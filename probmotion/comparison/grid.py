@@ -71,7 +71,8 @@ def compare(
     Raises
     ------
     ValueError
-        If a problem or sampler is unknown, two have one name, or a number is out of range.
+        If a problem or sampler is unknown, two have one name, a number is out of range, or
+        ``out`` holds finished cells of the same names that were made with other settings.
     OSError
         If ``out`` cannot be written to; said before anything is computed.
     KeyboardInterrupt
@@ -88,6 +89,13 @@ def compare(
     folder = Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else _writable(Path(out))
     plan = Plan.of(chosen, used, draws, chains, seeds)
     cells = _cells(folder, plan, chosen, used)
+    if taken := [cell for cell in cells if cell.taken()]:
+        first = taken[0]
+        raise ValueError(
+            f"out is {folder}, which holds {len(taken)} finished cells made with other settings, "
+            f"evidence or library versions, the first {first.problem}/{first.sampler}/{first.seed};"
+            " expected a folder of its own for another comparison"
+        )
     forget_unfinished(folder / "cells")
     plan.save(folder)
     missing = [cell for cell in cells if not cell.finished()]

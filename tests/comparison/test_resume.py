@@ -129,7 +129,7 @@ def test_a_finished_grid_is_not_run_again(tmp_path):
     assert runs(diary) == 4
 
 
-def test_other_settings_are_another_run(tmp_path):
+def test_other_settings_need_another_folder(tmp_path):
     diary = tmp_path / "diary"
     out = tmp_path / "out"
 
@@ -139,12 +139,19 @@ def test_other_settings_are_another_run(tmp_path):
         return runs(diary)
 
     assert run(generation()) == 1
-    assert run(generation(), spread=1.5) == 2
-    assert run(generation(), draws=40) == 3
-    assert run(generation(), draws=40, chains=4) == 4
-    assert run(monocular(), draws=40, chains=4) == 5
-    assert run(monocular(), draws=40, chains=4) == 5
-    assert run(generation()) == 6
+    kept = (out / "table.csv").read_bytes()
+    for change in (
+        {"problem": generation(), "spread": 1.5},
+        {"problem": generation(), "draws": 40},
+        {"problem": generation(), "chains": 4},
+        {"problem": monocular()},
+    ):
+        with pytest.raises(ValueError, match="holds 1 finished cells made with other settings"):
+            run(**change)
+    assert (out / "table.csv").read_bytes() == kept
+    assert run(generation()) == 1
+    # More of the same is no other comparison.
+    assert run(generation(), seeds=2) == 2
 
 
 def test_failures_are_tried_again_and_unfit_samplers_are_not(tmp_path):
