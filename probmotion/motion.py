@@ -36,8 +36,8 @@ class Motion:
     Raises
     ------
     ValueError
-        If shapes do not fit the skeleton, a value is NaN or infinite, there is no frame, or
-        ``fps`` is not above zero.
+        If shapes do not fit the skeleton, a value is NaN or infinite, there is no frame, a
+        rotation is not orthonormal, or ``fps`` is not above zero.
     """
 
     positions: np.ndarray
@@ -61,6 +61,12 @@ class Motion:
         if self.rotations is not None and self.rest_offsets is not None:
             check_shape("rotations", self.rotations, (*positions.shape[:2], 3, 3))
             check_finite("rotations", self.rotations)
+            product = self.rotations @ np.swapaxes(self.rotations, -1, -2)
+            gap = float(np.abs(product - np.eye(3)).max())
+            if gap > 1e-3:
+                raise ValueError(
+                    f"rotations is off orthonormal matrices by {gap:.2g}, expected at most 0.001"
+                )
             check_shape("rest_offsets", self.rest_offsets, (self.skeleton.n_joints, 3))
             check_finite("rest_offsets", self.rest_offsets)
 

@@ -124,3 +124,10 @@ def test_clips_of_a_folder_come_sorted_and_at_one_rate(tmp_path: Path) -> None:
     assert [(motion.fps, motion.frames) for motion in motions] == [(20.0, 21)] * 2
     one = load_motions([str(tmp_path / "b.npz")])
     assert [motion.fps for motion in one] == [60.0]
+
+
+def test_rotations_that_are_none_are_refused() -> None:
+    skeleton = Skeleton(["root", "tip"], [-1, 0])
+    rest = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="rotations is off orthonormal matrices by 1, expected"):
+        Motion(np.zeros((3, 2, 3)), skeleton, 30.0, np.zeros((3, 2, 3, 3)), rest)

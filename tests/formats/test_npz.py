@@ -49,7 +49,7 @@ def test_a_motion_reads_back_exactly(tmp_path: Path) -> None:
         rng.normal(size=(5, 3, 3)) * 1e3,
         skeleton,
         59.94,
-        rotations=rng.normal(size=(5, 3, 3, 3)),
+        rotations=np.linalg.qr(rng.normal(size=(5, 3, 3, 3)))[0],
         rest_offsets=rng.normal(size=(3, 3)),
         name="take 3",
     )
