@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     Executor,
@@ -16,6 +16,8 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 
 from probmotion.comparison.cells import Cell, run_cell
 from probmotion.sampling import progress_bar
@@ -105,7 +107,8 @@ def _feed(pool: ProcessPoolExecutor, waiting: list[Cell], workers: int, done: Do
     while running or (waiting and broken is None):
         while waiting and len(running) < workers and broken is None:
             cell = waiting.pop()
-            running[pool.submit(run_cell, cell)] = cell
+            with _born_deaf():
+                running[pool.submit(run_cell, cell)] = cell
         finished, _ = wait(running, return_when=FIRST_COMPLETED)
         for future in finished:
             error = future.exception()
@@ -118,6 +121,21 @@ def _feed(pool: ProcessPoolExecutor, waiting: list[Cell], workers: int, done: Do
             done(running.pop(future), error)
     if broken is not None:
         raise broken
+
+
+@contextmanager
+def _born_deaf() -> Iterator[None]:
+    """Processes that begin in the block do not hear Ctrl-C, not even while they load."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # It unblocks Ctrl-C when it starts, so it is started first.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker() -> None:

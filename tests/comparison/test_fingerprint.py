@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 from toy_samplers import PriorDraws, generation, monocular
 
 from probmotion.comparison.fingerprint import fingerprint
@@ -127,17 +127,23 @@ def test_what_cannot_be_told_apart_is_refused(value):
         fingerprint([value])
 
 
+def threads():
+    """Threads of every library that is loaded, by its file."""
+    return {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
+
+
 def test_one_thread_is_one_thread_and_then_what_it_was(monkeypatch):
+    with one_thread():
+        pass  # Loads what it needs, which another test may not have done yet.
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    before, torch_before = threadpool_info(), torch.get_num_threads()
-    with one_thread():
-        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
-        assert torch.get_num_threads() == 1
-        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
-    assert [pool["num_threads"] for pool in threadpool_info()][: len(before)] == [
-        pool["num_threads"] for pool in before
-    ]
-    assert torch.get_num_threads() == torch_before
+    with threadpool_limits(2):
+        before, torch_before = threads(), torch.get_num_threads()
+        with one_thread():
+            assert set(threads().values()) == {1}
+            assert torch.get_num_threads() == 1
+            assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+        assert threads() == before
+        assert torch.get_num_threads() == torch_before
     assert os.environ["OMP_NUM_THREADS"] == "3"
     assert "OPENBLAS_NUM_THREADS" not in os.environ
