@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import copy
 import os
-import pickle
-from dataclasses import dataclass, field, replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
-from toy_samplers import PriorDraws, generation, monocular
+from toy_samplers import Holder, Plain, PriorDraws, generation, monocular
 
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.threads import one_thread
-
-
-@dataclass(frozen=True)
-class Holder:
-    value: object
-    cache: dict = field(init=False, default_factory=dict)
-
-
-class Plain:
-    def __init__(self, value):
-        self.value = value
 
 
 class Slotted:
@@ -54,6 +44,7 @@ DIFFERENT = [
     {"a": 1},
     {"a": 2},
     {1, 2},
+    {"north", "east", "south", "west"},
     np.array([1.0]),
     np.array([[1.0]]),
     np.array([1.0], dtype=np.float32),
@@ -80,7 +71,13 @@ def test_different_things_have_different_fingerprints():
 @pytest.mark.parametrize("value", DIFFERENT, ids=range(len(DIFFERENT)))
 def test_a_copy_has_the_same_fingerprint(value):
     assert fingerprint(copy.deepcopy(value)) == fingerprint(value)
-    assert fingerprint(pickle.loads(pickle.dumps(value))) == fingerprint(value)
+
+
+def test_a_worker_finds_the_same_fingerprints():
+    """They travel as cells do, to a process with another seed of Python's hashes."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(fingerprint, DIFFERENT))
+    assert found == [fingerprint(value) for value in DIFFERENT]
 
 
 def test_caches_and_order_do_not_count():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,6 +15,21 @@ from probmotion.models import GaussianMixtureMotion
 from probmotion.priors import Samplable
 from probmotion.problems import Problem
 from probmotion.problems.evidence import observe
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A value, and a cache that does not count."""
+
+    value: object
+    cache: dict = field(init=False, default_factory=dict)
+
+
+class Plain:
+    """An object that is no dataclass."""
+
+    def __init__(self, value):
+        self.value = value
 
 
 def small_prior() -> GaussianMixtureMotion:
