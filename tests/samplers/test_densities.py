@@ -39,23 +39,23 @@ def likelihood_of(posterior: MotionPosterior):
 
 
 def test_chains_start_at_candidates_in_proportion_to_their_likelihood(posterior):
-    """3000 chains of 3 candidates each: how often the first, second, third is taken."""
+    """3000 chains of 3 candidates each: how often the likeliest, and the least likely, is taken."""
     log_likelihood, asked = likelihood_of(posterior)
     points = starting_points(posterior, log_likelihood, None, (3000, posterior.dim), 5, 3)
     assert asked == [3] * 3000
-    surprise = []
+    taken, shares = np.zeros((2, 3000, 3))
     for chain, point in enumerate(points):
         drawn = posterior.initial(seeds.generator(5, "initial", chain), 3)
-        weight = np.exp(posterior.log_likelihood(drawn) - posterior.log_likelihood(drawn).max())
-        share = weight / weight.sum()
-        taken = (drawn == point).all(axis=1)
-        assert taken.sum() == 1
-        # Each has mean 0 and this variance if the choice is in proportion.
-        variance = share @ (np.arange(3) - share @ np.arange(3)) ** 2
-        surprise.append((taken @ np.arange(3) - share @ np.arange(3), variance))
-    total, variance = np.sum(surprise, axis=0)
-    assert variance > 100
-    assert abs(total) < 4 * np.sqrt(variance)
+        logs = posterior.log_likelihood(drawn)
+        rank = np.argsort(logs)
+        weight = np.exp(logs[rank] - logs.max())
+        shares[chain] = weight / weight.sum()
+        taken[chain] = (drawn[rank] == point).all(axis=1)
+    assert (taken.sum(axis=1) == 1).all()
+    # Each chain's choice is a Bernoulli draw with its own known probability.
+    deviation = np.sqrt((shares * (1 - shares)).sum(axis=0))
+    assert (deviation > 5).all()
+    assert (abs((taken - shares).sum(axis=0)) < 4 * deviation).all()
     fewer = starting_points(posterior, log_likelihood, None, (2, posterior.dim), 5, 3)
     np.testing.assert_array_equal(fewer, points[:2])
 
