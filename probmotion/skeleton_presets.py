@@ -98,9 +98,20 @@ def _smpl22() -> Skeleton:
     )  # fmt: skip
 
 
+def _person17() -> Skeleton:
+    """One person as motion capture has it: the trunk's joints, limbs, no face (Yin et al. 2018)."""
+    return _tree(
+        "pelvis", "spine pelvis", "chest spine", "neck chest", "head neck",
+        "left_shoulder chest", "left_elbow left_shoulder", "left_wrist left_elbow",
+        "right_shoulder chest", "right_elbow right_shoulder", "right_wrist right_elbow",
+        "left_hip pelvis", "left_knee left_hip", "left_ankle left_knee",
+        "right_hip pelvis", "right_knee right_hip", "right_ankle right_knee",
+    )  # fmt: skip
+
+
 def _pair17() -> Skeleton:
-    """Two people of Human3.6M's 17 joints each."""
-    one = _h36m17()
+    """Two people of ``person17``'s joints."""
+    one = _person17()
     names = [f"person{p}:{name}" for p in range(2) for name in one.joint_names]
     return Skeleton(names, [*one.parents, *(q if q < 0 else q + 17 for q in one.parents)])
 
@@ -120,6 +131,7 @@ PRESETS: Mapping[str, Callable[[], Skeleton]] = {
     "gymnast-ball": _gymnast_ball,
     "h36m17": _h36m17,
     "pair17": _pair17,
+    "person17": _person17,
     "smpl22": _smpl22,
 }
 """Functions that make each skeleton, by name."""

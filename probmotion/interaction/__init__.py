@@ -1,0 +1,1 @@
+"""Interaction of characters: coordinates, views, annotations and the likelihood they make."""
