@@ -7,6 +7,7 @@ multiplies the precision and 0 hides an entry.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -20,7 +21,14 @@ from probmotion.motion import KeypointTrack, Motion
 from probmotion.priors import NotConjugate
 from probmotion.skeleton import Skeleton
 
-__all__ = ["EntryNoise", "Joints3D", "Keypoints2D", "Likelihood", "LinearObservation"]
+__all__ = [
+    "ComparesViews",
+    "EntryNoise",
+    "Joints3D",
+    "Keypoints2D",
+    "Likelihood",
+    "LinearObservation",
+]
 
 
 @runtime_checkable
@@ -32,6 +40,22 @@ class Likelihood(Protocol):
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Likelihood:
         """Return the likelihood of evidence drawn from p(y | X), X of shape (L, J, 3)."""
+
+
+@runtime_checkable
+class ComparesViews(Protocol):
+    """Evidence that compares a pose's views with annotations, and knows how those move."""
+
+    def evaluate(
+        self, positions: np.ndarray, generators: Sequence[np.random.Generator] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return log L and the closest annotations: ``(…, L, J, 3) → (…), (…, m)``.
+
+        With generators, one per pose, log L is of views that each draws anew.
+        """
+
+    def joint_speeds(self, closest: np.ndarray) -> np.ndarray:
+        """Return joints' mean squared turn and stretch there: ``(…, m) → (…, J, 2)``."""
 
 
 class LinearObservation(NamedTuple):

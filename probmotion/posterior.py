@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_shape
-from probmotion.likelihoods import Likelihood
-from probmotion.priors import HasLogDensity, Marginalises, MotionPrior
+from probmotion.likelihoods import ComparesViews, Likelihood
+from probmotion.priors import HasCoordinateSpeeds, HasLogDensity, Marginalises, MotionPrior
 from probmotion.seeds import RandomNumbers
 from probmotion.skeleton import Skeleton
 
@@ -90,13 +91,101 @@ class MotionPosterior:
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ) + log p(y | θ), the posterior's up to a constant: ``(…, dim) → (…)``.
 
-        NumPy, torch and JAX arrays alike, as far as the prior and likelihood allow.
+        NumPy, torch and JAX arrays alike, as far as the prior and likelihood allow. Where the
+        prior is 0 the evidence is not asked.
         """
         check_shape("theta", theta, ("…", self.dim))
         if not isinstance(self.prior, HasLogDensity):
             raise ValueError(f"prior {type(self.prior).__name__} has no log density")
         log_prior = self.prior.log_density(theta)
-        return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
+        if not isinstance(log_prior, np.ndarray | np.floating):
+            # Under a gradient or a compiler there is no asking where.
+            return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
+        if self.likelihood is None:
+            return self._shaped(theta, log_prior)
+        return self._with_evidence(theta, log_prior, lambda some: (self.log_likelihood(some),))[0]
+
+    def evaluate(
+        self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log density and the annotations that are closest, of annotated evidence.
+
+        Parameters
+        ----------
+        theta : ndarray, (n, dim)
+            Where.
+        generators : sequence of numpy.random.Generator, optional
+            One per point, which draws views of its own: the density is then an unbiased estimate.
+
+        Returns
+        -------
+        log_density : ndarray, (n,)
+        closest : ndarray of int, (n, m)
+            For :meth:`speeds`; 0 where the density is 0 whatever the evidence says.
+
+        Raises
+        ------
+        ValueError
+            If the evidence is not annotated.
+        """
+        if not isinstance(self.likelihood, ComparesViews):
+            raise ValueError(
+                f"likelihood is {type(self.likelihood).__name__}, expected annotated pairs, whose "
+                "views are compared"
+            )
+        likelihood = self.likelihood
+        log_prior = to_numpy(self.prior.log_density(theta))  # type: ignore[attr-defined]
+
+        def compared(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            own = None if generators is None else [generators[i] for i in np.flatnonzero(asked)]
+            return likelihood.evaluate(to_numpy(self.prior.motion(some)), own)
+
+        asked = self._worth_asking(theta, log_prior)
+        log_density, closest = self._with_evidence(theta, log_prior, compared)
+        return log_density, closest
+
+    def speeds(self, closest: np.ndarray) -> np.ndarray:
+        """Return each coordinate's mean squared step in the annotations of D' (eq. 12).
+
+        ``(n, m) → (n, dim)``; what :meth:`evaluate` found closest.
+        """
+        if not isinstance(self.likelihood, ComparesViews) or not isinstance(
+            self.prior, HasCoordinateSpeeds
+        ):
+            raise ValueError(
+                f"prior {type(self.prior).__name__} with likelihood "
+                f"{type(self.likelihood).__name__} has no speeds, expected annotated pairs"
+            )
+        return self.prior.coordinate_speeds(self.likelihood.joint_speeds(closest))
+
+    def _with_evidence(
+        self,
+        theta: np.ndarray,
+        log_prior: np.ndarray,
+        evidence: Callable[[np.ndarray], tuple[np.ndarray, ...]],
+    ) -> tuple[np.ndarray, ...]:
+        """Return the log density and what else ``evidence`` says, which is asked where it counts.
+
+        ``evidence`` takes some points, (n, dim), and returns arrays over them, the log likelihood
+        first.
+        """
+        log_prior = np.asarray(log_prior)
+        asked = self._worth_asking(theta, log_prior)
+        log_likelihood, *others = evidence(theta[asked])
+        log_density = np.full(log_prior.shape, -np.inf)
+        log_density[asked] = log_prior[asked] + np.asarray(log_likelihood)
+        full = [np.zeros((*log_prior.shape, *found.shape[1:]), found.dtype) for found in others]
+        for array, found in zip(full, others, strict=True):
+            array[asked] = found
+        return self._shaped(theta, log_density), *full
+
+    def _worth_asking(self, theta: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
+        """Return where the evidence can change the density, a mask."""
+        return log_prior > -np.inf
+
+    def _shaped(self, theta: np.ndarray, log_density: np.ndarray) -> np.ndarray:
+        """Return the density as it is drawn from; see :class:`TruncatedPosterior`."""
+        return log_density
 
     def log_likelihood(self, theta: Array) -> Array:
         """Return log p(y | θ): ``(…, dim) → (…)``.

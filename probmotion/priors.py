@@ -24,6 +24,7 @@ __all__ = [
     "Denoises2D",
     "Denoises3D",
     "ExactPosterior",
+    "HasCoordinateSpeeds",
     "HasExactPosterior",
     "HasLogDensity",
     "Marginalises",
@@ -74,13 +75,28 @@ class Samplable(Protocol):
 
 @runtime_checkable
 class HasLogDensity(Protocol):
-    """The prior's normalised log density in θ, and points to start a chain from."""
+    """The prior's log density in θ, and points to start a chain from.
+
+    It is normalised where it can be. A prior or likelihood without a gradient says so by an
+    attribute ``differentiable = False``.
+    """
 
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ): ``(…, dim) → (…)``."""
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n draws of θ from the prior, (n, dim)."""
+        """Return n points to start at, (n, dim): draws from the prior if it is `Samplable`."""
+
+
+@runtime_checkable
+class HasCoordinateSpeeds(Protocol):
+    """What joints' movement in a picture means for θ."""
+
+    def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
+        """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
+
+        ``joint_speeds`` holds the squared turns, radians², and stretches, metres², of joints.
+        """
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ chain k is the same however many chains run and a continued run goes on as if it
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -16,7 +16,7 @@ from probmotion import seeds
 from probmotion.checks import check_count, check_finite, check_shape
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
-from probmotion.priors import NotConjugate
+from probmotion.priors import NotConjugate, Samplable
 from probmotion.sampling import Sampler, UnsupportedPosterior, batches, require
 from probmotion.seeds import NormalStreams
 
@@ -55,15 +55,28 @@ class Density:
         ValueError
             If a value is NaN or +∞.
         """
-        value = self._counted(self.posterior.log_density, theta)
-        # NaN compares as false: one look finds both.
-        if not value.max() < np.inf:
-            bad = int(np.flatnonzero(~(value < np.inf))[0])
-            raise ValueError(
-                f"log_density is {value[bad]} at theta {theta[bad]}, expected a finite number or "
-                "-inf"
-            )
-        return value
+        return _below_infinity(self._counted(self.posterior.log_density, theta), theta)
+
+    def evaluate(
+        self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None, guided: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log density and the guide of proposals there (:mod:`proposals`).
+
+        Parameters
+        ----------
+        theta : ndarray, (n, dim)
+            Where.
+        generators : sequence of numpy.random.Generator, optional
+            One per point; the density is then an estimate from views that each draws anew.
+        guided : bool
+            Whether the guide is wanted; else it has no width.
+        """
+        if generators is None and not guided:
+            return self(theta), np.empty((len(theta), 0))
+        self.evaluations += len(theta)
+        value, closest = self.posterior.evaluate(theta, generators)
+        guide = self.posterior.speeds(closest) if guided else np.empty((len(theta), 0))
+        return _below_infinity(value, theta), guide
 
     def likelihood(self, theta: np.ndarray) -> np.ndarray:
         """Return log p(y | θ), ``(n, dim) → (n,)``; an evaluation like any other."""
@@ -78,16 +91,31 @@ class Density:
         except NotConjugate as error:
             raise not_conjugate(self.sampler, error) from error
 
-    def at_start(self, theta: np.ndarray) -> np.ndarray:
-        """Return the log density where chains start; a start of density 0 is an error."""
-        value = self(theta)
+    def at_start(
+        self,
+        theta: np.ndarray,
+        generators: Sequence[np.random.Generator] | None = None,
+        guided: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return density and guide where chains start; a start of density 0 is an error."""
+        value, guide = self.evaluate(theta, generators, guided)
         if not np.isfinite(value).all():
             bad = int(np.flatnonzero(~np.isfinite(value))[0])
             raise ValueError(
                 f"initial has log density {value[bad]} at point {bad}, expected starting points "
                 "of density above 0"
             )
-        return value
+        return value, guide
+
+
+def _below_infinity(value: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    # NaN compares as false: one look finds both.
+    if not value.max() < np.inf:
+        bad = int(np.flatnonzero(~(value < np.inf))[0])
+        raise ValueError(
+            f"log_density is {value[bad]} at theta {theta[bad]}, expected a finite number or -inf"
+        )
+    return value
 
 
 def not_conjugate(sampler: Sampler, error: NotConjugate) -> UnsupportedPosterior:
@@ -113,7 +141,8 @@ def starting_points(
     ``candidates`` draws of its own from the prior, in proportion to their likelihood
     (sampling-importance-resampling, Rubin 1987): nearly a draw from the posterior where enough
     candidates have a share, so that starts are spread over the modes as the mass is, and R-hat
-    still sees a chain that stays where it began. Without evidence it is a draw from the prior.
+    still sees a chain that stays where it began. Without evidence it is a draw from the prior. A
+    prior that cannot be drawn from says itself where to start.
 
     Parameters
     ----------
@@ -141,7 +170,11 @@ def starting_points(
     starts = []
     for chain in range(chains):
         rng = seeds.generator(seed, "initial", chain)
-        if posterior.likelihood is None or candidates <= n:
+        if (
+            posterior.likelihood is None
+            or candidates <= n
+            or not isinstance(posterior.prior, Samplable)
+        ):
             starts.append(posterior.initial(rng, n))
             continue
         drawn = posterior.initial(rng, candidates)
@@ -153,12 +186,14 @@ def starting_points(
 
 def continued(
     sampler: Sampler,
-    log_density: Callable[[np.ndarray], np.ndarray],
+    log_density: Callable[[np.ndarray], np.ndarray] | None,
     initial: object,
     chains: int,
     seed: int,
 ) -> Mapping[str, np.ndarray] | None:
     """Return the state that ``initial`` stopped in, or ``None`` where it is no finished run.
+
+    ``log_density`` tells whether it was of this posterior; ``None`` where densities are estimates.
 
     Raises
     ------
@@ -182,6 +217,8 @@ def continued(
                 f"initial is a run with {name} {expected}, and {name} is {came}: a run goes on as "
                 "it began; to start afresh where it stopped, pass an array of points"
             )
+    if log_density is None:
+        return initial.state
     last = initial.dataset.isel(draw=-1)
     stored, found = last["log_density"].values, log_density(last["theta"].values)
     if not np.allclose(found, stored, rtol=1e-6, atol=1e-6):

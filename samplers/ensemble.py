@@ -175,7 +175,7 @@ class _Rest(NamedTuple):
     @classmethod
     def begin(cls, density: Density, points: np.ndarray, seed: int) -> _Rest:
         chains, walkers, dim = points.shape
-        log_density = density.at_start(points.reshape(-1, dim)).reshape(chains, walkers)
+        log_density = density.at_start(points.reshape(-1, dim))[0].reshape(chains, walkers)
         sources = [np.random.MT19937(seeds.sequence(seed, "chain", k)) for k in range(chains)]
         random = np.stack([_words(np.random.RandomState(s).get_state()) for s in sources])
         return cls(points, log_density, random, unused=0, draws=0)

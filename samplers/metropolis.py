@@ -12,11 +12,12 @@ import numpy as np
 from probmotion import seeds
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
+from probmotion.likelihoods import ComparesViews
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
 from probmotion.samplers.densities import Density, continued, motions, starting_points
 from probmotion.samplers.proposals import AdaptiveCovariance, Proposal, ProposalState
-from probmotion.sampling import Interrupted, progress_bar
+from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar
 
 __all__ = ["MetropolisHastings"]
 
@@ -35,6 +36,10 @@ class MetropolisHastings:
         Steps from one draw to the next.
     candidates : int
         Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
+    pseudo_marginal : bool
+        Draw views anew for every proposal and keep the estimate with the state: chains are then
+        exact for the integral over views (Andrieu and Roberts 2009). By default annotated pairs
+        are seen from the views that the likelihood fixed.
     """
 
     name: ClassVar[str] = "mh"
@@ -44,6 +49,7 @@ class MetropolisHastings:
     warmup: int = 5000
     thin: int = 20
     candidates: int = 1000
+    pseudo_marginal: bool = False
 
     def __post_init__(self) -> None:
         check_count("candidates", self.candidates)
@@ -74,14 +80,16 @@ class MetropolisHastings:
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no density.
+            If the posterior has no density, or has no views where the settings ask for them.
         Interrupted
             On Ctrl-C; it carries the draws that were finished.
         """
         check_count("draws", draws)
         start = time.perf_counter()
         density = Density(self, posterior)
-        earlier = continued(self, posterior.log_density, initial, chains, seed)
+        self._require_views(posterior)
+        log_density = None if self.pseudo_marginal else posterior.log_density
+        earlier = continued(self, log_density, initial, chains, seed)
         warmup = self.warmup if earlier is None else 0
         kept = _Kept(chains, draws, posterior.dim)
         try:
@@ -91,10 +99,10 @@ class MetropolisHastings:
                     points = starting_points(
                         posterior, density.likelihood, initial, shape, seed, self.candidates
                     )
-                    walk = _Walk.begin(self.proposal, density, points, seed)
+                    walk = _Walk.begin(self, density, points, seed)
                     walk.warm_up(warmup, bar.update)
                 else:
-                    walk = _Walk.resume(self.proposal, density, earlier)
+                    walk = _Walk.resume(self, density, earlier)
                 for _ in range(draws):
                     kept.add(walk, walk.advance(self.thin))
                     bar.update(self.thin)
@@ -104,6 +112,18 @@ class MetropolisHastings:
             result = self._result(posterior, kept, density, seed, start)
             raise Interrupted(result) from stop
         return self._result(posterior, kept, density, seed, start)
+
+    def _require_views(self, posterior: MotionPosterior) -> None:
+        wanting = "pseudo_marginal=True" if self.pseudo_marginal else type(self.proposal).__name__
+        if not (self.pseudo_marginal or self.proposal.guided):
+            return
+        if not isinstance(posterior.likelihood, ComparesViews):
+            raise UnsupportedPosterior(
+                self.name,
+                f"with {wanting} needs evidence that compares views with annotations, which "
+                f"{type(posterior.likelihood).__name__} does not",
+                word="views",
+            )
 
     def _result(
         self, posterior: MotionPosterior, kept: _Kept, density: Density, seed: int, start: float
@@ -128,40 +148,49 @@ class MetropolisHastings:
 class _Walk:
     """Chains that walk side by side; nothing that one does depends on another."""
 
+    log_density: np.ndarray
+    guide: np.ndarray
+
     def __init__(
         self,
-        proposal: Proposal,
+        sampler: MetropolisHastings,
         density: Density,
-        theta: np.ndarray,
-        log_density: np.ndarray,
-        memory: ProposalState,
         generators: list[np.random.Generator],
+        theta: np.ndarray,
+        memory: ProposalState,
         draws: int,
     ) -> None:
-        self.proposal = proposal
+        self.proposal = sampler.proposal
+        self.fresh_views = sampler.pseudo_marginal
         self.density = density
-        self.theta = theta
-        self.log_density = log_density
-        self.memory = memory
         self.generators = generators
+        self.theta = theta
+        self.memory = memory
         self.draws = draws
 
     @classmethod
-    def begin(cls, proposal: Proposal, density: Density, theta: np.ndarray, seed: int) -> _Walk:
+    def begin(
+        cls, sampler: MetropolisHastings, density: Density, theta: np.ndarray, seed: int
+    ) -> _Walk:
         generators = [seeds.generator(seed, "chain", chain) for chain in range(len(theta))]
-        memory = proposal.begin(theta)
-        return cls(proposal, density, theta, density.at_start(theta), memory, generators, draws=0)
+        walk = cls(sampler, density, generators, theta, sampler.proposal.begin(theta), draws=0)
+        walk.log_density, walk.guide = density.at_start(theta, *walk._how())
+        return walk
 
     @classmethod
-    def resume(cls, proposal: Proposal, density: Density, state: Mapping[str, np.ndarray]) -> _Walk:
+    def resume(
+        cls, sampler: MetropolisHastings, density: Density, state: Mapping[str, np.ndarray]
+    ) -> _Walk:
         memory = {
             name.removeprefix(_MEMORY): values
             for name, values in state.items()
             if name.startswith(_MEMORY)
         }
         generators = [seeds.resumed_generator(words) for words in state["random"]]
-        where = (state["theta"], state["log_density"])
-        return cls(proposal, density, *where, memory, generators, draws=int(state["draws"]))
+        walk = cls(sampler, density, generators, state["theta"], memory, int(state["draws"]))
+        walk.log_density = state["log_density"]
+        walk.guide = state.get("guide", np.empty((len(walk.theta), 0)))
+        return walk
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all that :meth:`resume` needs."""
@@ -169,6 +198,8 @@ class _Walk:
         return {
             "theta": self.theta,
             "log_density": self.log_density,
+            # netCDF holds no array without width.
+            **({"guide": self.guide} if self.proposal.guided else {}),
             "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
             "draws": np.array(self.draws, dtype=np.int32),
             **{_MEMORY + name: values for name, values in memory.items()},
@@ -189,15 +220,21 @@ class _Walk:
 
     def _step(self) -> np.ndarray:
         """Take one step; return its probability of acceptance, (chains,)."""
-        proposed, log_ratio = self.proposal.propose(self.generators, self.theta, self.memory)
-        log_density = self.density(proposed)
+        proposed = self.proposal.propose(self.generators, self.theta, self.guide, self.memory)
+        log_density, guide = self.density.evaluate(proposed, *self._how())
+        log_ratio = self.proposal.log_ratio(self.theta, self.guide, proposed, guide, self.memory)
         log_acceptance = np.minimum(0.0, log_density - self.log_density + log_ratio)
         # −log of a number uniform on (0, 1].
         level = np.array([rng.standard_exponential() for rng in self.generators])
         accepted = -level < log_acceptance
         self.theta = np.where(accepted[:, None], proposed, self.theta)
         self.log_density = np.where(accepted, log_density, self.log_density)
+        self.guide = np.where(accepted[:, None], guide, self.guide)
         return np.exp(log_acceptance)
+
+    def _how(self) -> tuple[list[np.random.Generator] | None, bool]:
+        """How the density is to be evaluated: with which generators, and whether for a guide."""
+        return (self.generators if self.fresh_views else None), self.proposal.guided
 
 
 _MEMORY = "proposal_"

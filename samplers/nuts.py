@@ -16,7 +16,7 @@ from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
 from probmotion.samplers.densities import continued, motions, starting_points
 from probmotion.samplers.nuts_kernel import CHUNK, NutsKernel, compiled
-from probmotion.sampling import Interrupted, progress_bar, require
+from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
 
 __all__ = ["NUTS"]
 
@@ -92,6 +92,7 @@ class NUTS:
         check_count("draws", draws)
         start = time.perf_counter()
         require(self, posterior)
+        self._require_gradient(posterior)
         with jax.enable_x64(True):
             kernel = compiled(self, posterior)
             earlier = continued(self, kernel.log_densities, initial, chains, seed)
@@ -113,6 +114,16 @@ class NUTS:
                     raise
                 raise Interrupted(self._result(posterior, run, seed, start)) from stop
             return self._result(posterior, run, seed, start)
+
+    def _require_gradient(self, posterior: MotionPosterior) -> None:
+        for part in (posterior.prior, posterior.likelihood):
+            if not getattr(part, "differentiable", True):
+                raise UnsupportedPosterior(
+                    self.name,
+                    f"needs a density with a gradient, which {type(part).__name__} has not",
+                    word="gradient",
+                    others=("mh",),
+                )
 
     def _result(
         self, posterior: MotionPosterior, run: _Run, seed: int, start: float

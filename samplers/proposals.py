@@ -2,6 +2,8 @@
 
 A proposal is a frozen object of settings. What it remembers of each chain is a state: a dictionary
 of arrays whose first axis is the chain, so that it can be saved and chains never share anything.
+What the posterior says at a point beside its density is the point's guide: how far the evidence
+moves each coordinate, (chains, dim), for proposals that are ``guided``; of no width for others.
 """
 
 from __future__ import annotations
@@ -9,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from probmotion.checks import check_positive
 
-__all__ = ["AdaptiveCovariance", "Isotropic", "Proposal", "ProposalState"]
+__all__ = ["AdaptiveCovariance", "Isotropic", "Proposal", "ProposalState", "VelocityBiased"]
 
 ProposalState = Mapping[str, np.ndarray]
 """Arrays whose first axis is the chain."""
@@ -24,13 +26,20 @@ ProposalState = Mapping[str, np.ndarray]
 class Proposal(Protocol):
     """How chains propose, and what they learn from the answers during warm-up."""
 
+    guided: ClassVar[bool]
+    """Whether proposing needs the guide."""
+
     def begin(self, theta: np.ndarray) -> ProposalState:
         """Return the state of chains that start at ``theta``, (chains, dim)."""
 
     def propose(
-        self, generators: Sequence[np.random.Generator], theta: np.ndarray, state: ProposalState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the proposed points and the log ratio of proposal densities.
+        self,
+        generators: Sequence[np.random.Generator],
+        theta: np.ndarray,
+        guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return the proposed points θ', (chains, dim).
 
         Parameters
         ----------
@@ -38,16 +47,21 @@ class Proposal(Protocol):
             One per chain; chain k draws from the k-th alone.
         theta : ndarray, (chains, dim)
             Where the chains are.
+        guide : ndarray, (chains, dim) or (chains, 0)
+            The guide there.
         state : ProposalState
             What the proposal knows of each chain.
-
-        Returns
-        -------
-        proposed : ndarray, (chains, dim)
-            θ'.
-        log_ratio : ndarray, (chains,)
-            log q(θ | θ') − log q(θ' | θ); 0 for a symmetric proposal.
         """
+
+    def log_ratio(
+        self,
+        theta: np.ndarray,
+        guide: np.ndarray,
+        proposed: np.ndarray,
+        proposed_guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return log q(θ | θ') − log q(θ' | θ), (chains,); 0 for a symmetric proposal."""
 
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
@@ -80,6 +94,8 @@ class Isotropic:
         Acceptance that the warm-up steers each chain's s towards; ``None`` keeps ``scale``.
     """
 
+    guided: ClassVar[bool] = False
+
     kind: str = field(default="isotropic", init=False)
     scale: float = 0.1
     target: float | None = 0.234
@@ -95,11 +111,25 @@ class Isotropic:
         return {"log_scale": np.full(chains, math.log(self.scale)), "steps": np.zeros(chains)}
 
     def propose(
-        self, generators: Sequence[np.random.Generator], theta: np.ndarray, state: ProposalState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return θ + s ε and 0."""
-        step = np.exp(state["log_scale"])[:, None] * _normal(generators, theta.shape[1])
-        return theta + step, np.zeros(len(theta))
+        self,
+        generators: Sequence[np.random.Generator],
+        theta: np.ndarray,
+        guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return θ + s ε."""
+        return theta + np.exp(state["log_scale"])[:, None] * _normal(generators, theta.shape[1])
+
+    def log_ratio(
+        self,
+        theta: np.ndarray,
+        guide: np.ndarray,
+        proposed: np.ndarray,
+        proposed_guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return 0: the proposal is symmetric."""
+        return np.zeros(len(theta))
 
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
@@ -133,6 +163,8 @@ class AdaptiveCovariance:
         Acceptance that each chain's s is steered towards.
     """
 
+    guided: ClassVar[bool] = False
+
     kind: str = field(default="adaptive-covariance", init=False)
     scale: float = 0.1
     target: float = 0.234
@@ -154,11 +186,26 @@ class AdaptiveCovariance:
         }
 
     def propose(
-        self, generators: Sequence[np.random.Generator], theta: np.ndarray, state: ProposalState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return θ + s C ε and 0."""
+        self,
+        generators: Sequence[np.random.Generator],
+        theta: np.ndarray,
+        guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return θ + s C ε."""
         step = (state["root"] @ _normal(generators, theta.shape[1])[..., None])[..., 0]
-        return theta + np.exp(state["log_scale"])[:, None] * step, np.zeros(len(theta))
+        return theta + np.exp(state["log_scale"])[:, None] * step
+
+    def log_ratio(
+        self,
+        theta: np.ndarray,
+        guide: np.ndarray,
+        proposed: np.ndarray,
+        proposed_guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return 0: the proposal is symmetric."""
+        return np.zeros(len(theta))
 
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
@@ -190,6 +237,82 @@ class AdaptiveCovariance:
     def settled(self, state: ProposalState) -> ProposalState:
         """Return s and C."""
         return {"log_scale": state["log_scale"], "root": state["root"]}
+
+
+@dataclass(frozen=True)
+class VelocityBiased:
+    """θ' ~ N(θ, s² diag(σ₀² + b V(θ))): longer steps where the evidence moves (Yin et al. 2018).
+
+    V(θ), the guide, is the mean squared step of each coordinate in the annotations that are
+    closest to θ (eq. 12, with b = 1). It differs from point to point, so that the ratio of
+    proposal densities does not cancel.
+
+    Parameters
+    ----------
+    scale : float
+        s; where the warm-up begins.
+    base : float
+        σ₀, in units of θ.
+    bias : float
+        b, the weight of the velocities.
+    target : float or None
+        Acceptance that the warm-up steers each chain's s towards; ``None`` keeps ``scale``.
+    """
+
+    guided: ClassVar[bool] = True
+
+    kind: str = field(default="velocity-biased", init=False)
+    scale: float = 1.0
+    base: float = 0.05
+    bias: float = 1.0
+    target: float | None = 0.234
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "base", "bias"):
+            check_positive(name, getattr(self, name))
+        if self.target is not None:
+            _check_target(self.target)
+
+    def begin(self, theta: np.ndarray) -> ProposalState:
+        """Return s and the number of steps learnt from."""
+        return Isotropic(self.scale, self.target).begin(theta)
+
+    def propose(
+        self,
+        generators: Sequence[np.random.Generator],
+        theta: np.ndarray,
+        guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return θ + s σ(θ) ε."""
+        return theta + np.sqrt(self._variances(guide, state)) * _normal(generators, theta.shape[1])
+
+    def log_ratio(
+        self,
+        theta: np.ndarray,
+        guide: np.ndarray,
+        proposed: np.ndarray,
+        proposed_guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return log N(θ; θ', σ²(θ')) − log N(θ'; θ, σ²(θ))."""
+        there, back = self._variances(guide, state), self._variances(proposed_guide, state)
+        square = (proposed - theta) ** 2
+        return 0.5 * (np.log(there / back) + square / there - square / back).sum(axis=1)
+
+    def learn(
+        self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
+    ) -> ProposalState:
+        """Return the state with s moved towards the target."""
+        return Isotropic(self.scale, self.target).learn(state, theta, acceptance)
+
+    def settled(self, state: ProposalState) -> ProposalState:
+        """Return s."""
+        return {"log_scale": state["log_scale"]}
+
+    def _variances(self, guide: np.ndarray, state: ProposalState) -> np.ndarray:
+        s = np.exp(state["log_scale"])[:, None]
+        return s**2 * (self.base**2 + self.bias * guide)
 
 
 _FIRST_WINDOW = 50

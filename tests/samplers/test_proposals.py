@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ CHAINS = 8_000
 class DriftingStep:
     """θ' ~ N(θ + d, s² I): a step with a bias, such as the velocity of what is drawn."""
 
+    guided: ClassVar[bool] = False
+
     corrected: bool = True
     drift: float = 0.3
     scale: float = 0.6
@@ -26,12 +29,15 @@ class DriftingStep:
     def begin(self, theta):
         return {}
 
-    def propose(self, generators, theta, state):
+    def propose(self, generators, theta, guide, state):
         noise = np.stack([rng.standard_normal(theta.shape[1]) for rng in generators])
-        step = self.drift + self.scale * noise
+        return theta + self.drift + self.scale * noise
+
+    def log_ratio(self, theta, guide, proposed, proposed_guide, state):
+        if not self.corrected:
+            return np.zeros(len(theta))
         # log N(−step | d, s²) − log N(step | d, s²)
-        log_ratio = -2 * self.drift * step.sum(axis=1) / self.scale**2
-        return theta + step, log_ratio if self.corrected else np.zeros(len(theta))
+        return -2 * self.drift * (proposed - theta).sum(axis=1) / self.scale**2
 
     def learn(self, state, theta, acceptance):
         return state
@@ -92,7 +98,7 @@ def test_a_chain_proposes_the_same_beside_others(proposal):
         streams, at = generators(chains), theta[:chains]
         state = proposal.begin(at)
         for _ in range(120):  # beyond the end of the first window
-            at, _ = proposal.propose(streams, at, state)
+            at = proposal.propose(streams, at, np.empty((chains, 0)), state)
             state = proposal.learn(state, at, acceptance[:chains])
         return at
 
@@ -121,7 +127,7 @@ def test_a_chain_that_never_moved_can_still_propose():
     state = proposal.begin(np.zeros((1, 3)))
     for _ in range(50):
         state = proposal.learn(state, np.zeros((1, 3)), np.zeros(1))
-    proposed, _ = proposal.propose(generators(1), np.zeros((1, 3)), state)
+    proposed = proposal.propose(generators(1), np.zeros((1, 3)), np.empty((1, 0)), state)
     assert np.isfinite(proposed).all()
     assert (proposed != 0).all()
 
