@@ -36,6 +36,12 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Hastings (1970). Monte Carlo sampling methods using Markov chains and their applications. "
         "Biometrika 57.",
         "Haario, Saksman, Tamminen (2001). An adaptive Metropolis algorithm. Bernoulli 7.",
+        "Andrieu, Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo "
+        "computations. Annals of Statistics 37.",
+        "Yin, Huang, Ho, Wang, Komura, Cohen-Or, Zhang (2018). A sampling approach to generating "
+        "closely interacting 3D pose-pairs from 2D annotations. IEEE TVCG.",
+        "Akhter, Black (2015). Pose-conditioned joint angle limits for 3D human pose "
+        "reconstruction. CVPR.",
     ),
     "nuts": (
         "Hoffman, Gelman (2014). The No-U-Turn sampler. JMLR 15.",

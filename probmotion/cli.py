@@ -180,13 +180,13 @@ class List:
 
     def run(self) -> None:
         """Print three lists."""
-        from probmotion.problems import load_problem, problem_names
+        from probmotion.problems import problem_descriptions
         from probmotion.sampling import load_sampler, sampler_names
         from probmotion.settings_options import presets_of
         from probmotion.skeleton import Skeleton
         from probmotion.skeleton_presets import PRESETS
 
-        _print_list("problems", {name: load_problem(name).description for name in problem_names()})
+        _print_list("problems", problem_descriptions())
         kinds = {name: load_sampler(name) for name in sampler_names()}
         _print_list("samplers", {name: _first_line(kind) for name, kind in kinds.items()})
         presets = {

@@ -201,6 +201,18 @@ class MotionDraws:
         name = f"{self.dataset.attrs['sampler']}-{chain}-{draw}"
         return Motion(positions, self.skeleton, self.fps, name=name)
 
+    def playback(self, chain: int = 0) -> Motion:
+        """Return a chain's draws one after the other, as one motion to be looked through.
+
+        Of single poses (L = 1) that shows how the chain walks; any draw that pleases can be where
+        another run starts: ``initial=draws.dataset["theta"].values[:, k]``.
+        """
+        positions = self.positions.isel(chain=chain).values
+        name = f"{self.dataset.attrs['sampler']}-{chain}"
+        return Motion(
+            positions.reshape(-1, *positions.shape[2:]), self.skeleton, self.fps, name=name
+        )
+
     def motions(self) -> Iterator[Motion]:
         """Yield every draw, chain by chain."""
         for chain in range(self.dataset.sizes["chain"]):

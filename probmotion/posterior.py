@@ -102,8 +102,12 @@ class MotionPosterior:
             # Under a gradient or a compiler there is no asking where.
             return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
         if self.likelihood is None:
-            return self._shaped(theta, log_prior)
-        return self._with_evidence(theta, log_prior, lambda some: (self.log_likelihood(some),))[0]
+            return self._shaped(theta, np.asarray(log_prior))
+
+        def evidence(asked: np.ndarray) -> tuple[np.ndarray, ...]:
+            return (self.log_likelihood(theta[asked]),)
+
+        return self._with_evidence(theta, np.asarray(log_prior), evidence)[0]
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None = None
@@ -134,14 +138,13 @@ class MotionPosterior:
                 "views are compared"
             )
         likelihood = self.likelihood
-        log_prior = to_numpy(self.prior.log_density(theta))  # type: ignore[attr-defined]
+        log_prior = to_numpy(self.prior.log_density(theta))
 
-        def compared(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def evidence(asked: np.ndarray) -> tuple[np.ndarray, ...]:
             own = None if generators is None else [generators[i] for i in np.flatnonzero(asked)]
-            return likelihood.evaluate(to_numpy(self.prior.motion(some)), own)
+            return likelihood.evaluate(to_numpy(self.prior.motion(theta[asked])), own)
 
-        asked = self._worth_asking(theta, log_prior)
-        log_density, closest = self._with_evidence(theta, log_prior, compared)
+        log_density, closest = self._with_evidence(theta, log_prior, evidence)
         return log_density, closest
 
     def speeds(self, closest: np.ndarray) -> np.ndarray:
@@ -166,12 +169,10 @@ class MotionPosterior:
     ) -> tuple[np.ndarray, ...]:
         """Return the log density and what else ``evidence`` says, which is asked where it counts.
 
-        ``evidence`` takes some points, (n, dim), and returns arrays over them, the log likelihood
-        first.
+        ``evidence`` takes a mask of points and returns arrays over them, the log likelihood first.
         """
-        log_prior = np.asarray(log_prior)
         asked = self._worth_asking(theta, log_prior)
-        log_likelihood, *others = evidence(theta[asked])
+        log_likelihood, *others = evidence(asked)
         log_density = np.full(log_prior.shape, -np.inf)
         log_density[asked] = log_prior[asked] + np.asarray(log_likelihood)
         full = [np.zeros((*log_prior.shape, *found.shape[1:]), found.dtype) for found in others]

@@ -98,22 +98,36 @@ def _smpl22() -> Skeleton:
     )  # fmt: skip
 
 
+# Metres. Thinner than flesh on purpose: with radii of real limbs (forearm 3.5 cm, trunk 10 cm)
+# real salsa pairs have a penetration of .17 m at the median, most of it of arms beside their own
+# trunk. Begun at half of those and moved bone by bone until real pairs that dance within 1.2 m have
+# almost none (median and 90 % of frames under 3 mm), while of two people, one moved into the other,
+# each pair has decimetres. The root's number is there for completeness: it has no bone.
+_PERSON_RADII = {
+    "pelvis": 0.05, "spine": 0.045, "chest": 0.035, "neck": 0.02, "head": 0.06,
+    "shoulder": 0.025, "elbow": 0.02, "wrist": 0.01, "hip": 0.05, "knee": 0.045, "ankle": 0.03,
+}  # fmt: skip
+
+
 def _person17() -> Skeleton:
     """One person as motion capture has it: the trunk's joints, limbs, no face (Yin et al. 2018)."""
-    return _tree(
+    tree = _tree(
         "pelvis", "spine pelvis", "chest spine", "neck chest", "head neck",
         "left_shoulder chest", "left_elbow left_shoulder", "left_wrist left_elbow",
         "right_shoulder chest", "right_elbow right_shoulder", "right_wrist right_elbow",
         "left_hip pelvis", "left_knee left_hip", "left_ankle left_knee",
         "right_hip pelvis", "right_knee right_hip", "right_ankle right_knee",
     )  # fmt: skip
+    radii = [_PERSON_RADII[name.rpartition("_")[2]] for name in tree.joint_names]
+    return Skeleton(tree.joint_names, tree.parents, radii)
 
 
 def _pair17() -> Skeleton:
     """Two people of ``person17``'s joints."""
     one = _person17()
     names = [f"person{p}:{name}" for p in range(2) for name in one.joint_names]
-    return Skeleton(names, [*one.parents, *(q if q < 0 else q + 17 for q in one.parents)])
+    parents = [*one.parents, *(q if q < 0 else q + 17 for q in one.parents)]
+    return Skeleton(names, parents, (one.radii or ()) * 2)
 
 
 def _gymnast_ball() -> Skeleton:

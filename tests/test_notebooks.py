@@ -12,7 +12,7 @@ from probmotion import Comparison
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
-def run(name: str, folder: Path, monkeypatch) -> str:
+def run(name: str, folder: Path, pictures: int, monkeypatch) -> str:
     """Execute a notebook in ``folder``; return all that it printed."""
     import jupytext
     from nbclient import NotebookClient
@@ -28,7 +28,7 @@ def run(name: str, folder: Path, monkeypatch) -> str:
     )
     client.execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 5
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == pictures
     return "".join(
         output.get("text", output.get("data", {}).get("text/plain", "")) for output in outputs
     )
@@ -37,7 +37,7 @@ def run(name: str, folder: Path, monkeypatch) -> str:
 # Jupyter's own libraries warn about themselves.
 @pytest.mark.filterwarnings("default")
 def test_one_posterior_many_samplers(tmp_path, monkeypatch):
-    printed = run("01_one_posterior_many_samplers.py", tmp_path, monkeypatch)
+    printed = run("01_one_posterior_many_samplers.py", tmp_path, 5, monkeypatch)
     assert "120 clips" in printed
     assert len(list((tmp_path / "walks").glob("*.bvh"))) == 120
     assert (tmp_path / "take3.bvh").exists()
@@ -53,3 +53,18 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     assert evaluations["mvpc"] == pytest.approx(evaluations["mas"], rel=0.1)
     assert wide.loc["mh", "swd"] < 1.5
     assert wide.loc["mh", "rhat"] > 1.05
+
+
+@pytest.mark.filterwarnings("default")
+def test_pose_pairs(tmp_path, monkeypatch):
+    from probmotion import load_motion
+
+    printed = run("02_pose_pairs.py", tmp_path, 5, monkeypatch)
+    assert "90 of 90 frames are the dance" in printed
+    assert "108 dimensions" in printed
+    assert "200 annotations" in printed
+    walk = load_motion(tmp_path / "walk.bvh")
+    assert walk.frames == 150
+    assert len(walk.skeleton.roots) == 2
+    accepted = float(printed.split("accepted: ")[1].split()[0])
+    assert 0.15 < accepted < 0.35

@@ -68,7 +68,8 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
         for room, place in ROOMS.items()
         for path in (ROOT / room).rglob("*.py")
     }
-    assert held == wanted | {"probmotion/py.typed"}
+    data = {"py.typed", "data/registry.csv", "models/weights/joint_limits.npz"}
+    assert held == wanted | {f"probmotion/{name}" for name in data}
 
 
 def test_it_imports_from_where_it_was_installed(installed, tmp_path):

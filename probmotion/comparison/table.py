@@ -39,6 +39,17 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         },
     ),
     (
+        "held-out poses",
+        {
+            "seconds": "seconds",
+            "coverage_interaction": "D_IC",
+            "coverage_cartesian": "D_C",
+            "coverage_shape-context": "D_S",
+            "at_cap": "at cap",
+            "near_floor": "near floor",
+        },
+    ),
+    (
         "the run",
         {
             "seconds": "seconds",
@@ -59,6 +70,10 @@ exact (1; below: over-confident); mean: error of the mean / √tr (0); off: vari
 manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
 styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
 The frame and table.csv hold more measures."""
+_COVERAGE_LEGEND = """\
+D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
+joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
+density is cut."""
 
 
 class ComparisonTable(pd.DataFrame):
@@ -87,6 +102,8 @@ class ComparisonTable(pd.DataFrame):
         parts = [self._problem(problem) for problem in problems]
         if any(self["metric"] == "swd"):
             parts.append(_LEGEND)
+        if any(self["metric"] == "coverage_cartesian"):
+            parts.append(_COVERAGE_LEGEND)
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
         return "\n\n".join(parts) if parts else "no cell is finished"

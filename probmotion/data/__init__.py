@@ -1,1 +1,1 @@
-"""Motions made by the project, and clips that a user points at."""
+"""Motions made by the project, clips that a user points at, and public ones fetched by name."""

@@ -17,6 +17,7 @@ from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.cost import costs
 from probmotion.metrics.structure import HasManifold, HasStyles
 from probmotion.priors import HasExactPosterior
+from probmotion.truncation import TruncatedPosterior
 
 if TYPE_CHECKING:
     from probmotion.posterior import MotionPosterior
@@ -43,6 +44,11 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     - ``share_<style>`` and ``share_error``: styles, and their total variation from exact draws'
     - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
 
+    Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
+    ``coverage_shape-context``, the mean distance of each to its nearest draw; see
+    :func:`~probmotion.metrics.coverage.coverage`. Of a truncated density: ``at_cap`` and
+    ``near_floor``, shares of draws.
+
     Against the truth, where it is known, millimetres: see :func:`accuracy_of`. Of chains: see
     :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost: ``seconds`` and evaluations.
 
@@ -62,6 +68,11 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
         found |= _against_reference(problem, positions, seed)
     if problem.truth is not None:
         found |= accuracy_of(positions, problem.truth, problem.posterior)
+    if problem.held_out is not None:
+        found |= _coverage_of(positions, problem.held_out)
+    if isinstance(problem.posterior, TruncatedPosterior) and "theta" in draws.dataset:
+        kept = draws.dataset["theta"].values, draws.dataset["log_density"].values
+        found |= problem.posterior.run_shares(*kept)
     return found | chain_diagnostics(draws) | costs(draws)
 
 
@@ -134,6 +145,15 @@ def _shares(prior: object, positions: np.ndarray) -> dict[str, float]:
         return {}
     shares = prior.style_responsibilities(positions).mean(axis=0)
     return {style: float(share) for style, share in zip(prior.styles, shares, strict=True)}
+
+
+def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float]:
+    from probmotion.interaction.pose_distances import MEASURES
+    from probmotion.metrics.coverage import coverage
+
+    # Poses are compared one by one, whatever motion they are a frame of.
+    poses, draws = (motions.reshape(-1, *motions.shape[-2:]) for motions in (held_out, positions))
+    return {f"coverage_{kind}": float(coverage(poses, draws, kind)) for kind in MEASURES}
 
 
 def accuracy_of(

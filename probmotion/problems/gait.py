@@ -45,11 +45,11 @@ def _problem(name: str, description: str, how: str, noise: float, quadruped: boo
 
 def _named(
     name: str, description: str, how: str, noise: float = 0.02, quadruped: bool = False
-) -> tuple[str, Callable[[], Problem]]:
-    return name, partial(_problem, name, description, how, noise, quadruped)
+) -> tuple[str, tuple[str, Callable[[], Problem]]]:
+    return name, (description, partial(_problem, name, description, how, noise, quadruped))
 
 
-GAIT_PROBLEMS: Mapping[str, Callable[[], Problem]] = dict(
+GAIT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = dict(
     [
         _named("gait", "people who walk, run and march, with no evidence: generation", "none"),
         _named("gait-monocular", "the same, 2D keypoints of one camera (σ 2 cm)", "monocular"),
@@ -75,4 +75,4 @@ GAIT_PROBLEMS: Mapping[str, Callable[[], Problem]] = dict(
         ),
     ]
 )
-"""Functions that make each problem, by name."""
+"""What each problem is, and the function that makes it, by name."""

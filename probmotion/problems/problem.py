@@ -28,23 +28,30 @@ class Problem:
         What is drawn from.
     truth : ndarray, (L, J, 3), optional
         The motion that the evidence is of, metres.
+    held_out : ndarray, (G, L, J, 3), optional
+        Real motions of the kind, metres, that draws are to cover; nobody has learnt from them.
 
     Raises
     ------
     ValueError
-        If the truth has another shape than the posterior's motions, or is not finite.
+        If the truth or a motion that was held out has another shape than the posterior's
+        motions, or is not finite.
     """
 
     name: str
     description: str
     posterior: MotionPosterior
     truth: np.ndarray | None = None
+    held_out: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
         if self.truth is not None:
-            shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
             check_shape("truth", self.truth, shape)
             check_finite("truth", self.truth)
+        if self.held_out is not None:
+            check_shape("held_out", self.held_out, ("G", *shape))
+            check_finite("held_out", self.held_out)
 
     @property
     def has_reference(self) -> bool:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from probmotion import MotionPosterior
-from probmotion.problems import Problem, load_problem, problem_names
+from probmotion.problems import Problem, load_problem
+from probmotion.problems.gait import GAIT_PROBLEMS
 
 WITH_EVIDENCE = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]
 
 
-@pytest.mark.parametrize("name", problem_names())
+@pytest.mark.parametrize("name", GAIT_PROBLEMS)
 def test_reference_draws_are_the_posteriors_and_seeded(name):
     problem = load_problem(name)
     assert problem.name == name

@@ -1,0 +1,296 @@
+"""Sets of pose-pairs: the frames that are the dance, clips held out whole, heights, the seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.motion import Motion
+from probmotion.skeleton import Skeleton
+
+__all__ = [
+    "SALSA_HELD_OUT",
+    "choose_seed",
+    "dance_frames",
+    "describe_dance_frames",
+    "ground_truth",
+    "hold_out",
+    "person_height",
+    "scaled_to_height",
+]
+
+SALSA_HELD_OUT = ("cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11")
+"""The salsa clips that no one learns from: 3 of 10, 2 658 of the 8 257 frames of dance."""
+
+# Shares of the body's height below the ankles and above the joint where the skull begins, after
+# Drillis and Contini's proportions (ankle .039, eyes .936, chin .870 of the height).
+_FOOT = 0.039
+_SKULL = 0.10
+_SEED_POSES = 400
+_LEG = ("hip", "knee", "ankle")
+
+
+def dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> np.ndarray:
+    """Return which frames are the dance.
+
+    Left out are the opening, until the partners first come near; frames in which someone is far
+    from everybody else; and glitches, the frames on both sides of an impossible step.
+
+    Parameters
+    ----------
+    motion : Motion
+        Two people or more.
+    farthest : float
+        Greatest distance of a person's root from the nearest other's, metres.
+    fastest : float
+        Greatest speed of a joint, metres per second.
+
+    Returns
+    -------
+    ndarray of bool, (L,)
+
+    Raises
+    ------
+    ValueError
+        If the motion is of one person, or a limit is not above 0.
+    """
+    return ~np.any(_not_the_dance(motion, farthest, fastest), axis=0)
+
+
+def describe_dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> str:
+    """Return one sentence: how many frames :func:`dance_frames` keeps, and why others go.
+
+    A frame is counted once, under the first reason that holds.
+    """
+    opening, apart, glitch = _not_the_dance(motion, farthest, fastest)
+    counts = opening.sum(), (apart & ~opening).sum(), (glitch & ~apart & ~opening).sum()
+    return (
+        f"{motion.name or 'the motion'}: {motion.frames - sum(counts)} of {motion.frames} frames "
+        f"are the dance; left out are {counts[0]} of the opening, {counts[1]} with the partners "
+        f"over {farthest:g} m apart and {counts[2]} beside a step faster than {fastest:g} m/s"
+    )
+
+
+def ground_truth(
+    motions: Sequence[Motion], n: int | None = None, *, farthest: float = 1.2, fastest: float = 7.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pose-pairs evenly apart among the dance frames of several clips.
+
+    Yin et al. (2018), section 6, take 6 000 frames in this way from the salsa of the CMU database.
+
+    Parameters
+    ----------
+    motions : sequence of Motion
+        Clips of one skeleton, each with two people or more.
+    n : int, optional
+        How many; all frames of the dance by default.
+    farthest, fastest : float
+        As in :func:`dance_frames`.
+
+    Returns
+    -------
+    positions : ndarray, (n, J, 3)
+        Metres.
+    clip, frame : ndarray of int, (n,)
+        Where each comes from: the index of the motion, and the frame in it.
+
+    Raises
+    ------
+    ValueError
+        If there is no motion, skeletons differ, or fewer than ``n`` frames are the dance.
+    """
+    if not motions:
+        raise ValueError("motions is empty, expected at least one")
+    for motion in motions:
+        if motion.skeleton != motions[0].skeleton:
+            raise ValueError(
+                f"motions has {motion} of another skeleton than {motions[0]}, expected one; "
+                "motion.retarget(skeleton) has it"
+            )
+    frames = [
+        np.flatnonzero(dance_frames(motion, farthest=farthest, fastest=fastest))
+        for motion in motions
+    ]
+    clip = np.repeat(np.arange(len(motions)), [len(kept) for kept in frames])
+    frame = np.concatenate(frames)
+    total = len(frame)
+    if n is None:
+        n = total
+    check_count("n", n)
+    if n > total:
+        raise ValueError(f"n is {n}, expected at most the {total} frames of the dance")
+    chosen = (2 * np.arange(n) + 1) * total // (2 * n)  # the middles of n equal stretches
+    every = np.concatenate([m.positions[kept] for m, kept in zip(motions, frames, strict=True)])
+    return every[chosen], clip[chosen], frame[chosen]
+
+
+def hold_out(
+    motions: Sequence[Motion], names: Sequence[str] = SALSA_HELD_OUT
+) -> tuple[list[Motion], list[Motion]]:
+    """Return the motions that are held in and those held out: whole clips, by name.
+
+    Raises
+    ------
+    ValueError
+        If a name is not that of exactly one motion, or no motion would be left in or out.
+    """
+    if isinstance(names, str):
+        raise ValueError(f"names is {names!r}, expected a list of names")
+    known = [motion.name for motion in motions]
+    for name in names:
+        if known.count(name) != 1:
+            raise ValueError(
+                f"names has {name!r}, which is the name of {known.count(name)} motions, expected "
+                f"one of {', '.join(dict.fromkeys(known))}"
+            )
+    held_in = [motion for motion in motions if motion.name not in names]
+    held_out = [motion for motion in motions if motion.name in names]
+    if not held_in or not held_out:
+        raise ValueError(
+            f"names has {len(held_out)} of the {len(motions)} motions, expected at least one to be "
+            "held out and one to be left"
+        )
+    return held_in, held_out
+
+
+def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Return how tall the people stand, from the lengths of their bones.
+
+    The height is the sum of shin, thigh (means of both sides), the midpoint of the hips to the
+    pelvis and the bones from there to ``head``, divided by 0.861: 3.9 % of the height
+    are below the ankles and 10 % above the joint at which the skull begins.
+
+    Parameters
+    ----------
+    positions : ndarray, (…, J, 3)
+        Pose-pairs, metres; they need not stand.
+    skeleton : Skeleton
+        K trees, each with the hips, knees and ankles, and with a ``head`` where the skull begins.
+
+    Returns
+    -------
+    ndarray, (…, K)
+        Metres.
+
+    Raises
+    ------
+    ValueError
+        If a person lacks one of the joints.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    check_shape("positions", positions, ("…", skeleton.n_joints, 3))
+    return np.stack([_height(positions, skeleton, root) for root in skeleton.roots], axis=-1)
+
+
+def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
+    """Return the motion scaled about the world's origin so that its people's mean height is given.
+
+    ONE factor for all: who is taller stays taller, what touches still touches.
+
+    Parameters
+    ----------
+    motion : Motion
+        Any number of people.
+    height : float
+        Mean of :func:`person_height` over people and frames, metres.
+    """
+    check_positive("height", height)
+    factor = height / person_height(motion.positions, motion.skeleton).mean()
+    offsets = motion.rest_offsets
+    return replace(
+        motion,
+        positions=motion.positions * factor,
+        rest_offsets=None if offsets is None else offsets * factor,
+    )
+
+
+def choose_seed(positions: np.ndarray) -> int:
+    """Return the index of the one pose-pair to start from: the medoid of all.
+
+    It is the one whose mean distance to the others is the least. Distances are root mean square
+    over the joints, metres, after the best rotation and translation of the whole pair (Kabsch),
+    among at most 400 pose-pairs evenly apart, so that everybody finds the same one.
+
+    Parameters
+    ----------
+    positions : ndarray, (n, J, 3)
+        Pose-pairs of the clips that are held in, metres.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or a position is not finite.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    check_shape("positions", positions, ("n", "J", 3))
+    if len(positions) == 0:
+        raise ValueError("positions has no pose-pair, expected at least one")
+    check_finite("positions", positions)
+    n = min(len(positions), _SEED_POSES)
+    chosen = (2 * np.arange(n) + 1) * len(positions) // (2 * n)
+    centred = positions[chosen] - positions[chosen].mean(axis=1, keepdims=True)
+    total = np.zeros(n)
+    for index in range(n):
+        total[index] = _aligned_distances(centred[index], centred).sum()
+    return int(chosen[total.argmin()])
+
+
+def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the rms distances of a pose (J, 3) to others (n, J, 3), centred, when best turned.
+
+    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), whose last term is at best σ₁ + σ₂ ± σ₃.
+    """
+    products = pose.T @ others
+    sigma = np.linalg.svd(products, compute_uv=False)
+    best = sigma[:, 0] + sigma[:, 1] + np.sign(np.linalg.det(products)) * sigma[:, 2]
+    square = (pose**2).sum() + (others**2).sum(axis=(1, 2)) - 2 * best
+    return np.sqrt(np.maximum(square, 0.0) / len(pose))
+
+
+def _not_the_dance(motion: Motion, farthest: float, fastest: float) -> np.ndarray:
+    """Return (3, L): frames of the opening, with someone apart, and beside impossible steps."""
+    check_positive("farthest", farthest)
+    check_positive("fastest", fastest)
+    roots = motion.positions[:, motion.skeleton.roots]
+    if roots.shape[1] < 2:
+        raise ValueError(f"motion is {motion} of 1 person, expected 2 or more")
+    distances = np.linalg.norm(roots[:, :, None] - roots[:, None], axis=-1)
+    distances += np.where(np.eye(roots.shape[1]), np.inf, 0.0)
+    apart = distances.min(axis=-1).max(axis=-1) > farthest
+    near = np.flatnonzero(~apart)
+    opening = np.arange(motion.frames) < (near[0] if len(near) else motion.frames)
+    step = np.linalg.norm(np.diff(motion.positions, axis=0), axis=-1).max(axis=-1)
+    fast = step * motion.fps > fastest
+    glitch = np.append(fast, False) | np.append(False, fast)
+    return np.stack([opening, apart, glitch])
+
+
+def _height(positions: np.ndarray, skeleton: Skeleton, root: int) -> np.ndarray:
+    """Return the height (…) of the person below ``root``."""
+    tree = [j for j in range(skeleton.n_joints) if j == root or root in skeleton.ancestors(j)]
+    names = skeleton.subset(tree).canonical_names
+    wanted = ("head", *(f"{side}_{part}" for side in ("left", "right") for part in _LEG))
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise ValueError(
+            f"skeleton lacks {', '.join(missing)} below {skeleton.joint_names[root]!r}, expected "
+            "hips, knees, ankles and a head"
+        )
+    at = {name: positions[..., tree[names.index(name)], :] for name in wanted}
+    hips = (at["left_hip"] + at["right_hip"]) / 2
+    head = tree[names.index("head")]
+    chain = [head, *skeleton.ancestors(head)]
+    length = np.linalg.norm(hips - positions[..., root, :], axis=-1)
+    for joint, parent in pairwise(chain):
+        length = length + np.linalg.norm(
+            positions[..., joint, :] - positions[..., parent, :], axis=-1
+        )
+    for side in ("left", "right"):
+        for upper, lower in pairwise(_LEG):
+            bone = at[f"{side}_{upper}"] - at[f"{side}_{lower}"]
+            length = length + np.linalg.norm(bone, axis=-1) / 2
+    return length / (1 - _FOOT - _SKULL)

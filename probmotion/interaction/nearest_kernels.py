@@ -1,0 +1,288 @@
+"""One projection against annotations, compiled: align, compare, abandon what cannot be nearest.
+
+No sum here is reordered by the compiler, so a projection's result is the same bits whatever else
+is in its batch and however many threads share it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from probmotion.interaction.graph_kernels import edge_room, graph_into
+from probmotion.interaction.plane_contexts import context_cost, polar_bins
+
+__all__ = [
+    "CARTESIAN",
+    "INTERACTION",
+    "SHAPE_CONTEXT",
+    "Prepared",
+    "all_distances",
+    "nearest_in_batch",
+    "nearest_in_batch_on_threads",
+]
+
+INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
+_SMALLEST = 1e-300  # keeps the weights of no edges from being divided by 0
+
+
+class Prepared(NamedTuple):
+    """What is computed of n annotations once; joints about their visible mean, 0 where hidden."""
+
+    joints: np.ndarray
+    """(n, 2, J) float64, metres."""
+    seen: np.ndarray
+    """(n, J) float64, 1 where visible and 0 where hidden."""
+    n_visible: np.ndarray
+    """(n,) int64."""
+    square: np.ndarray
+    """(n,) sums of squared coordinates."""
+    edge_start: np.ndarray
+    """(n + 1,) where each annotation's edges begin."""
+    edges: np.ndarray
+    """(2, E) uint16."""
+    weights: np.ndarray
+    """(E,) w_ij / W of eq. 8."""
+    contexts: np.ndarray
+    """(n, J, 60) uint8 shape contexts."""
+    shared: np.ndarray
+    """(J, J) of :func:`~probmotion.interaction.shape_context.shared_table`."""
+    offsets: np.ndarray
+    """(J, 2) what degenerate joints are moved by."""
+
+
+def _nearest(
+    projections: np.ndarray,
+    candidates: np.ndarray,
+    prepared: Prepared,
+    measure: int,
+    graph: int,
+    epsilon: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least distance and its annotation for (B, V, J, 2) and (V, N)."""
+    n_items, n_views = projections.shape[0], projections.shape[1]
+    distances = np.empty((n_items, n_views))
+    indices = np.empty((n_items, n_views), dtype=np.int64)
+    for flat in numba.prange(n_items * n_views):
+        item, view = flat // n_views, flat % n_views
+        best, index = _nearest_of(
+            projections[item, view], candidates[view], prepared, measure, graph, epsilon
+        )
+        distances[item, view] = best
+        indices[item, view] = index
+    return distances, indices
+
+
+nearest_in_batch = numba.njit(cache=True)(_nearest)
+nearest_in_batch_on_threads = numba.njit(cache=True, parallel=True)(_nearest)
+
+
+@numba.njit(cache=True)
+def all_distances(
+    projections: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
+) -> np.ndarray:
+    """Return the distances of (B, J, 2) to all n annotations, (B, n)."""
+    n_items, n_annotations = projections.shape[0], prepared.joints.shape[0]
+    out = np.empty((n_items, n_annotations))
+    for item in range(n_items):
+        points = projections[item]
+        joints, edges, weights, n_edges, bins = _look(points, prepared, measure, graph, epsilon)
+        apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
+        for k in range(n_annotations):
+            cosine, sine, _ = _rotation(joints, prepared.joints[k])
+            out[item, k] = _distance(
+                joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure,
+                np.inf, apart, terms,
+            )  # fmt: skip
+    return out
+
+
+@numba.njit(cache=True)
+def _nearest_of(
+    points: np.ndarray,
+    candidates: np.ndarray,
+    prepared: Prepared,
+    measure: int,
+    graph: int,
+    epsilon: float,
+) -> tuple[float, int]:
+    """Return the least distance of one projection to its candidates, and which it is."""
+    n_candidates = candidates.shape[0]
+    joints, edges, weights, n_edges, bins = _look(points, prepared, measure, graph, epsilon)
+    turns, left = np.empty((2, n_candidates)), np.empty(n_candidates)
+    n_joints, square = joints.shape[1], 0.0
+    for joint in range(n_joints):
+        square += joints[0, joint] ** 2 + joints[1, joint] ** 2
+    for position in range(n_candidates):
+        k = candidates[position]
+        turns[0, position], turns[1, position], product = _rotation(joints, prepared.joints[k])
+        n_visible, of_visible = prepared.n_visible[k], square
+        if n_visible < n_joints:
+            of_visible = _square_of_visible(joints, prepared.seen[k], n_visible)
+        left[position] = (of_visible + prepared.square[k] - 2.0 * product) / max(n_visible, 1)
+    apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
+    best, where = np.inf, n_candidates
+    # What aligns best is likely nearest: visited first, it lets others be abandoned soon.
+    for position in np.argsort(left):
+        found = _distance(
+            joints, edges, weights, n_edges, bins, candidates[position], turns[0, position],
+            turns[1, position], prepared, measure, best, apart, terms,
+        )  # fmt: skip
+        if found < best or (found == best and position < where):
+            best, where = found, position
+    return best, int(candidates[where])
+
+
+@numba.njit(cache=True)
+def _look(
+    points: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
+    """Return a projection's joints about their mean, its graph and weights, or its polar bins."""
+    n_joints = points.shape[0]
+    joints = np.empty((2, n_joints))
+    for axis in range(2):
+        mean = 0.0
+        for joint in range(n_joints):
+            mean += points[joint, axis]
+        mean /= n_joints
+        for joint in range(n_joints):
+            joints[axis, joint] = points[joint, axis] - mean
+    n_edges = 0
+    most = edge_room(n_joints, graph) if measure == INTERACTION else 0
+    edges, weights = np.empty((2, most), dtype=np.uint16), np.empty(most)
+    bins = np.empty((2, 0, 0))
+    if measure == INTERACTION:
+        rows = np.empty((most, 2), dtype=np.uint16)
+        n_edges, _ = graph_into(points, graph, prepared.offsets, rows)
+        for edge in range(n_edges):
+            i, j = rows[edge, 0], rows[edge, 1]
+            x, y = joints[0, i] - joints[0, j], joints[1, i] - joints[1, j]
+            edges[0, edge], edges[1, edge] = i, j
+            weights[edge] = 1.0 / max(epsilon, np.sqrt(x * x + y * y))
+        weights[:n_edges] /= max(_sum(weights, n_edges), _SMALLEST)
+    elif measure == SHAPE_CONTEXT:
+        bins = polar_bins(joints)
+    return joints, edges, weights, n_edges, bins
+
+
+@numba.njit(cache=True)
+def _rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
+    """Return cos and sin of the least-squares rotation and Σ target · (rotated source).
+
+    ``target`` is about its mean and 0 where hidden, so ``source`` may be about any point.
+    """
+    along, across = 0.0, 0.0
+    for joint in range(source.shape[1]):
+        along += source[0, joint] * target[0, joint] + source[1, joint] * target[1, joint]
+        across += source[0, joint] * target[1, joint] - source[1, joint] * target[0, joint]
+    length = np.sqrt(along * along + across * across)
+    if length > 0:
+        return along / length, across / length, length
+    return 1.0, 0.0, 0.0
+
+
+@numba.njit(cache=True)
+def _square_of_visible(joints: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
+    """Return the sum of squared distances of the visible joints from their mean."""
+    square, sum_x, sum_y = 0.0, 0.0, 0.0
+    for joint in range(joints.shape[1]):
+        x, y = seen[joint] * joints[0, joint], seen[joint] * joints[1, joint]
+        sum_x, sum_y, square = sum_x + x, sum_y + y, square + x * x + y * y
+    return square - (sum_x * sum_x + sum_y * sum_y) / max(n_visible, 1)
+
+
+@numba.njit(cache=True)
+def _distance(
+    joints: np.ndarray,
+    edges: np.ndarray,
+    weights: np.ndarray,
+    n_edges: int,
+    bins: np.ndarray,
+    k: int,
+    cosine: float,
+    sine: float,
+    prepared: Prepared,
+    measure: int,
+    best: float,
+    apart: np.ndarray,
+    terms: np.ndarray,
+) -> float:
+    """Return the distance to annotation k, or infinity once it is certain to be above ``best``."""
+    seen = prepared.seen[k]
+    if measure == SHAPE_CONTEXT:
+        angle = np.arctan2(sine, cosine)
+        return context_cost(bins, angle, seen, prepared.contexts[k], prepared.shared)
+    target = prepared.joints[k]
+    for joint in range(joints.shape[1]):
+        x, y = joints[0, joint], joints[1, joint]
+        apart[0, joint] = cosine * x - sine * y - target[0, joint]
+        apart[1, joint] = sine * x + cosine * y - target[1, joint]
+    if measure == CARTESIAN:
+        return _root_mean_square(apart, seen, prepared.n_visible[k])
+    hidden = prepared.n_visible[k] < joints.shape[1]
+    total = _own_part(apart, edges, weights, n_edges, hidden, seen, terms)
+    start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
+    if total > best or start == stop:
+        return np.inf
+    own_edges, own_weights = prepared.edges, prepared.weights
+    for edge in range(start, stop):
+        i, j = own_edges[0, edge], own_edges[1, edge]
+        x, y = apart[0, i] - apart[0, j], apart[1, i] - apart[1, j]
+        terms[edge - start] = own_weights[edge] * np.sqrt(x * x + y * y)
+    return total + _sum(terms, stop - start)
+
+
+@numba.njit(cache=True)
+def _own_part(
+    apart: np.ndarray,
+    edges: np.ndarray,
+    weights: np.ndarray,
+    n_edges: int,
+    hidden: bool,
+    seen: np.ndarray,
+    terms: np.ndarray,
+) -> float:
+    """Return the first sum of eq. 8, over the projection's graph, infinite if it is empty."""
+    for edge in range(n_edges):
+        i, j = edges[0, edge], edges[1, edge]
+        x, y = apart[0, i] - apart[0, j], apart[1, i] - apart[1, j]
+        terms[edge] = weights[edge] * np.sqrt(x * x + y * y)
+    if not hidden:
+        return _sum(terms, n_edges) if n_edges > 0 else np.inf
+    for edge in range(n_edges):
+        terms[edge] *= seen[edges[0, edge]] * seen[edges[1, edge]]
+    total = _sum(terms, n_edges)
+    for edge in range(n_edges):
+        terms[edge] = weights[edge] * seen[edges[0, edge]] * seen[edges[1, edge]]
+    weight = _sum(terms, n_edges)
+    return total / weight if weight > 0 else np.inf
+
+
+@numba.njit(cache=True)
+def _sum(terms: np.ndarray, n_terms: int) -> float:
+    """Return a sum in four strands, which the processor can add side by side."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = n_terms - n_terms % 4
+    for k in range(0, whole, 4):
+        a, b, c, d = a + terms[k], b + terms[k + 1], c + terms[k + 2], d + terms[k + 3]
+    for k in range(whole, n_terms):
+        a += terms[k]
+    return (a + b) + (c + d)
+
+
+@numba.njit(cache=True)
+def _root_mean_square(apart: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
+    """Return the root mean square over visible joints, their mean difference taken off."""
+    if n_visible == 0:
+        return np.inf
+    sum_x, sum_y, square = 0.0, 0.0, 0.0
+    for joint in range(apart.shape[1]):
+        sum_x += seen[joint] * apart[0, joint]
+        sum_y += seen[joint] * apart[1, joint]
+    mean_x, mean_y = sum_x / n_visible, sum_y / n_visible
+    for joint in range(apart.shape[1]):
+        x, y = apart[0, joint] - mean_x, apart[1, joint] - mean_y
+        square += seen[joint] * (x * x + y * y)
+    return np.sqrt(square / n_visible)

@@ -1,0 +1,107 @@
+"""Problems on people who interact closely: annotated 2D pairs, one 3D seed, whole clips held out.
+
+There is no exact answer; what a run is judged by is how well its draws cover the 3D pose-pairs of
+clips that neither the annotations nor the seed are from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from probmotion.motion import Motion
+from probmotion.problems.problem import Problem
+
+if TYPE_CHECKING:
+    from probmotion.models.pair_posterior import PairSettings
+
+__all__ = ["PAIR_PROBLEMS", "pairs_problem"]
+
+
+def pairs_problem(
+    motions: Sequence[Motion],
+    held_out: Sequence[str],
+    *,
+    n_annotations: int = 6000,
+    n_held_out: int = 300,
+    settings: PairSettings | None = None,
+    seed: int = 0,
+    name: str = "pairs",
+    description: str = "",
+) -> Problem:
+    """Return the problem of covering the pose-pairs of clips that were held out.
+
+    Frames of the dance of all other clips are annotated in 2D, each in a view drawn at random;
+    their medoid is the one 3D seed.
+
+    Parameters
+    ----------
+    motions : sequence of Motion
+        Clips of ``pair17``.
+    held_out : sequence of str
+        Names of the clips to hold out, whole.
+    n_annotations : int
+        Annotated frames, at most as many as there are.
+    n_held_out : int
+        Pose-pairs of the held-out clips to be covered, evenly apart.
+    settings : PairSettings, optional
+        The posterior's numbers.
+    seed : int
+        Seed of frames, views and the likelihood's views.
+    name, description : str
+        What tables call the problem.
+
+    Raises
+    ------
+    ValueError
+        If no clip is left or held out, or a clip has another skeleton than ``pair17``.
+    """
+    # Compiled code is imported by those who use it.
+    from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth, hold_out
+    from probmotion.interaction.annotation_sources import draw_annotations
+    from probmotion.models.pair_posterior import pair_posterior
+
+    shown, hidden = hold_out(motions, held_out)
+    chosen = [dance_frames(motion) for motion in shown]
+    n = min(n_annotations, int(sum(frames.sum() for frames in chosen)))
+    annotations = draw_annotations(shown, n, seed, frames=chosen).annotations
+    poses, _, _ = ground_truth(shown)
+    posterior = pair_posterior(
+        poses[choose_seed(poses)], annotations, settings, fps=shown[0].fps, view_seed=seed
+    )
+    there = sum(int(dance_frames(motion).sum()) for motion in hidden)
+    covered, _, _ = ground_truth(hidden, min(n_held_out, there))
+    return Problem(name, description, posterior, held_out=covered[:, None])
+
+
+_MADE = "two made people who dance, 300 annotated 2D pairs and one 3D seed: coverage"
+_SALSA = "salsa (CMU 60 and 61), 6000 annotated 2D pairs of 7 clips and one 3D seed: coverage"
+
+
+def _made() -> Problem:
+    from probmotion.data.dances import make_dances
+    from probmotion.models.pair_posterior import PairSettings
+
+    return pairs_problem(
+        make_dances(8, seed=0),
+        ["dance-6", "dance-7"],
+        n_annotations=300,
+        n_held_out=60,
+        settings=PairSettings(n_views=16, n_near=16),
+        name="dance-pairs",
+        description=_MADE,
+    )
+
+
+def _salsa() -> Problem:
+    from probmotion.data.downloads import salsa_pairs
+    from probmotion.data.pair_sets import SALSA_HELD_OUT
+
+    return pairs_problem(salsa_pairs(), SALSA_HELD_OUT, name="salsa-pairs", description=_SALSA)
+
+
+PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
+    "dance-pairs": (_MADE, _made),
+    "salsa-pairs": (_SALSA, _salsa),
+}
+"""What each problem is, and the function that makes it, by name."""

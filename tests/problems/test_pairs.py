@@ -1,0 +1,132 @@
+"""Problems on pose-pairs: held out whole, drawn from, measured by coverage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import probmotion as pm
+from probmotion.data.dances import make_dances
+from probmotion.data.pair_sets import SALSA_HELD_OUT
+from probmotion.metrics import measure
+from probmotion.metrics.coverage import coverage
+from probmotion.models.pair_posterior import PairSettings
+from probmotion.problems import (
+    Problem,
+    load_problem,
+    pairs_problem,
+    problem_descriptions,
+    problem_names,
+)
+from probmotion.samplers import MetropolisHastings
+from probmotion.samplers.proposals import Isotropic
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return load_problem("dance-pairs")
+
+
+def test_they_are_listed_without_being_made():
+    assert {"dance-pairs", "salsa-pairs"} <= set(problem_names())
+    assert "6000 annotated 2D pairs" in problem_descriptions()["salsa-pairs"]
+    assert set(problem_descriptions()) == set(problem_names())
+
+
+def test_a_description_is_that_of_the_problem(problem):
+    assert problem.description == problem_descriptions()["dance-pairs"]
+    assert load_problem("gait").description == problem_descriptions()["gait"]
+
+
+def test_clips_are_held_out_whole(problem):
+    """No annotation, and not the seed, is of a clip that is to be covered."""
+    shown = np.concatenate([dance.positions for dance in make_dances(6)])
+    hidden = np.concatenate([dance.positions for dance in make_dances(8)[6:]])
+    assert problem.held_out.shape == (60, 1, 34, 3)
+    for pose in problem.held_out[:, 0]:
+        assert np.abs(hidden - pose).max(axis=(1, 2)).min() == 0
+        assert np.abs(shown - pose).max(axis=(1, 2)).min() > 1e-3
+    seed = problem.posterior.prior.seed[0]
+    assert np.abs(shown - seed).max(axis=(1, 2)).min() == 0
+    sources = set(problem.posterior.likelihood.annotations.sources)
+    assert sources <= {f"dance-{number}" for number in range(6)}
+
+
+def test_runs_are_measured_by_coverage(problem):
+    sampler = MetropolisHastings(Isotropic(0.02), warmup=300, thin=2)
+    draws = sampler.sample(problem.posterior, draws=30, chains=2, progress=False)
+    found = measure(problem, draws, seed=0)
+    poses = draws.flat()[:, 0]
+    for kind in ("interaction", "cartesian", "shape-context"):
+        assert found[f"coverage_{kind}"] == pytest.approx(
+            coverage(problem.held_out[:, 0], poses, kind)
+        )
+    assert 0 <= found["at_cap"] <= 1
+    assert 0 <= found["near_floor"] <= 1
+    assert "swd" not in found
+
+
+def test_compare_says_who_can_and_why_others_cannot(problem, tmp_path):
+    samplers = {"mh": MetropolisHastings(Isotropic(0.02), warmup=200, thin=2)}
+    comparison = pm.compare(
+        problem,
+        samplers | {name: name for name in ("nuts", "ensemble", "mas", "sds", "exact")},
+        draws=20,
+        chains=2,
+        out=tmp_path,
+        progress=False,
+    )
+    text = str(comparison.table())
+    assert "held-out poses" in text
+    for words in ("D_IC", "near floor", "Denoises2D", "gradient", "dimension"):
+        assert words in text
+    assert "needs a density with a gradient, which PosePairPrior has not; mh would do" in text
+
+
+def test_wrong_input_is_named():
+    dances = make_dances(2)
+    with pytest.raises(ValueError, match="dance-9"):
+        pairs_problem(dances, ["dance-9"])
+    with pytest.raises(ValueError, match="held_out has shape"):
+        Problem("p", "", load_problem("gait").posterior, held_out=np.zeros((3, 1, 34, 3)))
+
+
+def test_salsa_is_the_published_experiment(real_data):
+    problem = load_problem("salsa-pairs")
+    evidence = problem.posterior.likelihood
+    assert len(evidence.annotations) > 5000
+    assert not set(evidence.annotations.sources) & set(SALSA_HELD_OUT)
+    assert problem.held_out.shape == (300, 1, 34, 3)
+    assert problem.posterior.dim == 108
+    # The annotations' views had to be estimated; the seed is within the prior's support.
+    assert np.isfinite(problem.posterior.log_seed)
+    log_f = problem.posterior.prior.log_plausibility(problem.held_out)
+    assert np.median(log_f) > -2
+    assert np.quantile(log_f, 0.1) > -20
+
+
+def test_salsa_without_data_says_how_to_get_it(monkeypatch, tmp_path):
+    from probmotion.data import downloads
+    from probmotion.problems import pairs
+
+    look = downloads.salsa_pairs
+
+    def nowhere(folder=None):
+        return look(tmp_path / "nothing")
+
+    monkeypatch.setattr(downloads, "salsa_pairs", nowhere)
+    with pytest.raises((FileNotFoundError, ValueError)) as failure:
+        pairs.PAIR_PROBLEMS["salsa-pairs"][1]()
+    assert "\n" not in str(failure.value)
+
+
+def test_a_small_problem_of_ones_own():
+    problem = pairs_problem(
+        make_dances(3),
+        ["dance-2"],
+        n_annotations=20,
+        n_held_out=5,
+        settings=PairSettings(n_views=4, n_near=4, measure="cartesian"),
+    )
+    assert problem.held_out.shape == (5, 1, 34, 3)
+    assert problem.posterior.likelihood.measure == "cartesian"
