@@ -162,15 +162,14 @@ def calibration(study: Study) -> pd.DataFrame:
 def noise(study: Study) -> pd.DataFrame:
     """σ_l: acceptance, step and coverage; from this the defaults are chosen."""
     scales = {
-        "interaction": (0.01, 0.02, 0.05, 0.1),
-        "cartesian": (0.005, 0.01, 0.02, 0.05),
+        "interaction": (0.003, 0.005, 0.01, 0.02, 0.05),
+        "cartesian": (0.0025, 0.005, 0.01, 0.02),
         "shape-context": (0.01, 0.02, 0.05, 0.1),
     }
     rows = []
     for density, sizes in scales.items():
         for size in sizes:
-            steps = study.steps // (20 if density == "shape-context" else 5)
-            draws = study.run(study.posterior(density, noise=size), steps=steps)
+            draws = study.run(study.posterior(density, noise=size), steps=study.steps // 5)
             rows += [
                 {"density": density, "noise": size, **summary(draws), **row}
                 for row in coverage_rows(study, draws)

@@ -213,7 +213,7 @@ def _distance(
     seen = prepared.seen[k]
     if measure == SHAPE_CONTEXT:
         angle = np.arctan2(sine, cosine)
-        return context_cost(bins, angle, seen, prepared.contexts[k], prepared.shared)
+        return context_cost(bins, angle, seen, prepared.contexts[k], prepared.shared, best)
     target = prepared.joints[k]
     for joint in range(joints.shape[1]):
         x, y = joints[0, joint], joints[1, joint]

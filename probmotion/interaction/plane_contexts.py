@@ -44,9 +44,16 @@ def polar_bins(joints: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def context_cost(
-    bins: np.ndarray, turn: float, seen: np.ndarray, contexts: np.ndarray, shared: np.ndarray
+    bins: np.ndarray,
+    turn: float,
+    seen: np.ndarray,
+    contexts: np.ndarray,
+    shared: np.ndarray,
+    best: float,
 ) -> float:
     """Return the mean χ² cost of a projection turned by ``turn`` and an annotation.
+
+    Infinity as soon as it is certain to exceed ``best``.
 
     Parameters
     ----------
@@ -58,13 +65,17 @@ def context_cost(
         1 for the annotation's visible joints, (J,), and shape contexts over them, (J, 60) uint8.
     shared : numpy.ndarray
         From :func:`~probmotion.interaction.shape_context.shared_table`, J − 1 counts at most.
+    best : float
+        The least cost so far.
     """
     n_joints, n_visible = contexts.shape[0], 0
     for joint in range(n_joints):
         n_visible += 1 if seen[joint] > 0 else 0
     if n_visible < 2:
         return np.inf
-    total, turned = 0.0, turn * _PER_RADIAN
+    total, looked_at, turned = 0.0, 0, turn * _PER_RADIAN
+    # Rounding must not abandon a cost that equals the best.
+    enough = (best + 1e-9) * n_visible * (n_visible - 1)
     counts = np.empty(contexts.shape[1], dtype=np.uint8)
     for i in range(n_joints):
         if seen[i] == 0:
@@ -81,4 +92,8 @@ def context_cost(
                 counts[np.int64(bins[0, i, j]) + sector] += 1
         for k in range(counts.size):
             total += shared[counts[k], contexts[i, k]]
+        looked_at += 1
+        # What is left may agree wholly, and then adds nothing.
+        if looked_at * (n_visible - 1) - total > enough:
+            return np.inf
     return 1.0 - total / (n_visible * (n_visible - 1))
