@@ -7,6 +7,7 @@ turns along. Everything is 0 at the seed.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -86,27 +87,19 @@ class PoseChart:
         check_shape("theta", theta, ("…", self.dim))
         xp = array_namespace(theta)
         turns, places, bends, stretches = self._parts(theta)
-        roots = vector_to_matrix(turns)
         local = vector_to_matrix(
             xp.sum(constant(self._bases, theta) * bends[..., None, :], axis=-1)
         )
-        vectors = xp.exp(stretches)[..., None] * constant(self._bones, theta)
-        ends, starts = self._ends
-        frames: dict[int, Array] = {}
-        found: dict[int, Array] = {}
-        for k, root in enumerate(self.skeleton.roots):
-            frames[root] = roots[..., k, :, :]
-            found[root] = places[..., k, :] + constant(self.seed[root], theta)
+        vectors = (xp.exp(stretches)[..., None] * constant(self._bones, theta))[..., None]
+        frames = vector_to_matrix(turns)
+        joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
+        found = [joints]
         # A generation of bones at a time: few large products are faster than many small ones.
-        for generation in self._generations:
-            parents = [starts[bone] for bone in generation]
-            above = xp.stack([frames[parent] for parent in parents], axis=-3)
-            turned = xp.matmul(above, local[..., generation, :, :])
-            bones = xp.matmul(turned, vectors[..., generation, :, None])[..., 0]
-            for row, bone in enumerate(generation):
-                frames[ends[bone]] = turned[..., row, :, :]
-                found[ends[bone]] = found[parents[row]] + bones[..., row, :]
-        return xp.stack([found[joint] for joint in range(self.skeleton.n_joints)], axis=-2)
+        for bones, above in self._generations:
+            frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
+            joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
+            found.append(joints)
+        return xp.concat(found, axis=-2)[..., self._places, :]
 
     def coordinates(self, positions: np.ndarray) -> np.ndarray:
         """Return a θ at which the pose is ``positions``: ``(…, J, 3) → (…, dim)``.
@@ -137,13 +130,12 @@ class PoseChart:
             frames[root] = _best_rotation(self._bones[below], vectors[..., below, :])
             turns[..., k, :] = matrix_to_vector(frames[root])
             places[..., k, :] = positions[..., root, :] - self.seed[root]
-        for generation in self._generations:
-            for bone in generation:
-                above = frames[starts[bone]]
-                aim = (np.swapaxes(above, -1, -2) @ vectors[..., bone, :, None])[..., 0]
-                vector = _least_turn(self._bones[bone] / rest[bone], aim / lengths[..., bone, None])
-                bends[..., bone, :] = vector @ self._bases[bone]
-                frames[ends[bone]] = above @ vector_to_matrix(vector)
+        for bone in (bone for bones, _ in self._generations for bone in bones):
+            above = frames[starts[bone]]
+            aim = (np.swapaxes(above, -1, -2) @ vectors[..., bone, :, None])[..., 0]
+            vector = _least_turn(self._bones[bone] / rest[bone], aim / lengths[..., bone, None])
+            bends[..., bone, :] = vector @ self._bases[bone]
+            frames[ends[bone]] = above @ vector_to_matrix(vector)
         return theta
 
     def log_measure(self, theta: Array) -> Array:
@@ -198,14 +190,22 @@ class PoseChart:
         bones = theta[..., 6 * n_roots :].reshape((*batch, n_bones, 3))
         return turns, places, bones[..., :2], bones[..., 2]
 
-    @property
-    def _generations(self) -> list[list[int]]:
-        """Bones by their distance from the root, nearest first."""
-        depth = [len(self.skeleton.ancestors(joint)) for joint in self._ends[0]]
-        return [
-            [bone for bone, found in enumerate(depth) if found == level]
-            for level in range(1, max(depth, default=0) + 1)
-        ]
+    @cached_property
+    def _generations(self) -> list[tuple[list[int], list[int]]]:
+        """Bones by their distance from a root, and each one's parent among the joints before."""
+        before, generations = list(self.skeleton.roots), []
+        while bones := [k for k, (_, parent) in enumerate(self.skeleton.bones) if parent in before]:
+            above = [before.index(self.skeleton.bones[k][1]) for k in bones]
+            generations.append((bones, above))
+            before = [self.skeleton.bones[k][0] for k in bones]
+        return generations
+
+    @cached_property
+    def _places(self) -> list[int]:
+        """Where each joint is in the order of roots, first generation, second, …"""
+        order = list(self.skeleton.roots)
+        order += [self.skeleton.bones[k][0] for bones, _ in self._generations for k in bones]
+        return [order.index(joint) for joint in range(self.skeleton.n_joints)]
 
 
 def _square_to(directions: np.ndarray) -> np.ndarray:

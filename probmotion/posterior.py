@@ -88,6 +88,12 @@ class MotionPosterior:
         """Length of θ."""
         return self.prior.dim
 
+    @property
+    def differentiable(self) -> bool:
+        """Whether the log density has a gradient, as far as its parts say."""
+        parts = (self.prior, self.likelihood)
+        return all(getattr(part, "differentiable", True) for part in parts)
+
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ) + log p(y | θ), the posterior's up to a constant: ``(…, dim) → (…)``.
 
@@ -102,7 +108,7 @@ class MotionPosterior:
             # Under a gradient or a compiler there is no asking where.
             return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
         if self.likelihood is None:
-            return self._shaped(theta, np.asarray(log_prior))
+            return self._shaped(np.asarray(log_prior), self._log_measure(theta))
 
         def evidence(asked: np.ndarray) -> tuple[np.ndarray, ...]:
             return (self.log_likelihood(theta[asked]),)
@@ -171,21 +177,28 @@ class MotionPosterior:
 
         ``evidence`` takes a mask of points and returns arrays over them, the log likelihood first.
         """
-        asked = self._worth_asking(theta, log_prior)
+        log_measure = self._log_measure(theta)
+        asked = self._worth_asking(log_prior, log_measure)
         log_likelihood, *others = evidence(asked)
         log_density = np.full(log_prior.shape, -np.inf)
         log_density[asked] = log_prior[asked] + np.asarray(log_likelihood)
         full = [np.zeros((*log_prior.shape, *found.shape[1:]), found.dtype) for found in others]
         for array, found in zip(full, others, strict=True):
             array[asked] = found
-        return self._shaped(theta, log_density), *full
+        return self._shaped(log_density, log_measure), *full
 
-    def _worth_asking(self, theta: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
+    # What a posterior that changes the density's shape overrides: TruncatedPosterior.
+
+    def _log_measure(self, theta: np.ndarray) -> np.ndarray:
+        """Return the log density of the measure that shapes are relative to."""
+        return np.zeros(theta.shape[:-1])
+
+    def _worth_asking(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         """Return where the evidence can change the density, a mask."""
         return log_prior > -np.inf
 
-    def _shaped(self, theta: np.ndarray, log_density: np.ndarray) -> np.ndarray:
-        """Return the density as it is drawn from; see :class:`TruncatedPosterior`."""
+    def _shaped(self, log_density: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
+        """Return the density that is drawn from."""
         return log_density
 
     def log_likelihood(self, theta: Array) -> Array:

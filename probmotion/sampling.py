@@ -24,6 +24,7 @@ __all__ = [
     "progress_bar",
     "require",
     "sampler_names",
+    "suited",
 ]
 
 
@@ -116,8 +117,19 @@ def require(sampler: Sampler, posterior: MotionPosterior) -> None:
 
 
 def suited(posterior: MotionPosterior) -> list[str]:
-    """Return the names of registered samplers whose required protocols the prior implements."""
-    return [name for name in sampler_names() if not missing(load_sampler(name), posterior)]
+    """Return the names of the registered samplers that can draw from a posterior.
+
+    The prior has what they require, a gradient where they need one (``needs_gradient``), and no
+    more dimensions than they take by default (``largest_dim``).
+    """
+    kinds = {name: load_sampler(name) for name in sampler_names()}
+    return [
+        name
+        for name, kind in kinds.items()
+        if not missing(kind, posterior)
+        and (posterior.differentiable or not getattr(kind, "needs_gradient", False))
+        and posterior.dim <= getattr(kind, "largest_dim", posterior.dim)
+    ]
 
 
 @cache

@@ -105,22 +105,21 @@ class TruncatedPosterior(MotionPosterior):
             "near_floor": float((level < self.log_floor + _NEAR).mean()),
         }
 
-    def _worth_asking(self, theta: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
+    def _log_measure(self, theta: Array) -> np.ndarray:
+        measure = getattr(self.prior, "log_measure", None)
+        return super()._log_measure(theta) if measure is None else measure(theta)
+
+    def _worth_asking(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         bound = getattr(self.likelihood, "log_bound", math.inf)
         with np.errstate(invalid="ignore"):
-            most = log_prior - self._log_measure(theta) + bound
+            most = log_prior - log_measure + bound
         return (log_prior > -np.inf) & (most >= self.log_floor)
 
-    def _shaped(self, theta: np.ndarray, log_density: np.ndarray) -> np.ndarray:
-        log_measure = self._log_measure(theta)
+    def _shaped(self, log_density: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         with np.errstate(invalid="ignore"):
             level = log_density - log_measure
         level = np.where(level >= self.log_floor, np.minimum(level, self.log_cap), -np.inf)
         return level + np.where(np.isfinite(level), log_measure, 0.0)
-
-    def _log_measure(self, theta: Array) -> np.ndarray:
-        measure = getattr(self.prior, "log_measure", None)
-        return np.zeros(theta.shape[:-1]) if measure is None else measure(theta)
 
 
 def limit_for_dimension(dim: int) -> float:

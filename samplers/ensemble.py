@@ -16,7 +16,7 @@ from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
 from probmotion.samplers.autocorrelation import autocorrelation_time
 from probmotion.samplers.densities import Density, continued, motions, starting_points
-from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar
+from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, suited
 
 __all__ = ["Ensemble"]
 
@@ -130,7 +130,7 @@ class Ensemble:
                 f"is for at most {self.largest_dim} dimensions (largest_dim), and the posterior "
                 f"has {dim}",
                 word="dimension",
-                others=("mh", "nuts"),
+                others=suited(posterior),
             )
         walkers = 4 * dim if self.walkers is None else self.walkers
         if walkers < 2 * dim:

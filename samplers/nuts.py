@@ -16,7 +16,7 @@ from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
 from probmotion.samplers.densities import continued, motions, starting_points
 from probmotion.samplers.nuts_kernel import CHUNK, NutsKernel, compiled
-from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
+from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require, suited
 
 __all__ = ["NUTS"]
 
@@ -44,6 +44,7 @@ class NUTS:
 
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+    needs_gradient: ClassVar[bool] = True
 
     warmup: int = 500
     target_acceptance: float = 0.8
@@ -122,7 +123,7 @@ class NUTS:
                     self.name,
                     f"needs a density with a gradient, which {type(part).__name__} has not",
                     word="gradient",
-                    others=("mh",),
+                    others=suited(posterior),
                 )
 
     def _result(

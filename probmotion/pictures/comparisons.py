@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probmotion.pictures.pairs import draw_pairs
 from probmotion.pictures.skeletons import draw_skeletons
 
 if TYPE_CHECKING:
     from probmotion.comparison import Comparison
     from probmotion.problems import Problem
+    from probmotion.skeleton import Skeleton
 
 __all__ = ["draw_comparison", "draw_problem"]
 
 _SHOWN = 4
+_POSES = 6
 
 
 def draw_comparison(
@@ -47,7 +50,7 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
 
     Where there is evidence, motions are seen from the side of the first camera, which is what it
     does not show, and the truth stands behind them in grey. Where there is none, all motions are
-    turned to the same heading.
+    turned to the same heading. Of single poses, some that were held out stand above the draws.
 
     Raises
     ------
@@ -59,7 +62,8 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
         if result.problem == problem.name and result.seed == 0 and result.failure is None:
             motions = comparison.draws(problem.name, result.sampler).flat()
             # Neighbours in a chain look alike: show draws that are far apart.
-            drawn[result.sampler] = motions[:: max(1, len(motions) // _SHOWN)]
+            shown = _SHOWN if problem.held_out is None else _POSES
+            drawn[result.sampler] = motions[:: max(1, len(motions) // shown)]
     rows = {}
     if "exact" in drawn:
         rows["exact"] = drawn.pop("exact")
@@ -69,6 +73,9 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
     if not rows:
         raise ValueError(f"problem is {problem.name!r}, which no sampler drew from")
     posterior = problem.posterior
+    if problem.held_out is not None:
+        _draw_poses({"held out": problem.held_out} | rows, posterior.skeleton, path, problem.name)
+        return
     cameras = getattr(posterior.likelihood, "cameras", None)
     if posterior.likelihood is None:
         sided = bool(posterior.skeleton.mirrored_pairs)
@@ -84,3 +91,13 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
         truth=problem.truth,
         title=problem.name + ("" if cameras is None else ", seen from the camera's side"),
     )
+
+
+def _draw_poses(
+    rows: dict[str, np.ndarray], skeleton: Skeleton, path: str | Path, title: str
+) -> None:
+    """Write poses of several people, each row's evenly apart: (n, 1, J, 3)."""
+    chosen = {
+        label: motions[:: max(1, len(motions) // _POSES), 0] for label, motions in rows.items()
+    }
+    draw_pairs(chosen, skeleton, path, columns=_POSES, azimuth=0.6, elevation=0.2, title=title)

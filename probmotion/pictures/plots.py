@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_quality_against_cost"]
 
+_QUALITIES = ("swd", "coverage_interaction")
 _WORDS = {
+    "coverage_interaction": "mean distance of a held-out pose\nto its nearest draw (D_IC, m)",
     "swd": "sliced Wasserstein distance to exact draws\n(1 = as far as other exact draws)",
     "seconds": "seconds",
 }
@@ -27,7 +29,7 @@ def plot_quality_against_cost(
     table: pd.DataFrame,
     path: str | Path | None = None,
     *,
-    quality: str = "swd",
+    quality: str | None = None,
     cost: str = "seconds",
 ) -> Figure:
     """Return a figure of ``quality`` against ``cost``, a panel per problem, and write it as PNG.
@@ -41,8 +43,11 @@ def plot_quality_against_cost(
         Columns problem, sampler, seed, metric, value: what :meth:`Comparison.table` returns.
     path : str or Path, optional
         Where to write, ``.png``; nowhere by default.
-    quality, cost : str
-        Metrics of the table.
+    quality : str, optional
+        Metric of the table; by default the distance from exact draws or, in a table that has
+        none, how well draws cover poses that were held out.
+    cost : str
+        Metric of the table.
 
     Raises
     ------
@@ -51,6 +56,8 @@ def plot_quality_against_cost(
     """
     from matplotlib.figure import Figure
 
+    if quality is None:
+        quality = next((name for name in _QUALITIES if (table["metric"] == name).any()), "swd")
     problems = [str(name) for name in dict.fromkeys(table["problem"])]
     points = {problem: _points(table, problem, quality, cost) for problem in problems}
     if not any(points.values()):
@@ -67,6 +74,8 @@ def plot_quality_against_cost(
         _draw_panel(
             panel, problem, points[problem], styles, _absent(table, problem, points[problem])
         )
+        if quality == "swd" and points[problem]:
+            panel.axhline(1.0, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
         panel.set_xlabel(_WORDS.get(cost, cost), color=INK)
     for panel in panels[len(problems) :]:
         panel.set_visible(False)
@@ -131,7 +140,6 @@ def _draw_panel(
     if not points:
         axes.set(xticks=[], yticks=[])
         return
-    axes.axhline(1.0, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
     for name, (cost, quality) in points.items():
         colour, marker = styles[name]
         x, y = cost.mean(), quality.mean()

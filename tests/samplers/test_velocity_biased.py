@@ -164,7 +164,7 @@ def test_evidence_that_compares_no_views_is_refused(two_bumps):
 
 
 def test_nuts_says_what_has_no_gradient():
-    with pytest.raises(UnsupportedPosterior, match="gradient, which Pictures has not; mh would do"):
+    with pytest.raises(UnsupportedPosterior, match="which Pictures has not; ensemble, mh would do"):
         NUTS().sample(MotionPosterior(Point(), Pictures()), draws=2, progress=False)
 
 
