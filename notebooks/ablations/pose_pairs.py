@@ -3,9 +3,9 @@
     python notebooks/ablations/pose_pairs.py --out pose-pairs
     python notebooks/ablations/pose_pairs.py --quick --out quick     (made dances, minutes)
 
-Parts, each of which leaves a CSV file and pictures in ``--out`` and is not run again once it is
-there: calibration, noise, truncation, velocity, coverage, embedding, completion. ``--parts``
-chooses.
+Parts: noise, calibration, truncation, velocity, coverage, embedding, completion; ``--parts``
+chooses. Each leaves a CSV file and pictures in ``--out``. A run that has left its file in
+``--out/runs`` is not made again, so that what is interrupted goes on.
 Real data are looked for as in :func:`probmotion.data.downloads.salsa_pairs`.
 """
 
@@ -15,7 +15,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +54,9 @@ from probmotion.samplers.proposals import Isotropic, Proposal, VelocityBiased
 from probmotion.truncation import TruncatedPosterior, limit_for_dimension
 
 SEED = 0
+_EVERY = 4
 # Each density at the noise at which it covers best (part "noise").
-NOISE = {"interaction": 0.05, "cartesian": 0.05, "shape-context": 0.05}
+NOISE = {"interaction": 0.005, "cartesian": 0.005, "shape-context": 0.02}
 
 
 @dataclass(frozen=True)
@@ -114,17 +115,48 @@ class Study:
         """Return every state of the chains after the warm-up."""
         proposal = Isotropic(0.02) if proposal is None else proposal
         sampler = MetropolisHastings(proposal, warmup=self.warmup, thin=1)
-        return sampler.sample(posterior, draws=steps or self.steps, chains=self.chains, seed=SEED)
+        return sampler.sample(
+            posterior, draws=steps or self.steps, chains=self.chains, seed=SEED, progress=False
+        )
+
+    def keep(self, name: str, poses: np.ndarray) -> None:
+        """Write some draws of every chain, (chains, n, J, 3), for what comes after."""
+        with (
+            written_whole(self.out / f"poses-{name}.npz") as path,
+            open(path, "wb") as file,
+        ):
+            np.savez_compressed(file, poses=poses.astype(np.float32))
+
+    def kept(self, name: str) -> np.ndarray:
+        """Read what :meth:`keep` wrote."""
+        with np.load(self.out / f"poses-{name}.npz") as archive:
+            return archive["poses"].astype(np.float64)
+
+    def once(self, name: str, make: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+        """Return the table of one run; it is made where its file is missing."""
+        path = self.out / "runs" / f"{name}.csv"
+        if not path.exists():
+            start = time.perf_counter()
+            table = make()
+            path.parent.mkdir(exist_ok=True)
+            with written_whole(path) as unfinished:
+                table.to_csv(unfinished, index=False)
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+        return pd.read_csv(path)
 
     def covered(
         self, draws: MotionDraws, counts: list[int] | None = None
     ) -> Iterator[tuple[str, int, int, float]]:
-        """Yield measure, chain, number of draws and coverage."""
-        poses = draws.positions.values[:, :, 0]
-        wanted = [poses.shape[1]] if counts is None else counts
+        """Yield measure, chain, number of draws and coverage.
+
+        Every fourth draw is compared: the next ones are mostly the same pose or a step away.
+        """
+        poses = draws.positions.values[:, ::_EVERY, 0]
+        wanted = [draws.positions.sizes["draw"]] if counts is None else counts
         for measure in MEASURES:
             for chain, states in enumerate(poses):
-                found = coverage(self.held_out, states, measure, wanted)
+                compared = [-(-count // _EVERY) for count in wanted]
+                found = coverage(self.held_out, states, measure, compared)
                 for count, value in zip(wanted, found, strict=True):
                     yield measure, chain, count, float(value)
 
@@ -166,30 +198,30 @@ def noise(study: Study) -> pd.DataFrame:
         "cartesian": (0.0025, 0.005, 0.01, 0.02),
         "shape-context": (0.01, 0.02, 0.05, 0.1),
     }
-    rows = []
-    for density, sizes in scales.items():
-        for size in sizes:
-            draws = study.run(study.posterior(density, noise=size), steps=study.steps // 5)
-            rows += [
-                {"density": density, "noise": size, **summary(draws), **row}
-                for row in coverage_rows(study, draws)
-            ]
-    return pd.DataFrame(rows)
+
+    def run(density: str, size: float) -> pd.DataFrame:
+        draws = study.run(study.posterior(density, noise=size), steps=study.steps // 10)
+        return coverage_rows(study, draws, density=density, noise=size)
+
+    return pd.concat(
+        study.once(f"noise-{density}-{size}", partial(run, density, size))
+        for density, sizes in scales.items()
+        for size in sizes
+    )
 
 
 def truncation(study: Study) -> pd.DataFrame:
     """c of eq. 11: shares of draws where the density is cut, and coverage."""
-    rows = []
-    for limit in (100.0, limit_for_dimension(108), np.inf):
+
+    def run(limit: float) -> pd.DataFrame:
         posterior = study.posterior("interaction", limit=limit)
-        draws = study.run(posterior, steps=study.steps // 5)
+        draws = study.run(posterior, steps=study.steps // 10)
         kept = draws.dataset
         shares = posterior.run_shares(kept["theta"].values, kept["log_density"].values)
-        rows += [
-            {"limit": limit, **shares, **summary(draws), **row}
-            for row in coverage_rows(study, draws)
-        ]
-    return pd.DataFrame(rows)
+        return coverage_rows(study, draws, limit=limit, **shares)
+
+    limits = (100.0, limit_for_dimension(108), np.inf)
+    return pd.concat(study.once(f"truncation-{c:.3g}", partial(run, c)) for c in limits)
 
 
 def velocity(study: Study) -> pd.DataFrame:
@@ -197,38 +229,43 @@ def velocity(study: Study) -> pd.DataFrame:
     posterior = study.posterior("interaction")
     proposals = {
         "isotropic": Isotropic(0.02),
-        "biased, b = 1": VelocityBiased(bias=1.0),
-        "biased, b = 30": VelocityBiased(bias=30.0),
-        "velocity alone": VelocityBiased(base=0.005, bias=30.0),
+        "biased-1": VelocityBiased(base=0.02, bias=1.0),
+        "biased-10": VelocityBiased(base=0.02, bias=10.0),
+        "velocity-alone": VelocityBiased(base=0.001, bias=1.0),
     }
-    rows, shown = [], {}
-    for name, proposal in proposals.items():
-        draws = study.run(posterior, proposal, steps=study.steps // 5)
-        shown[name] = draws.positions.values[0, early(draws), 0]
-        rows += [{"proposal": name, **summary(draws), **row} for row in coverage_rows(study, draws)]
+
+    def run(name: str) -> pd.DataFrame:
+        draws = study.run(posterior, proposals[name], steps=study.steps // 10)
+        study.keep(name, draws.positions.values[:1, early(draws), 0])
+        return coverage_rows(study, draws, proposal=name)
+
+    table = pd.concat(study.once(name, partial(run, name)) for name in proposals)
     draw_pairs(
-        {name: shown[name] for name in ("isotropic", "biased, b = 1")},
+        {name: study.kept(name)[0] for name in ("isotropic", "biased-1")},
         posterior.skeleton,
         study.out / "figure7.png",
         columns=4,
         title="draws 200, 400, 600 and 800: unbiased and velocity-biased proposals",
     )
-    return pd.DataFrame(rows)
+    return table
 
 
 def densities(study: Study) -> pd.DataFrame:
     """Coverage against the number of draws, four densities, three dissimilarities (figure 9)."""
     counts = sorted({c for c in (100, 1000, 10_000, 100_000) if c < study.steps} | {study.steps})
-    rows, shown = [], {}
-    for density in ("interaction", "cartesian", "shape-context", "prior"):
+
+    def run(density: str) -> pd.DataFrame:
         draws = study.run(study.posterior(density))
         every = max(1, study.steps // 1000)
-        keep_states(study, density, draws.positions.values[:, ::every, 0])
-        shown[density] = draws.positions.values[0, early(draws), 0]
-        rows += [
-            {"density": density, "measure": m, "chain": k, "draws": n, "coverage": value}
-            for m, k, n, value in study.covered(draws, counts)
-        ]
+        study.keep(density, draws.positions.values[:, ::every, 0])
+        study.keep(f"{density}-early", draws.positions.values[:1, early(draws), 0])
+        rows = study.covered(draws, counts)
+        table = pd.DataFrame(rows, columns=["measure", "chain", "draws", "coverage"])
+        return table.assign(density=density, **summary(draws))
+
+    names = ("interaction", "cartesian", "prior", "shape-context")
+    table = pd.concat(study.once(f"coverage-{name}", partial(run, name)) for name in names)
+    rows = []
     for measure in MEASURES:
         seed = coverage(study.held_out, study.seed_pose[None], measure)
         real = coverage(study.held_out, study.held_in, measure)
@@ -241,30 +278,34 @@ def densities(study: Study) -> pd.DataFrame:
                 "coverage": real,
             }
         )
-    table = pd.DataFrame(rows)
-    draw_coverage(table[table["chain"].notna()], study.out / "figure9.png")
+    draw_coverage(table, study.out / "figure9.png")
     draw_pairs(
-        {"prior alone": shown["prior"], "prior and likelihood": shown["interaction"]},
+        {
+            "prior alone": study.kept("prior-early")[0],
+            "prior and\nlikelihood": study.kept("interaction-early")[0],
+        },
         study.posterior("prior").skeleton,
         study.out / "figure6.png",
         columns=4,
         title="draws 200, 400, 600 and 800 of one chain",
     )
-    return table
+    return pd.concat([table, pd.DataFrame(rows)])
 
 
 def embedding(study: Study) -> pd.DataFrame:
     """Draws over the space of the real pairs, by multidimensional scaling (figure 8)."""
-    real = study.held_out[:: max(1, len(study.held_out) // 150)]
-    sets = {"real": real}
+    sets = {"real": study.held_out[:: max(1, len(study.held_out) // 150)]}
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
-        states = kept_states(study, density)[0]
-        sets[kind] = states[:: max(1, len(states) // 150)]
+        # Of a thousand draws evenly apart those whose numbers grow tenfold twice.
+        states = study.kept(density)[0]
+        sets[kind] = np.concatenate([states[:10], states[10:100:2], states[100::9]])
     sets["seed"] = study.seed_pose[None]
     poses = np.concatenate(list(sets.values()))
     kinds = [kind for kind, some in sets.items() for _ in some]
     points = classical_scaling(pose_distances(poses, poses, "interaction"))
-    draw_embedding(points, kinds, study.out / "figure8.png")
+    parts = {f"{study.steps // 100} draws": 10, f"{study.steps // 10} draws": 55}
+    counts = parts | {f"{study.steps} draws": len(sets["prior"])}
+    draw_embedding(points, kinds, study.out / "figure8.png", counts=counts)
     return pd.DataFrame({"kind": kinds, "x": points[:, 0], "y": points[:, 1]})
 
 
@@ -276,7 +317,7 @@ def completion(study: Study) -> pd.DataFrame:
     whole = draw_annotations(study.clips[1], n, SEED, frames=frames)
     annotated = study.pictures.annotations
     skeleton = annotated.skeleton
-    states = kept_states(study, "interaction").reshape(-1, skeleton.n_joints, 3)
+    states = study.kept("interaction").reshape(-1, skeleton.n_joints, 3)
     rows = []
     for index in range(n):
         keypoints, visible = asked.annotations.keypoints[index], asked.annotations.visible[index]
@@ -310,9 +351,10 @@ def summary(draws: MotionDraws) -> dict[str, float]:
     }
 
 
-def coverage_rows(study: Study, draws: MotionDraws) -> list[dict[str, object]]:
-    """Return one row per measure and chain."""
-    return [{"measure": m, "chain": k, "coverage": c} for m, k, _, c in study.covered(draws)]
+def coverage_rows(study: Study, draws: MotionDraws, **labels: object) -> pd.DataFrame:
+    """Return one row per measure and chain of a run."""
+    table = pd.DataFrame(study.covered(draws), columns=["measure", "chain", "draws", "coverage"])
+    return table.assign(**labels, **summary(draws))
 
 
 def early(draws: MotionDraws) -> list[int]:
@@ -321,21 +363,9 @@ def early(draws: MotionDraws) -> list[int]:
     return [min(number, last) for number in (200, 400, 600, 800)]
 
 
-def keep_states(study: Study, density: str, states: np.ndarray) -> None:
-    """Write some states of every chain, (chains, n, J, 3), for the parts that come after."""
-    with written_whole(study.out / f"states-{density}.npz") as path, open(path, "wb") as file:
-        np.savez_compressed(file, states=states.astype(np.float32))
-
-
-def kept_states(study: Study, density: str) -> np.ndarray:
-    """Read what :func:`keep_states` wrote; the part "coverage" has to come first."""
-    with np.load(study.out / f"states-{density}.npz") as archive:
-        return archive["states"].astype(np.float64)
-
-
 PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
-    "calibration": calibration,
     "noise": noise,
+    "calibration": calibration,
     "truncation": truncation,
     "velocity": velocity,
     "coverage": densities,
@@ -346,7 +376,7 @@ PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
 
 def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     """Return what is printed of a part: means over chains and pairs."""
-    keys = [k for k in ("density", "proposal", "noise", "limit", "draws", "method") if k in table]
+    keys = [k for k in ("density", "proposal", "noise", "limit", "draws") if k in table]
     if name == "completion":
         return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
     if "measure" not in table:

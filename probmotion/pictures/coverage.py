@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +78,7 @@ def draw_embedding(
     kinds: Sequence[str],
     path: str | Path | None = None,
     *,
-    counts: Sequence[int] | None = None,
+    counts: Mapping[str, int] | None = None,
     title: str = "",
 ) -> Figure:
     """Return a figure of embedded poses, and write it as PNG (Yin et al. 2018, figure 8).
@@ -91,9 +91,9 @@ def draw_embedding(
         ``"real"``, ``"prior"``, ``"posterior"`` or ``"seed"``.
     path : str or Path, optional
         Where to write, ``.png``; nowhere by default.
-    counts : sequence of int, optional
-        A panel for each, with so many draws of the prior and of the posterior, the first ones; one
-        panel with all by default.
+    counts : mapping of str to int, optional
+        A panel for each, by title, with so many draws of the prior and of the posterior, the first
+        ones; one panel with all by default.
     title : str
         Above the picture.
 
@@ -110,20 +110,19 @@ def draw_embedding(
     unknown = sorted(set(kinds) - set(_KINDS))
     if unknown:
         raise ValueError(f"kinds has {unknown}, expected some of {', '.join(_KINDS)}")
-    panels: Sequence[int | None] = [None] if counts is None else counts
+    panels: Mapping[str, int | None] = {"": None} if counts is None else counts
     figure = Figure(figsize=(0.3 + 3.6 * len(panels), 4.1), layout="constrained")
     shown = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
-    for axes, count in zip(shown, panels, strict=True):
+    for axes, (label, count) in zip(shown, panels.items(), strict=True):
         _draw_points(axes, points, np.asarray(kinds), count)
-        if count is not None:
-            axes.set_title(f"{count} draws", size=10, color=INK)
+        axes.set_title(label, size=10, color=INK)
     middle, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.ptp(points, axis=0).max()
     limits = np.stack([middle - 0.54 * reach, middle + 0.54 * reach], axis=1)
     shown[0].set(xlim=limits[0], ylim=limits[1])
     handles, labels = shown[-1].get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(handles), frameon=False,
-        labelcolor=INK, markerscale=1.5,
+        handles, labels, loc="outside lower center", frameon=False, labelcolor=INK,
+        ncols=len(handles) if len(panels) > 1 else 2, markerscale=1.5,
     )  # fmt: skip
     if title:
         figure.suptitle(title, size=12, color=INK, x=0.02, ha="left")

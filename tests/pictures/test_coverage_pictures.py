@@ -53,7 +53,7 @@ def offsets(figure, panel):
 
 def test_every_panel_has_so_many_draws_and_all_real_poses(points, tmp_path):
     path = tmp_path / "embedding.png"
-    figure = draw_embedding(points, KINDS, path, counts=[2, 7], title="draws")
+    figure = draw_embedding(points, KINDS, path, counts={"few": 2, "more": 7}, title="draws")
     for panel, count in enumerate((2, 7)):
         shown = offsets(figure, panel)
         np.testing.assert_array_equal(shown["real"], points[:10])
