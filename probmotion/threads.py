@@ -6,10 +6,18 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
-__all__ = ["one_thread"]
+__all__ = ["one_thread", "only_one_thread"]
 
 _READ_WHEN_LOADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_ONLY_ONE: ContextVar[bool] = ContextVar("only_one_thread", default=False)
+
+
+def only_one_thread() -> bool:
+    """Return whether the caller is inside :func:`one_thread`: our own loops then use one, too."""
+    return _ONLY_ONE.get()
 
 
 @contextmanager
@@ -26,12 +34,14 @@ def one_thread() -> Iterator[None]:
     torch = sys.modules.get("torch")
     torch_threads = torch.get_num_threads() if torch else 0
     os.environ.update(dict.fromkeys(_READ_WHEN_LOADED, "1"))
+    token = _ONLY_ONE.set(True)
     try:
         if torch:
             torch.set_num_threads(1)
         with threadpool_limits(1):
             yield
     finally:
+        _ONLY_ONE.reset(token)
         if torch:
             torch.set_num_threads(torch_threads)
         for name, value in before.items():

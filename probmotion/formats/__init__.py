@@ -75,7 +75,10 @@ def save_motion(motion: Motion, path: str | Path) -> None:
 
 
 def read_keypoints(
-    path: str | Path, fps: float | None = None, skeleton: Skeleton | str | None = None
+    path: str | Path,
+    fps: float | None = None,
+    skeleton: Skeleton | str | None = None,
+    people: int | None = None,
 ) -> list[KeypointTrack]:
     """Read the 2D keypoint tracks of a file: one per person and camera.
 
@@ -88,6 +91,8 @@ def read_keypoints(
     skeleton : Skeleton or str, optional
         The keypoints of a JSON file in their order; see
         :func:`~probmotion.formats.keypoint_json.read_keypoint_json`.
+    people : int, optional
+        How many people to follow in a JSON file that does not say who is who.
 
     Raises
     ------
@@ -102,6 +107,10 @@ def read_keypoints(
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if path.suffix.lower() == ".npz":
+        if people is not None:
+            raise ValueError(
+                f"people was given with {path}, expected none: npz files say who is who"
+            )
         if skeleton is not None:
             raise ValueError(f"skeleton was given with {path}, expected none: npz files hold it")
         return read_keypoint_npz(path, fps)
@@ -109,4 +118,4 @@ def read_keypoints(
         raise ValueError(
             f"fps is missing, expected frames per second: {path} is JSON, which does not hold it"
         )
-    return read_keypoint_json(path, fps, skeleton)
+    return read_keypoint_json(path, fps, skeleton, people)

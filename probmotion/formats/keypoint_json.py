@@ -29,9 +29,10 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.checks import check_positive
+from probmotion.checks import check_count, check_positive
 from probmotion.formats.errors import MotionFileError, read_bytes, shortened
 from probmotion.formats.keypoint_layouts import keypoint_skeleton
+from probmotion.formats.keypoint_linking import link_people
 from probmotion.formats.keypoint_tracks import (
     Detection,
     Frames,
@@ -51,7 +52,10 @@ _TWO_LAYOUTS = {25: " ('body25' and 'body25b' have as many)"}
 
 
 def read_keypoint_json(
-    path: str | Path, fps: float, skeleton: Skeleton | str | None = None
+    path: str | Path,
+    fps: float,
+    skeleton: Skeleton | str | None = None,
+    people: int | None = None,
 ) -> list[KeypointTrack]:
     """Read every person's keypoint track.
 
@@ -66,12 +70,16 @@ def read_keypoint_json(
         :data:`~probmotion.formats.keypoint_layouts.LAYOUTS` or of a preset. By default what COCO
         ``categories`` say, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25
         are ambiguous.
+    people : int, optional
+        How many people to follow from image to image where the file has no track ids; see
+        :func:`~probmotion.formats.keypoint_linking.link_people`.
 
     Returns
     -------
     tracks : list of KeypointTrack
         One per person, and video where the images belong to several. People are told apart by
-        ``track_id``, ``idx`` or ``person_id``; without them a frame may hold one person.
+        ``track_id``, ``idx`` or ``person_id``; without them a frame may hold one person, unless
+        ``people`` says how many to follow.
 
     Raises
     ------
@@ -80,7 +88,8 @@ def read_keypoint_json(
     FileNotFoundError
         If there is no such file.
     ValueError
-        If ``fps`` is not above 0 or ``skeleton`` is no known name.
+        If ``fps`` is not above 0, ``skeleton`` is no known name, or ``people`` are more than any
+        image shows.
     """
     path = Path(path)
     check_positive("fps", fps)
@@ -122,6 +131,10 @@ def read_keypoint_json(
     counts = sorted({len(detection.values) for detection in detections})
     if len(counts) > 1:
         raise MotionFileError(f"{path}: people have {counts} keypoints, expected one number")
+    if people is not None:
+        check_count("people", people)
+        if all(detection.person is None for detection in detections):
+            detections = link_people(detections, people)
     return tracks_of(detections, frames, _checked_skeleton(given, counts, path), float(fps), path)
 
 

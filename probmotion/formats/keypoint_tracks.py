@@ -161,7 +161,7 @@ def tracks_of(
                 who = f"person {shortened(detection.person)} twice"
             raise MotionFileError(
                 f"{detection.where}: frame {detection.frame} holds {who}, expected track ids "
-                "(track_id, idx or person_id) that tell people apart"
+                "(track_id, idx or person_id) that tell people apart, or how many people to follow"
             )
         track[detection.frame] = detection
     if frames is None:

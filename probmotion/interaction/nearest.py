@@ -22,6 +22,7 @@ from probmotion.interaction.nearest_kernels import (
     nearest_in_batch_on_threads,
 )
 from probmotion.interaction.shape_context import shape_contexts, shared_table
+from probmotion.threads import only_one_thread
 
 __all__ = ["MEASURES", "PairComparer"]
 
@@ -121,8 +122,9 @@ class PairComparer:
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])
         # One thread needs no pool of threads, which a process could not fork after.
-        threads = numba.get_num_threads() > 1 and projections.shape[0] * projections.shape[1] > 1
-        kernel = nearest_in_batch_on_threads if threads else nearest_in_batch
+        alone = only_one_thread() or numba.get_num_threads() == 1
+        several = projections.shape[0] * projections.shape[1] > 1
+        kernel = nearest_in_batch_on_threads if several and not alone else nearest_in_batch
         return kernel(projections, candidates, self._prepared, *self._options)
 
     def distances(self, projections: np.ndarray) -> np.ndarray:

@@ -254,3 +254,20 @@ def test_real_pairs_agree_with_the_plain_formulas(real_data: Path) -> None:
         for k, v, distance in zip(keypoints, visible, row, strict=True):
             wanted = plain(p, k, v, "interaction", "delaunay", 0.05)
             assert distance == pytest.approx(wanted, abs=1e-12)
+
+
+def test_inside_one_thread_the_serial_kernel_runs(monkeypatch) -> None:
+    """As under a comparison's clock, whatever the number of cores."""
+    from probmotion.interaction import nearest
+    from probmotion.threads import one_thread
+
+    used = []
+    for name in ("nearest_in_batch", "nearest_in_batch_on_threads"):
+        monkeypatch.setattr(nearest, name, lambda *_, name=name: used.append(name))
+    monkeypatch.setattr(nearest.numba, "get_num_threads", lambda: 4)
+    rng = np.random.default_rng(0)
+    comparer = PairComparer(rng.random((3, 5, 2)), np.ones((3, 5), dtype=bool))
+    with one_thread():
+        comparer.nearest(rng.random((2, 2, 5, 2)), np.zeros((2, 1), dtype=int))
+    comparer.nearest(rng.random((2, 2, 5, 2)), np.zeros((2, 1), dtype=int))
+    assert used == ["nearest_in_batch", "nearest_in_batch_on_threads"]
