@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -65,9 +65,10 @@ class Study:
 
     out: Path
     quick: bool
-    steps: int
+    draws: int
     chains: int
     warmup: int
+    repeats: int
     n_annotations: int
     n_held_out: int
 
@@ -89,34 +90,39 @@ class Study:
         return ground_truth(self.clips[1], self.n_held_out)[0]
 
     @cached_property
-    def pictures(self) -> DrawnAnnotations:
-        """Frames that are annotated in 2D, and the truth behind them."""
-        frames = [dance_frames(clip) for clip in self.clips[0]]
-        n = min(self.n_annotations, sum(int(some.sum()) for some in frames))
-        return draw_annotations(self.clips[0], n, SEED, frames=frames)
-
-    @cached_property
     def seed_pose(self) -> np.ndarray:
         """The one 3D pose-pair, (J, 3)."""
         return self.held_in[choose_seed(self.held_in)]
 
-    def posterior(self, density: str, **changes: object) -> TruncatedPosterior:
+    def pictures(self, repeat: int) -> DrawnAnnotations:
+        """Frames that are annotated in 2D, and the truth behind them: others in every repeat."""
+        frames = [dance_frames(clip) for clip in self.clips[0]]
+        n = min(self.n_annotations, sum(int(some.sum()) for some in frames))
+        return draw_annotations(self.clips[0], n, repeat, frames=frames)
+
+    def posterior(self, density: str, repeat: int = 0, **changes: object) -> TruncatedPosterior:
         """Return the posterior over a density: a measure's name, or ``"prior"``."""
         if density == "prior":
-            settings = replace(PairSettings(), **changes)
-            return pair_posterior(self.seed_pose, None, settings)
-        settings = PairSettings(measure=density, noise=NOISE[density])
-        settings = replace(settings, **changes)
-        return pair_posterior(self.seed_pose, self.pictures.annotations, settings)
+            return pair_posterior(self.seed_pose, None, replace(PairSettings(), **changes))
+        settings = replace(PairSettings(measure=density, noise=NOISE[density]), **changes)
+        pictures = self.pictures(repeat).annotations
+        return pair_posterior(self.seed_pose, pictures, settings, view_seed=repeat)
 
     def run(
-        self, posterior: TruncatedPosterior, proposal: Proposal | None = None, steps: int = 0
+        self,
+        posterior: TruncatedPosterior,
+        repeat: int = 0,
+        proposal: Proposal | None = None,
+        draws: int = 0,
     ) -> MotionDraws:
-        """Return every state of the chains after the warm-up."""
-        proposal = Isotropic(0.02) if proposal is None else proposal
-        sampler = MetropolisHastings(proposal, warmup=self.warmup, thin=1)
+        """Return every state after the warm-up of chains that start at the seed, side by side."""
+        sampler = MetropolisHastings(proposal or Isotropic(0.02), warmup=self.warmup, thin=1)
         return sampler.sample(
-            posterior, draws=steps or self.steps, chains=self.chains, seed=SEED, progress=False
+            posterior,
+            draws=(draws or self.draws) // self.chains,
+            chains=self.chains,
+            seed=repeat,
+            progress=False,
         )
 
     def keep(self, name: str, poses: np.ndarray) -> None:
@@ -144,21 +150,23 @@ class Study:
             print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
         return pd.read_csv(path)
 
-    def covered(
-        self, draws: MotionDraws, counts: list[int] | None = None
-    ) -> Iterator[tuple[str, int, int, float]]:
-        """Yield measure, chain, number of draws and coverage.
+    def covered(self, draws: MotionDraws, counts: list[int] | None = None) -> pd.DataFrame:
+        """Return coverage by the first so many draws of all chains, step by step.
 
-        Every fourth draw is compared: the next ones are mostly the same pose or a step away.
+        Every fourth step is compared: the ones between are mostly the same pose or a step away.
         """
         poses = draws.positions.values[:, ::_EVERY, 0]
-        wanted = [draws.positions.sizes["draw"]] if counts is None else counts
-        for measure in MEASURES:
-            for chain, states in enumerate(poses):
-                compared = [-(-count // _EVERY) for count in wanted]
-                found = coverage(self.held_out, states, measure, compared)
-                for count, value in zip(wanted, found, strict=True):
-                    yield measure, chain, count, float(value)
+        poses = np.swapaxes(poses, 0, 1).reshape(-1, *poses.shape[2:])
+        counts = counts or [self.chains * draws.positions.sizes["draw"]]
+        compared = [max(1, min(len(poses), count // _EVERY)) for count in counts]
+        rows = [
+            {"measure": measure, "draws": count, "coverage": value}
+            for measure in MEASURES
+            for count, value in zip(
+                counts, coverage(self.held_out, poses, measure, compared), strict=True
+            )
+        ]
+        return pd.DataFrame(rows)
 
 
 def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.ndarray]:
@@ -172,7 +180,7 @@ def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.nda
 def calibration(study: Study) -> pd.DataFrame:
     """What the density says of real pairs, of the seed and of draws."""
     posterior = study.posterior("interaction")
-    draws = study.run(posterior, steps=max(400, study.steps // 10))
+    draws = study.run(posterior, draws=study.draws // 10)
     rng = seeds.generator(SEED, "calibration")
     real = study.held_in[rng.choice(len(study.held_in), min(400, len(study.held_in)), False)]
     drawn = draws.positions.values[:, :: max(1, draws.positions.sizes["draw"] // 100), 0]
@@ -196,15 +204,17 @@ def noise(study: Study) -> pd.DataFrame:
     scales = {
         "interaction": (0.003, 0.005, 0.01, 0.02, 0.05),
         "cartesian": (0.0025, 0.005, 0.01, 0.02),
-        "shape-context": (0.01, 0.02, 0.05, 0.1),
+        "shape-context": (0.005, 0.01, 0.02),
     }
 
-    def run(density: str, size: float) -> pd.DataFrame:
-        draws = study.run(study.posterior(density, noise=size), steps=study.steps // 10)
-        return coverage_rows(study, draws, density=density, noise=size)
+    def run(density: str, size: float, repeat: int) -> pd.DataFrame:
+        posterior = study.posterior(density, repeat, noise=size)
+        draws = study.run(posterior, repeat, draws=study.draws // 10)
+        return study.covered(draws).assign(density=density, noise=size, **summary(draws))
 
     return pd.concat(
-        study.once(f"noise-{density}-{size}", partial(run, density, size))
+        study.once(f"noise-{density}-{size}-{repeat}", partial(run, density, size, repeat))
+        for repeat in range(study.repeats)
         for density, sizes in scales.items()
         for size in sizes
     )
@@ -213,20 +223,22 @@ def noise(study: Study) -> pd.DataFrame:
 def truncation(study: Study) -> pd.DataFrame:
     """c of eq. 11: shares of draws where the density is cut, and coverage."""
 
-    def run(limit: float) -> pd.DataFrame:
-        posterior = study.posterior("interaction", limit=limit)
-        draws = study.run(posterior, steps=study.steps // 10)
+    def run(limit: float, repeat: int) -> pd.DataFrame:
+        posterior = study.posterior("interaction", repeat, limit=limit)
+        draws = study.run(posterior, repeat, draws=study.draws // 10)
         kept = draws.dataset
         shares = posterior.run_shares(kept["theta"].values, kept["log_density"].values)
-        return coverage_rows(study, draws, limit=limit, **shares)
+        return study.covered(draws).assign(limit=limit, **shares, **summary(draws))
 
-    limits = (100.0, limit_for_dimension(108), np.inf)
-    return pd.concat(study.once(f"truncation-{c:.3g}", partial(run, c)) for c in limits)
+    return pd.concat(
+        study.once(f"truncation-{limit:.3g}-{repeat}", partial(run, limit, repeat))
+        for repeat in range(study.repeats)
+        for limit in (100.0, limit_for_dimension(108), np.inf)
+    )
 
 
 def velocity(study: Study) -> pd.DataFrame:
     """Biased against unbiased proposals at the same acceptance and number of draws (figure 7)."""
-    posterior = study.posterior("interaction")
     proposals = {
         "isotropic": Isotropic(0.02),
         "biased-1": VelocityBiased(base=0.02, bias=1.0),
@@ -234,61 +246,68 @@ def velocity(study: Study) -> pd.DataFrame:
         "velocity-alone": VelocityBiased(base=0.001, bias=1.0),
     }
 
-    def run(name: str) -> pd.DataFrame:
-        draws = study.run(posterior, proposals[name], steps=study.steps // 10)
-        study.keep(name, draws.positions.values[:1, early(draws), 0])
-        return coverage_rows(study, draws, proposal=name)
+    def run(name: str, repeat: int) -> pd.DataFrame:
+        posterior = study.posterior("interaction", repeat)
+        draws = study.run(posterior, repeat, proposals[name], draws=study.draws // 10)
+        study.keep(f"{name}-{repeat}", draws.positions.values[0, early(draws), 0])
+        return study.covered(draws).assign(proposal=name, **summary(draws))
 
-    table = pd.concat(study.once(name, partial(run, name)) for name in proposals)
+    table = pd.concat(
+        study.once(f"velocity-{name}-{repeat}", partial(run, name, repeat))
+        for repeat in range(study.repeats)
+        for name in proposals
+    )
     draw_pairs(
-        {name: study.kept(name)[0] for name in ("isotropic", "biased-1")},
-        posterior.skeleton,
+        {"unbiased": study.kept("isotropic-0"), "velocity-\nbiased": study.kept("biased-1-0")},
+        study.posterior("prior").skeleton,
         study.out / "figure7.png",
         columns=4,
-        title="draws 200, 400, 600 and 800: unbiased and velocity-biased proposals",
+        title="states 200, 400, 600 and 800 of a chain, by proposal",
     )
     return table
 
 
 def densities(study: Study) -> pd.DataFrame:
     """Coverage against the number of draws, four densities, three dissimilarities (figure 9)."""
-    counts = sorted({c for c in (100, 1000, 10_000, 100_000) if c < study.steps} | {study.steps})
+    counts = [study.draws // 100, study.draws // 10, study.draws]
 
-    def run(density: str) -> pd.DataFrame:
-        draws = study.run(study.posterior(density))
-        every = max(1, study.steps // 1000)
-        study.keep(density, draws.positions.values[:, ::every, 0])
-        study.keep(f"{density}-early", draws.positions.values[:1, early(draws), 0])
-        rows = study.covered(draws, counts)
-        table = pd.DataFrame(rows, columns=["measure", "chain", "draws", "coverage"])
-        return table.assign(density=density, **summary(draws))
+    def run(density: str, repeat: int) -> pd.DataFrame:
+        draws = study.run(study.posterior(density, repeat), repeat)
+        states = np.swapaxes(draws.positions.values[:, :, 0], 0, 1)
+        states = states.reshape(-1, *states.shape[2:])
+        study.keep(f"{density}-{repeat}", states[:: max(1, len(states) // 2000)])
+        study.keep(f"{density}-early-{repeat}", draws.positions.values[0, early(draws), 0])
+        return study.covered(draws, counts).assign(density=density, **summary(draws))
 
-    names = ("interaction", "cartesian", "prior", "shape-context")
-    table = pd.concat(study.once(f"coverage-{name}", partial(run, name)) for name in names)
-    rows = []
-    for measure in MEASURES:
-        seed = coverage(study.held_out, study.seed_pose[None], measure)
-        real = coverage(study.held_out, study.held_in, measure)
-        rows.append({"density": "the seed alone", "measure": measure, "draws": 1, "coverage": seed})
-        rows.append(
-            {
-                "density": "all held-in real pairs",
-                "measure": measure,
-                "draws": len(study.held_in),
-                "coverage": real,
-            }
-        )
+    table = pd.concat(
+        study.once(f"coverage-{density}-{repeat}", partial(run, density, repeat))
+        for repeat in range(study.repeats)
+        for density in ("interaction", "cartesian", "shape-context", "prior")
+    )
     draw_coverage(table, study.out / "figure9.png")
     draw_pairs(
         {
-            "prior alone": study.kept("prior-early")[0],
-            "prior and\nlikelihood": study.kept("interaction-early")[0],
+            "prior alone": study.kept("prior-early-0"),
+            "prior and\nlikelihood": study.kept("interaction-early-0"),
         },
         study.posterior("prior").skeleton,
         study.out / "figure6.png",
         columns=4,
-        title="draws 200, 400, 600 and 800 of one chain",
+        title="states 200, 400, 600 and 800 of a chain, by density",
     )
+    rows = [
+        {
+            "density": name,
+            "measure": measure,
+            "draws": len(poses),
+            "coverage": coverage(study.held_out, poses, measure),
+        }
+        for name, poses in (
+            ("the seed alone", study.seed_pose[None]),
+            ("all held-in real pairs", study.held_in),
+        )
+        for measure in MEASURES
+    ]
     return pd.concat([table, pd.DataFrame(rows)])
 
 
@@ -296,15 +315,15 @@ def embedding(study: Study) -> pd.DataFrame:
     """Draws over the space of the real pairs, by multidimensional scaling (figure 8)."""
     sets = {"real": study.held_out[:: max(1, len(study.held_out) // 150)]}
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
-        # Of a thousand draws evenly apart those whose numbers grow tenfold twice.
-        states = study.kept(density)[0]
-        sets[kind] = np.concatenate([states[:10], states[10:100:2], states[100::9]])
+        # Of two thousand draws evenly apart some of the first 20, of the first 200 and of all.
+        states = study.kept(f"{density}-0")
+        sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
     poses = np.concatenate(list(sets.values()))
     kinds = [kind for kind, some in sets.items() for _ in some]
     points = classical_scaling(pose_distances(poses, poses, "interaction"))
-    parts = {f"{study.steps // 100} draws": 10, f"{study.steps // 10} draws": 55}
-    counts = parts | {f"{study.steps} draws": len(sets["prior"])}
+    parts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
+    counts = parts | {f"{study.draws} draws": len(sets["prior"])}
     draw_embedding(points, kinds, study.out / "figure8.png", counts=counts)
     return pd.DataFrame({"kind": kinds, "x": points[:, 0], "y": points[:, 1]})
 
@@ -315,9 +334,9 @@ def completion(study: Study) -> pd.DataFrame:
     n = 10 if study.quick else 60
     asked = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
     whole = draw_annotations(study.clips[1], n, SEED, frames=frames)
-    annotated = study.pictures.annotations
+    annotated = study.pictures(0).annotations
     skeleton = annotated.skeleton
-    states = study.kept("interaction").reshape(-1, skeleton.n_joints, 3)
+    states = study.kept("interaction-0")
     rows = []
     for index in range(n):
         keypoints, visible = asked.annotations.keypoints[index], asked.annotations.visible[index]
@@ -349,12 +368,6 @@ def summary(draws: MotionDraws) -> dict[str, float]:
         "ess": found["ess_bulk"],
         "seconds": draws.seconds,
     }
-
-
-def coverage_rows(study: Study, draws: MotionDraws, **labels: object) -> pd.DataFrame:
-    """Return one row per measure and chain of a run."""
-    table = pd.DataFrame(study.covered(draws), columns=["measure", "chain", "draws", "coverage"])
-    return table.assign(**labels, **summary(draws))
 
 
 def early(draws: MotionDraws) -> list[int]:
@@ -396,16 +409,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("pose-pairs"))
     parser.add_argument("--parts", nargs="*", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--quick", action="store_true", help="made dances, few draws")
-    parser.add_argument("--steps", type=int, default=None, help="draws of a chain")
-    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--draws", type=int, help="of all chains; 100000 by default")
+    parser.add_argument("--repeats", type=int, default=3, help="with other annotations each")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     study = Study(
         options.out,
         options.quick,
-        steps=options.steps or (1000 if options.quick else 100_000),
-        chains=options.chains,
+        draws=options.draws or (4000 if options.quick else 100_000),
+        chains=4,
         warmup=300 if options.quick else 3000,
+        repeats=options.repeats,
         n_annotations=300 if options.quick else 6000,
         n_held_out=40 if options.quick else 300,
     )
