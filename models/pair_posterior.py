@@ -19,7 +19,11 @@ __all__ = ["PairSettings", "pair_posterior"]
 
 @dataclass(frozen=True)
 class PairSettings:
-    """Every number of the posterior over pose-pairs; the defaults move a chain on metric data.
+    """Every number of the posterior over pose-pairs.
+
+    The published ones, but for two that ``notebooks/ablations/pose_pairs.py`` shows: ``noise``
+    is in the middle of the range where draws cover real pairs alike, and nothing is truncated, as
+    a density that is cut at 100 times the seed's is flat where most draws are.
 
     Parameters
     ----------
@@ -34,7 +38,7 @@ class PairSettings:
     shortest_edge : float
         ε of eq. 8, metres.
     noise : float
-        σ_l of eq. 9, metres.
+        σ_l of eq. 9, in the unit of the measure: metres, but for shape contexts, which have none.
     limit : float
         c of eq. 11; infinity does not truncate.
     n_views, n_near : int
@@ -51,7 +55,7 @@ class PairSettings:
     max_invalid: int = 8
     view_bandwidth: float = 0.5
     shortest_edge: float = 0.05
-    noise: float = 0.05
+    noise: float = 0.005
     limit: float = math.inf
     n_views: int = 32
     n_near: int = 32
@@ -62,7 +66,7 @@ class PairSettings:
 
     @classmethod
     def paper(cls) -> PairSettings:
-        """Return the published numbers; on data in metres a chain hardly moves with them."""
+        """Return the published numbers."""
         return cls(noise=0.01, limit=100.0)
 
 
@@ -129,4 +133,12 @@ def pair_posterior(
             likelihood = AnnotatedPairs.estimated(annotations, prior.seed[0], **numbers)
         else:
             likelihood = AnnotatedPairs(annotations, **numbers)  # type: ignore[arg-type]
-    return TruncatedPosterior(prior, likelihood, limit=settings.limit)
+    posterior = TruncatedPosterior(prior, likelihood, limit=settings.limit)
+    log_density = posterior.log_density(prior.seed_coordinates())
+    if not np.isfinite(log_density).all():
+        worst = int(log_density.argmin())
+        raise ValueError(
+            f"seed {worst} is below 1/{settings.limit:g} of the first seed's density, where "
+            "truncation leaves nothing: expected seeds of like density, or a greater limit"
+        )
+    return posterior

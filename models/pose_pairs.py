@@ -8,6 +8,7 @@ import numpy as np
 
 from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_count, check_positive, check_shape
+from probmotion.data.pair_sets import check_close_people
 from probmotion.models.joint_limits import JointLimits
 from probmotion.models.penetration import penetration_depth
 from probmotion.models.pose_chart import PoseChart
@@ -15,7 +16,7 @@ from probmotion.skeleton import Skeleton
 
 __all__ = ["PosePairPrior"]
 
-# Chains that start at one pose start this far apart, so that no two are the same.
+# Walkers of an ensemble that start at one pose start this far apart, so that no two are the same.
 _JITTER = 1e-3
 
 
@@ -52,7 +53,8 @@ class PosePairPrior:
     Raises
     ------
     ValueError
-        If a seed is outside the prior's support; the message names the joints.
+        If a seed is not of people in metres within reach of each other, or is outside the prior's
+        support; the message names the joints.
     """
 
     seed: np.ndarray
@@ -82,6 +84,8 @@ class PosePairPrior:
             raise ValueError("seed has no pose, expected at least one")
         if self.skeleton.radii is None:
             raise ValueError("skeleton has no bone radii, expected one per joint for penetration")
+        for number, pose in enumerate(poses):
+            check_close_people(f"seed {number}", pose, self.skeleton)
         chart = PoseChart(poses[0], self.skeleton, self.bone_noise, self.root_noise)
         limits = JointLimits.shipped() if self.limits is None else self.limits
         object.__setattr__(self, "joint_limits", limits.on(self.skeleton))
@@ -109,9 +113,13 @@ class PosePairPrior:
         return self.chart.coordinates(poses)
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n points to start at, (n, dim): seeds chosen at random, a millimetre off."""
-        chosen = self.chart.coordinates(self.seed)[rng.integers(len(self.seed), size=n)]
+        """Return n points to start at, (n, dim): seeds in turn, a millimetre off."""
+        chosen = self.seed_coordinates()[np.arange(n) % len(self.seed)]
         return chosen + _JITTER * rng.standard_normal((n, self.dim))
+
+    def seed_coordinates(self) -> np.ndarray:
+        """Return θ of the seeds, (S, dim)."""
+        return self.chart.coordinates(self.seed)
 
     def log_density(self, theta: Array) -> np.ndarray:
         """Return log f(Θ) with the measure it is relative to, up to a constant: NumPy arrays.
@@ -119,7 +127,17 @@ class PosePairPrior:
         ``(…, dim) → (…)``; −∞ outside the support.
         """
         theta = to_numpy(theta)
-        return self.log_measure(theta) + self.log_plausibility(self.motion(theta))
+        log_measure = self.log_measure(theta)
+        flat = theta.reshape(-1, self.dim)
+        # A bone can be longer than any number.
+        with np.errstate(over="ignore", invalid="ignore"):
+            positions = self.motion(flat)
+        inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
+        log_f = np.full(len(flat), -np.inf)
+        log_f[inside] = self.log_plausibility(positions[inside])
+        return np.where(log_f > -np.inf, log_measure.reshape(-1), 0.0).reshape(
+            log_measure.shape
+        ) + log_f.reshape(log_measure.shape)
 
     def log_measure(self, theta: Array) -> np.ndarray:
         """Return the log density of the measure that f is relative to: ``(…, dim) → (…)``."""

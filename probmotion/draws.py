@@ -207,6 +207,9 @@ class MotionDraws:
         Of single poses (L = 1) that shows how the chain walks; any draw that pleases can be where
         another run starts: ``initial=draws.dataset["theta"].values[:, k]``.
         """
+        chains = self.positions.sizes["chain"]
+        if not 0 <= chain < chains:
+            raise ValueError(f"chain is {chain!r}, expected a number from 0 to {chains - 1}")
         positions = self.positions.isel(chain=chain).values
         name = f"{self.dataset.attrs['sampler']}-{chain}"
         return Motion(

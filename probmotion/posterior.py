@@ -153,6 +153,13 @@ class MotionPosterior:
         log_density, closest = self._with_evidence(theta, log_prior, evidence)
         return log_density, closest
 
+    def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what a run on this posterior should keep of every draw, by name: nothing here.
+
+        ``theta`` (…, dim) and ``log_density`` (…) are the draws; values are arrays of (…).
+        """
+        return {}
+
     def speeds(self, closest: np.ndarray) -> np.ndarray:
         """Return each coordinate's mean squared step in the annotations of D' (eq. 12).
 

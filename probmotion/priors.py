@@ -27,6 +27,7 @@ __all__ = [
     "HasCoordinateSpeeds",
     "HasExactPosterior",
     "HasLogDensity",
+    "HasSeeds",
     "Marginalises",
     "MotionPrior",
     "NotConjugate",
@@ -85,7 +86,15 @@ class HasLogDensity(Protocol):
         """Return log p(θ): ``(…, dim) → (…)``."""
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n points to start at, (n, dim): draws from the prior if it is `Samplable`."""
+        """Return n points to start at, (n, dim): draws from the prior unless it `HasSeeds`."""
+
+
+@runtime_checkable
+class HasSeeds(Protocol):
+    """A prior that cannot be drawn from, and says itself where chains start."""
+
+    def seed_coordinates(self) -> np.ndarray:
+        """Return θ of the seeds, (S, dim); chain k starts at the k-th, and so on round."""
 
 
 @runtime_checkable

@@ -47,7 +47,7 @@ class TruncatedPosterior(MotionPosterior):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.limit > 1:
+        if not (isinstance(self.limit, int | float) and self.limit > 1):
             raise ValueError(f"limit is {self.limit!r}, expected c above 1, or infinity")
         theta = np.zeros(self.dim) if self.seed is None else np.asarray(self.seed, np.float64)
         check_shape("seed", theta, (self.dim,))
@@ -87,8 +87,8 @@ class TruncatedPosterior(MotionPosterior):
             )
         return super().evaluate(theta, generators)
 
-    def run_shares(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, float]:
-        """Return the shares of draws at the cap, and within 1 nat of the floor.
+    def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
+        """Return which draws are at the cap, and which within 1 nat of the floor, as 1 and 0.
 
         Parameters
         ----------
@@ -97,12 +97,11 @@ class TruncatedPosterior(MotionPosterior):
         log_density : ndarray, (…)
             Their log density.
         """
-        if math.isinf(self.limit):
-            return {"at_cap": 0.0, "near_floor": 0.0}
-        level = log_density - self._log_measure(theta)
+        with np.errstate(invalid="ignore"):
+            level = log_density - self._log_measure(theta)
         return {
-            "at_cap": float((level > self.log_cap - 1e-9).mean()),
-            "near_floor": float((level < self.log_floor + _NEAR).mean()),
+            "at_cap": (level > self.log_cap - 1e-9).astype(np.int8),
+            "near_floor": (level < self.log_floor + _NEAR).astype(np.int8),
         }
 
     def _log_measure(self, theta: Array) -> np.ndarray:

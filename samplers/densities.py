@@ -16,7 +16,7 @@ from probmotion import seeds
 from probmotion.checks import check_count, check_finite, check_shape
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
-from probmotion.priors import NotConjugate, Samplable
+from probmotion.priors import HasSeeds, NotConjugate
 from probmotion.sampling import Sampler, UnsupportedPosterior, batches, require
 from probmotion.seeds import NormalStreams
 
@@ -141,8 +141,8 @@ def starting_points(
     ``candidates`` draws of its own from the prior, in proportion to their likelihood
     (sampling-importance-resampling, Rubin 1987): nearly a draw from the posterior where enough
     candidates have a share, so that starts are spread over the modes as the mass is, and R-hat
-    still sees a chain that stays where it began. Without evidence it is a draw from the prior. A
-    prior that cannot be drawn from says itself where to start.
+    still sees a chain that stays where it began. Without evidence it is a draw from the prior. Of a
+    prior with seeds each chain starts at one of them in turn.
 
     Parameters
     ----------
@@ -170,11 +170,11 @@ def starting_points(
     starts = []
     for chain in range(chains):
         rng = seeds.generator(seed, "initial", chain)
-        if (
-            posterior.likelihood is None
-            or candidates <= n
-            or not isinstance(posterior.prior, Samplable)
-        ):
+        if isinstance(posterior.prior, HasSeeds) and n == 1:
+            seeded = posterior.prior.seed_coordinates()
+            starts.append(seeded[[chain % len(seeded)]])
+            continue
+        if posterior.likelihood is None or candidates <= n:
             starts.append(posterior.initial(rng, n))
             continue
         drawn = posterior.initial(rng, candidates)
@@ -186,14 +186,12 @@ def starting_points(
 
 def continued(
     sampler: Sampler,
-    log_density: Callable[[np.ndarray], np.ndarray] | None,
+    log_density: Callable[[np.ndarray], np.ndarray],
     initial: object,
     chains: int,
     seed: int,
 ) -> Mapping[str, np.ndarray] | None:
     """Return the state that ``initial`` stopped in, or ``None`` where it is no finished run.
-
-    ``log_density`` tells whether it was of this posterior; ``None`` where densities are estimates.
 
     Raises
     ------
@@ -217,10 +215,10 @@ def continued(
                 f"initial is a run with {name} {expected}, and {name} is {came}: a run goes on as "
                 "it began; to start afresh where it stopped, pass an array of points"
             )
-    if log_density is None:
-        return initial.state
     last = initial.dataset.isel(draw=-1)
-    stored, found = last["log_density"].values, log_density(last["theta"].values)
+    # Of a run whose densities are estimates the state holds what they are to be compared with.
+    stored = initial.state.get("fixed", last["log_density"].values)
+    found = log_density(last["theta"].values)
     if not np.allclose(found, stored, rtol=1e-6, atol=1e-6):
         raise ValueError(
             f"initial is a run of another posterior: its last log density is {stored[0]:.6g}, and "

@@ -52,6 +52,11 @@ class MetropolisHastings:
     pseudo_marginal: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.proposal, type) or not hasattr(self.proposal, "propose"):
+            raise ValueError(
+                f"proposal is {self.proposal!r}, expected an object with settings such as "
+                "Isotropic()"
+            )
         check_count("candidates", self.candidates)
         check_count("warmup", self.warmup, least=0)
         check_count("thin", self.thin)
@@ -88,8 +93,7 @@ class MetropolisHastings:
         start = time.perf_counter()
         density = Density(self, posterior)
         self._require_views(posterior)
-        log_density = None if self.pseudo_marginal else posterior.log_density
-        earlier = continued(self, log_density, initial, chains, seed)
+        earlier = continued(self, posterior.log_density, initial, chains, seed)
         warmup = self.warmup if earlier is None else 0
         kept = _Kept(chains, draws, posterior.dim)
         try:
@@ -120,8 +124,12 @@ class MetropolisHastings:
         if not isinstance(posterior.likelihood, ComparesViews):
             raise UnsupportedPosterior(
                 self.name,
-                f"with {wanting} needs evidence that compares views with annotations, which "
-                f"{type(posterior.likelihood).__name__} does not",
+                f"with {wanting} needs evidence that compares views with annotations, and "
+                + (
+                    "there is no evidence"
+                    if posterior.likelihood is None
+                    else f"{type(posterior.likelihood).__name__} does not"
+                ),
                 word="views",
             )
 
@@ -139,7 +147,10 @@ class MetropolisHastings:
             seconds=time.perf_counter() - start,
             theta=theta,
             log_density=kept.log_density[:, :n],
-            statistics={"acceptance": kept.acceptance[:, :n]},
+            statistics={
+                "acceptance": kept.acceptance[:, :n],
+                **posterior.draw_statistics(theta, kept.log_density[:, :n]),
+            },
             counts={"density": density.evaluations},
             state=state,
         )
@@ -200,6 +211,8 @@ class _Walk:
             "log_density": self.log_density,
             # netCDF holds no array without width.
             **({"guide": self.guide} if self.proposal.guided else {}),
+            # An estimate does not tell which posterior it is of.
+            **({"fixed": self.density(self.theta)} if self.fresh_views else {}),
             "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
             "draws": np.array(self.draws, dtype=np.int32),
             **{_MEMORY + name: values for name, values in memory.items()},

@@ -343,5 +343,5 @@ def _normal(generators: Sequence[np.random.Generator], dim: int) -> np.ndarray:
 
 
 def _check_target(target: float) -> None:
-    if not 0 < target < 1:
+    if not (isinstance(target, int | float) and 0 < target < 1):
         raise ValueError(f"target is {target!r}, expected an acceptance between 0 and 1")

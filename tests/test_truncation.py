@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from probmotion.samplers import MetropolisHastings
+from probmotion.samplers.proposals import Isotropic
 from probmotion.skeleton import Skeleton
 from probmotion.truncation import TruncatedPosterior, limit_for_dimension
 
@@ -75,7 +77,7 @@ def test_infinity_leaves_the_density_as_it_is():
     whole = TruncatedPosterior(Line(), Slope())
     expected = Line().log_density(THETA) + np.minimum(0, THETA[:, 0] - 4)
     assert np.allclose(whole.log_density(THETA), expected)
-    assert whole.run_shares(THETA, expected) == {"at_cap": 0.0, "near_floor": 0.0}
+    assert all(not flags.any() for flags in whole.draw_statistics(THETA, expected).values())
 
 
 def test_evidence_is_asked_only_where_it_could_save_the_point():
@@ -95,8 +97,19 @@ def test_a_single_point_is_a_batch_of_no_axes():
 def test_shares_are_of_the_cap_and_of_a_nat_above_the_floor():
     posterior = TruncatedPosterior(Line(), seed=np.array([3.0, 0.0]), limit=math.exp(2))
     theta = np.array([[0.0, 1.0], [2.0, 0.0], [np.sqrt(2 * 5.7), 0.0], [np.sqrt(2 * 5.4), 0.0]])
-    shares = posterior.run_shares(theta, posterior.log_density(theta))
-    assert shares == {"at_cap": 0.5, "near_floor": 0.25}
+    flags = posterior.draw_statistics(theta, posterior.log_density(theta))
+    assert flags["at_cap"].tolist() == [1, 1, 0, 0]
+    assert flags["near_floor"].tolist() == [0, 0, 1, 0]
+
+
+def test_every_run_keeps_where_its_draws_are_cut():
+    posterior = TruncatedPosterior(Line(), limit=2.0)
+    sampler = MetropolisHastings(Isotropic(1.0, None), warmup=0, thin=1)
+    start = np.zeros((1, 2))
+    draws = sampler.sample(posterior, draws=300, initial=start, progress=False)
+    level = draws.dataset["log_density"] + np.abs(draws.dataset["theta"][..., 1])
+    assert np.array_equal(draws.dataset["near_floor"], (level < -np.log(2) + 1).astype(int))
+    assert not draws.dataset["at_cap"].any()
 
 
 def test_the_limit_for_a_dimension_keeps_a_gaussians_draws():

@@ -12,10 +12,12 @@ Real data are looked for as in :func:`probmotion.data.downloads.salsa_pairs`.
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +36,7 @@ from probmotion.data.pair_sets import (
 from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
 from probmotion.interaction.annotation_sources import DrawnAnnotations, draw_annotations
+from probmotion.interaction.backbones import annotation_views
 from probmotion.interaction.completion import (
     complete_keypoints,
     hidden_joint_error,
@@ -41,6 +44,7 @@ from probmotion.interaction.completion import (
 )
 from probmotion.interaction.coordinates import align_rigidly
 from probmotion.interaction.pose_distances import MEASURES, pose_distances
+from probmotion.interaction.retrieval import views_around
 from probmotion.interaction.views import project_to_views
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.coverage import coverage
@@ -54,9 +58,10 @@ from probmotion.samplers.proposals import Isotropic, Proposal, VelocityBiased
 from probmotion.truncation import TruncatedPosterior, limit_for_dimension
 
 SEED = 0
-_EVERY = 4
-# Each density at the noise at which it covers best (part "noise").
-NOISE = {"interaction": 0.005, "cartesian": 0.005, "shape-context": 0.02}
+# σ_l by part "noise", on the validation clips: the others where they cover best, interaction
+# coordinates at the default, in the middle of the range where they cover alike.
+VALIDATION = ("cmu_60_61_02", "cmu_60_61_10")
+NOISE = {"interaction": 0.005, "cartesian": 0.01, "shape-context": 0.005}
 
 
 @dataclass(frozen=True)
@@ -71,13 +76,21 @@ class Study:
     repeats: int
     n_annotations: int
     n_held_out: int
+    validating: bool = False
 
     @cached_property
     def clips(self) -> tuple[list, list]:
-        """Clips that are shown, and clips that are held out whole."""
+        """Clips that are shown, and clips that are held out whole.
+
+        What is chosen is chosen on clips that are held out of those that are shown.
+        """
         if self.quick:
-            return hold_out(make_dances(8), ["dance-6", "dance-7"])
-        return hold_out(salsa_pairs(), SALSA_HELD_OUT)
+            shown, hidden = hold_out(make_dances(8), ["dance-6", "dance-7"])
+        else:
+            shown, hidden = hold_out(salsa_pairs(), SALSA_HELD_OUT)
+        if self.validating:
+            return hold_out(shown, ["dance-5"] if self.quick else VALIDATION)
+        return shown, hidden
 
     @cached_property
     def held_in(self) -> np.ndarray:
@@ -135,7 +148,10 @@ class Study:
 
     def kept(self, name: str) -> np.ndarray:
         """Read what :meth:`keep` wrote."""
-        with np.load(self.out / f"poses-{name}.npz") as archive:
+        path = self.out / f"poses-{name}.npz"
+        if not path.exists():
+            raise SystemExit(f"{path} is missing: run the part that makes it, coverage, first")
+        with np.load(path) as archive:
             return archive["poses"].astype(np.float64)
 
     def once(self, name: str, make: Callable[[], pd.DataFrame]) -> pd.DataFrame:
@@ -151,22 +167,23 @@ class Study:
         return pd.read_csv(path)
 
     def covered(self, draws: MotionDraws, counts: list[int] | None = None) -> pd.DataFrame:
-        """Return coverage by the first so many draws of all chains, step by step.
-
-        Every fourth step is compared: the ones between are mostly the same pose or a step away.
-        """
-        poses = draws.positions.values[:, ::_EVERY, 0]
-        poses = np.swapaxes(poses, 0, 1).reshape(-1, *poses.shape[2:])
-        counts = counts or [self.chains * draws.positions.sizes["draw"]]
-        compared = [max(1, min(len(poses), count // _EVERY)) for count in counts]
+        """Return coverage by the first so many draws of all chains, step by step."""
+        poses = step_by_step(draws)
+        counts = counts or [len(poses)]
         rows = [
             {"measure": measure, "draws": count, "coverage": value}
             for measure in MEASURES
             for count, value in zip(
-                counts, coverage(self.held_out, poses, measure, compared), strict=True
+                counts, coverage(self.held_out, poses, measure, counts), strict=True
             )
         ]
         return pd.DataFrame(rows)
+
+
+def step_by_step(draws: MotionDraws) -> np.ndarray:
+    """Return the poses of all chains, first step first: (chains × draws, J, 3)."""
+    poses = np.swapaxes(draws.positions.values[:, :, 0], 0, 1)
+    return poses.reshape(-1, *poses.shape[2:])
 
 
 def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.ndarray]:
@@ -200,7 +217,8 @@ def calibration(study: Study) -> pd.DataFrame:
 
 
 def noise(study: Study) -> pd.DataFrame:
-    """σ_l: acceptance, step and coverage; from this the defaults are chosen."""
+    """σ_l: acceptance, step and coverage of the validation clips; defaults are chosen from it."""
+    study = replace(study, validating=True)
     scales = {
         "interaction": (0.003, 0.005, 0.01, 0.02, 0.05),
         "cartesian": (0.0025, 0.005, 0.01, 0.02),
@@ -226,8 +244,7 @@ def truncation(study: Study) -> pd.DataFrame:
     def run(limit: float, repeat: int) -> pd.DataFrame:
         posterior = study.posterior("interaction", repeat, limit=limit)
         draws = study.run(posterior, repeat, draws=study.draws // 10)
-        kept = draws.dataset
-        shares = posterior.run_shares(kept["theta"].values, kept["log_density"].values)
+        shares = {name: float(draws.dataset[name].mean()) for name in ("at_cap", "near_floor")}
         return study.covered(draws).assign(limit=limit, **shares, **summary(draws))
 
     return pd.concat(
@@ -273,16 +290,15 @@ def densities(study: Study) -> pd.DataFrame:
 
     def run(density: str, repeat: int) -> pd.DataFrame:
         draws = study.run(study.posterior(density, repeat), repeat)
-        states = np.swapaxes(draws.positions.values[:, :, 0], 0, 1)
-        states = states.reshape(-1, *states.shape[2:])
-        study.keep(f"{density}-{repeat}", states[:: max(1, len(states) // 2000)])
+        poses = step_by_step(draws)
+        study.keep(f"{density}-{repeat}", poses[:: max(1, len(poses) // 10_000)])
         study.keep(f"{density}-early-{repeat}", draws.positions.values[0, early(draws), 0])
         return study.covered(draws, counts).assign(density=density, **summary(draws))
 
     table = pd.concat(
         study.once(f"coverage-{density}-{repeat}", partial(run, density, repeat))
+        for density in ("interaction", "cartesian", "prior", "shape-context")
         for repeat in range(study.repeats)
-        for density in ("interaction", "cartesian", "shape-context", "prior")
     )
     draw_coverage(table, study.out / "figure9.png")
     draw_pairs(
@@ -317,6 +333,7 @@ def embedding(study: Study) -> pd.DataFrame:
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
         # Of two thousand draws evenly apart some of the first 20, of the first 200 and of all.
         states = study.kept(f"{density}-0")
+        states = states[:: max(1, len(states) // 2000)]
         sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
     poses = np.concatenate(list(sets.values()))
@@ -329,28 +346,35 @@ def embedding(study: Study) -> pd.DataFrame:
 
 
 def completion(study: Study) -> pd.DataFrame:
-    """Hidden joints of held-out pairs: error beside the two baselines, in the picture, metres."""
+    """Hidden joints of held-out pairs: error beside the two baselines, in the picture, metres.
+
+    Every method gets the same estimate of the view, from the seed's torsos.
+    """
     frames = [dance_frames(clip) for clip in study.clips[1]]
     n = 10 if study.quick else 60
     asked = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
     whole = draw_annotations(study.clips[1], n, SEED, frames=frames)
     annotated = study.pictures(0).annotations
     skeleton = annotated.skeleton
+    views = annotation_views(asked.annotations, study.seed_pose)
     states = study.kept("interaction-0")
     rows = []
     for index in range(n):
         keypoints, visible = asked.annotations.keypoints[index], asked.annotations.visible[index]
         truth = whole.annotations.keypoints[index]
-        view = asked.views[index]
+        view = views[index]
+        if np.isnan(view).any():  # too little of a torso is seen
+            continue
         lifted = lift_people(keypoints, visible, study.seed_pose, skeleton, view)
-        picture = project_to_views(lifted[None], view[None], skeleton)[0, 0]
         seed = project_to_views(study.seed_pose[None], view[None], skeleton)[0, 0]
         for name, positions in {
-            "draws": complete_keypoints(keypoints, visible, states, skeleton).positions,
+            "draws": complete_keypoints(
+                keypoints, visible, states, skeleton, views=views_around(view)
+            ).positions,
             "nearest annotation": nearest_annotation_completion(
                 keypoints, visible, annotated.keypoints, skeleton
             ).positions,
-            "single-pose lifting": np.asarray(align_rigidly(picture, keypoints, visible)),
+            "single-pose lifting": lifted[:, :2],
             "the seed": np.asarray(align_rigidly(seed, keypoints, visible)),
         }.items():
             error = hidden_joint_error(truth, positions, ~visible)
@@ -403,6 +427,17 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     return wide.round(4)
 
 
+def same_study(study: Study) -> None:
+    """Stop where the folder holds runs of another study, which would be taken for this one's."""
+    about = {k: v for k, v in asdict(study).items() if k not in ("out", "repeats", "validating")}
+    about |= {"noise": NOISE, "version": version("probmotion")}
+    path = study.out / "study.json"
+    if path.exists() and json.loads(path.read_text()) != about:
+        raise SystemExit(f"{path} is of another study, expected {about}: choose another --out")
+    with written_whole(path) as unfinished:
+        unfinished.write_text(json.dumps(about))
+
+
 def main() -> None:
     """Run the parts that are not there yet; print every table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -412,6 +447,8 @@ def main() -> None:
     parser.add_argument("--draws", type=int, help="of all chains; 100000 by default")
     parser.add_argument("--repeats", type=int, default=3, help="with other annotations each")
     options = parser.parse_args()
+    if options.repeats < 1 or (options.draws is not None and options.draws < 400):
+        parser.error("expected --repeats of at least 1 and --draws of at least 400")
     options.out.mkdir(parents=True, exist_ok=True)
     study = Study(
         options.out,
@@ -423,6 +460,7 @@ def main() -> None:
         n_annotations=300 if options.quick else 6000,
         n_held_out=40 if options.quick else 300,
     )
+    same_study(study)
     for name in options.parts:
         path = options.out / f"{name}.csv"
         start = time.perf_counter()

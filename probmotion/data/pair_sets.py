@@ -14,6 +14,7 @@ from probmotion.skeleton import Skeleton
 
 __all__ = [
     "SALSA_HELD_OUT",
+    "check_close_people",
     "choose_seed",
     "dance_frames",
     "describe_dance_frames",
@@ -31,6 +32,8 @@ SALSA_HELD_OUT = ("cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11")
 _FOOT = 0.039
 _SKULL = 0.10
 _SEED_POSES = 400
+_HEIGHTS = (0.5, 3.0)
+_FARTHEST = 5.0
 _LEG = ("hip", "knee", "ankle")
 
 
@@ -118,6 +121,9 @@ def ground_truth(
     clip = np.repeat(np.arange(len(motions)), [len(kept) for kept in frames])
     frame = np.concatenate(frames)
     total = len(frame)
+    if total == 0:
+        first = describe_dance_frames(motions[0], farthest=farthest, fastest=fastest)
+        raise ValueError(f"motions has no frame of dance, expected some; of the first, {first}")
     if n is None:
         n = total
     check_count("n", n)
@@ -184,6 +190,29 @@ def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("…", skeleton.n_joints, 3))
     return np.stack([_height(positions, skeleton, root) for root in skeleton.roots], axis=-1)
+
+
+def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
+    """Raise ``ValueError`` unless a pose (J, 3) is of people in metres, within reach of each other.
+
+    People are 0.5 to 3 m tall (:func:`person_height`), their roots at most 5 m apart.
+    """
+    check_shape(name, pose, (skeleton.n_joints, 3))
+    check_finite(name, pose)
+    heights = person_height(pose, skeleton)
+    odd = heights[(heights < _HEIGHTS[0]) | (heights > _HEIGHTS[1])]
+    if odd.size:
+        raise ValueError(
+            f"{name} has people {odd[0]:.3g} m tall, expected {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} "
+            "m: positions are metres"
+        )
+    roots = pose[list(skeleton.roots)]
+    apart = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
+    if apart > _FARTHEST:
+        raise ValueError(
+            f"{name} has people {apart:.3g} m apart, expected at most {_FARTHEST:g} m: they "
+            "interact closely"
+        )
 
 
 def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:

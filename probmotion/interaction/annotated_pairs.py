@@ -59,7 +59,7 @@ class AnnotatedPairs:
     annotations: Annotations
     n_views: int = 32
     n_near: int = 32
-    noise: float = 0.05
+    noise: float = 0.005
     view_bandwidth: float = 0.5
     measure: str = "interaction"
     graph: str = "delaunay"
@@ -82,6 +82,9 @@ class AnnotatedPairs:
                 "annotations has no views, expected them known or estimated: use "
                 "AnnotatedPairs.estimated(annotations, seed_pose)"
             )
+        check_positive("view_bandwidth", self.view_bandwidth)
+        check_positive("shortest_edge", self.shortest_edge)
+        _check_metres(self.annotations)
         distribution = ViewDistribution(self.annotations.views, self.view_bandwidth)
         comparer = PairComparer(
             self.annotations.keypoints,
@@ -105,14 +108,31 @@ class AnnotatedPairs:
         Parameters
         ----------
         annotations : Annotations
-            What was annotated; views that it has are not used.
+            What was annotated; views that it has are not used. Those whose view cannot be estimated
+        are left out and counted in ``dropped``.
         seed_pose : ndarray, (J, 3)
             A 3D pose-pair, whose torsos are fitted to the annotations, metres.
         **settings
             The other parameters of the class.
         """
+        if np.shape(seed_pose) != (annotations.skeleton.n_joints, 3):
+            raise ValueError(
+                f"seed_pose has shape {np.shape(seed_pose)}, expected "
+                f"({annotations.skeleton.n_joints}, 3): the annotations are of "
+                f"{len(annotations.skeleton.roots)} people"
+            )
         views = annotation_views(annotations, seed_pose)
-        return cls(replace(annotations, views=views), **settings)  # type: ignore[arg-type]
+        known = ~np.isnan(views).any(axis=-1)
+        if not known.any():
+            raise ValueError(
+                f"annotations shows too little of the torsos in all {len(views)} pictures to "
+                "estimate views, expected at least three torso joints of each person in one"
+            )
+        dropped = dict(annotations.dropped)
+        if not known.all():
+            dropped["view not to be estimated"] = int((~known).sum())
+        kept = replace(annotations, views=views).subset(np.flatnonzero(known))
+        return cls(replace(kept, dropped=dropped), **settings)  # type: ignore[arg-type]
 
     @property
     def skeleton(self) -> Skeleton:
@@ -179,6 +199,12 @@ class AnnotatedPairs:
         log_density = logsumexp(log_terms, axis=-1) - math.log(self.n_views)
         return log_density.reshape(batch), closest.reshape(*batch, self.n_views)
 
+    def degenerate_share(self, positions: np.ndarray) -> float:
+        """Return the share of pictures of poses (n, 1, J, 3) whose joints had to be joggled."""
+        check_shape("positions", positions, ("n", 1, self.n_joints, 3))
+        pictures = project_to_views(positions[:, 0], self.views, self.skeleton)
+        return self.comparer.degenerate(pictures) / (pictures.shape[0] * pictures.shape[1])
+
     def joint_speeds(self, closest: np.ndarray) -> np.ndarray:
         """Return how fast joints move in the annotations that are closest (eq. 12's mean).
 
@@ -228,3 +254,21 @@ class AnnotatedPairs:
             turn, stretch = self.annotations.local_differences()
             object.__setattr__(self, "squared", np.stack([turn**2, stretch**2], axis=-1))
         return self.__dict__["squared"]
+
+
+def _check_metres(annotations: Annotations) -> None:
+    """Raise ``ValueError`` where the pictures' bones are of no one's length."""
+    ends, starts = np.array(annotations.skeleton.bones).T
+    bones = annotations.keypoints[:, ends] - annotations.keypoints[:, starts]
+    seen = annotations.visible[:, ends] & annotations.visible[:, starts]
+    if not seen.any():
+        return
+    length = float(np.quantile(np.linalg.norm(bones[seen], axis=-1), 0.9))
+    if not _BONES[0] < length < _BONES[1]:
+        raise ValueError(
+            f"annotations has bones {length:.3g} long (0.9 quantile), expected {_BONES[0]:g} to "
+            f"{_BONES[1]:g} m: keypoints are metres"
+        )
+
+
+_BONES = (0.05, 2.0)

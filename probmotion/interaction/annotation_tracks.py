@@ -18,7 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probmotion.checks import check_finite, check_positive, check_shape
+from probmotion.checks import check_positive
+from probmotion.data.pair_sets import check_close_people
 from probmotion.interaction.annotations import Annotations
 from probmotion.motion import KeypointTrack
 from probmotion.skeleton import Skeleton
@@ -63,8 +64,7 @@ def annotations_of_tracks(
     """
     skeleton = Skeleton.preset("pair17")
     seed = np.asarray(seed, dtype=np.float64)
-    check_shape("seed", seed, (skeleton.n_joints, 3))
-    check_finite("seed", seed)
+    check_close_people("seed", seed, skeleton)
     _check_tracks(tracks, len(skeleton.roots))
     check_positive("least_confidence", least_confidence)
     person = Skeleton.preset("person17")

@@ -16,7 +16,7 @@ import numpy as np
 from probmotion.checks import check_positive, check_shape
 from probmotion.files import written_whole
 from probmotion.interaction.local_frames import chests, trees
-from probmotion.motion import KeypointTrack, Motion
+from probmotion.motion import KeypointTrack
 from probmotion.skeleton import Skeleton
 
 __all__ = ["Annotations"]
@@ -104,36 +104,6 @@ class Annotations:
         object.__setattr__(self, "dropped", dict(self.dropped))
 
     @classmethod
-    def from_pairs(
-        cls,
-        motions: Sequence[Motion],
-        n: int,
-        seed: int,
-        *,
-        frames: Sequence[np.ndarray] | None = None,
-        world_views: np.ndarray | None = None,
-        known_views: bool = False,
-        noise: float = 0.0,
-        hidden: float = 0.0,
-    ) -> Annotations:
-        """Return pictures of frames drawn from 3D motions.
-
-        See :func:`~probmotion.interaction.annotation_sources.draw_annotations`.
-        """
-        from probmotion.interaction.annotation_sources import draw_annotations
-
-        return draw_annotations(
-            motions,
-            n,
-            seed,
-            frames=frames,
-            world_views=world_views,
-            known_views=known_views,
-            noise=noise,
-            hidden=hidden,
-        ).annotations
-
-    @classmethod
     def from_tracks(
         cls,
         tracks: Sequence[KeypointTrack],
@@ -159,7 +129,10 @@ class Annotations:
         """Return the annotations at ``indices``, in that order."""
         chosen = np.asarray(indices)
         if chosen.dtype == np.bool_:
+            check_shape("indices", chosen, (len(self),))
             chosen = np.flatnonzero(chosen)
+        elif chosen.size and not np.issubdtype(chosen.dtype, np.integer):
+            raise ValueError(f"indices is of {chosen.dtype}, expected integers or a mask")
         if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self)):
             raise ValueError(
                 f"indices has values from {chosen.min()} to {chosen.max()}, expected them from 0 "
@@ -173,6 +146,41 @@ class Annotations:
             neighbours=self.neighbours[chosen],
             views=None if self.views is None else self.views[chosen],
             sources=None if self.sources is None else [self.sources[i] for i in chosen],
+        )
+
+    @classmethod
+    def joined(cls, several: Sequence[Annotations]) -> Annotations:
+        """Return the annotations of several videos as one set.
+
+        Views are kept where all have them, names of videos where any has them.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or they differ in skeleton or frame rate.
+        """
+        if not several:
+            raise ValueError("several is empty, expected at least one set of annotations")
+        first = several[0]
+        for number, other in enumerate(several):
+            if other.skeleton != first.skeleton or other.fps != first.fps:
+                raise ValueError(
+                    f"several[{number}] has {other.skeleton.n_joints} joints at {other.fps:g} "
+                    f"frames per second, expected the first one's {first.skeleton.n_joints} at "
+                    f"{first.fps:g}"
+                )
+        views = [other.views for other in several if other.views is not None]
+        names = [other.sources or [""] * len(other) for other in several]
+        reasons = dict.fromkeys(reason for other in several for reason in other.dropped)
+        return cls(
+            np.concatenate([other.keypoints for other in several]),
+            np.concatenate([other.visible for other in several]),
+            first.skeleton,
+            np.concatenate([other.neighbours for other in several]),
+            first.fps,
+            views=np.concatenate(views) if len(views) == len(several) else None,
+            sources=[name for some in names for name in some] if any(map(any, names)) else None,
+            dropped={r: sum(other.dropped.get(r, 0) for other in several) for r in reasons},
         )
 
     def describe(self) -> str:

@@ -14,7 +14,7 @@ from probmotion.interaction.nearest import PairComparer
 from probmotion.interaction.views import project_to_views
 from probmotion.skeleton import Skeleton
 
-__all__ = ["Retrieved", "retrieve", "view_grid"]
+__all__ = ["Retrieved", "retrieve", "view_grid", "views_around"]
 
 _PICTURES = 4096
 """Pictures compared at once; does not change what is found."""
@@ -33,16 +33,26 @@ class Retrieved(NamedTuple):
 
 
 def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
-    """Return views (φ, θ) all around a pair, from its own horizon up and down, (V, 2), radians.
+    """Return views (φ, θ) all around a pair, (V, 2), radians.
 
-    φ is even over the circle, from −π on; θ is even between 60° and 120°, where videos are
-    taken from, or 90° alone.
+    φ is even over the circle, from −π on; θ is even between 50° and 100°, from well above to a
+    little below the pair's own horizon, where videos are taken from, or 90° alone.
     """
     check_count("n_azimuths", n_azimuths)
     check_count("n_heights", n_heights)
     azimuths = np.arange(n_azimuths) * (2 * np.pi / n_azimuths) - np.pi
-    heights = np.linspace(np.pi / 3, 2 * np.pi / 3, n_heights) if n_heights > 1 else [np.pi / 2]
+    low, high = np.radians((50.0, 100.0))
+    heights = np.linspace(low, high, n_heights) if n_heights > 1 else [np.pi / 2]
     return np.stack(np.meshgrid(azimuths, heights, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def views_around(view: np.ndarray) -> np.ndarray:
+    """Return 15 views around an estimated one, (15, 2), radians: up to 30° in φ and 15° in θ."""
+    check_shape("view", view, (2,))
+    check_finite("view", np.asarray(view))
+    turns, tilts = np.radians((-30.0, -15.0, 0.0, 15.0, 30.0)), np.radians((-15.0, 0.0, 15.0))
+    offsets = np.stack(np.meshgrid(turns, tilts, indexing="ij"), axis=-1).reshape(-1, 2)
+    return view + offsets
 
 
 def retrieve(

@@ -17,7 +17,6 @@ from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.cost import costs
 from probmotion.metrics.structure import HasManifold, HasStyles
 from probmotion.priors import HasExactPosterior
-from probmotion.truncation import TruncatedPosterior
 
 if TYPE_CHECKING:
     from probmotion.posterior import MotionPosterior
@@ -29,6 +28,7 @@ _DIRECTIONS = 256
 # Exact draws to compare with: sets as large as the run's, as many as make about 4000.
 _ENOUGH, _MOST_SETS = 4000, 8
 _MILLIMETRES = 1000.0
+_LOOKED_AT = 100
 
 
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
@@ -47,7 +47,8 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
     ``coverage_shape-context``, the mean distance of each to its nearest draw; see
     :func:`~probmotion.metrics.coverage.coverage`. Of a truncated density: ``at_cap`` and
-    ``near_floor``, shares of draws.
+    ``near_floor``, shares of draws; of annotated evidence ``degenerate``, the share of a draw's
+    pictures (of 100 draws) that have no triangulation of their own.
 
     Against the truth, where it is known, millimetres: see :func:`accuracy_of`. Of chains: see
     :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost: ``seconds`` and evaluations.
@@ -70,9 +71,10 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
         found |= accuracy_of(positions, problem.truth, problem.posterior)
     if problem.held_out is not None:
         found |= _coverage_of(positions, problem.held_out)
-    if isinstance(problem.posterior, TruncatedPosterior) and "theta" in draws.dataset:
-        kept = draws.dataset["theta"].values, draws.dataset["log_density"].values
-        found |= problem.posterior.run_shares(*kept)
+    for name in ("at_cap", "near_floor"):
+        if name in draws.dataset:
+            found[name] = float(draws.dataset[name].mean())
+    found |= _degenerate(problem, positions)
     return found | chain_diagnostics(draws) | costs(draws)
 
 
@@ -154,6 +156,14 @@ def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float
     # Poses are compared one by one, whatever motion they are a frame of.
     poses, draws = (motions.reshape(-1, *motions.shape[-2:]) for motions in (held_out, positions))
     return {f"coverage_{kind}": float(coverage(poses, draws, kind)) for kind in MEASURES}
+
+
+def _degenerate(problem: Problem, positions: np.ndarray) -> dict[str, float]:
+    likelihood = problem.posterior.likelihood
+    counted = getattr(likelihood, "degenerate_share", None)
+    if counted is None:
+        return {}
+    return {"degenerate": float(counted(positions[:: max(1, len(positions) // _LOOKED_AT)]))}
 
 
 def accuracy_of(

@@ -45,7 +45,7 @@ def test_the_density_is_equations_6_and_9(likelihood, poses, drawn):
                 moved = align_rigidly(picture, annotation)
                 d = dissimilarity(moved, annotation, graph_edges(moved), graph_edges(annotation))
                 best = min(best, float(d))
-            terms.append(-(best**2) / (2 * 0.05**2))
+            terms.append(-(best**2) / (2 * likelihood.noise**2))
         expected.append(logsumexp(terms) - np.log(6))
     assert np.allclose(likelihood.log_density(poses), expected, atol=1e-8)
 
@@ -169,3 +169,41 @@ def test_a_posterior_of_other_joints_is_refused(likelihood):
 
     with pytest.raises(ValueError, match="likelihood"):
         MotionPosterior(load_problem("gait").posterior.prior, likelihood)
+
+
+def test_pictures_whose_view_cannot_be_estimated_are_counted(drawn):
+    hidden = draw_annotations(make_dances(4), 60, seed=0, hidden=0.7).annotations
+    estimated = AnnotatedPairs.estimated(hidden, drawn.positions[0], n_views=4)
+    left_out = estimated.annotations.dropped["view not to be estimated"]
+    assert left_out > 0
+    assert len(estimated.annotations) == 60 - left_out
+    assert "view not to be estimated" in estimated.annotations.describe()
+    trunk = np.array(["hip" in name or "knee" in name for name in hidden.skeleton.joint_names])
+    from dataclasses import replace
+
+    legs = replace(hidden, visible=np.tile(trunk, (60, 1)))
+    with pytest.raises(ValueError, match="too little of the torsos in all 60 pictures"):
+        AnnotatedPairs.estimated(legs, drawn.positions[0])
+
+
+def test_what_is_not_in_metres_or_of_other_people_is_refused(drawn):
+    from dataclasses import replace
+
+    thousand = replace(drawn.annotations, keypoints=1000 * drawn.annotations.keypoints)
+    with pytest.raises(ValueError, match=r"annotations has bones .* long .*keypoints are metres"):
+        AnnotatedPairs(thousand)
+    with pytest.raises(ValueError, match=r"seed_pose has shape \(17, 3\), expected \(34, 3\)"):
+        AnnotatedPairs.estimated(drawn.annotations, drawn.positions[0, :17])
+    with pytest.raises(ValueError, match="shortest_edge is 0"):
+        AnnotatedPairs(drawn.annotations, shortest_edge=0)
+    with pytest.raises(ValueError, match="view_bandwidth is 0"):
+        AnnotatedPairs(drawn.annotations, view_bandwidth=0)
+
+
+def test_pictures_that_had_to_be_joggled_are_counted(likelihood, poses):
+    assert likelihood.degenerate_share(poses) == 0
+    flat = poses.copy()
+    flat[0] = flat[0, :, :1]
+    flat[0, :, [0, 17]] += np.array([[[0.0, 0, 0]], [[0.3, 0, 0]]])
+    flat[0, :, [2, 19]] += np.array([0.0, 0.3, 0.0])
+    assert 0 < likelihood.degenerate_share(flat) <= 1 / 4

@@ -121,7 +121,7 @@ def test_subset_and_length() -> None:
 
 
 def test_save_and_load_give_the_same(tmp_path: Path) -> None:
-    drawn = Annotations.from_pairs(DANCES, 20, 0, known_views=True, hidden=0.2)
+    drawn = draw_annotations(DANCES, 20, 0, known_views=True, hidden=0.2).annotations
     for given in (replace(drawn, dropped={"one person missing": 3}), some_annotations()):
         given.save(tmp_path / "seen.npz")
         read = Annotations.load(tmp_path / "seen.npz")
@@ -489,3 +489,28 @@ def test_two_people_of_a_real_video(real_data: Path) -> None:
     both = seen.visible[:, [head, ankle]].all(axis=1)
     height = (seen.keypoints[:, head, 1] - seen.keypoints[:, ankle, 1])[both]
     assert 1.0 < np.median(height) < 2.0  # metres, upright
+
+
+def test_videos_are_joined() -> None:
+    first = draw_annotations(DANCES[:1], 7, 0, hidden=0.2).annotations
+    second = draw_annotations(DANCES[1:2], 5, 1).annotations
+    both = Annotations.joined([first, second])
+    assert len(both) == 12
+    np.testing.assert_array_equal(both.keypoints[7:], second.keypoints)
+    np.testing.assert_array_equal(both.visible[:7], first.visible)
+    np.testing.assert_array_equal(both.neighbours[7:], second.neighbours)
+    assert both.sources == (*first.sources, *second.sources)
+    assert both.views is None
+    slower = replace(second, fps=25.0)
+    with pytest.raises(ValueError, match=r"several\[1\] has 34 joints at 25 frames per second"):
+        Annotations.joined([first, slower])
+    with pytest.raises(ValueError, match="several is empty"):
+        Annotations.joined([])
+
+
+def test_indices_of_a_subset_are_integers_or_a_mask() -> None:
+    seen = draw_annotations(DANCES[:1], 7, 0).annotations
+    with pytest.raises(ValueError, match="indices is of float64, expected integers or a mask"):
+        seen.subset([0.7, 1.2])
+    with pytest.raises(ValueError, match=r"indices has shape \(3,\), expected \(7\)"):
+        seen.subset(np.ones(3, dtype=bool))

@@ -8,7 +8,7 @@ import pytest
 from probmotion import Skeleton
 from probmotion.data.dances import make_dances
 from probmotion.interaction.coordinates import interaction_distance
-from probmotion.interaction.retrieval import retrieve, view_grid
+from probmotion.interaction.retrieval import retrieve, view_grid, views_around
 from probmotion.interaction.views import project_to_views
 
 PAIR = Skeleton.preset("pair17")
@@ -90,7 +90,8 @@ def test_the_default_views_go_round_the_pair():
     views = view_grid()
     assert views.shape == (48, 2)
     assert np.unique(views, axis=0).shape == (48, 2)
-    assert np.abs(views[:, 1] - np.pi / 2).max() == pytest.approx(np.pi / 6)
+    assert np.degrees(views[:, 1]).min() == pytest.approx(50)
+    assert np.degrees(views[:, 1]).max() == pytest.approx(100)
     # Between two views of the grid a pair still finds itself first.
     between = project_to_views(DRAWS[11][None], views[[20]] + 0.15, PAIR)[0, 0]
     assert retrieve(between, DRAWS[::3][:9], PAIR).distances[0] > 1e-3
@@ -109,3 +110,12 @@ def test_bad_input_is_refused_in_a_sentence():
     broken[0, 0, 0] = np.inf
     with pytest.raises(ValueError, match="draws has 1 values that are NaN or infinite"):
         retrieve(query, broken, PAIR)
+
+
+def test_views_around_an_estimate_hold_it_and_what_is_near():
+    views = views_around(np.array([0.3, 1.2]))
+    assert views.shape == (15, 2)
+    assert np.abs(views - [0.3, 1.2]).sum(axis=1).min() < 1e-12
+    assert np.degrees(np.abs(views - [0.3, 1.2]).max(axis=0)) == pytest.approx([30, 15])
+    with pytest.raises(ValueError, match="view has 1 values that are NaN"):
+        views_around(np.array([np.nan, 1.0]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from probmotion import MotionPosterior, UnsupportedPosterior
 from probmotion.data.dances import make_dances
 from probmotion.data.pair_sets import choose_seed
+from probmotion.interaction.annotation_sources import draw_annotations
 from probmotion.models.joint_limits import JointLimits
 from probmotion.models.pair_posterior import PairSettings, pair_posterior
 from probmotion.models.penetration import penetration_depth
@@ -88,11 +91,17 @@ def test_where_the_pair_stands_and_faces_is_no_matter(prior, poses):
 
 
 def test_chains_start_at_the_seeds(poses):
-    prior = PosePairPrior(poses[:2], PAIR)
-    start = prior.motion(prior.initial(np.random.default_rng(0), 40))[:, 0]
-    apart = np.abs(start[:, None] - poses[:2]).max(axis=(-2, -1))
+    prior = PosePairPrior(poses[:3], PAIR)
+    sampler = MetropolisHastings(Isotropic(1e-9, None), warmup=0, thin=1)
+    draws = sampler.sample(MotionPosterior(prior), draws=1, chains=4, progress=False)
+    start = draws.positions.values[:, 0, 0]
+    assert np.allclose(start, poses[[0, 1, 2, 0]], atol=1e-6)
+    # Walkers of one ensemble are spread over the seeds, and no two are the same.
+    walkers = prior.motion(prior.initial(np.random.default_rng(0), 40))[:, 0]
+    apart = np.abs(walkers[:, None] - poses[:3]).max(axis=(-2, -1))
     assert np.all(apart.min(axis=1) < 0.02)
-    assert set(apart.argmin(axis=1)) == {0, 1}
+    assert set(apart.argmin(axis=1)) == {0, 1, 2}
+    assert len(np.unique(walkers, axis=0)) == 40
     assert np.allclose(prior.motion(prior.coordinates(poses[5]))[0], poses[5])
 
 
@@ -109,6 +118,10 @@ def test_wrong_input_is_named(poses):
         "position_noise is 0": {"position_noise": 0},
         "max_invalid is -1": {"max_invalid": -1},
         "seed has no pose": {"seed": poses[:0]},
+        "seed 0 has people 1.* m tall, expected 0.5 to 3 m: pos": {"seed": 1000 * poses[0]},
+        "seed 0 has people 50.* m apart, expected at most 5 m": {
+            "seed": poses[0] + np.repeat([[0.0, 0, 0], [50, 0, 0]], 17, axis=0)
+        },
     }.items():
         with pytest.raises(ValueError, match=match):
             PosePairPrior(**{"seed": poses[0], "skeleton": PAIR, **arguments})
@@ -138,6 +151,54 @@ def test_a_chain_keeps_to_the_support(prior):
     assert np.isfinite(log_f).all()
     again = prior.log_density(draws.dataset["theta"].values)
     assert np.allclose(again, draws.dataset["log_density"].values)
+
+
+def test_every_setting_reaches_the_posterior(poses):
+    drawn = draw_annotations([make_dances(1)[0]], 30, seed=0, known_views=True)
+    settings = PairSettings(
+        penetration_weight=3.0,
+        position_noise=0.07,
+        max_invalid=5,
+        view_bandwidth=0.3,
+        shortest_edge=0.08,
+        noise=0.04,
+        limit=1e9,
+        n_views=5,
+        n_near=6,
+        measure="cartesian",
+        graph="gabriel",
+        bone_noise=0.02,
+        root_noise=0.5,
+    )
+    posterior = pair_posterior(poses[0], drawn.annotations, settings, view_seed=7)
+    prior, evidence = posterior.prior, posterior.likelihood
+    found = {
+        name: getattr(holder, name)
+        for holder, names in (
+            (prior, "penetration_weight position_noise max_invalid bone_noise root_noise"),
+            (evidence, "view_bandwidth shortest_edge noise n_views n_near measure graph"),
+            (posterior, "limit"),
+        )
+        for name in names.split()
+    }
+    assert found == asdict(settings)
+    assert (evidence.seed, evidence.distribution.bandwidth) == (7, 0.3)
+    assert (prior.chart.bone_noise, prior.chart.root_noise) == (0.02, 0.5)
+
+
+def test_a_seed_that_truncation_leaves_nothing_of_is_named(poses):
+    broken = bent_back(poses[1])
+    with pytest.raises(ValueError, match="seed 1 is below 1/100 of the first seed's density"):
+        pair_posterior(poses[:1].repeat(2, 0) * 0 + np.stack([poses[0], broken]), None,
+                       PairSettings(limit=100.0, max_invalid=20))  # fmt: skip
+
+
+def test_absurd_points_have_no_density(prior):
+    theta = np.zeros((3, prior.dim))
+    theta[1], theta[2, -1] = 1e5, 1e5
+    log_density = prior.log_density(theta)
+    assert np.isfinite(log_density[0])
+    assert np.isneginf(log_density[1:]).all()
 
 
 def test_the_papers_numbers_are_a_preset():

@@ -157,6 +157,40 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(pseudo_marginal, tmp_path):
     assert np.array_equal(np.concatenate(theta, axis=1), whole.dataset["theta"].values)
 
 
+def test_chains_with_fresh_views_do_not_depend_on_each_other():
+    """Some proposals leave the prior's support, where no views are drawn for them."""
+
+    class Bounded(Point):
+        def log_density(self, theta):
+            return np.where(np.abs(theta).max(axis=-1) < 2, 0.0, -np.inf)
+
+    posterior = MotionPosterior(Bounded(), Pictures(noise=0.5))
+    sampler = mh(Isotropic(1.5, None), pseudo_marginal=True)
+    start = np.zeros((4, 3))
+    together = sampler.sample(posterior, draws=20, chains=4, initial=start, progress=False)
+    alone = sampler.sample(posterior, draws=20, chains=1, initial=start[:1], progress=False)
+    assert float(together.dataset["acceptance"].mean()) < 0.6
+    theta = [run.dataset["theta"].values[0] for run in (together, alone)]
+    assert np.array_equal(*theta)
+    kept = [run.dataset["log_density"].values[0] for run in (together, alone)]
+    assert np.array_equal(*kept)
+
+
+def test_estimates_of_another_posterior_are_not_gone_on_from():
+    sampler = mh(Isotropic(1.0, None), pseudo_marginal=True)
+    first = sampler.sample(MotionPosterior(Point(), Pictures(0.5)), draws=3, progress=False)
+
+    class Steeper(Pictures):
+        def evaluate(self, positions, generators=None):
+            log_density, closest = super().evaluate(positions, generators)
+            return 3 * log_density - 1, closest
+
+    with pytest.raises(ValueError, match="initial is a run of another posterior"):
+        sampler.sample(
+            MotionPosterior(Point(), Steeper(0.5)), draws=3, initial=first, progress=False
+        )
+
+
 def test_evidence_that_compares_no_views_is_refused(two_bumps):
     for sampler in (mh(VelocityBiased()), mh(Isotropic(), pseudo_marginal=True)):
         with pytest.raises(UnsupportedPosterior, match="needs evidence that compares views"):
@@ -166,6 +200,15 @@ def test_evidence_that_compares_no_views_is_refused(two_bumps):
 def test_nuts_says_what_has_no_gradient():
     with pytest.raises(UnsupportedPosterior, match="which Pictures has not; ensemble, mh would do"):
         NUTS().sample(MotionPosterior(Point(), Pictures()), draws=2, progress=False)
+
+
+def test_settings_that_are_none_are_refused(two_bumps):
+    with pytest.raises(ValueError, match=r"proposal is <class .*VelocityBiased'>, expected an obj"):
+        MetropolisHastings(proposal=VelocityBiased)
+    with pytest.raises(ValueError, match="proposal is 'isotropic'"):
+        MetropolisHastings(proposal="isotropic")
+    with pytest.raises(ValueError, match=r"target is '0\.2'"):
+        VelocityBiased(target="0.2")
 
 
 def test_truncation_and_fresh_views_exclude_each_other():
