@@ -77,11 +77,10 @@ def triangulation_share(given: Problem, theta: np.ndarray) -> float:
 
 
 def keep_many(folder: str | None, draws: int) -> None:
-    """Keep and save ``draws`` draws of the prior, which is fast; print the memory it took."""
-    whole = problem(folder).posterior
-    prior = type(whole)(whole.prior)
-    sampler = MetropolisHastings(Isotropic(), warmup=100, thin=1)
-    kept = sampler.sample(prior, draws=draws // CHAINS, chains=CHAINS, progress=False)
+    """Keep and save ``draws`` draws; print the memory it took."""
+    sampler = MetropolisHastings(Isotropic(0.02), warmup=WARMUP, thin=1)
+    posterior = problem(folder).posterior
+    kept = sampler.sample(posterior, draws=draws // CHAINS, chains=CHAINS, progress=False)
     with tempfile.TemporaryDirectory() as place:
         kept.save(Path(place) / "draws.nc")
     print(f"draws_kept: {kept.positions.sizes['draw'] * CHAINS}")
@@ -98,7 +97,7 @@ def main() -> None:
         keep_many(options.data, options.keep)
         return
     given = problem(options.data)
-    sampler = MetropolisHastings(Isotropic(), warmup=WARMUP, thin=1)
+    sampler = MetropolisHastings(Isotropic(0.02), warmup=WARMUP, thin=1)
     sampler.sample(given.posterior, draws=2, chains=CHAINS, progress=False)  # compiles
     draws = sampler.sample(given.posterior, draws=DRAWS, chains=CHAINS, progress=False)
     print(f"threads: {numba.get_num_threads()}")

@@ -223,18 +223,34 @@ class JointLimits:
 
     @classmethod
     def load(cls, path: str | Path) -> JointLimits:
-        """Return the limits that :meth:`save` wrote, for ``person17``."""
-        with np.load(path) as archive:
-            bin_rings, cell_rings = (int(number) for number in archive["rings"])
-            n_cells = len(sphere_rings(cell_rings)[1])
-            return cls(
-                allowed=np.unpackbits(archive["allowed"], axis=-1, count=n_cells).astype(bool),
-                rest=archive["rest"],
-                tilt=float(archive["tilt"]),
-                bin_rings=bin_rings,
-                cell_rings=cell_rings,
-                provenance=json.loads(str(archive["provenance"])),
-            )
+        """Return the limits that :meth:`save` wrote, for ``person17``.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one that :meth:`save` wrote.
+        FileNotFoundError
+            If there is no such file.
+        """
+        try:
+            with np.load(path) as archive:
+                bin_rings, cell_rings = (int(number) for number in archive["rings"])
+                n_cells = len(sphere_rings(cell_rings)[1])
+                return cls(
+                    allowed=np.unpackbits(archive["allowed"], axis=-1, count=n_cells).astype(bool),
+                    rest=archive["rest"],
+                    tilt=float(archive["tilt"]),
+                    bin_rings=bin_rings,
+                    cell_rings=cell_rings,
+                    provenance=json.loads(str(archive["provenance"])),
+                )
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # a damaged archive fails in a dozen ways
+            raise ValueError(
+                f"path is {str(path)!r}, which holds no joint limits, expected a file that save() "
+                "wrote"
+            ) from error
 
 
 def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:

@@ -125,8 +125,8 @@ draw_calibration(levels, "calibration.png")
 Image("calibration.png")
 
 # %% [markdown]
-# Draws lie below the seed, as they must: in 108 dimensions there is far more room a little below
-# the mode than at it.
+# All three should overlap. Here draws are likelier than most real pairs: each chain has settled
+# where one annotation, seen from one side, is matched well, and moves on slowly.
 #
 # ## 5. What are the draws like?
 #

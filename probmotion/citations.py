@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-__all__ = ["CITATIONS", "citations_of"]
+__all__ = ["CITATIONS", "OF_SETTINGS", "POSE_PAIRS", "citations_of"]
 
 _OURS = "The probmotion authors. probmotion: one posterior over 3D skeletal motion, many samplers."
 _DDPM = "Ho, Jain, Abbeel (2020). Denoising diffusion probabilistic models. NeurIPS."
@@ -36,12 +36,6 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Hastings (1970). Monte Carlo sampling methods using Markov chains and their applications. "
         "Biometrika 57.",
         "Haario, Saksman, Tamminen (2001). An adaptive Metropolis algorithm. Bernoulli 7.",
-        "Andrieu, Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo "
-        "computations. Annals of Statistics 37.",
-        "Yin, Huang, Ho, Wang, Komura, Cohen-Or, Zhang (2018). A sampling approach to generating "
-        "closely interacting 3D pose-pairs from 2D annotations. IEEE TVCG.",
-        "Akhter, Black (2015). Pose-conditioned joint angle limits for 3D human pose "
-        "reconstruction. CVPR.",
     ),
     "nuts": (
         "Hoffman, Gelman (2014). The No-U-Turn sampler. JMLR 15.",
@@ -55,7 +49,35 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
 }
 """By sampler, without this program itself."""
 
+OF_SETTINGS: Mapping[str, tuple[str, ...]] = {
+    '"pseudo_marginal": true': (
+        "Andrieu, Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo "
+        "computations. Annals of Statistics 37.",
+    ),
+}
+"""By what stands in a run's settings."""
 
-def citations_of(sampler: str) -> list[str]:
-    """Return the works to cite for draws of a sampler, by its name; ours alone if it is unknown."""
-    return [*CITATIONS.get(sampler, ()), _OURS]
+POSE_PAIRS = (
+    "Yin, Huang, Ho, Wang, Komura, Cohen-Or, Zhang (2018). A sampling approach to generating "
+    "closely interacting 3D pose-pairs from 2D annotations. IEEE TVCG.",
+    "Akhter, Black (2015). Pose-conditioned joint angle limits for 3D human pose "
+    "reconstruction. CVPR.",
+)
+"""Of draws of people who interact."""
+
+
+def citations_of(sampler: str, settings: str = "", people: int = 1) -> list[str]:
+    """Return the works to cite for draws; ours alone if the sampler is unknown.
+
+    Parameters
+    ----------
+    sampler : str
+        Its name.
+    settings : str
+        Its settings as JSON.
+    people : int
+        Trees of the skeleton.
+    """
+    used = [work for words, works in OF_SETTINGS.items() if words in settings for work in works]
+    pairs = POSE_PAIRS if people > 1 and sampler == "mh" else ()
+    return [*CITATIONS.get(sampler, ()), *used, *pairs, _OURS]

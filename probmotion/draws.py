@@ -241,7 +241,8 @@ class MotionDraws:
         """Return the works to cite for these draws."""
         from probmotion.citations import citations_of
 
-        return citations_of(self.dataset.attrs["sampler"])
+        attributes, people = self.dataset.attrs, len(self.skeleton.roots)
+        return citations_of(attributes["sampler"], attributes["settings"], people)
 
     def save(self, path: str | Path) -> None:
         """Write the draws as netCDF, ``.nc``; nothing is left at ``path`` if writing fails.

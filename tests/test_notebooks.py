@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -68,3 +69,5 @@ def test_pose_pairs(tmp_path, monkeypatch):
     assert len(walk.skeleton.roots) == 2
     accepted = float(printed.split("accepted: ")[1].split()[0])
     assert 0.15 < accepted < 0.35
+    drawn, seed = re.search(r"coverage: ([\d.]+) m, by the seed alone ([\d.]+) m", printed).groups()
+    assert float(drawn) < float(seed)

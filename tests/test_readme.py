@@ -113,10 +113,10 @@ def test_the_published_table_is_the_demonstration_of_every_sampler():
 
 
 def test_every_cited_work_is_listed():
-    from probmotion.citations import CITATIONS
+    from probmotion.citations import CITATIONS, OF_SETTINGS, POSE_PAIRS
 
     words = " ".join(README.split())
-    for works in CITATIONS.values():
+    for works in [*CITATIONS.values(), *OF_SETTINGS.values(), POSE_PAIRS]:
         for work in works:
             assert work in words
 

@@ -133,7 +133,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
 
     Looked at, in this order: ``folder`` and nothing else, if given; the folder that the
     environment variable ``PROBMOTION_DATA`` names; ``../shared/data`` beside the current
-    directory, and beside this repository; the cache of :func:`download`. A folder holds the clips
+    directory; the cache of :func:`download`. A folder holds the clips
     if all ten are there, as archives (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or as
     pairs of BVH files (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``).
 
@@ -155,7 +155,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     if folder is not None:
         places = [Path(folder)]
     else:
-        places = [Path("../shared/data"), Path(__file__).resolve().parents[3] / "shared" / "data"]
+        places = [Path("../shared/data")]
         if os.environ.get(_FOLDER_VARIABLE):
             places.insert(0, Path(os.environ[_FOLDER_VARIABLE]))
         places.append(data_folder())

@@ -211,7 +211,7 @@ class AnnotatedPairs:
         Parameters
         ----------
         closest : ndarray of int, (…, m)
-            Annotations, one per view: D'.
+            Annotations, one per view: D'. One that is closest in several views counts as often.
 
         Returns
         -------

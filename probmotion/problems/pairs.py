@@ -7,6 +7,7 @@ clips that neither the annotations nor the seed are from.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from probmotion.motion import Motion
@@ -93,15 +94,25 @@ def _made() -> Problem:
     )
 
 
-def _salsa() -> Problem:
+def _salsa(name: str, description: str, paper: bool) -> Problem:
     from probmotion.data.downloads import salsa_pairs
     from probmotion.data.pair_sets import SALSA_HELD_OUT
+    from probmotion.models.pair_posterior import PairSettings
 
-    return pairs_problem(salsa_pairs(), SALSA_HELD_OUT, name="salsa-pairs", description=_SALSA)
+    return pairs_problem(
+        salsa_pairs(),
+        SALSA_HELD_OUT,
+        settings=PairSettings.paper() if paper else None,
+        name=name,
+        description=description,
+    )
 
+
+_PAPER = "the same with the published numbers: σ_l = 0.01 and a density cut at 100 times the seed's"
 
 PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
     "dance-pairs": (_MADE, _made),
-    "salsa-pairs": (_SALSA, _salsa),
+    "salsa-pairs": (_SALSA, partial(_salsa, "salsa-pairs", _SALSA, False)),
+    "salsa-pairs-paper": (_PAPER, partial(_salsa, "salsa-pairs-paper", _PAPER, True)),
 }
 """What each problem is, and the function that makes it, by name."""

@@ -207,3 +207,21 @@ def test_pictures_that_had_to_be_joggled_are_counted(likelihood, poses):
     flat[0, :, [0, 17]] += np.array([[[0.0, 0, 0]], [[0.3, 0, 0]]])
     flat[0, :, [2, 19]] += np.array([0.0, 0.3, 0.0])
     assert 0 < likelihood.degenerate_share(flat) <= 1 / 4
+
+
+def test_the_shortest_edge_is_the_densitys(drawn, poses):
+    """ε counts where joints are near: the coarser it is, the less near joints weigh."""
+    fine, coarse = (
+        AnnotatedPairs(drawn.annotations, shortest_edge=size, noise=0.1) for size in (0.01, 0.5)
+    )
+    assert np.abs(fine.log_density(poses) - coarse.log_density(poses)).min() > 1e-3
+
+
+def test_views_are_estimated_from_the_first_seed(drawn):
+    from probmotion.models.pair_posterior import PairSettings, pair_posterior
+
+    unknown = draw_annotations(make_dances(4), 60, seed=0).annotations
+    seeds = drawn.positions[[0, 30]]
+    several = pair_posterior(seeds, unknown, PairSettings(n_views=4))
+    first = AnnotatedPairs.estimated(unknown, seeds[0], n_views=4)
+    assert np.array_equal(several.likelihood.annotations.views, first.annotations.views)

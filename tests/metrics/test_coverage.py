@@ -218,3 +218,12 @@ def test_bad_input_is_refused_in_a_sentence():
         coverage(TRUTHS, broken)
     with pytest.raises(ValueError, match="second has 1 values that are NaN"):
         pose_distances(TRUTHS, broken, "cartesian")
+
+
+def test_draws_that_share_a_joint_are_different_draws():
+    """A repeat is one in every joint: two poses with one place of the root are not."""
+    rng = np.random.default_rng(5)
+    truth = rng.standard_normal((4, 6, 3))
+    draws = np.concatenate([rng.standard_normal((3, 6, 3)), truth])
+    draws -= draws[:, :1]
+    assert coverage(truth, draws) == pytest.approx(0, abs=1e-9)

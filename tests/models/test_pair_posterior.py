@@ -101,6 +101,10 @@ def test_fresh_views_are_an_option_and_the_fixed_ones_are_not_touched():
     # Estimates are kept as they were, and are not those of the fixed views.
     assert np.abs(again - draws.dataset["log_density"].values).max() > 0.1
     assert np.array_equal(run(posterior, pseudo_marginal=True).flat(), draws.flat())
+    cited = " ".join(draws.citations())
+    assert "Andrieu, Roberts" in cited
+    assert "3D pose-pairs from 2D annotations" in cited
+    assert "Andrieu" not in " ".join(run(posterior).citations())
 
 
 def test_several_seeds_run_several_chains():

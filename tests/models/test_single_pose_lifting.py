@@ -117,3 +117,19 @@ def test_bad_input_is_refused_in_a_sentence():
         lift_people(seen, ALL, SEED, PAIR, VIEW, seed_weight=-1)
     with pytest.raises(ValueError, match="keypoints has 2 values that are NaN or infinite"):
         lift_people(np.where(np.arange(34)[:, None] == 5, np.nan, seen), ALL, SEED, PAIR, VIEW)
+
+
+def test_limits_pull_bones_into_their_range():
+    """A picture of knees that bend forwards is met less, and by poses that bodies can take."""
+    limits = JointLimits.shipped(PAIR)
+    wrong = DANCE[30].copy()
+    for name in ("left", "right"):
+        knee, ankle = (PAIR.index(f"person0:{name}_{part}") for part in ("knee", "ankle"))
+        wrong[ankle] = wrong[knee] + 0.4 * np.array([0.5, 0.8, 0.3])
+    seen = picture(wrong)
+
+    def beyond(weight):
+        lifted = lift_people(seen, ALL, SEED, PAIR, VIEW, validity_weight=weight)
+        return np.linalg.norm(lifted - limits.nearest_valid(lifted))
+
+    assert beyond(1.0) < 0.7 * beyond(1e-6)
