@@ -76,7 +76,7 @@ def citations_of(sampler: str, settings: str = "", people: int = 1) -> list[str]
     settings : str
         Its settings as JSON.
     people : int
-        Trees of the skeleton.
+        People in the motion.
     """
     used = [work for words, works in OF_SETTINGS.items() if words in settings for work in works]
     pairs = POSE_PAIRS if people > 1 and sampler == "mh" else ()

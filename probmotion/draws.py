@@ -241,7 +241,8 @@ class MotionDraws:
         """Return the works to cite for these draws."""
         from probmotion.citations import citations_of
 
-        attributes, people = self.dataset.attrs, len(self.skeleton.roots)
+        attributes, names = self.dataset.attrs, self.skeleton.canonical_names
+        people = sum(names[root].endswith("pelvis") for root in self.skeleton.roots)
         return citations_of(attributes["sampler"], attributes["settings"], people)
 
     def save(self, path: str | Path) -> None:

@@ -82,8 +82,25 @@ class Proposal(Protocol):
         """Return what proposing needs of a state once the warm-up is over."""
 
 
+class _Symmetric:
+    """What proposals share that go from one point to another as often as back."""
+
+    guided: ClassVar[bool] = False
+
+    def log_ratio(
+        self,
+        theta: np.ndarray,
+        guide: np.ndarray,
+        proposed: np.ndarray,
+        proposed_guide: np.ndarray,
+        state: ProposalState,
+    ) -> np.ndarray:
+        """Return 0: the proposal is symmetric."""
+        return np.zeros(len(theta))
+
+
 @dataclass(frozen=True)
-class Isotropic:
+class Isotropic(_Symmetric):
     """θ' = θ + s ε, ε ~ N(0, I): the random walk of Metropolis et al. (1953).
 
     Parameters
@@ -93,8 +110,6 @@ class Isotropic:
     target : float or None
         Acceptance that the warm-up steers each chain's s towards; ``None`` keeps ``scale``.
     """
-
-    guided: ClassVar[bool] = False
 
     kind: str = field(default="isotropic", init=False)
     scale: float = 0.1
@@ -120,17 +135,6 @@ class Isotropic:
         """Return θ + s ε."""
         return theta + np.exp(state["log_scale"])[:, None] * _normal(generators, theta.shape[1])
 
-    def log_ratio(
-        self,
-        theta: np.ndarray,
-        guide: np.ndarray,
-        proposed: np.ndarray,
-        proposed_guide: np.ndarray,
-        state: ProposalState,
-    ) -> np.ndarray:
-        """Return 0: the proposal is symmetric."""
-        return np.zeros(len(theta))
-
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
     ) -> ProposalState:
@@ -147,7 +151,7 @@ class Isotropic:
 
 
 @dataclass(frozen=True)
-class AdaptiveCovariance:
+class AdaptiveCovariance(_Symmetric):
     """θ' = θ + s C ε, C Cᵀ the covariance of the chain's own warm-up (Haario et al. 2001).
 
     The warm-up is cut into windows of 50, 100, 200, … steps. At the end of each the covariance of
@@ -162,8 +166,6 @@ class AdaptiveCovariance:
     target : float
         Acceptance that each chain's s is steered towards.
     """
-
-    guided: ClassVar[bool] = False
 
     kind: str = field(default="adaptive-covariance", init=False)
     scale: float = 0.1
@@ -195,17 +197,6 @@ class AdaptiveCovariance:
         """Return θ + s C ε."""
         step = (state["root"] @ _normal(generators, theta.shape[1])[..., None])[..., 0]
         return theta + np.exp(state["log_scale"])[:, None] * step
-
-    def log_ratio(
-        self,
-        theta: np.ndarray,
-        guide: np.ndarray,
-        proposed: np.ndarray,
-        proposed_guide: np.ndarray,
-        state: ProposalState,
-    ) -> np.ndarray:
-        """Return 0: the proposal is symmetric."""
-        return np.zeros(len(theta))
 
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
