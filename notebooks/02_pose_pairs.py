@@ -30,6 +30,7 @@ from probmotion.data.dances import make_dances
 from probmotion.data.pair_sets import choose_seed, dance_frames, describe_dance_frames, ground_truth
 from probmotion.data.pairs import load_pairs
 from probmotion.interaction.annotation_sources import draw_annotations
+from probmotion.interaction.coordinates import align_rigidly
 from probmotion.interaction.retrieval import retrieve
 from probmotion.interaction.views import project_to_views
 from probmotion.metrics.coverage import coverage
@@ -99,18 +100,22 @@ print(f"{posterior.dim} dimensions; log density of the seed {posterior.log_seed:
 # %% [markdown]
 # ## 4. Draws
 #
-# `mh` walks. Two chains, both from the seed; the warm-up finds the size of the steps.
+# `mh` walks. Four chains, all from the seed; the warm-up finds the size of the steps.
 
 # %%
-sampler = MetropolisHastings(Isotropic(0.02), warmup=1000, thin=10)
-draws = sampler.sample(posterior, draws=150, chains=2, seed=0, progress=False)
+sampler = MetropolisHastings(Isotropic(0.02), warmup=1500, thin=20)
+draws = sampler.sample(posterior, draws=150, chains=4, seed=0, progress=False)
 print(f"accepted: {float(draws.dataset['acceptance'].mean()):.2f}")
 
 drawn_poses = draws.flat()[:, 0]
-draw_pairs({"draws": drawn_poses[::50]}, skeleton, "draws.png", azimuth=0.6, elevation=0.2)
+shown_poses = align_rigidly(drawn_poses[::100], np.broadcast_to(seed, (6, *seed.shape)))
+draw_pairs({"draws": shown_poses}, skeleton, "draws.png", azimuth=0.6, elevation=0.2)
 Image("draws.png")
 
 # %% [markdown]
+# Where the pair stands and which way is up is nothing that a picture tells: to be looked at, draws
+# are turned to the seed.
+#
 # Is the density one that real pairs could be drawn from? Before anything is believed, look at what
 # it says of real pairs, of the seed and of its own draws.
 

@@ -59,7 +59,7 @@ class AnnotatedPairs:
     annotations: Annotations
     n_views: int = 32
     n_near: int = 32
-    noise: float = 0.005
+    noise: float = 0.01
     view_bandwidth: float = 0.5
     measure: str = "interaction"
     graph: str = "delaunay"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probmotion.interaction.coordinates import align_rigidly
 from probmotion.pictures.pairs import draw_pairs
 from probmotion.pictures.skeletons import draw_skeletons
 
@@ -96,8 +97,17 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
 def _draw_poses(
     rows: dict[str, np.ndarray], skeleton: Skeleton, path: str | Path, title: str
 ) -> None:
-    """Write poses of several people, each row's evenly apart: (n, 1, J, 3)."""
+    """Write poses of several people, each row's evenly apart: (n, 1, J, 3).
+
+    All are turned to the first, as where a pair stands and which way is up may be left open.
+    """
     chosen = {
-        label: motions[:: max(1, len(motions) // _POSES), 0] for label, motions in rows.items()
+        label: motions[:: max(1, len(motions) // _POSES), 0][:_POSES]
+        for label, motions in rows.items()
+    }
+    first = next(iter(chosen.values()))[0]
+    chosen = {
+        label: align_rigidly(poses, np.broadcast_to(first, poses.shape))
+        for label, poses in chosen.items()
     }
     draw_pairs(chosen, skeleton, path, columns=_POSES, azimuth=0.6, elevation=0.2, title=title)
