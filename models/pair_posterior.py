@@ -23,8 +23,8 @@ class PairSettings:
 
     The published ones, but for ``limit``: a density that is cut at 100 times the seed's is flat
     where most draws are. ``noise``, of which the paper does not say the unit, is right in metres:
-    coverage hardly changes from .003 to .02 and is lost at .05, and at .01 real pairs are about as
-    likely as draws (``notebooks/ablations/pose_pairs.py``, parts noise and calibration).
+    coverage hardly changes from .003 to .02 and is lost at .05, and at .01 draws are as likely as
+    real pairs are (``notebooks/ablations/pose_pairs.py``, parts noise and calibration).
 
     Parameters
     ----------
