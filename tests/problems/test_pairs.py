@@ -30,7 +30,7 @@ def problem() -> Problem:
 
 def test_they_are_listed_without_being_made():
     assert {"dance-pairs", "salsa-pairs", "salsa-pairs-paper"} <= set(problem_names())
-    assert "6000 annotated 2D pairs" in problem_descriptions()["salsa-pairs"]
+    assert "5599 annotated 2D pairs" in problem_descriptions()["salsa-pairs"]
     assert set(problem_descriptions()) == set(problem_names())
 
 
@@ -120,7 +120,7 @@ def test_salsa_is_the_published_experiment(real_data, monkeypatch):
     monkeypatch.setenv("PROBMOTION_DATA", str(real_data))
     problem = load_problem("salsa-pairs")
     evidence = problem.posterior.likelihood
-    assert len(evidence.annotations) > 5000
+    assert len(evidence.annotations) == 5599
     assert not set(evidence.annotations.sources) & set(SALSA_HELD_OUT)
     assert problem.held_out.shape == (300, 1, 34, 3)
     assert problem.posterior.dim == 108
