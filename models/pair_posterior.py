@@ -22,9 +22,9 @@ class PairSettings:
     """Every number of the posterior over pose-pairs.
 
     The published ones, but for ``limit``: a density that is cut at 100 times the seed's is flat
-    where most draws are. ``noise``, of which the paper does not say the unit, is right in metres:
-    coverage hardly changes from .003 to .02 and is lost at .05, and at .01 draws are as likely as
-    real pairs are (``notebooks/ablations/pose_pairs.py``, parts noise and calibration).
+    where most draws are. ``noise``, of which the paper does not say the unit, does in metres: draws
+    cover better than the seed alone up to .01 and worse from .02 on, and below .01 real pairs are
+    far less likely than draws (``notebooks/ablations/pose_pairs.py``, parts noise and calibration).
 
     Parameters
     ----------
