@@ -25,7 +25,8 @@ def draw_calibration(
     ----------
     levels : mapping of mapping of ndarray, (n,)
         By kind of pose (real, draws, the seed), then by part of the density, the same parts for
-        every kind: nats. A panel per part; a kind of a single pose is a line.
+        every kind: nats. A panel per part; a kind of a single pose is a line. What lies below the
+        lowest hundredth of all, or is −∞, stands in the lowest bar.
     path : str or Path, optional
         Where to write, ``.png``; nowhere by default.
     title : str
