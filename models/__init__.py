@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from probmotion.models.gaussian_mixture import GaussianMixtureMotion
+    from probmotion.models.motion_diffusion import MotionDiffusion
 
-_HOMES = {"GaussianMixtureMotion": "gaussian_mixture"}
+_HOMES = {"GaussianMixtureMotion": "gaussian_mixture", "MotionDiffusion": "motion_diffusion"}
 
-__all__ = ["GaussianMixtureMotion"]
+__all__ = ["GaussianMixtureMotion", "MotionDiffusion"]
 
 
 def __getattr__(name: str) -> Any:

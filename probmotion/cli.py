@@ -1,4 +1,4 @@
-"""The command line: ``probmotion compare | list | show | convert``.
+"""The command line: ``probmotion compare | list | show | convert | train``.
 
 Each command is a dataclass whose fields are its options. Libraries are imported by the command
 that needs them, so that help and mistakes answer at once.
@@ -31,6 +31,7 @@ commands:
   list      the problems, the samplers and the skeletons that are known by name
   show      say what is in a file of motion, keypoints or draws; draw it
   convert   write a motion to another format, frame rate or skeleton
+  train     learn a prior, or what priors are measured with
 
 probmotion COMMAND --help lists the options of a command."""
 
@@ -298,8 +299,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if words else 2
-    if words[0] not in _COMMANDS:
-        return _complain(f"command is {words[0]!r}, expected one of {', '.join(_COMMANDS)}", 2)
+    commands = [*_COMMANDS, "train"]
+    if words[0] not in commands:
+        return _complain(f"command is {words[0]!r}, expected one of {', '.join(commands)}", 2)
     with warnings.catch_warnings():
         warnings.showwarning = _note
         try:
@@ -324,8 +326,16 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     """Return the command with its options; a wrong option ends the process with status 2."""
     import tyro
 
-    kind = _COMMANDS[name]
     prog = f"probmotion {name}"
+    if name == "train":
+        from probmotion.training_commands import TRAINABLE
+
+        known = ", ".join(TRAINABLE)
+        if not words or words[0] not in TRAINABLE:
+            got = repr(words[0]) if words else "missing"
+            raise ValueError(f"what to train is {got}, expected one of {known}")
+        return tyro.cli(TRAINABLE[words[0]], prog=f"{prog} {words[0]}", args=words[1:])
+    kind = _COMMANDS[name]
     if kind is not Compare:
         return tyro.cli(kind, prog=prog, args=words)
     from probmotion.settings_options import objects_as_words, settings_of_samplers

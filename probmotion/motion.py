@@ -11,7 +11,7 @@ import numpy as np
 from probmotion.checks import check_count, check_finite, check_positive, check_shape
 from probmotion.skeleton import Skeleton
 
-__all__ = ["KeypointTrack", "Motion", "load_motion", "load_motions"]
+__all__ = ["KeypointTrack", "Motion", "files_named", "load_motion", "load_motions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +237,17 @@ def load_motions(
     FileNotFoundError
         If a pattern matches no file.
     """
+    return [load_motion(path, fps) for path in files_named(paths)]
+
+
+def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    """Return the files that paths or patterns such as ``"walks/*.bvh"`` name, sorted.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a pattern matches no file.
+    """
     from glob import glob, has_magic
 
     given = [paths] if isinstance(paths, str | Path) else list(paths)
@@ -246,4 +257,4 @@ def load_motions(
         if not matches:
             raise FileNotFoundError(f"paths has {pattern!r}, which matches no file")
         found += matches
-    return [load_motion(path, fps) for path in sorted(found)]
+    return [Path(path) for path in sorted(found)]

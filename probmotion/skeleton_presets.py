@@ -122,6 +122,16 @@ def _person17() -> Skeleton:
     return Skeleton(tree.joint_names, tree.parents, radii)
 
 
+def _person14() -> Skeleton:
+    """What motion capture and 2D detectors have in common: trunk ends and limbs."""
+    return _tree(
+        "pelvis", "neck pelvis", "left_shoulder neck", "left_elbow left_shoulder",
+        "left_wrist left_elbow", "right_shoulder neck", "right_elbow right_shoulder",
+        "right_wrist right_elbow", "left_hip pelvis", "left_knee left_hip", "left_ankle left_knee",
+        "right_hip pelvis", "right_knee right_hip", "right_ankle right_knee",
+    )  # fmt: skip
+
+
 def _pair17() -> Skeleton:
     """Two people of ``person17``'s joints."""
     one = _person17()
@@ -145,6 +155,7 @@ PRESETS: Mapping[str, Callable[[], Skeleton]] = {
     "gymnast-ball": _gymnast_ball,
     "h36m17": _h36m17,
     "pair17": _pair17,
+    "person14": _person14,
     "person17": _person17,
     "smpl22": _smpl22,
 }

@@ -22,7 +22,7 @@ from probmotion.samplers.ancestral import MotionState, ancestral, cosine_schedul
 from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.separate_views import SeparateViews
-from probmotion.samplers.views import MultiViewDenoiser, Views
+from probmotion.samplers.views import MultiViewDenoiser, Views, views_around
 from probmotion.sampling import UnsupportedPosterior, require
 from probmotion.seeds import NormalStreams
 
@@ -41,7 +41,7 @@ class MultiViewAncestral:
     steps : int
         Number of denoising steps T.
     n_views : int
-        V, evenly around the motion.
+        V, evenly around the motion; two are 120° apart.
     elevation : float
         Of all views, radians.
     perspective : bool
@@ -120,11 +120,8 @@ class MultiViewAncestral:
     @property
     def cameras(self) -> Cameras:
         """The V views."""
-        return Cameras.ring(
-            self.n_views,
-            elevation=self.elevation,
-            distance=self.distance,
-            perspective=self.perspective,
+        return views_around(
+            self.n_views, self.elevation, distance=self.distance, perspective=self.perspective
         )
 
     @property

@@ -25,7 +25,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from probmotion.cameras import Cameras
 from probmotion.checks import check_count, check_positive
 from probmotion.diffusion import NoiseSchedule
 from probmotion.draws import MotionDraws
@@ -41,7 +40,7 @@ from probmotion.samplers.ancestral import (
 )
 from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
-from probmotion.samplers.views import MultiViewDenoiser, Views, symmetric_power
+from probmotion.samplers.views import MultiViewDenoiser, Views, symmetric_power, views_around
 from probmotion.sampling import require
 from probmotion.seeds import NormalStreams
 
@@ -61,7 +60,7 @@ class MultiViewPredictorCorrector:
     corrector_size : float
         ε, in (0, 1].
     n_views : int
-        V, orthographic, evenly around the motion.
+        V, orthographic, evenly around the motion; two are 120° apart.
     elevation : float
         Of all views, radians. Views that never tilt cannot tell a motion from its mirror image.
     gamma : float
@@ -161,7 +160,7 @@ class MultiViewPredictorCorrector:
             )
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
-        views = Views(Cameras.ring(self.n_views, elevation=self.elevation))
+        views = Views(views_around(self.n_views, self.elevation))
         denoiser = MultiViewDenoiser(prior, views)
         guide = guide_towards(self, posterior, self.guidance, denoiser)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)

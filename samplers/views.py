@@ -14,7 +14,7 @@ import numpy as np
 from probmotion.cameras import Cameras
 from probmotion.priors import DenoiserCovariance2D, DenoiserCovariance3D, Denoises2D, Denoises3D
 
-__all__ = ["MotionDenoiser", "MultiViewDenoiser", "Views", "symmetric_power"]
+__all__ = ["MotionDenoiser", "MultiViewDenoiser", "Views", "symmetric_power", "views_around"]
 
 
 class Views:
@@ -67,6 +67,18 @@ class Views:
         for view in range(1, V):
             out += flat[:, view] @ axes[view]
         return out.reshape(B, L, J, 3)
+
+
+def views_around(
+    n_views: int, elevation: float, *, distance: float = 7.0, perspective: bool = False
+) -> Cameras:
+    """Return V views evenly around the motion, the first at azimuth 0.
+
+    Two stand 120° apart (MAS, table 2): opposite ones would see the same, and nothing of the depth.
+    """
+    azimuth = 2 * np.pi * np.arange(n_views) / max(3, n_views)
+    tilt = np.full(n_views, elevation)
+    return Cameras.around(azimuth, tilt, distance=distance, perspective=perspective)
 
 
 class MotionDenoiser:

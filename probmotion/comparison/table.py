@@ -50,6 +50,18 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         },
     ),
     (
+        "filmed, against real",
+        {
+            "seconds": "seconds",
+            "fid": "FID",
+            "diversity_ratio": "diversity",
+            "view_precision": "P",
+            "view_recall": "R",
+            "fid_side": "FID side",
+            "view_recall_side": "R side",
+        },
+    ),
+    (
         "the run",
         {
             "seconds": "seconds",
@@ -74,6 +86,11 @@ _COVERAGE_LEGEND = """\
 D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
 joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
 density is cut."""
+
+_GENERATION_LEGEND = """\
+FID: Fréchet distance of the features of random views and of held-out real ones; it falls with the
+number of draws; diversity: mean distance of two motions / real motions' (1 is right); P, R:
+precision and recall; side: from π/4 to 3π/4 beside the first view."""
 
 
 class ComparisonTable(pd.DataFrame):
@@ -104,6 +121,8 @@ class ComparisonTable(pd.DataFrame):
             parts.append(_LEGEND)
         if any(self["metric"] == "coverage_cartesian"):
             parts.append(_COVERAGE_LEGEND)
+        if any(self["metric"] == "fid"):
+            parts.append(_GENERATION_LEGEND)
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
         return "\n\n".join(parts) if parts else "no cell is finished"

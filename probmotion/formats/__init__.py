@@ -1,4 +1,4 @@
-"""Reading and writing motion files: BVH, npz and keypoint JSON."""
+"""Reading and writing motion files: BVH, npz, keypoint JSON and DeepLabCut tables."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from probmotion.formats.bvh import read_bvh
 from probmotion.formats.bvh_writing import write_bvh
+from probmotion.formats.deeplabcut import read_deeplabcut
 from probmotion.formats.errors import MotionFileError, MotionFileWarning
 from probmotion.formats.keypoint_json import read_keypoint_json
 from probmotion.formats.npz import read_keypoint_npz, read_npz, write_npz
@@ -85,12 +86,14 @@ def read_keypoints(
     Parameters
     ----------
     path : str or Path
-        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, or an ``.npz`` archive.
+        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, a ``.csv`` table of
+        DeepLabCut, or an ``.npz`` archive.
     fps : float, optional
-        Frames per second. JSON files do not hold it: there it must be given.
+        Frames per second. JSON files and tables do not hold it: there it must be given.
     skeleton : Skeleton or str, optional
-        The keypoints of a JSON file in their order; see
-        :func:`~probmotion.formats.keypoint_json.read_keypoint_json`.
+        The keypoints of a JSON file in their order (see
+        :func:`~probmotion.formats.keypoint_json.read_keypoint_json`), or the joints to take from a
+        table (see :func:`~probmotion.formats.deeplabcut.read_deeplabcut`).
     people : int, optional
         How many people to follow in a JSON file that does not say who is who.
 
@@ -114,8 +117,14 @@ def read_keypoints(
         if skeleton is not None:
             raise ValueError(f"skeleton was given with {path}, expected none: npz files hold it")
         return read_keypoint_npz(path, fps)
+    table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
     if fps is None:
+        kind = "a table" if table else "JSON"
         raise ValueError(
-            f"fps is missing, expected frames per second: {path} is JSON, which does not hold it"
+            f"fps is missing, expected frames per second: {path} is {kind}, which does not hold it"
         )
+    if table:
+        if people is not None:
+            raise ValueError(f"people was given with {path}, expected none: tables say who is who")
+        return read_deeplabcut(path, fps, skeleton)
     return read_keypoint_json(path, fps, skeleton, people)

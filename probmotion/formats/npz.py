@@ -68,7 +68,7 @@ def read_npz(path: str | Path) -> Motion:
     FileNotFoundError
         If there is no such file.
     """
-    archive = _Archive(Path(path))
+    archive = Archive(Path(path))
     if "positions" not in archive.keys and "keypoints" in archive.keys:
         archive.fail("keypoints came without positions, expected 3D: use read_keypoints for 2D")
     positions = archive.numbers("positions")
@@ -150,7 +150,7 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
     FileNotFoundError
         If there is no such file.
     """
-    archive = _Archive(Path(path))
+    archive = Archive(Path(path))
     keypoints = archive.numbers("keypoints")
     confidence = archive.numbers("confidence")
     if keypoints.ndim not in (3, 4) or keypoints.shape[-1] != 2 or 0 in keypoints.shape:
@@ -177,7 +177,7 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
         raise MotionFileError(f"{archive.path}: {error}") from error
 
 
-class _Archive:
+class Archive:
     """The arrays of one ``.npz`` file, each read and checked when it is asked for."""
 
     def __init__(self, path: Path) -> None:

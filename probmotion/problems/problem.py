@@ -8,6 +8,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.checks import check_count, check_finite, check_shape
+from probmotion.metrics.generation import GenerationReference
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasExactPosterior, NotConjugate
 
@@ -30,6 +31,8 @@ class Problem:
         The motion that the evidence is of, metres.
     held_out : ndarray, (G, L, J, 3), optional
         Real motions of the kind, metres, that draws are to cover; nobody has learnt from them.
+    generation : GenerationReference, optional
+        Real 2D motion of the kind that draws, filmed, are to be like.
 
     Raises
     ------
@@ -43,6 +46,7 @@ class Problem:
     posterior: MotionPosterior
     truth: np.ndarray | None = None
     held_out: np.ndarray | None = None
+    generation: GenerationReference | None = None
 
     def __post_init__(self) -> None:
         shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)

@@ -1,0 +1,174 @@
+"""What MAS costs with a network of the paper's size: V = 5, L = 180, J = 16, 100 steps.
+
+Perspective views, one motion, fresh weights. ``outside_network_share`` is the share of the time
+outside the network's forward passes; ``network_gflops_share`` the rate of its floating-point
+operations over that of a large product of float32 matrices in the same run, on the same threads;
+``memory_gib`` the peak of a process that does nothing else. With CUDA also motions per second, 64
+at a time.
+"""
+
+from __future__ import annotations
+
+import os
+
+THREADS = os.environ.setdefault("OMP_NUM_THREADS", "1")
+for threads in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[threads] = THREADS
+
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from probmotion import MotionPosterior
+from probmotion.models.diffusion_settings import DiffusionSettings
+from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.models.standards import Standards
+from probmotion.samplers import MultiViewAncestral
+from probmotion.skeleton import Skeleton
+
+FRAMES, JOINTS, VIEWS = 180, 16, 5
+
+
+def paper_prior(device: str = "cpu") -> tuple[MotionDiffusion, torch.nn.Module]:
+    """Return a prior of the paper's size with fresh weights, and its network."""
+    size = DiffusionSettings.paper(FRAMES)
+    rng = np.random.default_rng(0)
+    standards = Standards(0.2 * rng.normal(size=(JOINTS, 2)), np.full((JOINTS, 2), 0.2))
+    skeleton = Skeleton([f"joint-{j}" for j in range(JOINTS)], [-1] + [0] * (JOINTS - 1))
+    network = size.network(JOINTS)
+    prior = MotionDiffusion(network, size, standards, skeleton, 20.0, device=device)
+    return prior, network
+
+
+@dataclass
+class Timer:
+    """Seconds inside the network's forward passes."""
+
+    device: str
+    seconds: list[float] = field(default_factory=list)
+    begun: float = 0.0
+
+    def attach(self, network: torch.nn.Module) -> None:
+        """Count every forward pass from now on."""
+        network.register_forward_pre_hook(self._begin)
+        network.register_forward_hook(self._end)
+
+    def _begin(self, *_: Any) -> None:
+        self.begun = self._now()
+
+    def _end(self, *_: Any) -> None:
+        self.seconds.append(self._now() - self.begun)
+
+    def _now(self) -> float:
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def run(prior: MotionDiffusion, draws: int, steps: int = 100) -> float:
+    """Return the seconds of MAS."""
+    sampler = MultiViewAncestral(steps=steps, n_views=VIEWS, perspective=True)
+    begun = time.perf_counter()
+    sampler.sample(MotionPosterior(prior), draws=draws, progress=False)
+    return time.perf_counter() - begun
+
+
+def matmul_gflops(n: int = 2048, repeats: int = 15) -> float:
+    """Return the median rate of a product of n × n float32 matrices."""
+    a, b = torch.randn(n, n), torch.randn(n, n)
+    seconds = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        torch.mm(a, b)
+        seconds.append(time.perf_counter() - begun)
+    return 2 * n**3 / statistics.median(seconds) / 1e9
+
+
+def network_gflop(network: torch.nn.Module) -> float:
+    """Return the floating-point operations of one step, V views, in units of 10⁹."""
+    motions, levels = torch.zeros(VIEWS, FRAMES, 2 * JOINTS), torch.zeros(VIEWS)
+    counter = FlopCounterMode(display=False)
+    # The counter does not know PyTorch's fused encoder layer.
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        with counter, torch.no_grad():
+            network(motions, levels)
+    finally:
+        torch.backends.mha.set_fastpath_enabled(True)
+    return float(counter.get_total_flops()) / 1e9
+
+
+def on_cpu(steps: int = 100) -> dict[str, float]:
+    """Return the figures of one motion on the CPU."""
+    prior, network = paper_prior()
+    timer = Timer("cpu")
+    timer.attach(network)
+    run(prior, draws=1, steps=2)
+    gflop = network_gflop(network)
+    timer.seconds.clear()
+    before = matmul_gflops()
+    seconds = run(prior, draws=1, steps=steps)
+    rate = (before + matmul_gflops()) / 2
+    # Medians throughout: others may use the machine for a while.
+    return {
+        "outside_network_share": 1 - sum(timer.seconds) / seconds,
+        "network_gflops_share": gflop / statistics.median(timer.seconds) / rate,
+        "step_milliseconds": 1000 * seconds / steps,
+        "network_gflop_per_step": gflop,
+        "matmul_gflops": rate,
+    }
+
+
+def on_cuda() -> dict[str, float]:
+    """Return the figures of one motion and of 64 on a GPU."""
+    prior, network = paper_prior("cuda")
+    run(prior, draws=1, steps=10)
+    one = run(prior, draws=1)
+    run(prior, draws=64, steps=10)
+    many = run(prior, draws=64)
+    # Waiting for the GPU at every forward pass would slow the figures above.
+    timer = Timer("cuda")
+    timer.attach(network)
+    seconds = run(prior, draws=64)
+    return {
+        "cuda_seconds_one_motion": one,
+        "cuda_motions_per_second": 64 / many,
+        "cuda_network_share": sum(timer.seconds) / seconds,
+        "cuda_memory_gib": torch.cuda.max_memory_allocated() / 2**30,
+    }
+
+
+def peak_memory() -> float:
+    """Return the peak memory of this process after a few steps of one motion, GiB."""
+    run(paper_prior()[0], draws=1, steps=5)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def main() -> None:
+    """Print the figures."""
+    figures = on_cpu()
+    # A fresh process, whose peak nothing else has raised.
+    fresh = subprocess.run(
+        [sys.executable, __file__, "--memory"], check=True, capture_output=True, text=True
+    )
+    figures["memory_gib"] = float(fresh.stdout)
+    if torch.cuda.is_available():
+        figures |= on_cuda()
+    for name, value in figures.items():
+        print(f"{name}: {value:.4g}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(int(THREADS))
+    if sys.argv[1:] == ["--memory"]:
+        print(peak_memory())
+    else:
+        main()

@@ -1,0 +1,92 @@
+"""The transformer of the motion diffusion model (MDM, Tevet et al. 2023), which MAS learns in 2D.
+
+An encoder over frames: input and output are linear maps of a frame's 2J numbers, the noise level
+is one more token in front, positions are sinusoidal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+__all__ = ["MotionTransformer", "sinusoids"]
+
+
+class MotionTransformer(nn.Module):
+    """(noisy motion, level) → clean motion, in standardised units.
+
+    Parameters
+    ----------
+    features : int
+        Numbers per frame, 2J.
+    frames : int
+        Most frames L.
+    layers, width, heads, feedforward : int
+        Of the encoder.
+    dropout : float
+        Share of activations that are left out in training.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        frames: int,
+        *,
+        layers: int,
+        width: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.width = width
+        self.enter = nn.Linear(features, width)
+        self.leave = nn.Linear(width, features)
+        self.level = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.dropout = nn.Dropout(dropout)
+        layer = nn.TransformerEncoderLayer(
+            width, heads, feedforward, dropout, activation="gelu", batch_first=True
+        )
+        self.encoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
+        places = sinusoids(torch.arange(frames + 1), width)
+        self.register_buffer("places", places, persistent=False)
+
+    def forward(
+        self, motions: torch.Tensor, levels: torch.Tensor, valid: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Return the clean motions.
+
+        Parameters
+        ----------
+        motions : Tensor, (N, L, 2J)
+            Noisy motions.
+        levels : Tensor, (N,)
+            Numbers of the noise levels, 0 to T, which need not be whole.
+        valid : Tensor of bool, (N, L), optional
+            Frames that are part of the motion; all by default.
+
+        Returns
+        -------
+        Tensor, (N, L, 2J)
+        """
+        first = self.level(sinusoids(levels, self.width))[:, None]
+        tokens = torch.cat([first, self.enter(motions)], dim=1)
+        tokens = self.dropout(tokens + self.places[: tokens.shape[1]])
+        ignored = None
+        if valid is not None:
+            ignored = torch.cat([torch.zeros_like(valid[:, :1]), ~valid], dim=1)
+        return self.leave(self.encoder(tokens, src_key_padding_mask=ignored)[:, 1:])
+
+
+def sinusoids(places: torch.Tensor, width: int) -> torch.Tensor:
+    """Return the embedding of positions (Vaswani et al. 2017, section 3.5): ``(N,) → (N, width)``.
+
+    Sines stand at even places, cosines at odd ones.
+    """
+    rates = torch.exp(
+        torch.arange(0, width, 2, device=places.device) * (-math.log(10_000.0) / width)
+    )
+    angles = places.to(torch.float32)[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)

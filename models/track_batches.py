@@ -1,0 +1,212 @@
+"""Batches of 2D tracks for learning: random sub-sequences, varied, padded to one length."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from probmotion.checks import check_count
+from probmotion.models.standards import Standards
+from probmotion.motion import KeypointTrack
+from probmotion.skeleton import Skeleton
+
+__all__ = ["Augmentation", "Batch", "TrackBatches"]
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How tracks are varied (MAS, section 6.1; the authors' training).
+
+    Parameters
+    ----------
+    shortest : float
+        Least share of the window that a random sub-sequence keeps, above 0 and at most 1.
+    scale : float
+        Tracks are scaled by a factor from 1 − scale to 1 + scale.
+    shift : float
+        Tracks are moved by up to this much, metres; 0 where the root is at the origin.
+    mirror : bool
+        Mirror every other track, left and right joints exchanged.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    """
+
+    shortest: float = 0.5
+    scale: float = 0.05
+    shift: float = 0.0
+    mirror: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.shortest <= 1:
+            raise ValueError(f"shortest is {self.shortest}, expected above 0 and at most 1")
+        if not 0 <= self.scale < 1:
+            raise ValueError(f"scale is {self.scale}, expected at least 0 and below 1")
+        if not 0 <= self.shift < np.inf:
+            raise ValueError(f"shift is {self.shift}, expected a number of at least 0")
+
+    @classmethod
+    def none(cls) -> Augmentation:
+        """Return the augmentation that changes nothing."""
+        return cls(1.0, 0.0, 0.0, False)
+
+
+class Batch(NamedTuple):
+    """Tracks padded to one length."""
+
+    keypoints: np.ndarray
+    """(B, L, J, 2) float32, metres; 0 where not seen or not there."""
+    seen: np.ndarray
+    """(B, L, J) bool: joints whose confidence is not below the threshold."""
+    valid: np.ndarray
+    """(B, L) bool: frames that are there and in which something is seen."""
+
+
+class TrackBatches:
+    """Random windows of tracks.
+
+    A frame is as likely to be in one whichever track it is of; frames near a track's ends are in
+    fewer windows than those between.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Of one skeleton and frame rate, metres, centred.
+    frames : int
+        Length L of a window; shorter tracks are padded.
+    threshold : float
+        Least confidence of a joint that counts.
+    augmentation : Augmentation
+        How windows are varied.
+
+    Raises
+    ------
+    ValueError
+        If there is no track, they differ in skeleton or frame rate, none has a confident joint, or
+        a number is out of range.
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[KeypointTrack],
+        frames: int,
+        threshold: float,
+        augmentation: Augmentation,
+    ) -> None:
+        check_count("frames", frames, least=2)
+        if not 0 <= threshold < np.inf:
+            raise ValueError(f"threshold is {threshold}, expected a number of at least 0")
+        _check_alike(tracks)
+        self.skeleton: Skeleton = tracks[0].skeleton
+        self.fps = tracks[0].fps
+        self.frames = frames
+        self.augmentation = augmentation
+        self._seen = [(track.confidence >= threshold) & (track.confidence > 0) for track in tracks]
+        if not any(seen.any() for seen in self._seen):
+            raise ValueError(
+                f"tracks has no joint of confidence {threshold:g} or more, expected some to learn "
+                "from"
+            )
+        self._keypoints = [
+            np.where(seen[..., None], track.keypoints, 0.0).astype(np.float32)
+            for track, seen in zip(tracks, self._seen, strict=True)
+        ]
+        # A draw shows no more frames of a long track than a window's, and all of a short one's.
+        lengths = np.array([track.frames for track in tracks])
+        windows = lengths / np.minimum(lengths, frames)
+        self._share = windows / windows.sum()
+        self.description = describe_tracks(tracks)
+
+    @property
+    def standards(self) -> Standards:
+        """Mean and deviation of the joints that are seen, with the mirror images if there are."""
+        points = np.concatenate(self._keypoints).astype(np.float64)
+        seen = np.concatenate(self._seen)
+        if self.augmentation.mirror:
+            points = np.concatenate([points, self._mirrored(points)])
+            seen = np.concatenate([seen, seen[:, self._exchanged]])
+        count = np.maximum(seen.sum(axis=0), 1)[:, None]
+        mean = (points * seen[..., None]).sum(axis=0) / count
+        squares = ((points - mean) ** 2 * seen[..., None]).sum(axis=0) / count
+        # Rounding leaves a root that pictures are centred on with a hair's breadth.
+        return Standards(mean, np.where(squares > 1e-12, np.sqrt(squares), 0.0))
+
+    def draw(self, rng: np.random.Generator, n: int) -> Batch:
+        """Return n random windows."""
+        check_count("n", n)
+        J = self.skeleton.n_joints
+        batch = Batch(
+            np.zeros((n, self.frames, J, 2), np.float32),
+            np.zeros((n, self.frames, J), bool),
+            np.zeros((n, self.frames), bool),
+        )
+        for row, track in enumerate(rng.choice(len(self._share), n, p=self._share)):
+            keypoints, seen = self._window(rng, int(track))
+            length = len(keypoints)
+            batch.keypoints[row, :length] = keypoints
+            batch.seen[row, :length] = seen
+            batch.valid[row, :length] = seen.any(axis=-1)
+        return batch
+
+    def _window(self, rng: np.random.Generator, track: int) -> tuple[np.ndarray, np.ndarray]:
+        keypoints, seen = self._keypoints[track], self._seen[track]
+        longest = min(self.frames, len(keypoints))
+        shortest = max(1, int(np.ceil(self.augmentation.shortest * longest)))
+        length = int(rng.integers(shortest, longest + 1))
+        start = int(rng.integers(0, len(keypoints) - length + 1))
+        keypoints, seen = keypoints[start : start + length], seen[start : start + length]
+        factor = 1 + self.augmentation.scale * rng.uniform(-1, 1)
+        moved = self.augmentation.shift * rng.uniform(-1, 1, 2)
+        turned = rng.random() < 0.5
+        if self.augmentation.mirror and turned:
+            keypoints, seen = self._mirrored(keypoints), seen[:, self._exchanged]
+        return np.where(seen[..., None], factor * keypoints + moved, 0.0), seen
+
+    @property
+    def _exchanged(self) -> np.ndarray:
+        """For every joint, the one on the other side."""
+        order = np.arange(self.skeleton.n_joints)
+        for left, right in self.skeleton.mirrored_pairs:
+            order[[left, right]] = right, left
+        return order
+
+    def _mirrored(self, keypoints: np.ndarray) -> np.ndarray:
+        return keypoints[:, self._exchanged] * np.array([-1, 1], keypoints.dtype)
+
+
+def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
+    """Return how many tracks, frames and clips there are, the clips' names and a digest of all."""
+    digest = hashlib.sha256()
+    for track in tracks:
+        digest.update(np.nan_to_num(track.keypoints, nan=0.0).tobytes())
+        digest.update(track.confidence.tobytes())
+    clips = sorted({track.name.rpartition("/")[0] or track.name for track in tracks})
+    return {
+        "tracks": len(tracks),
+        "frames": sum(track.frames for track in tracks),
+        "clips": clips,
+        "sha256": digest.hexdigest(),
+    }
+
+
+def _check_alike(tracks: Sequence[KeypointTrack]) -> None:
+    if not tracks:
+        raise ValueError("tracks is empty, expected at least one track")
+    first = tracks[0]
+    for track in tracks:
+        if track.skeleton != first.skeleton:
+            raise ValueError(
+                f"tracks has {track.name or 'one'} with other joints than "
+                f"{first.name or 'the first'}, expected one skeleton"
+            )
+        if track.fps != first.fps:
+            raise ValueError(
+                f"tracks has {track.name or 'one'} at {track.fps:g} frames per second and "
+                f"{first.name or 'the first'} at {first.fps:g}, expected one rate"
+            )

@@ -1,0 +1,116 @@
+"""Cleaning a 2D track with a 2D motion diffusion model.
+
+A detection is the true keypoint plus an error of standard deviation σ: up to a factor, a noisy
+motion at the level where √((1−ᾱ)/ᾱ) is σ, of which the denoiser's estimate is the posterior mean.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from probmotion.cameras import Cameras
+from probmotion.checks import check_count, check_positive
+from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.motion import KeypointTrack
+
+__all__ = ["denoise_track"]
+
+
+def denoise_track(
+    track: KeypointTrack,
+    prior: MotionDiffusion,
+    *,
+    noise: float,
+    threshold: float = 0.3,
+    rounds: int = 10,
+) -> KeypointTrack:
+    """Return the track as the prior believes it to be.
+
+    Joints below the threshold are not believed at all. They start at the prior's mean and take
+    the denoiser's estimate, at levels that fall from as much noise as signal to the detector's,
+    while what was seen stays as it was: a heuristic fill, not a draw.
+
+    Parameters
+    ----------
+    track : KeypointTrack
+        Prepared: metres, centred as the prior's data were, its joints and frame rate.
+    prior : MotionDiffusion
+        What cleans it.
+    noise : float
+        σ, standard deviation of a confident detection, metres.
+    threshold : float
+        Least confidence of a detection that is believed.
+    rounds : int
+        Noise levels on the way to the detector's, where some joint is not believed.
+
+    Returns
+    -------
+    KeypointTrack
+        Every joint in every frame; confidence 1 where it was believed, and as it came elsewhere.
+
+    Raises
+    ------
+    ValueError
+        If joints or frame rate are not the prior's, no joint is confident, a number is out of
+        range, or the noise is beyond the levels that the prior has learnt.
+    """
+    check_positive("noise", noise)
+    check_count("rounds", rounds)
+    _check_track(track, prior)
+    believed = (track.confidence >= threshold) & (track.confidence > 0)
+    if not believed.any():
+        raise ValueError(
+            f"track {track.name or 'unnamed'} has no joint of confidence {threshold:g} or more, "
+            "expected some"
+        )
+    seen = np.where(believed[..., None], track.keypoints, prior.standards.mean) / prior.scale
+    target = noise / prior.scale
+    levels = np.array([target])
+    if not believed.all():
+        levels = np.geomspace(max(1.0, target), target, rounds)
+    clean = seen
+    for sigma in levels:
+        given = np.where(believed[..., None], seen, clean)
+        clean = _denoise(prior, given, float(sigma))
+    confidence = np.where(believed, 1.0, track.confidence)
+    return replace(track, keypoints=clean * prior.scale, confidence=confidence)
+
+
+def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the estimate of a track of any length, (L, J, 2), normalised units.
+
+    Longer ones go through in windows that overlap by half, blended by weights that fall to the
+    windows' ends, so that there is no seam.
+    """
+    alpha_bar = 1 / (1 + sigma**2)
+    noisy = math.sqrt(alpha_bar) * keypoints
+    frames = len(keypoints)
+    window = min(frames, prior.settings.frames)
+    starts = np.unique([*range(0, frames - window + 1, max(1, window // 2)), frames - window])
+    views = np.stack([noisy[start : start + window] for start in starts])
+    camera = Cameras.ring(1)
+    clean = prior.denoise(views[:, None], alpha_bar, camera)[:, 0]
+    ramp = np.minimum(np.arange(window) + 1.0, window - np.arange(window))
+    total, weight = np.zeros_like(keypoints), np.zeros(frames)
+    for start, part in zip(starts, clean, strict=True):
+        total[start : start + window] += ramp[:, None, None] * part
+        weight[start : start + window] += ramp
+    return total / weight[:, None, None]
+
+
+def _check_track(track: KeypointTrack, prior: MotionDiffusion) -> None:
+    if track.skeleton.canonical_names != prior.skeleton.canonical_names:
+        raise ValueError(
+            f"track is of the joints {', '.join(track.skeleton.joint_names)}, expected the prior's,"
+            f" {', '.join(prior.skeleton.joint_names)}"
+        )
+    if abs(track.fps - prior.fps) > 1e-6 * prior.fps:
+        raise ValueError(
+            f"track is at {track.fps:g} frames per second, expected the prior's {prior.fps:g}; "
+            "resample it"
+        )
+    if track.frames < 2:
+        raise ValueError("track has 1 frame, expected at least 2")

@@ -1,0 +1,85 @@
+"""What changes while a network is trained, and how it is kept so that a run can go on."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from probmotion.files import written_whole
+from probmotion.models.checkpoints import MODEL, Checkpoint, load_checkpoint, save_checkpoint
+
+__all__ = ["LOSSES", "STATE", "Run", "keep_run", "resume_run"]
+
+STATE, LOSSES = "state.safetensors", "losses.csv"
+"""Beside the model, in the folder of a run: what it goes on from, and its losses."""
+
+
+@dataclass(eq=False)
+class Run:
+    """Everything that changes from step to step."""
+
+    network: nn.Module
+    average: nn.Module
+    optimiser: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+    history: list[dict[str, float]] = field(default_factory=list)
+    recent: list[float] = field(default_factory=list)
+
+
+def keep_run(run: Run, kind: str, described: dict[str, Any], folder: Path) -> None:
+    """Write the model, its losses and, last, the state to go on from."""
+    card = described | {"step": run.step, "seconds": run.seconds, "history": run.history}
+    save_checkpoint(folder / MODEL, Checkpoint(kind, card, run.average.state_dict()))
+    with (
+        written_whole(folder / LOSSES) as path,
+        open(path, "w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.DictWriter(file, ["step", "loss", "validation_loss", "seconds"])
+        writer.writeheader()
+        writer.writerows(run.history)
+    tensors = {f"network.{name}": value for name, value in run.network.state_dict().items()}
+    tensors |= {f"average.{name}": value for name, value in run.average.state_dict().items()}
+    for number, moments in run.optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{number}.{name}": value for name, value in moments.items()}
+    state = card | {"recent": run.recent}
+    save_checkpoint(folder / STATE, Checkpoint(_state_of(kind), state, tensors))
+
+
+def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> None:
+    """Bring a run to where the one in the folder was stopped."""
+    kept = load_checkpoint(folder / STATE, _state_of(kind))
+    for part in ("network", "training"):
+        for name, wanted in described[part].items():
+            got = kept.settings[part].get(name)
+            # Checkpoints may come more often and the end later: no step is changed by it.
+            if got != wanted and name not in ("steps", "checkpoint_every"):
+                raise ValueError(
+                    f"out is {folder}, which holds a run with {name} {got}, expected {wanted}; "
+                    "give it a folder of its own"
+                )
+    parts: dict[str, dict[str, torch.Tensor]] = {}
+    for name, tensor in kept.tensors.items():
+        part, _, rest = name.partition(".")
+        parts.setdefault(part, {})[rest] = tensor
+    run.network.load_state_dict(parts["network"])
+    run.average.load_state_dict(parts["average"])
+    moments: dict[int, dict[str, torch.Tensor]] = {}
+    for name, tensor in parts.get("optimiser", {}).items():
+        number, _, rest = name.partition(".")
+        moments.setdefault(int(number), {})[rest] = tensor
+    held = run.optimiser.state_dict()
+    run.optimiser.load_state_dict({"state": moments, "param_groups": held["param_groups"]})
+    run.step = int(kept.settings["step"])
+    run.seconds = float(kept.settings["seconds"])
+    run.history = list(kept.settings["history"])
+    run.recent = list(kept.settings["recent"])
+
+
+def _state_of(kind: str) -> str:
+    return f"{kind} in training"

@@ -1,0 +1,389 @@
+"""3D motion from 2D data alone: the shape of MAS's tables 2 and 3 on our clips, and 3D truth.
+
+    python notebooks/ablations/mas.py --out mas
+    python notebooks/ablations/mas.py --quick --out quick     (made walks, tiny networks, a minute)
+
+Parts: table, strided, exact; ``--parts`` chooses. The networks of walk2d come with the package; the
+lifter is trained here, on the same tracks. Motions that are left in ``--out/motions`` are not made
+again, so that what is interrupted goes on. Clips are looked for in ``--data``, by default
+../shared/data beside the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from probmotion import seeds
+from probmotion.data.learning import (
+    LearningTracks,
+    film_clips,
+    film_windows,
+    split_tracks,
+)
+from probmotion.data.projections import (
+    DetectorNoise,
+    Filming,
+    centre_motion,
+    project_clips,
+)
+from probmotion.data.walks import made_walks, walk_clips
+from probmotion.files import written_whole
+from probmotion.formats.predictions import read_predictions
+from probmotion.metrics import measure
+from probmotion.metrics.generation import COLLAPSED_BELOW, GenerationReference
+from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
+from probmotion.models.diffusion_settings import DiffusionSettings
+from probmotion.models.diffusion_training import DiffusionTrainee
+from probmotion.models.evaluator import TrackEvaluator
+from probmotion.models.evaluator_training import EvaluatorTrainee
+from probmotion.models.lifter import LifterSettings, PoseLifter
+from probmotion.models.lifter_training import LifterTrainee
+from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.models.pose_flow import FlowSettings, PoseFlow
+from probmotion.models.pose_flow_training import PoseFlowTrainee
+from probmotion.models.track_autoencoder import EvaluatorSettings
+from probmotion.models.track_batches import Augmentation
+from probmotion.models.training import train
+from probmotion.models.training_settings import TrainingSettings
+from probmotion.motion import Motion
+from probmotion.pictures import draw_skeletons
+from probmotion.posterior import MotionPosterior
+from probmotion.problems import load_problem
+from probmotion.samplers import (
+    MultiViewAncestral,
+    MultiViewPredictorCorrector,
+    ScoreDistillation,
+)
+from probmotion.samplers.ancestral2d import Ancestral2D
+from probmotion.sampling import Sampler
+from probmotion.skeleton import Skeleton
+
+SEED = 0
+FPS = 20.0
+PERSON = Skeleton.preset("person14")
+
+
+@dataclass(frozen=True)
+class Study:
+    """The data, the networks, and how much to draw."""
+
+    out: Path
+    data: Path
+    quick: bool
+    draws: int
+    iterations: int
+    repeats: int
+    steps: int
+    predictions: Path | None = None
+
+    @cached_property
+    def clips(self) -> dict[str, list[Motion]]:
+        """3D clips by part; of those to learn from only pictures are used."""
+        if self.quick:
+            walks = made_walks(24, seconds=4)
+            return {"train": walks[:16], "validation": walks[16:18], "test": walks[18:]}
+        return walk_clips(self.data)
+
+    @cached_property
+    def tracks(self) -> LearningTracks:
+        """What cameras and a detector make of the clips."""
+        every = [clip for clips in self.clips.values() for clip in clips]
+        filmed = film_clips(every, PERSON, FPS, views=8 if self.quick else 64)
+        names = {part: [clip.name for clip in clips] for part, clips in self.clips.items()}
+        return split_tracks(filmed.tracks, validation=names["validation"], test=names["test"])
+
+    def views(self, part: str, n: int) -> np.ndarray:
+        """Return random 2D windows of a part, (n, L, J, 2)."""
+        return film_windows(self.clips[part], PERSON, FPS, self.frames, n, seed=SEED + 1)
+
+    def motions(self, part: str) -> np.ndarray:
+        """Return all 3D windows of a part, (n, L, J, 3), metres: the truth that nobody saw."""
+        clips = [
+            centre_motion(clip.retarget(PERSON).resample(FPS)).positions
+            for clip in self.clips[part]
+        ]
+        return np.concatenate([windows(clip, self.frames) for clip in clips])
+
+    @cached_property
+    def prior(self) -> MotionDiffusion:
+        """The 2D motion diffusion model."""
+        if not self.quick:
+            return MotionDiffusion.load("walk2d")
+        size = DiffusionSettings.tiny(20)
+        trainee = DiffusionTrainee(self.tracks.train, self.tracks.validation, size)
+        settings = TrainingSettings(steps=600, batch=32, learning_rate=2e-3, ema=0.99)
+        return MotionDiffusion.load(self.trained("diffusion", trainee, settings))
+
+    @cached_property
+    def reference(self) -> GenerationReference:
+        """Held-out real 2D motion, and the evaluator that makes its features."""
+        if not self.quick:
+            found = load_problem("walk2d").generation
+            assert found is not None
+            return found
+        trainee = EvaluatorTrainee(
+            self.tracks.train, self.tracks.validation, EvaluatorSettings.tiny(20)
+        )
+        settings = TrainingSettings(steps=300, batch=32, learning_rate=2e-3, ema=0.99)
+        evaluator = TrackEvaluator.load(self.trained("evaluator", trainee, settings))
+        return GenerationReference(evaluator, evaluator.features(self.views("test", 200)))
+
+    @property
+    def frames(self) -> int:
+        """Frames L of a motion."""
+        return self.prior.frames
+
+    def trained(self, name: str, trainee: object, settings: TrainingSettings) -> Path:
+        """Train a network, or go on; return its checkpoint."""
+        return train(trainee, settings, self.out / name, progress=False).model
+
+    def once(self, name: str, make: Callable[[], np.ndarray]) -> tuple[np.ndarray, float]:
+        """Return motions or views and the seconds that they took; made where they are missing."""
+        path = self.out / "motions" / f"{name}.npz"
+        if not path.exists():
+            start = time.perf_counter()
+            made = make()
+            seconds = time.perf_counter() - start
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as unfinished, open(unfinished, "wb") as file:
+                np.savez_compressed(file, made=made.astype(np.float32), seconds=seconds)
+            print(f"{name}: {len(made)} in {seconds:.0f} s", flush=True)
+        with np.load(path) as archive:
+            return archive["made"].astype(np.float64), float(archive["seconds"])
+
+    def draw(self, name: str, sampler: Sampler, posterior: MotionPosterior) -> tuple:
+        """Return a sampler's 3D motions, (n, L, J, 3), and the seconds that they took."""
+
+        def make() -> np.ndarray:
+            return sampler.sample(posterior, draws=self.draws, seed=SEED, progress=False).flat()
+
+        return self.once(name, make)
+
+
+def samplers(iterations: int) -> dict[str, Sampler]:
+    """Return what table 2 compares, and what this project adds."""
+    return {
+        "MAS": MultiViewAncestral(perspective=True),
+        "MAS, orthographic": MultiViewAncestral(),
+        "MAS, 2 views": MultiViewAncestral(n_views=2, perspective=True),
+        "MAS, no 3D noise": MultiViewAncestral(perspective=True, shared_noise=False),
+        "mvpc": MultiViewPredictorCorrector(),
+        "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
+        "SDS, uniform": ScoreDistillation(iterations=iterations),
+        "SDS, annealed": ScoreDistillation(iterations=iterations, levels="annealed"),
+    }
+
+
+def table(study: Study) -> pd.DataFrame:
+    """Tables 2 and 3: 2D against held-out 2D, all around and from the side, and 3D against 3D."""
+    posterior = MotionPosterior(study.prior)
+    real = study.motions("test")
+    rows = []
+
+    def add(
+        name: str, motions: np.ndarray | None, views: np.ndarray | None, seconds: float
+    ) -> None:
+        rows.append(score(study, name, motions, views, real, seconds))
+        print(rows[-1], flush=True)
+
+    # As many real motions to learn from as there are draws, other ones in every repeat.
+    add("truth, 2D", None, study.views("train", 10 * study.draws), math.nan)
+    rng = seeds.generator(SEED, "truth")
+    shown = study.motions("train")
+    shown = shown[rng.choice(len(shown), study.draws)]
+    # Clips walk one way; a draw may be turned to any.
+    turned = [
+        Motion(one, PERSON, FPS).turned(rng.uniform(0, 2 * math.pi)).positions for one in shown
+    ]
+    add("truth, 3D", np.stack(turned), None, math.nan)
+    views, seconds = study.once(
+        "2D model",
+        lambda: Ancestral2D().sample_views(posterior, draws=study.draws, seed=SEED, progress=False),
+    )
+    add("2D model", None, views, seconds / study.draws)
+    drawn = {}
+    for name, sampler in samplers(study.iterations).items():
+        motions, seconds = study.draw(name, sampler, posterior)
+        drawn[name] = motions
+        add(name, motions, None, seconds / study.draws)
+    lifted = study.views("train", study.draws)
+    for name, lifter in lifters(study).items():
+        motions, seconds = study.once(name, lambda lifter=lifter: lifter(lifted))
+        drawn[name] = motions
+        add(name, motions, None, seconds / study.draws)
+    draw_skeletons(
+        {"real, held out": real[:: max(1, len(real) // 4)], **drawn},
+        PERSON,
+        study.out / "draws.png",
+        heading=math.pi / 3,
+    )
+    return pd.DataFrame(rows)
+
+
+def score(
+    study: Study,
+    name: str,
+    motions: np.ndarray | None,
+    views: np.ndarray | None,
+    real: np.ndarray,
+    seconds: float,
+) -> dict[str, object]:
+    """Return one row; views alone have no side and no third dimension."""
+    row: dict[str, object] = {"name": name, "seconds": seconds}
+    asked = {"seed": SEED, "samples": study.draws, "repeats": study.repeats}
+    if motions is None:
+        assert views is not None
+        found = {"": study.reference.score_views(views, **asked)}
+    else:
+        found = {
+            "": study.reference.score_motions(motions, **asked),
+            "_side": study.reference.score_motions(motions, **asked, angles="side"),
+        }
+        near = nearest_distances(motions, real)
+        row |= {
+            "to_real_mm": 1000 * near.of_draws,
+            "of_real_mm": 1000 * near.of_real,
+            "mirrored": mirror_share(motions, real),
+            "bones_mm": 1000 * bone_changes(motions),
+        }
+    for where, scores in found.items():
+        for measured, (mean, sd) in scores.items():
+            row |= {f"{measured}{where}": mean, f"{measured}{where}_sd": sd}
+    row["collapsed"] = row["recall"] < COLLAPSED_BELOW
+    return row
+
+
+def bone_changes(motions: np.ndarray) -> float:
+    """Return the standard deviation in time of a bone's length, mean over bones and motions."""
+    ends, starts = np.array(PERSON.bones).T
+    lengths = np.linalg.norm(motions[:, :, ends] - motions[:, :, starts], axis=-1)
+    return float(lengths.std(axis=1).mean())
+
+
+def lifters(study: Study) -> Mapping[str, Callable[[np.ndarray], np.ndarray]]:
+    """Return functions (n, L, J, 2) → (n, L, J, 3) that lift single pictures."""
+    flow_trainee = PoseFlowTrainee(
+        study.tracks.train,
+        study.tracks.validation,
+        FlowSettings.tiny() if study.quick else FlowSettings.small(),
+    )
+    steps = study.steps // 10 if study.quick else study.steps
+    settings = TrainingSettings(steps=steps, batch=256, learning_rate=1e-3)
+    flow = PoseFlow.load(study.trained("flow", flow_trainee, settings))
+    trainee = LifterTrainee(
+        study.tracks.train,
+        study.tracks.validation,
+        flow,
+        LifterSettings.tiny() if study.quick else LifterSettings.small(),
+    )
+    lifter = PoseLifter.load(study.trained("lifter", trainee, settings))
+    found: dict[str, Callable[[np.ndarray], np.ndarray]] = {"lifter": lifter.lift}
+    if study.predictions is not None:
+        read = read_predictions(study.predictions, PERSON, frames=study.frames, fps=FPS)
+        found[study.predictions.stem] = lambda views: read
+    return found
+
+
+def strided(study: Study) -> pd.DataFrame:
+    """MAS and mvpc with fewer levels than the network has learnt."""
+    posterior = MotionPosterior(study.prior)
+    real = study.motions("test")
+    rows = []
+    for steps in (10, 20, 50, 100):
+        for name, sampler in (
+            ("MAS", MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)),
+            ("mvpc", MultiViewPredictorCorrector(steps=steps, trained_steps=100)),
+        ):
+            motions, seconds = study.draw(f"{name}, {steps} steps", sampler, posterior)
+            row = score(study, name, motions, None, real, seconds / study.draws)
+            rows.append({"steps": steps, **row})
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def exact(study: Study) -> pd.DataFrame:
+    """How wrong the network makes a sampler: it learns from pictures of the prior of ``gait``.
+
+    There the right answer is known: each sampler draws with the exact 2D denoiser and with the
+    network, and both are compared with exact draws.
+    """
+    problem = load_problem("gait")
+    known = problem.posterior.prior
+    n = 400 if study.quick else 4000
+    drawn = known.sample(seeds.generator(SEED, "pictures"), n)
+    clips = [
+        Motion(motion, known.skeleton, known.fps, name=f"gait-{number}")
+        for number, motion in enumerate(drawn)
+    ]
+    # As the exact denoiser sees them: orthographic, one elevation, centred on average.
+    filming = Filming(tilt=0.0, perspective=False, centre="sequence")
+    tracks = project_clips(clips, views=4, filming=filming, noise=DetectorNoise.none())
+    held = len(tracks) // 10
+    size = DiffusionSettings.tiny(30) if study.quick else DiffusionSettings.small(30)
+    plain = replace(Augmentation.none(), shortest=1.0)
+    trainee = DiffusionTrainee(tracks[held:], tracks[:held], size, augmentation=plain)
+    settings = TrainingSettings(steps=study.steps // (10 if study.quick else 1), learning_rate=1e-3)
+    learnt = MotionDiffusion.load(study.trained("gait", trainee, settings))
+    rows = []
+    for name, sampler in (
+        ("mas", MultiViewAncestral()),
+        ("mvpc", MultiViewPredictorCorrector()),
+        ("mvpc, accurate", MultiViewPredictorCorrector.accurate()),
+    ):
+        for denoiser, prior in (("exact", known), ("network", learnt)):
+            draws = sampler.sample(
+                MotionPosterior(prior), draws=study.draws, seed=SEED, progress=False
+            )
+            measured = measure(problem, draws, SEED)
+            kept = ("swd", "tr", "mean_error", "off", "share_error", "precision", "recall")
+            rows.append(
+                {"sampler": name, "denoiser": denoiser, **{key: measured[key] for key in kept}}
+            )
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+PARTS = {"table": table, "strided": strided, "exact": exact}
+
+
+def main() -> None:
+    """Make the parts that are asked for, each a table in ``--out``."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--quick", action="store_true", help="made walks and tiny networks")
+    parser.add_argument("--draws", type=int, help="motions per sampler")
+    parser.add_argument("--iterations", type=int, help="of SDS")
+    parser.add_argument("--steps", type=int, default=4000, help="of training what is trained here")
+    parser.add_argument("--predictions", type=Path, help="another lifter's motions, npz")
+    asked = parser.parse_args()
+    study = Study(
+        out=asked.out,
+        data=asked.data,
+        quick=asked.quick,
+        draws=asked.draws or (24 if asked.quick else 256),
+        iterations=asked.iterations or (50 if asked.quick else 10_000),
+        repeats=10,
+        steps=asked.steps,
+        predictions=asked.predictions,
+    )
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for part in asked.parts:
+        made = PARTS[part](study)
+        with written_whole(asked.out / f"{part}.csv") as path:
+            made.to_csv(path, index=False)
+        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()

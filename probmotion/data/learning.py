@@ -1,0 +1,215 @@
+"""Data sets of 2D tracks to learn from: where they come from, and which clips are kept out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from probmotion import seeds
+from probmotion.data.projections import Centre, DetectorNoise, Filming, project_clips
+from probmotion.data.splits import Split, clip_of, split_clips, tracks_of_clips
+from probmotion.data.track_preparation import PreparedTracks, prepare_tracks
+from probmotion.data.track_sizes import bone_sizes
+from probmotion.data.walks import made_walks
+from probmotion.formats import read_keypoints
+from probmotion.motion import KeypointTrack, Motion, files_named
+from probmotion.skeleton import Skeleton
+
+__all__ = [
+    "LearningTracks",
+    "film_clips",
+    "film_windows",
+    "made_walks",
+    "read_tracks",
+    "split_tracks",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class LearningTracks:
+    """Prepared 2D tracks, apart by clip.
+
+    Parameters
+    ----------
+    train, validation, test : list of KeypointTrack
+        Metres, centred on the root. Weights are learnt from ``train`` alone; ``test`` is not even
+        looked at.
+    split : Split
+        The clips' names.
+    """
+
+    train: list[KeypointTrack]
+    validation: list[KeypointTrack]
+    test: list[KeypointTrack]
+    split: Split
+
+
+def film_clips(
+    motions: Sequence[Motion],
+    skeleton: Skeleton,
+    fps: float,
+    *,
+    views: int = 64,
+    seed: int = 0,
+    filming: Filming | None = None,
+    noise: DetectorNoise | None = None,
+) -> PreparedTracks:
+    """Return what cameras around 3D clips and a detector would have given, prepared.
+
+    Parameters
+    ----------
+    motions : sequence of Motion
+        The clips, of any skeletons that have the joints asked for.
+    skeleton : Skeleton
+        The joints that are detected.
+    fps : float
+        Frames per second of the tracks.
+    views, seed, filming, noise
+        See :func:`~probmotion.data.projections.project_clips`.
+    """
+    shot = Filming() if filming is None else filming
+    clips = [motion.retarget(skeleton) for motion in motions]
+    tracks = project_clips(clips, views=views, seed=seed, filming=shot, noise=noise)
+    # Cameras are alone with their clip: no other track stands in the same picture.
+    alone = [track.name for track in tracks]
+    return prepare_tracks(tracks, fps=fps, videos=alone, centre=shot.centre)
+
+
+def film_windows(
+    motions: Sequence[Motion], skeleton: Skeleton, fps: float, frames: int, n: int, *, seed: int
+) -> np.ndarray:
+    """Return n random windows of filmed clips, whole: ``(n, frames, J, 2)``, metres.
+
+    The detector errs but loses no joint, and windows with a hole are left out; all else is as in
+    :func:`film_clips`. Every window of every clip is as likely, from 64 sides.
+
+    Raises
+    ------
+    ValueError
+        If no clip is as long as a window.
+    """
+    noise = DetectorNoise(share=0.0)
+    filmed = film_clips(motions, skeleton, fps, views=64, seed=seed, noise=noise).tracks
+    every = [
+        sliding_window_view(track.keypoints, frames, axis=0).transpose(0, 3, 1, 2)
+        for track in filmed
+        if track.frames >= frames
+    ]
+    # Cleaning hides single entries that it takes for strays.
+    whole = [windows[np.isfinite(windows).all(axis=(1, 2, 3))] for windows in every]
+    if not sum(map(len, whole)):
+        raise ValueError(
+            f"motions has clips of at most {max(track.frames for track in filmed)} frames at "
+            f"{fps:g} frames per second, expected frames={frames} without a hole in one"
+        )
+    found = np.concatenate(whole)
+    return found[seeds.generator(seed, "windows").choice(len(found), n, replace=n > len(found))]
+
+
+def read_tracks(
+    paths: Iterable[str | Path],
+    skeleton: Skeleton,
+    fps: float,
+    *,
+    file_fps: float | None = None,
+    threshold: float = 0.3,
+    centre: Centre = "frame",
+    sizes: Mapping[str, float] | None = None,
+) -> PreparedTracks:
+    """Return the tracks of files of 2D keypoints, prepared, in metres.
+
+    Parameters
+    ----------
+    paths : iterable of str or Path
+        Files, or patterns of them. A track is called ``"<file>/<name>"``.
+    skeleton : Skeleton
+        The joints to bring tracks to.
+    fps : float
+        Frames per second of the data set.
+    file_fps : float, optional
+        Frames per second of files that do not hold it.
+    threshold : float
+        Least confidence that counts.
+    centre : {"frame", "sequence"}
+        Where the root is at the origin.
+    sizes : mapping of str to float, optional
+        Bone sizes that pixels are brought to; those of :func:`person_sizes` by default, for people.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a pattern matches no file.
+    """
+    raw: list[KeypointTrack] = []
+    videos: list[str] = []
+    for path in files_named(paths):
+        for number, track in enumerate(read_keypoints(path, fps=file_fps)):
+            raw.append(replace(track, name=f"{path.stem}/{track.name or number}"))
+            videos.append(path.stem)
+    reference = person_sizes(skeleton) if sizes is None else sizes
+    return prepare_tracks(
+        raw, fps=fps, skeleton=skeleton, sizes=reference, videos=videos, threshold=threshold,
+        centre=centre,
+    )  # fmt: skip
+
+
+def person_sizes(skeleton: Skeleton) -> dict[str, float]:
+    """Return how long a grown person's bones are in pictures, metres, by joint.
+
+    The statistic is :func:`~probmotion.data.track_sizes.bone_sizes` of people who are made to walk,
+    filmed from all around without errors.
+    """
+    return bone_sizes(
+        film_clips(made_walks(8), skeleton, 20.0, views=16, noise=DetectorNoise.none()).tracks
+    )
+
+
+def split_tracks(
+    tracks: Sequence[KeypointTrack],
+    *,
+    validation: Sequence[str] = (),
+    test: Sequence[str] = (),
+    seed: int = 0,
+) -> LearningTracks:
+    """Return tracks apart by clip: the clips that are named, or a tenth each at random.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Prepared tracks.
+    validation, test : sequence of str
+        Names of clips; both are given, or neither.
+    seed : int
+        Seed of the choice where none are given.
+
+    Raises
+    ------
+    ValueError
+        If only one of the two is given, a clip is in both, has no track, or none is left to learn
+        from.
+    """
+    if bool(validation) != bool(test):
+        given, missing = ("validation", "test") if validation else ("test", "validation")
+        raise ValueError(f"{given} is given without {missing}, expected clips for both or neither")
+    clips = {clip_of(track.name) for track in tracks}
+    if not validation:
+        split = split_clips(clips, seed=seed)
+    else:
+        if twice := sorted(set(validation) & set(test)):
+            raise ValueError(
+                f"test has {twice[0]!r}, which validation has too, expected other clips"
+            )
+        rest = sorted(clips - set(validation) - set(test))
+        if not rest:
+            raise ValueError("validation and test have every clip, expected some to learn from")
+        split = Split(tuple(rest), tuple(sorted(validation)), tuple(sorted(test)))
+    return LearningTracks(
+        tracks_of_clips(tracks, split.train),
+        tracks_of_clips(tracks, split.validation),
+        tracks_of_clips(tracks, split.test),
+        split,
+    )

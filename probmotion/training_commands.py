@@ -1,0 +1,287 @@
+"""The command ``probmotion train diffusion | evaluator | lifter``.
+
+Each is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import OmitArgPrefixes
+
+if TYPE_CHECKING:
+    from probmotion.data.learning import LearningTracks
+    from probmotion.models.training import TrainingResult
+    from probmotion.models.training_settings import TrainingSettings
+
+__all__ = ["TRAINABLE", "TrainDiffusion", "TrainEvaluator", "TrainLifter"]
+
+Size = Literal["tiny", "small", "paper", "reference-code"]
+
+
+@dataclass(frozen=True)
+class Data:
+    """What is learnt from: clips that are filmed, or tracks; people made to walk by default."""
+
+    clips: tuple[str, ...] = ()
+    """3D motion files, .npz or .bvh, or quoted patterns. They are filmed by cameras around them,
+    and a detector with errors finds the joints: only these pictures are learnt from."""
+
+    tracks: tuple[str, ...] = ()
+    """Files of 2D keypoints (.json, .npz, .csv), or quoted patterns. Names of files are those of
+    clips."""
+
+    tracks_fps: float | None = None
+    """Frames per second of keypoints in files that do not hold it."""
+
+    skeleton: str = "person14"
+    """The joints to learn (see probmotion list)."""
+
+    fps: float = 20.0
+    """Frames per second to learn at."""
+
+    validation: tuple[str, ...] = ()
+    """Names of clips (files without ending) on which the loss is watched; a tenth by default."""
+
+    test: tuple[str, ...] = ()
+    """Names of clips that are kept for measuring; a tenth by default."""
+
+    views: int = 64
+    """Cameras around each 3D clip."""
+
+    centre: Literal["frame", "sequence"] = "frame"
+    """Whether the root is at the origin in every frame, or on average."""
+
+    data_seed: int = 0
+    """Seed of cameras, detection errors and, where no clips are named, of the split."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How long and how fast to learn; by default as the size was tried."""
+
+    steps: int | None = None
+    """Gradient steps."""
+
+    batch: int | None = None
+    """Sequences per step."""
+
+    learning_rate: float | None = None
+    """Of AdamW, after a linear warm-up."""
+
+    checkpoint_every: int = 500
+    """Steps between two checkpoints, each with a validation loss."""
+
+    seed: int = 0
+    """Of the first weights, batches and noise."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute; mixed precision on cuda."""
+
+    def settings(self, usual: TrainingSettings) -> TrainingSettings:
+        """Return the usual settings of a size with what was asked for in their place."""
+        from dataclasses import replace
+
+        asked = {
+            name: value
+            for name, value in asdict(self).items()
+            if value is not None and name != "device"
+        }
+        return replace(usual, **asked)
+
+
+@dataclass(frozen=True)
+class TrainDiffusion:
+    """Learn a 2D motion diffusion model, a prior that mas, mvpc and sds draw 3D motion from.
+
+    The same command goes on where it was stopped; a run that is finished goes on with more steps.
+    """
+
+    out: Path
+    """Folder for model.safetensors, losses.csv and what is needed to go on."""
+
+    size: Size = "small"
+    """tiny: seconds, for trying out; small: minutes on two cores; paper and reference-code: a
+    GPU."""
+
+    frames: int | None = None
+    """Most frames of a motion; by default the size's own."""
+
+    threshold: float = 0.3
+    """Least confidence of a joint that is learnt from: .3 for people, .5 for horses, .01 with a
+    ball."""
+
+    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
+
+    def run(self) -> None:
+        """Train."""
+        from probmotion.models.diffusion_settings import DiffusionSettings
+        from probmotion.models.diffusion_training import DiffusionTrainee, usual_training
+        from probmotion.models.track_batches import Augmentation
+
+        preset = getattr(DiffusionSettings, self.size.replace("-", "_"))
+        size = preset() if self.frames is None else preset(self.frames)
+        found = learning_tracks(self.data, self.threshold)
+        shift = 0.0 if self.data.centre == "frame" else 0.1
+        trainee = DiffusionTrainee(
+            found.train,
+            found.validation,
+            size,
+            threshold=self.threshold,
+            augmentation=Augmentation(shift=shift),
+            seed=self.training.seed,
+        )
+        settings = self.training.settings(usual_training(self.size))
+        _train(trainee, settings, self.out, self.training.device)
+
+
+@dataclass(frozen=True)
+class TrainEvaluator:
+    """Learn what makes features of 2D motions, by which FID, precision and recall are measured.
+
+    The same command goes on where it was stopped.
+    """
+
+    out: Path
+    """Folder for model.safetensors, losses.csv and what is needed to go on."""
+
+    size: Literal["tiny", "small", "reference-code"] = "small"
+    """tiny: seconds, for trying out; small: minutes on two cores; reference-code: a GPU."""
+
+    frames: int | None = None
+    """Most frames of a motion; by default the size's own."""
+
+    threshold: float = 0.3
+    """Least confidence of a joint that is learnt from."""
+
+    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
+
+    def run(self) -> None:
+        """Train."""
+        from probmotion.models.evaluator_training import EvaluatorTrainee
+        from probmotion.models.track_autoencoder import EvaluatorSettings
+        from probmotion.models.training_settings import TrainingSettings
+
+        preset = getattr(EvaluatorSettings, self.size.replace("-", "_"))
+        size = preset() if self.frames is None else preset(self.frames)
+        found = learning_tracks(self.data, self.threshold)
+        trainee = EvaluatorTrainee(
+            found.train,
+            found.validation,
+            size,
+            threshold=self.threshold,
+            seed=self.training.seed,
+        )
+        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
+        _train(trainee, self.training.settings(usual), self.out, self.training.device)
+
+
+@dataclass(frozen=True)
+class TrainLifter:
+    """Learn an unsupervised lifter of 2D poses, a baseline: first the flow it learns from.
+
+    The same command goes on where it was stopped.
+    """
+
+    out: Path
+    """Folder for the folders flow and lifter, each with model.safetensors and losses.csv."""
+
+    size: Literal["tiny", "small"] = "small"
+    """tiny: seconds, for trying out; small: minutes on two cores."""
+
+    threshold: float = 0.3
+    """Least confidence of every joint of a pose that is learnt from."""
+
+    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
+
+    def run(self) -> None:
+        """Train the flow, then the lifter."""
+        from probmotion.models.lifter import LifterSettings
+        from probmotion.models.lifter_training import LifterTrainee
+        from probmotion.models.pose_flow import FlowSettings, PoseFlow
+        from probmotion.models.pose_flow_training import PoseFlowTrainee
+        from probmotion.models.training_settings import TrainingSettings
+
+        found = learning_tracks(self.data, self.threshold)
+        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 4000, learning_rate=1e-3)
+        settings = self.training.settings(usual)
+        device = self.training.device
+        flow_size = getattr(FlowSettings, self.size)()
+        flow = PoseFlowTrainee(
+            found.train, found.validation, flow_size, threshold=self.threshold, seed=settings.seed
+        )
+        learnt = PoseFlow.load(_train(flow, settings, self.out / "flow", device).model)
+        lifter = LifterTrainee(
+            found.train,
+            found.validation,
+            learnt,
+            getattr(LifterSettings, self.size)(),
+            threshold=self.threshold,
+            seed=settings.seed,
+        )
+        _train(lifter, settings, self.out / "lifter", device)
+
+
+def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
+    """Return the tracks that the options name, and print what preparing them dropped."""
+    from probmotion.data.learning import film_clips, read_tracks, split_tracks
+    from probmotion.data.projections import Filming
+    from probmotion.data.walks import made_walks
+    from probmotion.motion import load_motions
+    from probmotion.skeleton import Skeleton
+
+    if data.clips and data.tracks:
+        raise ValueError("clips and tracks are both given, expected one of them")
+    skeleton = Skeleton.preset(data.skeleton)
+    if data.tracks:
+        prepared = read_tracks(
+            data.tracks,
+            skeleton,
+            data.fps,
+            file_fps=data.tracks_fps,
+            threshold=threshold,
+            centre=data.centre,
+        )
+    else:
+        prepared = film_clips(
+            load_motions(data.clips) if data.clips else made_walks(),
+            skeleton,
+            data.fps,
+            views=data.views,
+            seed=data.data_seed,
+            filming=Filming(centre=data.centre),
+        )
+    print(prepared)
+    found = split_tracks(
+        prepared.tracks, validation=data.validation, test=data.test, seed=data.data_seed
+    )
+    for part in ("train", "validation", "test"):
+        names = getattr(found.split, part)
+        listed = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
+        print(f"{part}: {len(getattr(found, part))} tracks of {len(names)} clips: {listed}")
+    return found
+
+
+def _train(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> TrainingResult:
+    from probmotion.models.training import train
+
+    result = train(trainee, settings, out, device=device)
+    last = result.history[-1]
+    print(
+        f"wrote {result.model}: step {last['step']:.0f}, loss {last['loss']:.4f}, validation loss "
+        f"{last['validation_loss']:.4f}, {last['seconds']:.0f} s of steps"
+    )
+    return result
+
+
+TRAINABLE: dict[str, type[Any]] = {
+    "diffusion": TrainDiffusion,
+    "evaluator": TrainEvaluator,
+    "lifter": TrainLifter,
+}
+"""What can be trained, by name."""
