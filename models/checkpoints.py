@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import nn
 
 from probmotion.files import written_whole
@@ -103,10 +103,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint, *, half: bool = Fa
         "sha256": _digest(settings, tensors),
     }
     with written_whole(Path(path)) as unfinished:
-        try:
-            save_file(tensors, unfinished, metadata={_ENTRY: json.dumps(header)})
-        except SafetensorError as error:
-            raise OSError(str(error)) from error
+        unfinished.write_bytes(save(tensors, metadata={_ENTRY: json.dumps(header)}))
 
 
 def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:

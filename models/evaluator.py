@@ -85,7 +85,7 @@ class TrackEvaluator:
         self.card = dict(card or {})
         self.skeleton = skeleton
         self.fps = float(fps)
-        self._device = check_device(device)
+        self._device = check_device(device).type
         self._encoder = encoder.to(self._device).eval().requires_grad_(False)
 
     @classmethod
@@ -198,7 +198,7 @@ class TrackEvaluator:
         self, motions: np.ndarray, valid: np.ndarray
     ) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
         """Yield rows of motions, padded to one shape: (n, frames, 2J) and (n, frames)."""
-        tokens = _TOKENS if self._device.type == "cpu" else _GPU_TOKENS
+        tokens = _TOKENS if self._device == "cpu" else _GPU_TOKENS
         n = max(1, tokens // (self.frames + 2))
         N, L = valid.shape
         for start in range(0, N, n):

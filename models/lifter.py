@@ -206,7 +206,7 @@ class PoseLifter:
     def __init__(self, network: LifterNetwork, skeleton: Skeleton, *, device: str = "cpu") -> None:
         self.skeleton = skeleton
         self.settings = network.settings
-        self._device = check_device(device)
+        self._device = check_device(device).type
         self._network = network.to(self._device).eval().requires_grad_(False)
 
     @classmethod

@@ -19,7 +19,13 @@ import torch
 from probmotion.arrays import Array
 from probmotion.cameras import Cameras
 from probmotion.checks import check_count, check_finite, check_positive, check_shape
-from probmotion.models.checkpoints import CheckpointError, load_checkpoint, load_weights
+from probmotion.models.checkpoints import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    load_weights,
+    save_checkpoint,
+)
 from probmotion.models.diffusion_settings import DiffusionSettings
 from probmotion.models.motion_transformer import MotionTransformer
 from probmotion.models.standards import Standards
@@ -93,7 +99,7 @@ class MotionDiffusion:
                 f"frames is {self._frames}, expected at most {settings.frames}, the longest motion "
                 "that the network was trained on"
             )
-        self._device = check_device(device)
+        self._device = check_device(device).type
         self._network = network.to(self._device).eval().requires_grad_(False)
 
     @classmethod
@@ -141,6 +147,27 @@ class MotionDiffusion:
             card=checkpoint.settings,
         )
 
+    def save(self, path: str | Path, *, half: bool = False) -> None:
+        """Write the prior as a checkpoint, which :meth:`load` reads.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, ``.safetensors``.
+        half : bool
+            Store half-precision weights: half the size.
+
+        Raises
+        ------
+        ValueError
+            If the prior has no card to rebuild it by: only trained ones have.
+        OSError
+            If the file cannot be written.
+        """
+        if "network" not in self.card:
+            raise ValueError("the prior has no card, expected one that was trained or loaded")
+        save_checkpoint(path, Checkpoint(KIND, self.card, self._network.state_dict()), half=half)
+
     def of_length(self, frames: int) -> MotionDiffusion:
         """Return the same prior over motions of another length, 2 to ``settings.frames``."""
         other = copy.copy(self)
@@ -152,7 +179,7 @@ class MotionDiffusion:
             self._skeleton,
             self._fps,
             frames=frames,
-            device=self._device.type,
+            device=self._device,
             card=self.card,
         )
         return other
@@ -267,7 +294,7 @@ class MotionDiffusion:
     def _chunks(self, views: np.ndarray) -> Iterator[tuple[slice, torch.Tensor]]:
         """Yield rows of motions and their views as one batch, (n V, L, J, 2)."""
         B, V, L = views.shape[:3]
-        cpu = self._device.type == "cpu"
+        cpu = self._device == "cpu"
         n = max(1, (_TOKENS if cpu else _GPU_TOKENS) // (V * (L + 1)))
         if cpu:
             n = 1 if n < 4 else 1 << (n.bit_length() - 1)

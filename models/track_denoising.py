@@ -29,6 +29,9 @@ def denoise_track(
 ) -> KeypointTrack:
     """Return the track as the prior believes it to be.
 
+    A joint that is believed moves by at most ``noise``, in root mean square over its frames and
+    axes: so far goes the exact posterior mean, and an imperfect network may go no farther.
+
     Joints below the threshold are not believed at all. They start at the prior's mean and take
     the denoiser's estimate, at levels that fall from as much noise as signal to the detector's,
     while what was seen stays as it was: a heuristic fill, not a draw.
@@ -68,6 +71,12 @@ def denoise_track(
         )
     seen = np.where(believed[..., None], track.keypoints, prior.standards.mean) / prior.scale
     target = noise / prior.scale
+    last = prior.settings.schedule.alpha_bar[-1]
+    if target > (most := math.sqrt((1 - last) / last)):
+        raise ValueError(
+            f"noise is {noise:g}, expected at most {most * prior.scale:.3g} metres, the most that "
+            "the prior has learnt"
+        )
     levels = np.array([target])
     if not believed.all():
         levels = np.geomspace(max(1.0, target), target, rounds)
@@ -75,8 +84,25 @@ def denoise_track(
     for sigma in levels:
         given = np.where(believed[..., None], seen, clean)
         clean = _denoise(prior, given, float(sigma))
+    clean = _drawn_back(clean, seen, believed, target)
     confidence = np.where(believed, 1.0, track.confidence)
     return replace(track, keypoints=clean * prior.scale, confidence=confidence)
+
+
+def _drawn_back(
+    clean: np.ndarray, seen: np.ndarray, believed: np.ndarray, sigma: float
+) -> np.ndarray:
+    """Return the estimate, drawn towards detections as far as the network errs more than they.
+
+    The posterior mean is, in mean square, nearer than σ to a detection: σ² − v with posterior
+    variance v. If r², a joint's mean square distance, is more, the network has an error of its own,
+    of about r² − σ²; then the best combination takes the share σ²/r² of its estimate.
+    """
+    off = np.where(believed[..., None], seen - clean, 0.0)
+    count = 2 * np.maximum(believed.sum(axis=0), 1)
+    squares = (off**2).sum(axis=(0, 2)) / count
+    share = sigma**2 / np.maximum(squares, sigma**2)
+    return np.where(believed[..., None], seen - share[:, None] * off, clean)
 
 
 def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.ndarray:

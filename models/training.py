@@ -236,7 +236,7 @@ def _asked_to_stop() -> Iterator[Any]:
 
     def note(number: int, frame: Any) -> None:
         if asked:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt("stopped within a step; the last checkpoint is kept")
         asked.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -19,6 +19,9 @@ STATE, LOSSES = "state.safetensors", "losses.csv"
 """Beside the model, in the folder of a run: what it goes on from, and its losses."""
 
 
+_READABLE = 200
+
+
 @dataclass(eq=False)
 class Run:
     """Everything that changes from step to step."""
@@ -59,9 +62,11 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
             got = kept.settings[part].get(name)
             # Checkpoints may come more often and the end later: no step is changed by it.
             if got != wanted and name not in ("steps", "checkpoint_every"):
+                known = f"{name} {got}, expected {wanted}"
+                if len(known) > _READABLE:
+                    known = f"another {name}, expected the same"
                 raise ValueError(
-                    f"out is {folder}, which holds a run with {name} {got}, expected {wanted}; "
-                    "give it a folder of its own"
+                    f"out is {folder}, which holds a run with {known}; give it a folder of its own"
                 )
     parts: dict[str, dict[str, torch.Tensor]] = {}
     for name, tensor in kept.tensors.items():

@@ -29,7 +29,7 @@ One posterior over 3D motion, many samplers, and how wrong each of them is.
 commands:
   compare   draw with several samplers from the same posteriors; print how far each is off
   list      the problems, the samplers and the skeletons that are known by name
-  show      say what is in a file of motion, keypoints or draws; draw it
+  show      say what is in a file of motion, keypoints, draws or a network; draw it
   convert   write a motion to another format, frame rate or skeleton
   train     learn a prior, or what priors are measured with
 
@@ -216,7 +216,8 @@ def _first_line(kind: Any) -> str:
 
 @dataclass(frozen=True)
 class Show:
-    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz) or draws (.nc)."""
+    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz), draws (.nc) or a
+    trained network (.safetensors)."""
 
     file: Positional[Path]
     """The file."""
@@ -330,6 +331,11 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     if name == "train":
         from probmotion.training_commands import TRAINABLE
 
+        if words and words[0] in ("-h", "--help"):
+            print(f"usage: {prog} KIND [OPTIONS]\n")
+            _print_list("kinds", {kind: _first_line(what) for kind, what in TRAINABLE.items()})
+            print(f"\n{prog} KIND --help lists the options of a kind.")
+            raise SystemExit(0)
         known = ", ".join(TRAINABLE)
         if not words or words[0] not in TRAINABLE:
             got = repr(words[0]) if words else "missing"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from probmotion.motion import KeypointTrack, Motion
 from probmotion.skeleton import Skeleton
 
 __all__ = ["Summary", "summarise"]
+
+
+_LOSSES = ("loss", "validation_loss")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,7 @@ class Summary:
         from probmotion.pictures import draw_skeletons
 
         if not len(self.motions):
-            raise ValueError("picture is given for 2D keypoints, expected a file of 3D motion")
+            raise ValueError("picture is given, but the file holds no 3D motion; expected one")
         sided = bool(self.skeleton.mirrored_pairs)
         draw_skeletons(
             {self.label: self.motions},
@@ -58,7 +62,7 @@ class Summary:
 
 
 def summarise(path: Path, fps: float | None = None, skeleton: str | None = None) -> Summary:
-    """Return a summary of a file of motion, keypoints or draws.
+    """Return a summary of a file of motion, keypoints or draws, or of a trained network.
 
     Parameters
     ----------
@@ -78,6 +82,8 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
     """
     if path.suffix == ".nc":
         return _of_draws(path, MotionDraws.load(path))
+    if path.suffix == ".safetensors":
+        return _of_checkpoint(path)
     if _holds_keypoints(path):
         from probmotion.formats import read_keypoints
 
@@ -140,6 +146,39 @@ def _of_draws(path: Path, draws: MotionDraws) -> Summary:
         f"  settings: {attributes['settings']}",
     ]
     return Summary("\n".join(text), draws.skeleton, draws.flat()[:4], sampler)
+
+
+def _of_checkpoint(path: Path) -> Summary:
+    from safetensors import SafetensorError, safe_open
+
+    from probmotion.formats import MotionFileError
+
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})["probmotion"])
+            sizes = [np.prod(file.get_slice(name).get_shape()) for name in file.keys()]  # noqa: SIM118
+        card = header["settings"]
+        network, training = card["network"], card["training"]
+        last = card["history"][-1] if card["history"] else {}
+        skeleton = Skeleton(network["joint_names"], network["parents"])
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise MotionFileError(
+            f"{path} is damaged or of another program, expected a checkpoint of this one"
+        ) from error
+    shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
+    losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
+    data = network["data"]
+    text = [
+        f"{path}: a {header['kind']} of {sum(map(int, sizes))} numbers",
+        f"  {shape}",
+        _joints(skeleton),
+        f"  learnt from {data['tracks']} tracks of {', '.join(data['clips'])}",
+        f"  step {card['step']} of {training['steps']}, batches of {training['batch']}, "
+        f"{card['seconds']:.0f} s{losses}",
+    ]
+    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
 
 
 def _length(frames: int, fps: float) -> str:

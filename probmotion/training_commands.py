@@ -5,7 +5,7 @@ Each is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,6 +35,12 @@ class Data:
 
     tracks_fps: float | None = None
     """Frames per second of keypoints in files that do not hold it."""
+
+    layout: str | None = None
+    """What keypoints in JSON are (see probmotion list), where their number does not tell."""
+
+    people: int | None = None
+    """How many people to follow in JSON that does not say who is who."""
 
     skeleton: str = "person14"
     """The joints to learn (see probmotion list)."""
@@ -82,8 +88,9 @@ class Steps:
 
     def settings(self, usual: TrainingSettings) -> TrainingSettings:
         """Return the usual settings of a size with what was asked for in their place."""
-        from dataclasses import replace
+        from probmotion.models.training import check_device
 
+        check_device(self.device)  # here, because preparing data takes minutes
         asked = {
             name: value
             for name, value in asdict(self).items()
@@ -124,6 +131,7 @@ class TrainDiffusion:
 
         preset = getattr(DiffusionSettings, self.size.replace("-", "_"))
         size = preset() if self.frames is None else preset(self.frames)
+        settings = self.training.settings(usual_training(self.size))
         found = learning_tracks(self.data, self.threshold)
         shift = 0.0 if self.data.centre == "frame" else 0.1
         trainee = DiffusionTrainee(
@@ -134,7 +142,6 @@ class TrainDiffusion:
             augmentation=Augmentation(shift=shift),
             seed=self.training.seed,
         )
-        settings = self.training.settings(usual_training(self.size))
         _train(trainee, settings, self.out, self.training.device)
 
 
@@ -168,6 +175,8 @@ class TrainEvaluator:
 
         preset = getattr(EvaluatorSettings, self.size.replace("-", "_"))
         size = preset() if self.frames is None else preset(self.frames)
+        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
+        settings = self.training.settings(usual)
         found = learning_tracks(self.data, self.threshold)
         trainee = EvaluatorTrainee(
             found.train,
@@ -176,8 +185,7 @@ class TrainEvaluator:
             threshold=self.threshold,
             seed=self.training.seed,
         )
-        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
-        _train(trainee, self.training.settings(usual), self.out, self.training.device)
+        _train(trainee, settings, self.out, self.training.device)
 
 
 @dataclass(frozen=True)
@@ -207,9 +215,9 @@ class TrainLifter:
         from probmotion.models.pose_flow_training import PoseFlowTrainee
         from probmotion.models.training_settings import TrainingSettings
 
-        found = learning_tracks(self.data, self.threshold)
         usual = TrainingSettings(steps=1000 if self.size == "tiny" else 4000, learning_rate=1e-3)
         settings = self.training.settings(usual)
+        found = learning_tracks(self.data, self.threshold)
         device = self.training.device
         flow_size = getattr(FlowSettings, self.size)()
         flow = PoseFlowTrainee(
@@ -232,11 +240,14 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
     from probmotion.data.learning import film_clips, read_tracks, split_tracks
     from probmotion.data.projections import Filming
     from probmotion.data.walks import made_walks
-    from probmotion.motion import load_motions
+    from probmotion.motion import files_named, load_motion
     from probmotion.skeleton import Skeleton
 
     if data.clips and data.tracks:
         raise ValueError("clips and tracks are both given, expected one of them")
+    for name in ("tracks_fps", "layout", "people"):
+        if getattr(data, name) is not None and not data.tracks:
+            raise ValueError(f"{name} is given without tracks, expected --tracks FILE… beside it")
     skeleton = Skeleton.preset(data.skeleton)
     if data.tracks:
         prepared = read_tracks(
@@ -244,12 +255,16 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
             skeleton,
             data.fps,
             file_fps=data.tracks_fps,
+            layout=data.layout,
+            people=data.people,
             threshold=threshold,
             centre=data.centre,
         )
     else:
+        # A file may hold another name; options name clips by their files.
+        clips = [replace(load_motion(path), name=path.stem) for path in files_named(data.clips)]
         prepared = film_clips(
-            load_motions(data.clips) if data.clips else made_walks(),
+            clips or made_walks(skeleton=skeleton),
             skeleton,
             data.fps,
             views=data.views,
@@ -268,9 +283,15 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
 
 
 def _train(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> TrainingResult:
+    from probmotion.models.checkpoints import MODEL, load_checkpoint
     from probmotion.models.training import train
 
+    kept = out / MODEL
+    before = load_checkpoint(kept, trainee.kind).settings["step"] if kept.exists() else 0
     result = train(trainee, settings, out, device=device)
+    if before >= settings.steps:
+        print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}")
+        return result
     last = result.history[-1]
     print(
         f"wrote {result.model}: step {last['step']:.0f}, loss {last['loss']:.4f}, validation loss "

@@ -109,7 +109,9 @@ class MomentMatched:
     Parameters
     ----------
     steps : int
-        Conjugate-gradient steps, one product with C each.
+        Conjugate-gradient steps, one product with C each. The method supposes that C is symmetric,
+        which a learnt denoiser's is not quite: with more steps than the default its draws are
+        caught far from the evidence, or the run diverges, which is said.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -136,7 +138,13 @@ class MomentMatched:
 
             residual = root * (evidence.target - evidence.observe(clean))
             # W^½ on both sides keeps hidden entries (W = 0) in the system at no cost.
-            return clean + conjugate_gradients(spread, whiten, residual, self.steps)
+            guided = clean + conjugate_gradients(spread, whiten, residual, self.steps)
+            if not np.isfinite(guided).all():
+                raise ValueError(
+                    f"guidance with steps {self.steps} diverged at alpha_bar {alpha_bar:.3g}, "
+                    "expected fewer steps: the denoiser's Jacobian is not symmetric"
+                )
+            return guided
 
         return guide
 

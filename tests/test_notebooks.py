@@ -71,3 +71,32 @@ def test_pose_pairs(tmp_path, monkeypatch):
     assert 0.15 < accepted < 0.35
     drawn, seed = re.search(r"coverage: ([\d.]+) m, by the seed alone ([\d.]+) m", printed).groups()
     assert float(drawn) < float(seed)
+
+
+@pytest.mark.filterwarnings("default")
+def test_motion_from_2d(tmp_path, monkeypatch):
+    printed = run("03_motion_from_2d.py", tmp_path, 5, monkeypatch)
+    assert "centre     640 → 640" in printed
+    assert "train: 511 tracks of 32 clips" in printed
+    assert (tmp_path / "walks.html").exists()
+    losses = (tmp_path / "diffusion" / "losses.csv").read_text().splitlines()
+    assert len(losses) == 7
+
+    def numbers(words: str) -> list[float]:
+        """Return the numbers that follow in the same line."""
+        line = printed.split(words, 1)[1].splitlines()[0]
+        return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line)]
+
+    # FID, diversity, precision, recall.
+    real, flat, mas = (numbers(row) for row in ("\nreal ", "\n2D model ", "\nmas "))
+    assert real[0] < mas[0] < 1.2 * flat[0]
+    assert mas[2] > 0.9 * flat[2]
+    assert numbers("\nmas, no 3D noise ")[3] > 0.5
+    # To real motion, from it, mirrored.
+    assert numbers("\nmas: ")[0] < 1.3 * numbers("\nreal: ")[0]
+    assert numbers("\nmas: ")[2] < 0.1
+    for kind in ("found joints: ", "lost joints: "):
+        detected, cleaned = numbers(kind)
+        assert cleaned < 0.6 * detected
+    assert max(numbers("misses what was seen by, mm: ")) < 80
+    assert max(numbers("misses the truth by, mm: ")) < 0.5 * numbers("without evidence: ")[0]

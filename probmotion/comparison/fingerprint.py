@@ -21,8 +21,8 @@ def fingerprint(value: Any) -> str:
     """Return a hexadecimal digest of what ``value`` holds.
 
     Numbers, strings, arrays, lists, mappings, dataclasses (by the fields they are made with, so
-    that caches do not count), classes and functions (by name), and other objects by their
-    attributes.
+    that caches do not count), classes and functions (by name), networks (by layers and weights),
+    and other objects by their attributes.
 
     Raises
     ------
@@ -53,6 +53,9 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         array = np.ascontiguousarray(to_numpy(value))
         digest.update(f"{array.dtype.str}{array.shape}".encode())
         digest.update(array.tobytes())
+    elif callable(getattr(value, "state_dict", None)):
+        # A network: its layers and its weights, not what hangs on them while it runs.
+        parts += [repr(value), dict(value.state_dict())]
     elif isinstance(value, PurePath):
         digest.update(str(value).encode())
     elif isinstance(value, partial):

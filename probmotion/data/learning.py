@@ -116,6 +116,8 @@ def read_tracks(
     fps: float,
     *,
     file_fps: float | None = None,
+    layout: str | None = None,
+    people: int | None = None,
     threshold: float = 0.3,
     centre: Centre = "frame",
     sizes: Mapping[str, float] | None = None,
@@ -125,47 +127,77 @@ def read_tracks(
     Parameters
     ----------
     paths : iterable of str or Path
-        Files, or patterns of them. A track is called ``"<file>/<name>"``.
+        Files, or patterns of them, each of its own name. A track is called ``"<file>/<name>"``.
     skeleton : Skeleton
         The joints to bring tracks to.
     fps : float
         Frames per second of the data set.
     file_fps : float, optional
         Frames per second of files that do not hold it.
+    layout, people
+        What keypoints in files are, and how many people to follow, where files do not say; see
+        :func:`~probmotion.formats.read_keypoints`.
     threshold : float
         Least confidence that counts.
     centre : {"frame", "sequence"}
         Where the root is at the origin.
     sizes : mapping of str to float, optional
-        Bone sizes that pixels are brought to; those of :func:`person_sizes` by default, for people.
+        Bone sizes that pixels are brought to; those of :func:`body_sizes` by default.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file.
+    ValueError
+        If two files have one name, which is that of their clip.
     """
     raw: list[KeypointTrack] = []
     videos: list[str] = []
+    files: dict[str, Path] = {}
     for path in files_named(paths):
-        for number, track in enumerate(read_keypoints(path, fps=file_fps)):
-            raw.append(replace(track, name=f"{path.stem}/{track.name or number}"))
-            videos.append(path.stem)
-    reference = person_sizes(skeleton) if sizes is None else sizes
+        if path.stem in files:
+            raise ValueError(
+                f"paths has {files[path.stem]} and {path}, expected files of other names: a clip "
+                "is called as its file"
+            )
+        files[path.stem] = path
+        archive = path.suffix.lower() == ".npz"
+        said = {} if archive else {"fps": file_fps, "skeleton": layout, "people": people}
+        for track in read_keypoints(path, **said):
+            # A clip's name ends at the last slash, which names of images may have too.
+            name = f"{path.stem}/{track.name.replace('/', '_')}"
+            raw.append(replace(track, name=name))
+            videos.append(name if archive else _video(path, track))
+    reference = body_sizes(skeleton) if sizes is None else sizes
     return prepare_tracks(
         raw, fps=fps, skeleton=skeleton, sizes=reference, videos=videos, threshold=threshold,
         centre=centre,
     )  # fmt: skip
 
 
-def person_sizes(skeleton: Skeleton) -> dict[str, float]:
-    """Return how long a grown person's bones are in pictures, metres, by joint.
+def _video(path: Path, track: KeypointTrack) -> str:
+    """Return which pictures a track of a table or of JSON is from: people stand side by side.
 
-    The statistic is :func:`~probmotion.data.track_sizes.bone_sizes` of people who are made to walk,
-    filmed from all around without errors.
+    Readers call people ``"file video person"``; of several videos in a file, most differ in frames.
     """
-    return bone_sizes(
-        film_clips(made_walks(8), skeleton, 20.0, views=16, noise=DetectorNoise.none()).tracks
+    return f"{path} {track.name.rpartition(' ')[0]} {track.frames}"
+
+
+def body_sizes(skeleton: Skeleton) -> dict[str, float]:
+    """Return how long a grown body's bones are in pictures, metres, by joint.
+
+    The statistic is :func:`~probmotion.data.track_sizes.bone_sizes` of people, or quadrupeds, who
+    are made to walk, filmed from all around without errors.
+
+    Raises
+    ------
+    ValueError
+        If neither has all joints of the skeleton.
+    """
+    filmed = film_clips(
+        made_walks(8, skeleton), skeleton, 20.0, views=16, noise=DetectorNoise.none()
     )
+    return bone_sizes(filmed.tracks)
 
 
 def split_tracks(

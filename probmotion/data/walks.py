@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from probmotion.data.gaits import make_gaits
+from probmotion.data.gaits import make_gait, make_gaits
 from probmotion.motion import Motion, load_motion
+from probmotion.skeleton import Skeleton
 
 __all__ = ["WALK_CLIPS", "made_walks", "walk_clips"]
 
@@ -23,9 +24,9 @@ WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
         "deepmimic_human/humanoid3d_stealthy_walk",
     ),
 }
-"""Clips by part, 4100 frames at 30 a second. Left out are excerpts of others (humanoid3d_walk is
-within 1 cm of humanoid3d_long_walk1, humanoid3d_zombie_walk is one of humanoid3d_long_zombie), what
-has one clip only and so cannot be held out (the zombie), and runs."""
+"""Clips by part, 3352 frames at 30 a second. Left out are excerpts of others (humanoid3d_walk is,
+in the median, 1 cm from humanoid3d_long_walk1, humanoid3d_zombie_walk is one of
+humanoid3d_long_zombie), what has one clip only and so cannot be held out (the zombie), and runs."""
 
 
 def walk_clips(folder: str | Path) -> dict[str, list[Motion]]:
@@ -42,6 +43,35 @@ def walk_clips(folder: str | Path) -> dict[str, list[Motion]]:
     }
 
 
-def made_walks(n: int = 60, *, seconds: float = 6.0, fps: float = 30.0) -> list[Motion]:
-    """Return people who walk, made by the project itself, for where there are no clips."""
-    return make_gaits(n, styles={"walk": 1.0}, frames=round(seconds * fps), fps=fps)
+def made_walks(
+    n: int = 60,
+    skeleton: Skeleton | None = None,
+    *,
+    seconds: float = 6.0,
+    fps: float = 30.0,
+) -> list[Motion]:
+    """Return bodies that walk, made by the project itself, for where there are no clips.
+
+    Parameters
+    ----------
+    n : int
+        Number of clips.
+    skeleton : Skeleton, optional
+        What the clips must have the joints of: quadrupeds walk where it is one's; people by
+        default.
+    seconds, fps : float
+        Length of a clip, and its frames per second.
+
+    Raises
+    ------
+    ValueError
+        If neither people nor quadrupeds have the joints.
+    """
+    wanted = set() if skeleton is None else set(skeleton.canonical_names)
+    for style in ("walk", "quadruped-walk"):
+        if wanted <= set(make_gait(style).skeleton.canonical_names):
+            return make_gaits(n, styles={style: 1.0}, frames=round(seconds * fps), fps=fps)
+    raise ValueError(
+        f"skeleton has the joints {', '.join(sorted(wanted))}, expected those of a person or a "
+        "quadruped: bodies are made of no others"
+    )

@@ -6,6 +6,7 @@ from functools import cache
 
 from probmotion.problems.clips import clips_problem
 from probmotion.problems.gait import GAIT_PROBLEMS
+from probmotion.problems.learnt import LEARNT_PROBLEMS
 from probmotion.problems.pairs import PAIR_PROBLEMS, pairs_problem
 from probmotion.problems.problem import Problem
 from probmotion.threads import one_thread
@@ -19,7 +20,7 @@ __all__ = [
     "problem_names",
 ]
 
-_PROBLEMS = {**GAIT_PROBLEMS, **PAIR_PROBLEMS}
+_PROBLEMS = {**GAIT_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS}
 
 
 def problem_names() -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,11 +142,11 @@ def test_nothing_half_written_is_left(tmp_path, checkpoint, monkeypatch):
     with pytest.raises(ValueError, match="tensors has a, which is not finite"):
         save_checkpoint(path, Checkpoint(KIND, {}, {"a": torch.tensor([1e6])}), half=True)
 
-    def interrupted(tensors, file, metadata):
-        file.write_bytes(b"half")
+    def interrupted(file, content):
+        file.write_text("half", encoding="utf-8")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("probmotion.models.checkpoints.save_file", interrupted)
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(path, checkpoint)
     assert path.read_bytes() == before

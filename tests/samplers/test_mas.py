@@ -411,3 +411,14 @@ def test_the_next_level_gets_the_next_levels_noise(lively):
     state = Listening(MultiViewDenoiser(lively, views), schedule, shape)
     ancestral(state, NormalStreams([np.random.default_rng(0)]), lambda: None)
     assert asked == [5, 4, 3, 2, 1]
+
+
+def test_two_views_stand_120_degrees_apart():
+    """MAS, table 2: opposite views would see the same picture, mirrored, and no depth."""
+    np.testing.assert_allclose(
+        MultiViewAncestral(n_views=2).cameras.azimuth, [0, 2 * np.pi / 3], atol=1e-12
+    )
+    five = MultiViewAncestral(n_views=5, elevation=0.3, perspective=True, distance=4.0).cameras
+    ring = Cameras.ring(5, elevation=0.3, perspective=True, distance=4.0)
+    np.testing.assert_array_equal(five.rotation, ring.rotation)
+    np.testing.assert_array_equal(five.focal, ring.focal)

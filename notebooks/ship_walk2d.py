@@ -1,0 +1,126 @@
+"""What the problem walk2d ships with, from its training runs.
+
+    C="--clips $(python notebooks/ship_walk2d.py --list clips) --validation … --test …"
+    probmotion train diffusion --out runs/walk2d $C
+    probmotion train evaluator --out runs/walk2d-evaluator $C
+    python notebooks/ship_walk2d.py --runs runs
+
+``--list`` prints what goes into the two commands. Written to ``models/weights``: the prior and the
+evaluator in half precision, the features of held-out pictures, and a model card. Clips are looked
+for in ``--data``, by default ../shared/data beside the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probmotion.data.learning import film_windows
+from probmotion.data.projections import Filming
+from probmotion.data.walks import WALK_CLIPS, walk_clips
+from probmotion.files import written_whole
+from probmotion.models.checkpoints import WEIGHTS
+from probmotion.models.evaluator import TrackEvaluator
+from probmotion.models.motion_diffusion import MotionDiffusion
+
+ROOT = Path(__file__).parents[1]
+HELD_OUT = 1000
+SEED = 1
+
+
+def main() -> None:
+    """Write weights, features and card, or list the clips."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--list", choices=["clips", "validation", "test"])
+    asked = parser.parse_args()
+    if asked.list:
+        print(" ".join(listed(asked.list, asked.data)))
+        return
+    prior = MotionDiffusion.load(asked.runs / "walk2d")
+    evaluator = TrackEvaluator.load(asked.runs / "walk2d-evaluator")
+    prior.save(WEIGHTS / "walk2d.safetensors", half=True)
+    evaluator.save(WEIGHTS / "walk2d-evaluator.safetensors", half=True)
+    # As they will be loaded: features of half-precision weights.
+    evaluator = TrackEvaluator.load("walk2d-evaluator")
+    write_features(evaluator, prior, asked.data)
+    card = "\n".join(card_lines(prior.card, evaluator.card))
+    with written_whole(WEIGHTS / "walk2d.md") as path:
+        path.write_text(card + "\n", encoding="utf-8")
+    print(card)
+
+
+def listed(part: str, data: Path) -> list[str]:
+    """Return the files of all clips, or the names of those of a part."""
+    if part == "clips":
+        return [str(data / f"{name}.npz") for names in WALK_CLIPS.values() for name in names]
+    return [Path(name).name for name in WALK_CLIPS[part]]
+
+
+def write_features(evaluator: TrackEvaluator, prior: MotionDiffusion, data: Path) -> None:
+    """Write the features of random windows of the test clips, and how those were filmed."""
+    filming = Filming()
+    views = film_windows(
+        walk_clips(data)["test"], prior.skeleton, prior.fps, prior.frames, HELD_OUT, seed=SEED
+    )
+    held = io.BytesIO()
+    np.savez_compressed(
+        held,
+        features=evaluator.features(views).astype(np.float16),
+        elevation=filming.elevation,
+        distance=filming.distance,
+    )
+    with written_whole(WEIGHTS / "walk2d-features.npz") as path:
+        path.write_bytes(held.getvalue())
+
+
+def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
+    """Return the model card: what was learnt, from what, how, and how well it went."""
+    size, data = prior["network"]["size"], prior["network"]["data"]
+    lines = [
+        "# walk2d",
+        "",
+        "People who walk, some of them stealthily, as one camera sees them: a 2D motion diffusion",
+        "model (MAS, section 6.2) and the evaluator of its tables. Up to "
+        f"{size['frames']} frames of {len(prior['network']['joint_names'])} joints at "
+        f"{prior['network']['fps']:g} frames per second, the pelvis at the origin in every frame.",
+        "",
+        "- **Data**: 3D clips filmed by cameras around them (elevation "
+        f"{math.degrees(Filming().elevation):.2f}° ± {math.degrees(Filming().tilt):.0f}°, 7 m) and",
+        "  a detector with errors; only these pictures are learnt from. Learnt from: "
+        f"{', '.join(data['clips'])} ({data['tracks']} tracks, {data['frames']} frames).",
+        f"  The loss is watched on {', '.join(prior['network']['validation_data']['clips'])}.",
+        f"  Held out: {', '.join(listed('test', Path()))}.",
+        "- **Provenance**: humanoid3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng.",
+        "  cmu_*: mocap.cs.cmu.edu, free for research and commercial use; the database was created",
+        "  with funding from NSF EIA-0196217.",
+        "- **Not for**: other actions, cameras far above or below, people who travel through the",
+        "  picture; few bodies were learnt from, so proportions are theirs.",
+        "",
+        "| network | layers × width | steps | batch | seconds | loss | validation loss |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, card in (("prior", prior), ("evaluator", evaluator)):
+        shape, last = card["network"]["size"], card["history"][-1]
+        lines.append(
+            f"| {name} | {shape['layers']} × {shape['width']} | {card['step']} "
+            f"| {card['training']['batch']} | {card['seconds']:.0f} | {last['loss']:.4f} "
+            f"| {last['validation_loss']:.4f} |"
+        )
+    return [
+        *lines,
+        "",
+        "Seconds are of training steps on one thread of a CPU; no GPU was used. Commands: see",
+        "`notebooks/ship_walk2d.py`. How far its draws are from held-out motion:",
+        "`notebooks/ablations/mas.py`, and the README.",
+    ]
+
+
+if __name__ == "__main__":
+    main()
