@@ -162,8 +162,8 @@ def read_tracks(
             )
         files[path.stem] = path
         archive = path.suffix.lower() == ".npz"
-        said = {} if archive else {"fps": file_fps, "skeleton": layout, "people": people}
-        for track in read_keypoints(path, **said):
+        held = (None, None, None) if archive else (file_fps, layout, people)
+        for track in read_keypoints(path, *held):
             # A clip's name ends at the last slash, which names of images may have too.
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
