@@ -48,7 +48,8 @@ class DiffusionTrainee:
     Raises
     ------
     ValueError
-        If there is no track, they differ in skeleton or frame rate, or none has a confident joint.
+        If there is no track, they differ in skeleton or frame rate, none has a confident joint, or
+        ``tracks`` never shows one of the joints: nothing would say where it is.
     """
 
     kind = KIND
@@ -74,6 +75,11 @@ class DiffusionTrainee:
             raise ValueError(
                 f"validation is at {self.held_out.fps:g} frames per second, expected tracks' "
                 f"{self.batches.fps:g}"
+            )
+        if unseen := self.batches.never_seen:
+            raise ValueError(
+                f"tracks never shows {', '.join(unseen)} with a confidence of {threshold:g} or "
+                "more, expected every joint to be seen somewhere; choose a skeleton without them"
             )
         self.standards = self.batches.standards
         self.network = size.network(skeleton.n_joints, seed)

@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,7 +30,11 @@ from probmotion.models.diffusion_settings import DiffusionSettings
 from probmotion.models.motion_transformer import MotionTransformer
 from probmotion.models.standards import Standards
 from probmotion.models.training import check_device
+from probmotion.priors import NotConjugate
 from probmotion.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from probmotion.likelihoods import Likelihood
 
 __all__ = ["KIND", "MotionDiffusion"]
 
@@ -40,6 +44,8 @@ KIND = "motion-diffusion"
 # depend on whether the row is among those left over by blocks of four, so a chunk of several
 # motions has 4, 8, 16, …
 _TOKENS = 512
+# Evidence that is centred on a root that was detected errs by its noise, and seldom by more.
+_ROOT_DEVIATIONS = 6.0
 # On a GPU a chunk has as many tokens as fit a card of 8 GiB at the paper's size.
 _GPU_TOKENS = 200_000
 
@@ -229,9 +235,11 @@ class MotionDiffusion:
         Raises
         ------
         ValueError
-            If the shape is another, a number is not finite or ᾱ is beyond the schedule.
+            If the shape is another, a number is not finite or ᾱ is not above 0 and at most 1.
         """
         self._check(x_t)
+        if alpha_bar == 1:
+            return x_t.copy()  # without noise there is nothing to estimate
         network, enter, leave = self._door(alpha_bar)
         clean = np.empty_like(x_t)
         for rows, chunk in self._chunks(x_t):
@@ -261,6 +269,26 @@ class MotionDiffusion:
                 (pulled,) = torch.autograd.grad(clean, point, given)
             product[rows] = factor * _numbers(pulled, vectors)[: len(product[rows])]
         return product
+
+    def check_evidence(self, likelihood: Likelihood) -> None:
+        """Raise ``ValueError`` if evidence is of a motion that the prior cannot have.
+
+        A prior of pictures that were centred on the root in every frame has its root at the origin.
+        """
+        root = self._skeleton.roots[0]
+        if (self.standards.deviation[root] > 0).any() or not hasattr(likelihood, "linear"):
+            return
+        try:
+            _, target, precision = likelihood.linear()
+        except NotConjugate:
+            return
+        away = np.linalg.norm(target[:, :, root], axis=-1) * np.sqrt(precision[:, :, root])
+        if away.max(initial=0.0) > _ROOT_DEVIATIONS:
+            raise ValueError(
+                f"likelihood has the {self._skeleton.joint_names[root]} up to {away.max():.0f} "
+                "standard deviations off the origin, expected it there in every frame, as in the "
+                "pictures that the prior has learnt; see probmotion.data.projections.centre_motion"
+            )
 
     def _check(self, x_t: np.ndarray) -> None:
         check_shape("x_t", x_t, ("B", "V", "L", self._skeleton.n_joints, 2))

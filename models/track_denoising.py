@@ -18,6 +18,10 @@ from probmotion.motion import KeypointTrack
 
 __all__ = ["denoise_track"]
 
+# Detections farther than so many deviations of the data from its mean, in root mean square, are in
+# pixels or millimetres, or not centred: metres are within a few.
+_FARTHEST = 20.0
+
 
 def denoise_track(
     track: KeypointTrack,
@@ -57,7 +61,8 @@ def denoise_track(
     Raises
     ------
     ValueError
-        If joints or frame rate are not the prior's, no joint is confident, a number is out of
+        If joints or frame rate are not the prior's, no joint is confident, detections are so far
+        from the prior's mean that they cannot be in metres about the root, a number is out of
         range, or the noise is beyond the levels that the prior has learnt.
     """
     check_positive("noise", noise)
@@ -69,6 +74,7 @@ def denoise_track(
             f"track {track.name or 'unnamed'} has no joint of confidence {threshold:g} or more, "
             "expected some"
         )
+    _check_metres(track, prior, believed)
     seen = np.where(believed[..., None], track.keypoints, prior.standards.mean) / prior.scale
     target = noise / prior.scale
     last = prior.settings.schedule.alpha_bar[-1]
@@ -95,8 +101,9 @@ def _drawn_back(
     """Return the estimate, drawn towards detections as far as the network errs more than they.
 
     The posterior mean is, in mean square, nearer than σ to a detection: σ² − v with posterior
-    variance v. If r², a joint's mean square distance, is more, the network has an error of its own,
-    of about r² − σ²; then the best combination takes the share σ²/r² of its estimate.
+    variance v. If r², a joint's mean square distance, is more, the network has an error of its own.
+    Were that independent of the detection's, it would be r² − σ², and the best combination would
+    take the share σ²/r² of the estimate; as estimates lean on detections, less would be best.
     """
     off = np.where(believed[..., None], seen - clean, 0.0)
     count = 2 * np.maximum(believed.sum(axis=0), 1)
@@ -140,3 +147,13 @@ def _check_track(track: KeypointTrack, prior: MotionDiffusion) -> None:
         )
     if track.frames < 2:
         raise ValueError("track has 1 frame, expected at least 2")
+
+
+def _check_metres(track: KeypointTrack, prior: MotionDiffusion, believed: np.ndarray) -> None:
+    off = (track.keypoints - prior.standards.mean)[believed]
+    distance = math.sqrt((off**2).mean())
+    if distance > (most := _FARTHEST * prior.scale):
+        raise ValueError(
+            f"track {track.name or 'unnamed'} spans {distance:.3g} along an axis about the prior's "
+            f"mean, in root mean square, expected metres about the root, at most {most:.3g}"
+        )

@@ -111,7 +111,8 @@ def train(
         How to train. A finished run goes on with more ``steps``, all else equal.
     out : str or Path
         Folder for ``model.safetensors``, ``state.safetensors`` (to go on from) and
-        ``losses.csv``; made where it is missing.
+        ``losses.csv``; made where it is missing. A model that is missing or damaged beside a
+        state is written anew from it.
     device : str
         ``cpu`` or ``cuda``.
     progress : bool
@@ -149,7 +150,7 @@ def train(
             if progress and run.step % 20 == 0:
                 bar.set_postfix(loss=f"{np.mean(run.recent[-100:]):.4f}", refresh=False)
             if run.step % settings.checkpoint_every == 0 or run.step == settings.steps:
-                _validate(run, trainee, place)
+                _validate(run, trainee, place, folder)
                 keep_run(run, trainee.kind, described, folder)
             if stop():
                 keep_run(run, trainee.kind, described, folder)
@@ -188,7 +189,10 @@ def _take_step(
     size = nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
     value = float(loss.detach())
     if not (math.isfinite(value) and math.isfinite(float(size))):
-        raise Diverged(_diverged(step, value, folder))
+        what = f"the loss is {value:g}"
+        if math.isfinite(value):
+            what = "the gradient is not finite"
+        raise Diverged(_diverged(step, what, folder))
     run.optimiser.step()
     decay = settings.decay(step) if settings.ema else 0.0
     with torch.no_grad():
@@ -200,18 +204,23 @@ def _take_step(
     return value
 
 
-def _diverged(step: int, loss: float, folder: Path) -> str:
-    what = f"the loss is {loss:g}" if not math.isfinite(loss) else "the gradient is not finite"
-    kept = "there is no checkpoint yet"
-    if (folder / MODEL).exists():
-        kept = f"the last good checkpoint is {folder / MODEL}"
-    return f"training diverged at step {step}: {what}; {kept}; try a smaller learning_rate"
+def _diverged(step: int, what: str, folder: Path) -> str:
+    kept, where = "there is no checkpoint yet", ""
+    if (folder / STATE).exists():
+        # A folder holds a run of one rate.
+        kept, where = f"the last good checkpoint is {folder / MODEL}", " in another folder"
+    return f"training diverged at step {step}: {what}; {kept}; try a smaller learning_rate{where}"
 
 
-def _validate(run: Run, trainee: Trainee, device: torch.device) -> None:
+def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) -> None:
     run.average.eval()
     with torch.no_grad():
         loss = trainee.validation_loss(run.average, device)
+    if not math.isfinite(loss):
+        raise Diverged(_diverged(run.step, f"the validation loss is {loss:g}", folder))
+    for network in (run.network, run.average):
+        if not all(torch.isfinite(weights).all() for weights in network.parameters()):
+            raise Diverged(_diverged(run.step, "a weight is not finite", folder))
     row = {"step": run.step, "loss": float(np.mean(run.recent)), "validation_loss": loss}
     run.history.append(row | {"seconds": run.seconds})
     run.recent.clear()

@@ -11,9 +11,15 @@ import torch
 from torch import nn
 
 from probmotion.files import written_whole
-from probmotion.models.checkpoints import MODEL, Checkpoint, load_checkpoint, save_checkpoint
+from probmotion.models.checkpoints import (
+    MODEL,
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
+)
 
-__all__ = ["LOSSES", "STATE", "Run", "keep_run", "resume_run"]
+__all__ = ["LOSSES", "STATE", "Run", "keep_run", "resume_run", "steps_taken"]
 
 STATE, LOSSES = "state.safetensors", "losses.csv"
 """Beside the model, in the folder of a run: what it goes on from, and its losses."""
@@ -54,8 +60,32 @@ def keep_run(run: Run, kind: str, described: dict[str, Any], folder: Path) -> No
     save_checkpoint(folder / STATE, Checkpoint(_state_of(kind), state, tensors))
 
 
+def steps_taken(folder: Path, kind: str) -> int:
+    """Return how many steps the run in a folder has taken; 0 where there is none.
+
+    Raises
+    ------
+    CheckpointError
+        If the run is of another kind of network, or what it goes on from is damaged.
+    """
+    if (folder / STATE).exists():
+        return int(load_checkpoint(folder / STATE, _state_of(kind)).settings["step"])
+    return 0
+
+
 def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> None:
-    """Bring a run to where the one in the folder was stopped."""
+    """Bring a run to where the one in the folder was stopped.
+
+    The state holds all that the model does: where the model is missing or damaged it is written
+    anew, as it was.
+
+    Raises
+    ------
+    CheckpointError
+        If the run is of another kind of network, or its state is damaged.
+    ValueError
+        If the run has other settings or data; nothing is written then.
+    """
     kept = load_checkpoint(folder / STATE, _state_of(kind))
     for part in ("network", "training"):
         for name, wanted in described[part].items():
@@ -84,6 +114,11 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
     run.seconds = float(kept.settings["seconds"])
     run.history = list(kept.settings["history"])
     run.recent = list(kept.settings["recent"])
+    try:
+        load_checkpoint(folder / MODEL, kind)
+    except (CheckpointError, FileNotFoundError):
+        card = {name: value for name, value in kept.settings.items() if name != "recent"}
+        save_checkpoint(folder / MODEL, Checkpoint(kind, card, parts["average"]))
 
 
 def _state_of(kind: str) -> str:

@@ -1,11 +1,9 @@
 """What the problem walk2d ships with, from its training runs.
 
-    C="--clips $(python notebooks/ship_walk2d.py --list clips) --validation … --test …"
-    probmotion train diffusion --out runs/walk2d $C
-    probmotion train evaluator --out runs/walk2d-evaluator $C
     python notebooks/ship_walk2d.py --runs runs
 
-``--list`` prints what goes into the two commands. Written to ``models/weights``: the prior and the
+The commands that make the runs stand in the model card, ``models/weights/walk2d.md``, and below;
+``--list`` prints what goes into them. Written to ``models/weights``: the prior and the
 evaluator in half precision, the features of held-out pictures, and a model card. Clips are looked
 for in ``--data``, by default ../shared/data beside the repository.
 """
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from probmotion.data.learning import film_windows
 from probmotion.data.projections import Filming
@@ -29,8 +28,16 @@ from probmotion.models.evaluator import TrackEvaluator
 from probmotion.models.motion_diffusion import MotionDiffusion
 
 ROOT = Path(__file__).parents[1]
-HELD_OUT = 1000
-SEED = 1
+WINDOWS = 1000
+ROWS = ("truth, 2D", "truth, 3D", "2D model", "MAS", "mvpc")
+COMMANDS = (
+    'C="--clips $(python notebooks/ship_walk2d.py --list clips)"',
+    'C="$C --validation $(python notebooks/ship_walk2d.py --list validation)"',
+    'C="$C --test $(python notebooks/ship_walk2d.py --list test)"',
+    "probmotion train diffusion --out runs/walk2d $C",
+    "probmotion train evaluator --out runs/walk2d-evaluator $C",
+    "python notebooks/ship_walk2d.py --runs runs",
+)
 
 
 def main() -> None:
@@ -38,6 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--table", type=Path, help="table.csv of notebooks/ablations/mas.py")
     parser.add_argument("--list", choices=["clips", "validation", "test"])
     asked = parser.parse_args()
     if asked.list:
@@ -50,7 +58,10 @@ def main() -> None:
     # As they will be loaded: features of half-precision weights.
     evaluator = TrackEvaluator.load("walk2d-evaluator")
     write_features(evaluator, prior, asked.data)
-    card = "\n".join(card_lines(prior.card, evaluator.card))
+    lines = card_lines(prior.card, evaluator.card)
+    if asked.table is not None:
+        lines += measured(pd.read_csv(asked.table))
+    card = "\n".join(lines)
     with written_whole(WEIGHTS / "walk2d.md") as path:
         path.write_text(card + "\n", encoding="utf-8")
     print(card)
@@ -64,18 +75,16 @@ def listed(part: str, data: Path) -> list[str]:
 
 
 def write_features(evaluator: TrackEvaluator, prior: MotionDiffusion, data: Path) -> None:
-    """Write the features of random windows of the test clips, and how those were filmed."""
-    filming = Filming()
-    views = film_windows(
-        walk_clips(data)["test"], prior.skeleton, prior.fps, prior.frames, HELD_OUT, seed=SEED
-    )
+    """Write the features of random windows of test and training clips, and how they were filmed."""
+    filming, clips = Filming(), walk_clips(data)
+    found = {}
+    for seed, (name, part) in enumerate((("held_out", "test"), ("learnt", "train")), start=1):
+        views = film_windows(
+            clips[part], prior.skeleton, prior.fps, prior.frames, WINDOWS, seed=seed
+        )
+        found[name] = evaluator.features(views).astype(np.float16)
     held = io.BytesIO()
-    np.savez_compressed(
-        held,
-        features=evaluator.features(views).astype(np.float16),
-        elevation=filming.elevation,
-        distance=filming.distance,
-    )
+    np.savez_compressed(held, elevation=filming.elevation, distance=filming.distance, **found)
     with written_whole(WEIGHTS / "walk2d-features.npz") as path:
         path.write_bytes(held.getvalue())
 
@@ -116,10 +125,31 @@ def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
     return [
         *lines,
         "",
-        "Seconds are of training steps on one thread of a CPU; no GPU was used. Commands: see",
-        "`notebooks/ship_walk2d.py`. How far its draws are from held-out motion:",
-        "`notebooks/ablations/mas.py`, and the README.",
+        "Seconds are of training steps on one thread of a shared CPU; no GPU was used. The",
+        "validation loss is that of a body of which one other clip was learnt from. Commands:",
+        "",
+        *(f"    {line}" for line in COMMANDS),
     ]
+
+
+def measured(table: pd.DataFrame) -> list[str]:
+    """Return the rows of the ablation's table that say how good the prior is."""
+    columns = ("fid_learnt", "precision_learnt", "recall_learnt", "fid", "to_real_mm")
+    lines = [
+        "",
+        "Measured by `python notebooks/ablations/mas.py` (± over halves of the draws and sides):",
+        "",
+        "| | FID, learnt clips | P | R | FID, held-out clips | 3D to held-out, mm |",
+        "|---|---|---|---|---|---|",
+    ]
+    for _, row in table[table["name"].isin(ROWS)].iterrows():
+        cells = []
+        for name in columns:
+            spread = row.get(f"{name}_sd", math.nan)
+            number = "" if math.isnan(row[name]) else f"{row[name]:.3g}"
+            cells.append(number if math.isnan(spread) else f"{number} ± {spread:.2g}")
+        lines.append(f"| {row['name']} | {' | '.join(cells)} |")
+    return lines
 
 
 if __name__ == "__main__":

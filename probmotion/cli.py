@@ -99,7 +99,12 @@ class Compare:
     """Begin from settings that cost less, as a demonstration wants; the table names them."""
 
     pictures: bool = False
-    """Also write quality_against_cost.png and one picture of skeletons per problem."""
+    """Also write one picture of skeletons per problem and, where quality can be measured,
+    quality_against_cost.png."""
+
+    prior: str | None = None
+    """Also draw from a prior of your own: the folder of a run of probmotion train diffusion. There
+    is no evidence, and nothing to measure draws by but what they cost; they are in --out."""
 
     own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 
@@ -124,12 +129,12 @@ class Compare:
             out=self.out,
         )
         comparison.write(self.out)
+        print(comparison.table())
+        print(f"\ntable and draws are in {self.out}")
         if self.pictures:
             from probmotion.pictures.comparisons import draw_comparison
 
             draw_comparison(comparison, problems, self.out)
-        print(comparison.table())
-        print(f"\ntable and draws are in {self.out}")
 
     def _samplers(self) -> dict[str, Any]:
         from probmotion.sampling import sampler_names
@@ -141,10 +146,10 @@ class Compare:
     def _problems(self) -> list[Problem]:
         from probmotion.problems import load_problem
 
-        if not self.problems and not self.own.clips:
+        if not self.problems and not self.own.clips and self.prior is None:
             raise ValueError(
-                "no problem is given, expected names of problems (probmotion list shows them) or "
-                "clips of your own (--clips FILE…)"
+                "no problem is given, expected names of problems (probmotion list shows them), "
+                "clips of your own (--clips FILE…) or a prior of your own (--prior FOLDER)"
             )
         if not self.own.clips and self.own != Clips():
             changed = [entry.name for entry in fields(Clips) if self._differs(entry.name)]
@@ -152,7 +157,11 @@ class Compare:
                 f"{', '.join(changed)} is given without clips, expected --clips FILE… beside it"
             )
         problems = [load_problem(name) for name in self.problems]
-        return problems + ([problem_from(self.own)] if self.own.clips else [])
+        if self.own.clips:
+            problems.append(problem_from(self.own))
+        if self.prior is not None:
+            problems.append(problem_of_prior(self.prior))
+        return problems
 
     def _differs(self, option: str) -> bool:
         return getattr(self.own, option) != getattr(Clips(), option)
@@ -173,6 +182,19 @@ def problem_from(own: Clips) -> Problem:
         noise=own.noise,
         held_out=-1 if own.held_out is None else own.held_out,
     )
+
+
+def problem_of_prior(source: str) -> Problem:
+    """Return the problem to draw from a prior that a user trained, called as its folder."""
+    from probmotion.models.motion_diffusion import MotionDiffusion
+    from probmotion.posterior import MotionPosterior
+    from probmotion.problems import Problem
+
+    posterior = MotionPosterior(MotionDiffusion.load(source))
+    path = Path(source).resolve()
+    name = path.parent.name if path.name == "model.safetensors" else path.name
+    name = name.removesuffix(".safetensors")
+    return Problem(name, "a prior that was trained on tracks of one's own: generation", posterior)
 
 
 @dataclass(frozen=True)
@@ -216,17 +238,18 @@ def _first_line(kind: Any) -> str:
 
 @dataclass(frozen=True)
 class Show:
-    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz), draws (.nc) or a
-    trained network (.safetensors)."""
+    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or
+    a trained network (.safetensors)."""
 
     file: Positional[Path]
-    """The file."""
+    """The file; of a network also the folder of its run, or the name of one in the package."""
 
     fps: float | None = None
-    """Frames per second of keypoints in JSON, which does not hold it."""
+    """Frames per second of keypoints in JSON or a table, which do not hold it."""
 
     skeleton: str | None = None
-    """What keypoints in JSON are of (see probmotion list), where their number does not tell."""
+    """What keypoints in JSON are of (see probmotion list), where their number does not tell, or
+    which joints to take from a table."""
 
     picture: Path | None = None
     """Also draw the motion, or the first draws, to this .png."""
@@ -235,11 +258,21 @@ class Show:
         """Print a few lines about the file."""
         from probmotion.summaries import summarise
 
-        summary = summarise(self.file, self.fps, self.skeleton)
+        summary = summarise(_file_called(self.file), self.fps, self.skeleton)
         print(summary.text)
         if self.picture is not None:
             summary.draw(self.picture)
             print(f"wrote {self.picture}")
+
+
+def _file_called(path: Path) -> Path:
+    """Return the file of the network that comes with the package, where a path is its name."""
+    if path.suffix or path.exists():
+        return path
+    from probmotion import models
+
+    shipped = Path(models.__file__).parent / "weights" / f"{path}.safetensors"
+    return shipped if shipped.is_file() else path
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,13 @@ import numpy as np
 from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_shape
 from probmotion.likelihoods import ComparesViews, Likelihood
-from probmotion.priors import HasCoordinateSpeeds, HasLogDensity, Marginalises, MotionPrior
+from probmotion.priors import (
+    ChecksEvidence,
+    HasCoordinateSpeeds,
+    HasLogDensity,
+    Marginalises,
+    MotionPrior,
+)
 from probmotion.seeds import RandomNumbers
 from probmotion.skeleton import Skeleton
 
@@ -32,7 +38,7 @@ class MotionPosterior:
     ------
     ValueError
         If the likelihood is of other joints, another number of frames or another frame rate than
-        the prior, as far as it knows them.
+        the prior, as far as it knows them, or the prior cannot have made it.
     """
 
     prior: MotionPrior
@@ -61,6 +67,8 @@ class MotionPosterior:
                 f"likelihood is of the joints {', '.join(seen.joint_names)}, expected the prior's, "
                 f"{', '.join(self.skeleton.joint_names)}; retarget one to the other"
             )
+        if isinstance(self.prior, ChecksEvidence):
+            self.prior.check_evidence(self.likelihood)
         fps = getattr(self.likelihood, "fps", None)
         if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
             raise ValueError(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from probmotion.likelihoods import Likelihood
 
 __all__ = [
+    "ChecksEvidence",
     "DenoiserCovariance2D",
     "DenoiserCovariance3D",
     "Denoises2D",
@@ -106,6 +107,14 @@ class HasCoordinateSpeeds(Protocol):
 
         ``joint_speeds`` holds the squared turns, radians², and stretches, metres², of joints.
         """
+
+
+@runtime_checkable
+class ChecksEvidence(Protocol):
+    """A prior that knows of evidence it cannot have."""
+
+    def check_evidence(self, likelihood: Likelihood) -> None:
+        """Raise ``ValueError`` if no motion of the prior can have made the evidence."""
 
 
 @runtime_checkable

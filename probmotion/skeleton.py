@@ -134,6 +134,14 @@ class Skeleton:
         return tuple(pairs)
 
     @cached_property
+    def mirrored_order(self) -> tuple[int, ...]:
+        """For every joint, the one on the other side; itself where there is none."""
+        order = list(range(self.n_joints))
+        for left, right in self.mirrored_pairs:
+            order[left], order[right] = right, left
+        return tuple(order)
+
+    @cached_property
     def canonical_names(self) -> tuple[str, ...]:
         """The field's common name of each joint (``left_knee``), or its own where unknown."""
         return canonical_names(self.joint_names)

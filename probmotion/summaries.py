@@ -15,6 +15,7 @@ from probmotion.skeleton import Skeleton
 __all__ = ["Summary", "summarise"]
 
 
+_MODEL = "model.safetensors"
 _LOSSES = ("loss", "validation_loss")
 
 
@@ -67,11 +68,12 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
     Parameters
     ----------
     path : Path
-        The file.
+        The file; of a network also the folder of its training run.
     fps : float, optional
-        Frames per second of keypoints in JSON, which does not hold it.
+        Frames per second of keypoints in JSON or a table, which do not hold it.
     skeleton : str, optional
-        Preset that keypoints in JSON are of, where their number does not tell.
+        Preset that keypoints in JSON are of, where their number does not tell, or whose joints
+        are taken from a table.
 
     Raises
     ------
@@ -84,6 +86,8 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
         return _of_draws(path, MotionDraws.load(path))
     if path.suffix == ".safetensors":
         return _of_checkpoint(path)
+    if (path / _MODEL).is_file():
+        return _of_checkpoint(path / _MODEL)
     if _holds_keypoints(path):
         from probmotion.formats import read_keypoints
 
@@ -103,7 +107,7 @@ def _holds_keypoints(path: Path) -> bool:
         except BadZipFile:
             return False
         return "keypoints.npy" in names and "positions.npy" not in names
-    return path.suffix == ".json" or path.is_dir()
+    return path.suffix.lower() in (".json", ".csv", ".h5", ".hdf5") or path.is_dir()
 
 
 def _of_motion(path: Path, motion: Motion) -> Summary:

@@ -13,7 +13,6 @@ from tyro.conf import OmitArgPrefixes
 
 if TYPE_CHECKING:
     from probmotion.data.learning import LearningTracks
-    from probmotion.models.training import TrainingResult
     from probmotion.models.training_settings import TrainingSettings
 
 __all__ = ["TRAINABLE", "TrainDiffusion", "TrainEvaluator", "TrainLifter"]
@@ -30,8 +29,9 @@ class Data:
     and a detector with errors finds the joints: only these pictures are learnt from."""
 
     tracks: tuple[str, ...] = ()
-    """Files of 2D keypoints (.json, .npz, .csv), or quoted patterns. Names of files are those of
-    clips."""
+    """Files of 2D keypoints (.json, .npz, .csv), folders of a video's frames as OpenPose writes
+    them (--tracks op/video0 op/video1), or quoted patterns. Their names are those of clips. Of
+    other bodies than people, --skeleton must be named."""
 
     tracks_fps: float | None = None
     """Frames per second of keypoints in files that do not hold it."""
@@ -43,7 +43,7 @@ class Data:
     """How many people to follow in JSON that does not say who is who."""
 
     skeleton: str = "person14"
-    """The joints to learn (see probmotion list)."""
+    """The joints to learn (see probmotion list), which clips or tracks must have."""
 
     fps: float = 20.0
     """Frames per second to learn at."""
@@ -54,8 +54,8 @@ class Data:
     test: tuple[str, ...] = ()
     """Names of clips that are kept for measuring; a tenth by default."""
 
-    views: int = 64
-    """Cameras around each 3D clip."""
+    views: int | None = None
+    """Cameras around each 3D clip; 64 by default."""
 
     centre: Literal["frame", "sequence"] = "frame"
     """Whether the root is at the origin in every frame, or on average."""
@@ -132,6 +132,7 @@ class TrainDiffusion:
         preset = getattr(DiffusionSettings, self.size.replace("-", "_"))
         size = preset() if self.frames is None else preset(self.frames)
         settings = self.training.settings(usual_training(self.size))
+        _check_options(self.out, self.threshold)
         found = learning_tracks(self.data, self.threshold)
         shift = 0.0 if self.data.centre == "frame" else 0.1
         trainee = DiffusionTrainee(
@@ -173,10 +174,16 @@ class TrainEvaluator:
         from probmotion.models.track_autoencoder import EvaluatorSettings
         from probmotion.models.training_settings import TrainingSettings
 
+        if self.data.centre != "frame":
+            raise ValueError(
+                f"centre is {self.data.centre!r}, expected frame: draws are filmed with the root "
+                "at the origin in every frame"
+            )
         preset = getattr(EvaluatorSettings, self.size.replace("-", "_"))
         size = preset() if self.frames is None else preset(self.frames)
         usual = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
         settings = self.training.settings(usual)
+        _check_options(self.out, self.threshold)
         found = learning_tracks(self.data, self.threshold)
         trainee = EvaluatorTrainee(
             found.train,
@@ -192,7 +199,8 @@ class TrainEvaluator:
 class TrainLifter:
     """Learn an unsupervised lifter of 2D poses, a baseline: first the flow it learns from.
 
-    The same command goes on where it was stopped.
+    The same command goes on where it was stopped. More steps are steps of the lifter alone: the
+    flow that it has begun to learn from stays as it is.
     """
 
     out: Path
@@ -213,21 +221,27 @@ class TrainLifter:
         from probmotion.models.lifter_training import LifterTrainee
         from probmotion.models.pose_flow import FlowSettings, PoseFlow
         from probmotion.models.pose_flow_training import PoseFlowTrainee
+        from probmotion.models.training_runs import STATE
         from probmotion.models.training_settings import TrainingSettings
 
         usual = TrainingSettings(steps=1000 if self.size == "tiny" else 4000, learning_rate=1e-3)
         settings = self.training.settings(usual)
+        _check_options(self.out, self.threshold)
         found = learning_tracks(self.data, self.threshold)
         device = self.training.device
-        flow_size = getattr(FlowSettings, self.size)()
-        flow = PoseFlowTrainee(
-            found.train, found.validation, flow_size, threshold=self.threshold, seed=settings.seed
-        )
-        learnt = PoseFlow.load(_train(flow, settings, self.out / "flow", device).model)
+        if not (self.out / "lifter" / STATE).exists():
+            flow = PoseFlowTrainee(
+                found.train,
+                found.validation,
+                getattr(FlowSettings, self.size)(),
+                threshold=self.threshold,
+                seed=settings.seed,
+            )
+            _train(flow, settings, self.out / "flow", device)
         lifter = LifterTrainee(
             found.train,
             found.validation,
-            learnt,
+            PoseFlow.load(self.out / "flow"),
             getattr(LifterSettings, self.size)(),
             threshold=self.threshold,
             seed=settings.seed,
@@ -239,6 +253,7 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
     """Return the tracks that the options name, and print what preparing them dropped."""
     from probmotion.data.learning import film_clips, read_tracks, split_tracks
     from probmotion.data.projections import Filming
+    from probmotion.data.splits import clip_of
     from probmotion.data.walks import made_walks
     from probmotion.motion import files_named, load_motion
     from probmotion.skeleton import Skeleton
@@ -248,6 +263,8 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
     for name in ("tracks_fps", "layout", "people"):
         if getattr(data, name) is not None and not data.tracks:
             raise ValueError(f"{name} is given without tracks, expected --tracks FILE… beside it")
+    if data.tracks and data.views is not None:
+        raise ValueError("views is given with tracks, expected it only where clips are filmed")
     skeleton = Skeleton.preset(data.skeleton)
     if data.tracks:
         prepared = read_tracks(
@@ -267,11 +284,13 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
             clips or made_walks(skeleton=skeleton),
             skeleton,
             data.fps,
-            views=data.views,
+            views=64 if data.views is None else data.views,
             seed=data.data_seed,
             filming=Filming(centre=data.centre),
         )
     print(prepared)
+    if not (data.validation or data.test):
+        _check_clips({clip_of(track.name) for track in prepared.tracks})
     found = split_tracks(
         prepared.tracks, validation=data.validation, test=data.test, seed=data.data_seed
     )
@@ -282,22 +301,44 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
     return found
 
 
-def _train(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> TrainingResult:
+def _check_clips(clips: set[str]) -> None:
+    # Fewer have no tenth: half a clip is rounded to none.
+    if len(clips) < 6:
+        listed = ", ".join(sorted(clips))
+        raise ValueError(
+            f"the number of clips is {len(clips)} ({listed}), too few to keep out a tenth twice, "
+            "expected at least 6, or --validation NAME and --test NAME to say which are kept out"
+        )
+
+
+def _check_options(out: Path, threshold: float) -> None:
+    """Refuse at once what would be refused after minutes of preparing data."""
+    from probmotion.checks import check_positive
+
+    check_positive("threshold", threshold)
+    standing = next((place for place in (out, *out.parents) if place.exists()), out)
+    if standing.is_file():
+        where = "" if standing == out else f" below {standing}"
+        raise ValueError(f"out is {out},{where} which is a file, expected a folder")
+
+
+def _train(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
     from probmotion.models.checkpoints import MODEL, load_checkpoint
     from probmotion.models.training import train
+    from probmotion.models.training_runs import steps_taken
 
-    kept = out / MODEL
-    before = load_checkpoint(kept, trainee.kind).settings["step"] if kept.exists() else 0
+    before = steps_taken(out, trainee.kind)
+    if not before and (out / MODEL).exists():
+        load_checkpoint(out / MODEL, trainee.kind)  # another network's is not written over
     result = train(trainee, settings, out, device=device)
     if before >= settings.steps:
         print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}")
-        return result
+        return
     last = result.history[-1]
     print(
         f"wrote {result.model}: step {last['step']:.0f}, loss {last['loss']:.4f}, validation loss "
         f"{last['validation_loss']:.4f}, {last['seconds']:.0f} s of steps"
     )
-    return result
 
 
 TRAINABLE: dict[str, type[Any]] = {

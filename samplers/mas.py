@@ -22,7 +22,7 @@ from probmotion.samplers.ancestral import MotionState, ancestral, cosine_schedul
 from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.separate_views import SeparateViews
-from probmotion.samplers.views import MultiViewDenoiser, Views, views_around
+from probmotion.samplers.views import MultiViewDenoiser, Views, views_around, warn_of_level_views
 from probmotion.sampling import UnsupportedPosterior, require
 from probmotion.seeds import NormalStreams
 
@@ -141,6 +141,11 @@ class MultiViewAncestral:
     ) -> MotionDraws:
         """Return ``chains`` × ``draws`` independent draws.
 
+        Warns
+        -----
+        UserWarning
+            If the elevation is 0.
+
         Raises
         ------
         UnsupportedPosterior
@@ -150,6 +155,7 @@ class MultiViewAncestral:
         """
         require(self, posterior)
         refuse_initial(self, initial)
+        warn_of_level_views(self.name, self.elevation)
         state = self._state(posterior)
         return draw_independently(
             self,

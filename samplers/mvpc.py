@@ -17,7 +17,6 @@ whose small noise is large, are then drawn better than by MAS as well.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -40,7 +39,13 @@ from probmotion.samplers.ancestral import (
 )
 from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
-from probmotion.samplers.views import MultiViewDenoiser, Views, symmetric_power, views_around
+from probmotion.samplers.views import (
+    MultiViewDenoiser,
+    Views,
+    symmetric_power,
+    views_around,
+    warn_of_level_views,
+)
 from probmotion.sampling import require
 from probmotion.seeds import NormalStreams
 
@@ -152,12 +157,7 @@ class MultiViewPredictorCorrector:
         """
         require(self, posterior)
         refuse_initial(self, initial)
-        if self.elevation == 0:
-            warnings.warn(
-                "elevation is 0: views that never tilt leave a mirror ambiguity that mvpc cannot "
-                "resolve, expected an elevation such as pi/16",
-                stacklevel=2,
-            )
+        warn_of_level_views(self.name, self.elevation)
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
         views = Views(views_around(self.n_views, self.elevation))

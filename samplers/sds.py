@@ -48,8 +48,10 @@ class ScoreDistillation:
     elevation : float
         Of all views, radians.
     azimuths : int
-        The views are drawn from this many azimuths evenly around the circle; an exact prior
-        prepares each of them once.
+        The views are drawn from this many azimuths evenly along the arc; an exact prior prepares
+        each of them once.
+    arc : float
+        Radians of the circle that azimuths are drawn from, from 0; all by default.
     shared_noise : bool
         Project one 3D noise into the views of an iteration, rather than independent noise.
     levels : {"uniform", "annealed"}
@@ -79,6 +81,7 @@ class ScoreDistillation:
     n_views: int = 1
     elevation: float = math.pi / 16
     azimuths: int = 36
+    arc: float = 2 * math.pi
     shared_noise: bool = False
     levels: Levels = "uniform"
     weighting: Weighting = "constant"
@@ -93,12 +96,23 @@ class ScoreDistillation:
         check_count("steps", self.steps, least=2)
         check_count("azimuths", self.azimuths, least=self.n_views)
         check_positive("learning_rate", self.learning_rate)
+        check_positive("arc", self.arc)
+        if self.arc > 2 * math.pi:
+            raise ValueError(f"arc is {self.arc}, expected at most the circle, 2 pi")
         for name, known in (("levels", Levels), ("weighting", Weighting)):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}, expected one of "
                     f"{', '.join(get_args(known))}"
                 )
+
+    @classmethod
+    def reference_code(cls) -> ScoreDistillation:
+        """Return the settings of the MAS authors' released code, where they differ from the paper.
+
+        Its azimuths, uniform on [0, 1), are radians, so that it sees a sixth of the circle.
+        """
+        return cls(iterations=1000, weighting="residual", arc=1.0, schedule_power=4)
 
     @property
     def schedule(self) -> NoiseSchedule:
@@ -185,7 +199,7 @@ class ScoreDistillation:
         motions = streams.normal(*shape)
         adam = _Adam(motions, self.learning_rate)
         for t, numbers in zip(*self.plan(seed), strict=True):
-            azimuth = 2 * np.pi * numbers / self.azimuths
+            azimuth = self.arc * numbers / self.azimuths
             views = Views(Cameras.around(azimuth, np.full(self.n_views, self.elevation)))
             if self.shared_noise:
                 noise = views.project(streams.normal(*shape))

@@ -6,6 +6,7 @@ M = Σ_v w_v P_vᵀ P_v, w_v the views' weights (1 by default).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -14,7 +15,14 @@ import numpy as np
 from probmotion.cameras import Cameras
 from probmotion.priors import DenoiserCovariance2D, DenoiserCovariance3D, Denoises2D, Denoises3D
 
-__all__ = ["MotionDenoiser", "MultiViewDenoiser", "Views", "symmetric_power", "views_around"]
+__all__ = [
+    "MotionDenoiser",
+    "MultiViewDenoiser",
+    "Views",
+    "symmetric_power",
+    "views_around",
+    "warn_of_level_views",
+]
 
 
 class Views:
@@ -79,6 +87,16 @@ def views_around(
     azimuth = 2 * np.pi * np.arange(n_views) / max(3, n_views)
     tilt = np.full(n_views, elevation)
     return Cameras.around(azimuth, tilt, distance=distance, perspective=perspective)
+
+
+def warn_of_level_views(sampler: str, elevation: float) -> None:
+    """Warn a caller's caller if views are level: then a motion and its mirror image look alike."""
+    if elevation == 0:
+        warnings.warn(
+            "elevation is 0: views that never tilt leave a mirror ambiguity that "
+            f"{sampler} cannot resolve, expected an elevation such as pi/16",
+            stacklevel=3,
+        )
 
 
 class MotionDenoiser:

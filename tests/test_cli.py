@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -69,7 +70,7 @@ def test_every_command_explains_every_option(command, capsys):
     help_text = capsys.readouterr().out
     assert f"usage: probmotion {command}" in help_text
     if command == "compare":
-        for option in ("--clips", "--observe", "--workers", "--settings.mas.n-views"):
+        for option in ("--clips", "--prior", "--observe", "--workers", "--settings.mas.n-views"):
             assert option in help_text
 
 
@@ -114,6 +115,44 @@ def test_compare_draws_pictures(tmp_path):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_problem_without_exact_draws_has_pictures_too(tmp_path):
+    words = "compare walk2d --samplers mas --draws 12 --settings.mas.steps 2 --pictures --out"
+    assert main([*words.split(), str(tmp_path)]) == 0
+    for name in ("quality_against_cost.png", "skeletons_walk2d.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_table_is_printed_before_pictures_are_drawn(tmp_path, capsys, monkeypatch):
+    def fail(*_):
+        raise ValueError("no picture today")
+
+    monkeypatch.setattr("probmotion.pictures.comparisons.draw_comparison", fail)
+    words = "compare gait --samplers exact --draws 12 --pictures --out"
+    assert main([*words.split(), str(tmp_path)]) == 2
+    printed = capsys.readouterr()
+    assert "no picture today" in printed.err
+    assert "seconds" in printed.out
+
+
+@pytest.mark.parametrize("named", ["mine", "mine/model.safetensors"])
+def test_a_prior_of_one_s_own_is_drawn_from(named, tmp_path, capsys):
+    from probmotion.models.checkpoints import WEIGHTS
+
+    (tmp_path / "mine").mkdir()
+    shutil.copy(WEIGHTS / "walk2d.safetensors", tmp_path / "mine" / "model.safetensors")
+    words = "compare --samplers mas mh --draws 12 --settings.mas.steps 2 --pictures --prior"
+    out = tmp_path / "out"
+    assert main([*words.split(), str(tmp_path / named), "--out", str(out)]) == 0
+    table = pd.read_csv(out / "table.csv")
+    assert set(table["problem"]) == {"mine"}
+    drawn = table[table["sampler"] == "mas"]
+    assert {"seconds", "denoiser_evaluations"} <= set(drawn["metric"])
+    assert list(table[table["sampler"] == "mh"]["metric"]) == ["unsupported"]
+    assert MotionDraws.load(out / "cells" / "mine" / "mas" / "0" / "draws.nc").fps == 20
+    # Nothing measures quality, so that there is no plot of it.
+    assert {file.name for file in out.glob("*.png")} == {"skeletons_mine.png"}
+
+
 def test_a_preset_runs_beside_its_sampler(tmp_path):
     words = "compare gait --samplers mas mas.reference_code --draws 10 --settings.mas.steps 2"
     assert main([*words.split(), "--out", str(tmp_path)]) == 0
@@ -141,6 +180,38 @@ def test_show_tells_what_a_motion_is(tmp_path, capsys):
     assert "40 frames at 30 fps, 1.30 s" in printed
     assert "17 joints below pelvis" in printed
     assert picture.exists()
+
+
+def test_show_finds_a_network_by_its_folder_or_name(tmp_path, capsys, monkeypatch):
+    from probmotion.models.checkpoints import WEIGHTS
+
+    monkeypatch.chdir(tmp_path)
+    Path("mine").mkdir()
+    shutil.copy(WEIGHTS / "walk2d.safetensors", "mine/model.safetensors")
+    for given, file in {
+        "mine": Path("mine/model.safetensors"),
+        "walk2d": WEIGHTS / "walk2d.safetensors",
+    }.items():
+        assert main(["show", given]) == 0
+        printed = capsys.readouterr().out
+        assert printed.startswith(f"{file}: a motion-diffusion of ")
+        assert "14 joints below pelvis" in printed
+    assert main(["show", "walk3d"]) == 2
+    assert said(capsys) == "probmotion: there is no file walk3d"
+
+
+def test_show_reads_the_tables_of_deeplabcut(tmp_path, capsys):
+    path = tmp_path / "mouse.csv"
+    path.write_text(
+        "scorer,net,net,net,net,net,net\nbodyparts,nose,nose,nose,tail,tail,tail\n"
+        "coords,x,y,likelihood,x,y,likelihood\n0,1,2,0.5,3,4,1\n1,2,3,0.5,,,0\n"
+    )
+    assert main(["show", str(path), "--fps", "10"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{path}: 1 keypoint track\n" in printed
+    assert "2 frames at 10 fps, 0.10 s\n  75% seen\n  2 joints below nose, tail" in printed
+    assert main(["show", str(path)]) == 2
+    assert "fps is missing" in said(capsys)
 
 
 def test_show_and_convert_read_draws(tmp_path, capsys):
@@ -192,10 +263,11 @@ def one_frame(folder: Path) -> str:
         ("compare gait --samplers mcmc", ("'mcmc'", "exact", "nuts")),
         ("compare gait --samplers mas.best", ("'mas.best'", "mas.reference_code")),
         ("compare jump", ("'jump'", "gait-monocular")),
-        ("compare", ("no problem is given", "--clips")),
+        ("compare", ("no problem is given", "--clips", "--prior")),
         ("compare gait --draws 3", ("draws is 3",)),
         ("compare gait --chains 0", ("chains is 0",)),
         ("compare gait --observe sparse", ("observe is given without clips", "--clips")),
+        ("compare --prior no/such", ("no/such", "the folder of a training run")),
         ("compare --clips no/such/*.bvh", ("no/such/*.bvh", "no file")),
         ("compare --clips no/such.bvh", ("no/such.bvh",)),
         ("show no/such.bvh", ("no/such.bvh",)),

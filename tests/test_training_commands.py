@@ -147,6 +147,21 @@ def test_the_lifter_is_trained_after_its_flow(
     assert (tmp_path / "run" / "flow" / "model.safetensors").read_bytes() == flow
 
 
+def test_more_steps_of_a_lifter_leave_its_flow_alone(
+    walks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words("lifter", walks, tmp_path, "--steps", 5)) == 0
+    kept = {file.name: file.read_bytes() for file in (tmp_path / "flow").iterdir()}
+    assert main(words("lifter", walks, tmp_path, "--steps", 8)) == 0
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said.startswith(f"wrote {tmp_path / 'lifter' / 'model.safetensors'}: step 8, loss ")
+    assert {file.name: file.read_bytes() for file in (tmp_path / "flow").iterdir()} == kept
+    # Other data are still refused, and the flow has not learnt from them.
+    assert main(words("lifter", walks, tmp_path, "--steps", 9, "--data-seed", 1)) == 2
+    assert "which holds a run with " in sentence(capsys)
+    assert {file.name: file.read_bytes() for file in (tmp_path / "flow").iterdir()} == kept
+
+
 def test_real_detections_are_learnt_from(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -175,6 +190,20 @@ def test_a_finished_run_says_so_and_writes_nothing(
         said = capsys.readouterr().out.splitlines()[-1]
         assert said.endswith(f"is finished: it has taken 20 steps of {steps}")
         assert {file.name: file.read_bytes() for file in out.iterdir()} == kept
+
+
+def test_a_model_that_is_gone_or_damaged_comes_back(
+    walks: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = shutil.copytree(trained, tmp_path / "run")
+    model = out / "model.safetensors"
+    before = model.read_bytes()
+    for damaged in (None, before[:-100]):
+        model.unlink() if damaged is None else model.write_bytes(damaged)
+        assert main(words("diffusion", walks, out, "--steps", 20)) == 0
+        said = capsys.readouterr().out.splitlines()[-1]
+        assert said == f"{model} is finished: it has taken 20 steps of 20"
+        assert model.read_bytes() == before
 
 
 def test_more_steps_go_on_as_if_there_had_been_no_pause(
@@ -226,7 +255,11 @@ def test_a_folder_of_another_kind_is_left_alone(
 ) -> None:
     out = shutil.copytree(trained, tmp_path / "run")
     assert main(words("evaluator", walks, out, "--steps", 40)) == 2
-    assert "holds a motion-diffusion, expected a track-evaluator" in sentence(capsys)
+    named = "holds a motion-diffusion{0}, expected a track-evaluator{0}"
+    assert named.format(" in training") in sentence(capsys)
+    (out / "state.safetensors").unlink()
+    assert main(words("evaluator", walks, out, "--steps", 40)) == 2
+    assert named.format("") in sentence(capsys)
     assert MotionDiffusion.load(out).card["step"] == 20
 
 
@@ -283,7 +316,8 @@ def test_wrong_words_are_one_sentence(
     out = tmp_path / "run"
     table = tmp_path / "table.csv"
     table.write_text("a,b\n")
-    made = ["train", "diffusion", "--size", "tiny", "--views", "1", "--out", str(out)]
+    filmed_or_not = ["train", "diffusion", "--size", "tiny", "--out", str(out)]
+    made = [*filmed_or_not, "--views", "1"]
     cases = {
         ("train",): "what to train is missing, expected one of diffusion, evaluator, lifter",
         ("train", "vae"): "what to train is 'vae', expected one of diffusion, evaluator, lifter",
@@ -293,11 +327,20 @@ def test_wrong_words_are_one_sentence(
         "directory",
         (*made, "--clips", str(tmp_path / "no*.bvh")): f"paths has '{tmp_path}/no*.bvh', which "
         "matches no file",
-        (*made, "--tracks", str(tmp_path / "no.npz")): f"there is no file {tmp_path / 'no.npz'}",
-        (*made, "--tracks", str(table)): "fps is missing, expected frames per second: "
+        (
+            *filmed_or_not,
+            "--tracks",
+            str(tmp_path / "no.npz"),
+        ): f"there is no file {tmp_path / 'no.npz'}",
+        (*filmed_or_not, "--tracks", str(table)): "fps is missing, expected frames per second: "
         f"{table} is a table, which does not hold it",
         (*made, "--clips", walks, "--tracks-fps", "30"): "tracks_fps is given without tracks, "
         "expected --tracks FILE… beside it",
+        (*made, "--tracks", "a.json", "--views", "64"): "views is given with tracks, expected it "
+        "only where clips are filmed",
+        (*made, "--clips", walks): "the number of clips is 5 (walk0, walk1, walk2, walk3, "
+        "walk4), too few to keep out a tenth twice, expected at least 6, or --validation NAME and "
+        "--test NAME to say which are kept out",
         (*made, "--clips", walks, "--validation", "walk1"): "validation is given without test, "
         "expected clips for both or neither",
         (*made, "--clips", walks, "--test", "walk1"): "test is given without validation, "
@@ -335,23 +378,43 @@ def test_no_cuda_is_told_before_anything_is_read(
     assert sentence(capsys).startswith("device is 'cuda'")
 
 
-def test_a_file_in_the_folder_s_place_is_one_sentence(
-    walks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("kind", ["diffusion", "evaluator", "lifter"])
+def test_what_needs_no_data_is_refused_before_any_is_read(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "run").write_text("mine")
-    assert main(words("diffusion", walks, tmp_path / "run", "--steps", 1)) == 2
-    assert "run: " in sentence(capsys)
-    assert (tmp_path / "run").read_text() == "mine"
+    taken = tmp_path / "run"
+    taken.write_text("mine")
+    given = ["train", kind, "--clips", str(tmp_path / "no.npz")]
+    cases = {
+        ("--out", str(taken)): f"out is {taken}, which is a file, expected a folder",
+        ("--out", str(taken / "a" / "b")): f"out is {taken / 'a' / 'b'}, below {taken} which is a "
+        "file, expected a folder",
+        ("--out", str(tmp_path / "new"), "--threshold", "nan"): "threshold is nan, expected a "
+        "finite number above 0",
+    }
+    for more, wanted in cases.items():
+        assert main([*given, *more]) == 2
+        assert sentence(capsys) == wanted
+    assert taken.read_text() == "mine"
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+
+
+def test_six_clips_have_a_tenth(tmp_path: Path) -> None:
+    for number in range(6):
+        make_gait("walk", number, frames=60).save(tmp_path / f"walk{number}.npz")
+    given = ["train", "evaluator", "--clips", str(tmp_path / "walk*.npz"), "--views", "1"]
+    more = ["--size", "tiny", "--steps", "1", "--out", str(tmp_path / "run")]
+    assert main([*given, *more]) == 0
 
 
 def test_a_damaged_checkpoint_is_one_sentence(
     walks: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("model.safetensors", "state.safetensors"):
-        out = shutil.copytree(trained, tmp_path / name / "run")
-        (out / name).write_bytes((out / name).read_bytes()[:-100])
-        assert main(words("diffusion", walks, out, "--steps", 40)) == 2
-        assert f"{name} is damaged or no safetensors file" in sentence(capsys)
+    out = shutil.copytree(trained, tmp_path / "run")
+    state = out / "state.safetensors"
+    state.write_bytes(state.read_bytes()[:-100])
+    assert main(words("diffusion", walks, out, "--steps", 40)) == 2
+    assert f"{state} is damaged or no safetensors file" in sentence(capsys)
 
 
 def test_help_lists_the_kinds_and_every_option(capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from probmotion import seeds
+from probmotion.comparison.fingerprint import fingerprint
 from probmotion.data.learning import (
     LearningTracks,
     film_clips,
@@ -115,12 +116,17 @@ class Study:
         return film_windows(self.clips[part], PERSON, FPS, self.frames, n, seed=SEED + seed)
 
     def motions(self, part: str) -> np.ndarray:
-        """Return all 3D windows of a part, (n, L, J, 3), metres: the truth that nobody saw."""
+        """Return all 3D windows of a part and their mirror images, (n, L, J, 3), metres.
+
+        They are the truth that nobody saw; models learn from pictures in a mirror, too.
+        """
         clips = [
             centre_motion(clip.retarget(PERSON).resample(FPS)).positions
             for clip in self.clips[part]
         ]
-        return np.concatenate([windows(clip, self.frames) for clip in clips])
+        straight = np.concatenate([windows(clip, self.frames) for clip in clips])
+        mirrored = straight[:, :, list(PERSON.mirrored_order)] * np.array([-1.0, 1.0, 1.0])
+        return np.concatenate([straight, mirrored])
 
     @cached_property
     def prior(self) -> MotionDiffusion:
@@ -144,17 +150,8 @@ class Study:
         )
         settings = TrainingSettings(steps=300, batch=32, learning_rate=2e-3, ema=0.99)
         evaluator = TrackEvaluator.load(self.trained("evaluator", trainee, settings))
-        return GenerationReference(evaluator, evaluator.features(self.views("test", 200)))
-
-    @cached_property
-    def learnt(self) -> GenerationReference:
-        """The clips that were learnt from, filmed anew: how well the data are reproduced.
-
-        A few clips differ from a few others; a model of the first can only be so near to those
-        that were held out.
-        """
-        features = self.reference.evaluator.features(self.views("train", 1000, seed=2))
-        return replace(self.reference, held_out_features=features)
+        held_out, learnt = (evaluator.features(self.views(part, 200)) for part in ("test", "train"))
+        return GenerationReference(evaluator, held_out, learnt)
 
     @property
     def frames(self) -> int:
@@ -165,18 +162,27 @@ class Study:
         """Train a network, or go on; return its checkpoint."""
         return train(trainee, settings, self.out / name, progress=False).model
 
-    def once(self, name: str, make: Callable[[], np.ndarray]) -> tuple[np.ndarray, float]:
+    def once(
+        self, name: str, made_from: object, make: Callable[[], np.ndarray]
+    ) -> tuple[np.ndarray, float]:
         """Return motions or views and the seconds that they took; made where they are missing."""
         path = self.out / "motions" / f"{name}.npz"
+        origin = fingerprint(made_from)
         if not path.exists():
             start = time.perf_counter()
             made = make()
             seconds = time.perf_counter() - start
             path.parent.mkdir(parents=True, exist_ok=True)
             with written_whole(path) as unfinished, open(unfinished, "wb") as file:
-                np.savez_compressed(file, made=made.astype(np.float32), seconds=seconds)
+                np.savez_compressed(
+                    file, made=made.astype(np.float32), seconds=seconds, origin=origin
+                )
             print(f"{name}: {len(made)} in {seconds:.0f} s", flush=True)
         with np.load(path) as archive:
+            if str(archive["origin"]) != origin:
+                raise SystemExit(
+                    f"{path} was made with other settings or weights: use another --out"
+                )
             return archive["made"].astype(np.float64), float(archive["seconds"])
 
     def draw(self, name: str, sampler: Sampler, posterior: MotionPosterior) -> tuple:
@@ -185,7 +191,7 @@ class Study:
         def make() -> np.ndarray:
             return sampler.sample(posterior, draws=self.draws, seed=SEED, progress=False).flat()
 
-        return self.once(name, make)
+        return self.once(name, [sampler, posterior.prior, self.draws], make)
 
 
 def samplers(iterations: int) -> dict[str, Sampler]:
@@ -227,6 +233,7 @@ def table(study: Study) -> pd.DataFrame:
     add("truth, 3D", np.stack(turned), None, math.nan)
     views, seconds = study.once(
         "2D model",
+        [Ancestral2D(), study.prior, study.draws],
         lambda: Ancestral2D().sample_views(posterior, draws=study.draws, seed=SEED, progress=False),
     )
     add("2D model", None, views, seconds / study.draws)
@@ -236,8 +243,12 @@ def table(study: Study) -> pd.DataFrame:
         drawn[name] = motions
         add(name, motions, None, seconds / study.draws)
     lifted = study.views("train", study.draws)
+    with written_whole(study.out / "to_lift.npz") as path, open(path, "wb") as file:
+        np.savez_compressed(file, keypoints=lifted, fps=FPS, joint_names=PERSON.joint_names)
     for name, lifter in lifters(study).items():
-        motions, seconds = study.once(name, lambda lifter=lifter: lifter(lifted))
+        motions, seconds = study.once(
+            name, [lifter, lifted], lambda lifter=lifter: lifter.lift(lifted)
+        )
         drawn[name] = motions
         add(name, motions, None, seconds / study.draws)
     draw_skeletons(
@@ -261,17 +272,20 @@ def score(
 ) -> dict[str, object]:
     """Return one row; views alone have no side and no third dimension."""
     row: dict[str, object] = {"name": name, "seconds": seconds}
-    asked = {"seed": SEED, "samples": study.draws, "repeats": study.repeats}
+    # Other halves of the draws in every repeat, so that the ± holds the chance of draws.
+    asked = {"seed": SEED, "samples": study.draws // 2, "repeats": study.repeats}
     found = {}
     if motions is None:
         assert views is not None
         found[""] = study.reference.score_views(views, **asked)
-        found["_learnt"] = study.learnt.score_views(views, **asked)
+        found["_learnt"] = study.reference.of_learnt().score_views(views, **asked)
     else:
         found[""] = study.reference.score_motions(motions, **asked)
         found["_side"] = study.reference.score_motions(motions, **asked, angles="side")
-        found["_learnt"] = study.learnt.score_motions(motions, **asked)
-        found["_learnt_side"] = study.learnt.score_motions(motions, **asked, angles="side")
+        found["_learnt"] = study.reference.of_learnt().score_motions(motions, **asked)
+        found["_learnt_side"] = study.reference.of_learnt().score_motions(
+            motions, **asked, angles="side"
+        )
         near = nearest_distances(motions, real)
         row |= {
             "to_real_mm": 1000 * near.of_draws,
@@ -293,8 +307,24 @@ def bone_changes(motions: np.ndarray) -> float:
     return float(lengths.std(axis=1).mean())
 
 
-def lifters(study: Study) -> Mapping[str, Callable[[np.ndarray], np.ndarray]]:
-    """Return functions (n, L, J, 2) → (n, L, J, 3) that lift single pictures."""
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """What another lifter made of ``to_lift.npz``."""
+
+    motions: np.ndarray
+
+    def lift(self, views: np.ndarray) -> np.ndarray:
+        """Return its motions."""
+        if len(self.motions) != len(views):
+            raise SystemExit(
+                f"predictions are {len(self.motions)} motions, expected those of the {len(views)} "
+                "in to_lift.npz"
+            )
+        return self.motions
+
+
+def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions]:
+    """Return what lifts pictures, (n, L, J, 2) → (n, L, J, 3)."""
     flow_trainee = PoseFlowTrainee(
         study.tracks.train,
         study.tracks.validation,
@@ -310,10 +340,10 @@ def lifters(study: Study) -> Mapping[str, Callable[[np.ndarray], np.ndarray]]:
         LifterSettings.tiny() if study.quick else LifterSettings.small(),
     )
     lifter = PoseLifter.load(study.trained("lifter", trainee, settings))
-    found: dict[str, Callable[[np.ndarray], np.ndarray]] = {"lifter": lifter.lift}
+    found: dict[str, PoseLifter | Predictions] = {"lifter": lifter}
     if study.predictions is not None:
         read = read_predictions(study.predictions, PERSON, frames=study.frames, fps=FPS)
-        found[study.predictions.stem] = lambda views: read
+        found[study.predictions.stem] = Predictions(read)
     return found
 
 

@@ -59,6 +59,8 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
             "view_recall": "R",
             "fid_side": "FID side",
             "view_recall_side": "R side",
+            "fid_learnt": "FID learnt",
+            "view_recall_learnt": "R learnt",
         },
     ),
     (
@@ -90,7 +92,8 @@ density is cut."""
 _GENERATION_LEGEND = """\
 FID: Fréchet distance of the features of random views and of held-out real ones; it falls with the
 number of draws; diversity: mean distance of two motions / real motions' (1 is right); P, R:
-precision and recall; side: from π/4 to 3π/4 beside the first view."""
+precision and recall; side: from π/4 to 3π/4 beside the first view; learnt: against the clips that
+were learnt from, which few held-out clips need not be like."""
 
 
 class ComparisonTable(pd.DataFrame):

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from probmotion import seeds
+from probmotion.data.own_sizes import own_sizes
 from probmotion.data.projections import Centre, DetectorNoise, Filming, project_clips
 from probmotion.data.splits import Split, clip_of, split_clips, tracks_of_clips
 from probmotion.data.track_preparation import PreparedTracks, prepare_tracks
-from probmotion.data.track_sizes import bone_sizes
-from probmotion.data.walks import made_walks
+from probmotion.data.track_sizes import bone_sizes, scale_to_bones
+from probmotion.data.walks import made_walks, shared_skeleton
 from probmotion.formats import read_keypoints
 from probmotion.motion import KeypointTrack, Motion, files_named
 from probmotion.skeleton import Skeleton
@@ -85,7 +86,8 @@ def film_windows(
     """Return n random windows of filmed clips, whole: ``(n, frames, J, 2)``, metres.
 
     The detector errs but loses no joint, and windows with a hole are left out; all else is as in
-    :func:`film_clips`. Every window of every clip is as likely, from 64 sides.
+    :func:`film_clips`. Every window of every clip is as likely, from 64 sides, and as likely in a
+    mirror: what is compared with them has learnt from mirror images, too.
 
     Raises
     ------
@@ -107,7 +109,12 @@ def film_windows(
             f"{fps:g} frames per second, expected frames={frames} without a hole in one"
         )
     found = np.concatenate(whole)
-    return found[seeds.generator(seed, "windows").choice(len(found), n, replace=n > len(found))]
+    rng = seeds.generator(seed, "windows")
+    chosen = found[rng.choice(len(found), n, replace=n > len(found))]
+    turned = rng.random(n) < 0.5
+    flipped = chosen[turned][:, :, list(skeleton.mirrored_order)] * np.array([-1.0, 1.0])
+    chosen[turned] = flipped + 0.0  # a root at -0 is one at 0
+    return chosen
 
 
 def read_tracks(
@@ -123,6 +130,10 @@ def read_tracks(
     sizes: Mapping[str, float] | None = None,
 ) -> PreparedTracks:
     """Return the tracks of files of 2D keypoints, prepared, in metres.
+
+    Where no size of a bone is known (:func:`body_sizes` knows none, and ``sizes`` says none), the
+    unit is the body's length instead: the median over tracks of the diagonal of the body's box is
+    1 (:func:`~probmotion.data.own_sizes.own_sizes`).
 
     Parameters
     ----------
@@ -142,14 +153,15 @@ def read_tracks(
     centre : {"frame", "sequence"}
         Where the root is at the origin.
     sizes : mapping of str to float, optional
-        Bone sizes that pixels are brought to; those of :func:`body_sizes` by default.
+        Bone sizes that pixels are brought to, of all bones or some; those of :func:`body_sizes` by
+        default.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file.
     ValueError
-        If two files have one name, which is that of their clip.
+        If two files have one name, which is that of their clip, or no track shows a bone.
     """
     raw: list[KeypointTrack] = []
     videos: list[str] = []
@@ -168,11 +180,15 @@ def read_tracks(
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
             videos.append(name if archive else _video(path, track))
-    reference = body_sizes(skeleton) if sizes is None else sizes
-    return prepare_tracks(
-        raw, fps=fps, skeleton=skeleton, sizes=reference, videos=videos, threshold=threshold,
+    known = (body_sizes(skeleton) or None) if sizes is None else sizes
+    prepared = prepare_tracks(
+        raw, fps=fps, skeleton=skeleton, sizes=known, videos=videos, threshold=threshold,
         centre=centre,
     )  # fmt: skip
+    if known is not None:
+        return prepared
+    scaled, report = scale_to_bones(prepared.tracks, own_sizes(prepared.tracks))
+    return PreparedTracks(tuple(scaled), (*prepared.reports, report))
 
 
 def _video(path: Path, track: KeypointTrack) -> str:
@@ -187,16 +203,14 @@ def body_sizes(skeleton: Skeleton) -> dict[str, float]:
     """Return how long a grown body's bones are in pictures, metres, by joint.
 
     The statistic is :func:`~probmotion.data.track_sizes.bone_sizes` of people, or quadrupeds, who
-    are made to walk, filmed from all around without errors.
-
-    Raises
-    ------
-    ValueError
-        If neither has all joints of the skeleton.
+    are made to walk, filmed from all around without errors. Where neither has all joints, it is of
+    the bones that one of them shares (:func:`~probmotion.data.walks.shared_skeleton`): COCO's limbs
+    are a person's. There is none where no bone is shared.
     """
-    filmed = film_clips(
-        made_walks(8, skeleton), skeleton, 20.0, views=16, noise=DetectorNoise.none()
-    )
+    shared = shared_skeleton(skeleton)
+    if shared is None:
+        return {}
+    filmed = film_clips(made_walks(8, shared), shared, 20.0, views=16, noise=DetectorNoise.none())
     return bone_sizes(filmed.tracks)
 
 

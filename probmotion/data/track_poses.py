@@ -82,9 +82,7 @@ def mirrored_track(track: KeypointTrack) -> KeypointTrack:
     Its name ends in ``mirrored`` and is one of the same clip. The mirror image of the mirror image
     is the track itself.
     """
-    order = np.arange(track.skeleton.n_joints)
-    for left, right in track.skeleton.mirrored_pairs:
-        order[left], order[right] = right, left
+    order = list(track.skeleton.mirrored_order)
     twice = track.name.endswith(_MIRRORED)
     return replace(
         track,

@@ -9,7 +9,9 @@ from probmotion.data.gaits import make_gait, make_gaits
 from probmotion.motion import Motion, load_motion
 from probmotion.skeleton import Skeleton
 
-__all__ = ["WALK_CLIPS", "made_walks", "walk_clips"]
+__all__ = ["WALK_CLIPS", "made_walks", "shared_skeleton", "walk_clips"]
+
+_STYLES = ("walk", "quadruped-walk")
 
 WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
     "train": (
@@ -68,10 +70,36 @@ def made_walks(
         If neither people nor quadrupeds have the joints.
     """
     wanted = set() if skeleton is None else set(skeleton.canonical_names)
-    for style in ("walk", "quadruped-walk"):
+    for style in _STYLES:
         if wanted <= set(make_gait(style).skeleton.canonical_names):
             return make_gaits(n, styles={style: 1.0}, frames=round(seconds * fps), fps=fps)
     raise ValueError(
         f"skeleton has the joints {', '.join(sorted(wanted))}, expected those of a person or a "
         "quadruped: bodies are made of no others"
     )
+
+
+def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
+    """Return the joints, by canonical names, that a body of :func:`made_walks` has too.
+
+    Of people and quadrupeds, it is the body that has both ends of more of the skeleton's bones;
+    people where that is the same. A joint whose parent is left out becomes a root. None where no
+    bone is shared: then neither body is like the skeleton.
+    """
+    found: Skeleton | None = None
+    for style in _STYLES:
+        part = _joints_of(make_gait(style).skeleton, skeleton)
+        if part is not None and len(part.bones) > (0 if found is None else len(found.bones)):
+            found = part
+    return found
+
+
+def _joints_of(body: Skeleton, skeleton: Skeleton) -> Skeleton | None:
+    """Return what is left of the skeleton without the joints that the body lacks."""
+    known = [name in body.canonical_names for name in skeleton.canonical_names]
+    if all(known):
+        return skeleton
+    kept = [joint for joint, there in enumerate(known) if there]
+    above = [skeleton.parents[joint] for joint in kept]
+    names = [skeleton.joint_names[joint] for joint in kept]
+    return Skeleton(names, [kept.index(p) if p in kept else -1 for p in above]) if kept else None

@@ -1,4 +1,4 @@
-"""Reading and writing motion files: BVH, npz, keypoint JSON and DeepLabCut tables."""
+"""Reading and writing motion files: BVH, npz, keypoint JSON, DeepLabCut tables, predictions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from probmotion.formats.deeplabcut import read_deeplabcut
 from probmotion.formats.errors import MotionFileError, MotionFileWarning
 from probmotion.formats.keypoint_json import read_keypoint_json
 from probmotion.formats.npz import read_keypoint_npz, read_npz, write_npz
+from probmotion.formats.predictions import read_predictions
 from probmotion.motion import KeypointTrack, Motion
 from probmotion.skeleton import Skeleton
 
@@ -19,6 +20,7 @@ __all__ = [
     "read_bvh",
     "read_keypoints",
     "read_motion",
+    "read_predictions",
     "save_motion",
     "write_bvh",
 ]

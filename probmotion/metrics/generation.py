@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -211,6 +211,9 @@ class GenerationReference:
         Makes the features.
     held_out_features : ndarray, (M, D)
         Of real motions that neither the generator nor the evaluator learnt from.
+    learnt_features : ndarray, (M, D), optional
+        Of the clips that were learnt from, filmed anew. Where clips are few, those that were held
+        out are another matter, and no model of the first can come near them; see :meth:`of_learnt`.
     elevation : float
         Of the cameras that film generated 3D motions, radians.
     distance : float
@@ -224,12 +227,29 @@ class GenerationReference:
 
     evaluator: EncodesViews
     held_out_features: np.ndarray
+    learnt_features: np.ndarray | None = None
     elevation: float = math.pi / 16
     distance: float = 7.0
 
     def __post_init__(self) -> None:
         check_shape("held_out_features", self.held_out_features, ("M", "D"))
         check_finite("held_out_features", self.held_out_features)
+        if self.learnt_features is not None:
+            width = self.held_out_features.shape[1]
+            check_shape("learnt_features", self.learnt_features, ("M", width))
+            check_finite("learnt_features", self.learnt_features)
+
+    def of_learnt(self) -> GenerationReference:
+        """Return the reference whose real motions are those that were learnt from.
+
+        Raises
+        ------
+        ValueError
+            If their features are not known.
+        """
+        if self.learnt_features is None:
+            raise ValueError("learnt_features is missing, expected features of learnt motions")
+        return replace(self, held_out_features=self.learnt_features)
 
     def score_motions(
         self,
@@ -243,8 +263,8 @@ class GenerationReference:
         """Return the scores of 3D motions, (N, L, J, 3) metres.
 
         Every repeat films ``samples`` of them, or all if there are no more, each from a fresh
-        side. The ± so holds the chance of sides and, if there are more, of subsets; it does not
-        hold that of the draws themselves, of training, or of the held-out motions.
+        side. The ± so holds the chance of sides and, if there are more, of subsets: of halves it is
+        that of the draws over √2. It does not hold that of training, or of the held-out motions.
 
         Views from the ``side`` compare with held-out views from all around only if azimuth 0 is
         no side of the body's own: motions lifted from views at random azimuths, or that face any

@@ -48,7 +48,8 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
 
     Filmed, against held-out real 2D motion (MAS, section 6.3), mean over random views: ``fid``,
     ``diversity_ratio`` (over the real motion's), ``view_precision``, ``view_recall``, and from the
-    side ``fid_side`` and ``view_recall_side``.
+    side ``fid_side`` and ``view_recall_side``; ``fid_learnt`` and ``view_recall_learnt`` are
+    against the clips that were learnt from: few clips are far from few others, even real ones.
 
     Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
     ``coverage_shape-context``, the mean distance of each to its nearest draw; see
@@ -146,7 +147,7 @@ def _against_real_views(
     side = reference.score_motions(positions, seed=seed, samples=samples, angles="side")
     pairs = seeds.generator(seed, "real pairs")
     real = diversity(reference.held_out_features, pairs, _REAL_PAIRS)
-    return {
+    found = {
         "fid": around["fid"][0],
         "diversity_ratio": around["diversity"][0] / real,
         "view_precision": around["precision"][0],
@@ -154,6 +155,11 @@ def _against_real_views(
         "fid_side": side["fid"][0],
         "view_recall_side": side["recall"][0],
     }
+    if reference.learnt_features is not None:
+        again = reference.of_learnt().score_motions(positions, seed=seed, samples=samples)
+        found["fid_learnt"] = again["fid"][0]
+        found["view_recall_learnt"] = again["recall"][0]
+    return found
 
 
 def _off_manifold(prior: object, positions: np.ndarray) -> float | None:

@@ -117,7 +117,8 @@ def _compose(
     slot, low, high = _extent(strips, truth)
     strip_width = max(2.35, 7.0 / columns)
     strip_height = strip_width * (high - low) / (slot * moments)
-    label_width, head = 1.15, 0.42
+    # A letter of this size is about .09 inches wide.
+    label_width, head = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
     width = label_width + columns * (strip_width + 0.1)
     height = head + len(strips) * (strip_height + 0.08) + 0.05
     figure = Figure(figsize=(width, height))

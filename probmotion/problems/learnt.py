@@ -23,7 +23,7 @@ def learnt_problem(name: str, description: str) -> Problem:
     """Return the generation problem of a prior that comes with the package.
 
     Beside the prior's weights lie those of the evaluator, ``<name>-evaluator``, and the features
-    of held-out real 2D motion, ``<name>-features.npz``; the motion itself does not.
+    of real 2D motion, held out and learnt from, ``<name>-features.npz``; the motion itself is not.
 
     Raises
     ------
@@ -33,9 +33,13 @@ def learnt_problem(name: str, description: str) -> Problem:
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
     with np.load(weights / f"{name}-features.npz") as kept:
-        features = kept["features"].astype(np.float64)
-        elevation, distance = float(kept["elevation"]), float(kept["distance"])
-    reference = GenerationReference(evaluator, features, elevation, distance)
+        reference = GenerationReference(
+            evaluator,
+            kept["held_out"].astype(np.float64),
+            kept["learnt"].astype(np.float64),
+            float(kept["elevation"]),
+            float(kept["distance"]),
+        )
     posterior = MotionPosterior(MotionDiffusion.load(name))
     return Problem(name, description, posterior, generation=reference)
 

@@ -224,6 +224,38 @@ def test_a_constant_is_learnt_exactly(tmp_path):
         assert np.sqrt(((clean - keypoints) ** 2).mean()) < 0.03
 
 
+def test_people_who_stay_put_have_a_loss_of_unit_size_when_they_are_shifted():
+    # Metres: the path is in the data, and leads nowhere. Without the shift's part, it is 800.
+    keypoints = 0.3 * np.arange(8.0).reshape(4, 2)
+    keypoints = keypoints + 0.002 * np.random.default_rng(0).normal(size=(10, 4, 2))
+    keypoints -= keypoints[:, :1].mean(axis=0)
+    still = replace(track(), keypoints=keypoints)
+    trainee = made([still], augmentation=replace(NONE, shift=0.1))
+    loss = trainee.training_loss(Knows(np.zeros((10, 8))), np.random.default_rng(0), 2000, CPU)
+    assert loss.item() == pytest.approx(1, abs=0.1)
+    # A root that is at the origin is somewhere else in each window, and is learnt.
+    centred = made([track()], augmentation=replace(NONE, shift=0.1))
+    assert (centred.standards.deviation[0] > 0).all()
+
+
+def test_joints_that_no_track_shows_are_refused_and_held_out_ones_are_not():
+    confidence = np.ones((10, 4))
+    confidence[:, [1, 3]] = 0.1
+    blind = replace(track(), confidence=confidence)
+    with pytest.raises(
+        ValueError,
+        match=r"^tracks never shows left_hand, head with a confidence of 0\.3 or more, expected "
+        r"every joint to be seen somewhere; choose a skeleton without them$",
+    ):
+        made([blind], augmentation=NONE)
+    with pytest.raises(ValueError, match=r"^tracks never shows head with"):
+        made([blind])  # mirrored, the right hand is a left one
+    assert made([blind], threshold=0.1).batches.never_seen == ()
+    trainee = DiffusionTrainee([track()], [blind], SIZE)
+    with torch.no_grad():
+        assert math.isfinite(trainee.validation_loss(trainee.network.eval(), CPU))
+
+
 def test_bad_input_is_refused_in_a_sentence():
     point = Skeleton(["point", "other"], [-1, 0])
     with pytest.raises(ValueError, match="validation has another skeleton than tracks"):

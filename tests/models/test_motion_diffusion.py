@@ -387,3 +387,8 @@ def test_a_trained_network_approaches_the_exact_denoiser(gait, learnt, level, sh
     seen = pictures(gait, 500, 4)
     assert error(got) < 0.3 * error(seen.mean(axis=0))
     assert error(got) < share * error(per_frame_linear(seen, observed, deviation))
+
+
+def test_without_noise_a_motion_is_its_own_estimate(prior):
+    x = np.random.default_rng(0).standard_normal((2, 1, 5, prior.skeleton.n_joints, 2))
+    np.testing.assert_array_equal(prior.denoise(x, 1.0, Cameras.ring(1)), x)

@@ -182,6 +182,41 @@ def test_standards_are_mean_and_deviation_of_what_is_seen():
     assert standards.scale == pytest.approx(np.sqrt((moving**2).mean()))
 
 
+def test_standards_are_those_of_windows_that_are_moved():
+    given = track(frames=30)
+    given.keypoints[:, 3] = 0.7 + 0.002 * given.keypoints[:, 3]  # hardly moves
+    still = TrackBatches([given], 30, 0.3, NONE)
+    batches = TrackBatches([given], 30, 0.3, replace(NONE, shift=0.1))
+    standards = batches.standards
+    drawn = draw(batches, 4000).keypoints.astype(float)
+    # 4000 shifts: the deviation of a uniform number is known to 1 %.
+    np.testing.assert_allclose(drawn.std(axis=(0, 1)), standards.deviation, rtol=0.03)
+    np.testing.assert_allclose(drawn.mean(axis=(0, 1)), standards.mean, atol=0.005)
+    wanted = np.sqrt(still.standards.deviation**2 + 0.1**2 / 3)
+    np.testing.assert_allclose(standards.deviation, wanted, rtol=1e-12)
+    root = PERSON.roots[0]
+    np.testing.assert_allclose(standards.deviation[root], 0.1 / np.sqrt(3))
+    np.testing.assert_array_equal(still.standards.deviation[root], 0)
+
+
+def test_joints_that_no_track_shows_are_named():
+    given = track()
+    confidence = given.confidence.copy()
+    left, right = (PERSON.joint_names.index(f"{side}_ankle") for side in ("left", "right"))
+    confidence[:, [left, 1]] = 0.2
+    low = replace(given, confidence=confidence)
+    assert TrackBatches([low], 30, 0.3, NONE).never_seen == ("neck", "left_ankle")
+    assert TrackBatches([low], 30, 0.2, NONE).never_seen == ()
+    # In a mirror the right ankle is a left one.
+    assert TrackBatches([low], 30, 0.3, Augmentation()).never_seen == ("neck",)
+    # One track is enough.
+    assert TrackBatches([low, track(name="clip/1")], 30, 0.3, NONE).never_seen == ()
+    confidence = confidence.copy()
+    confidence[:, right] = 0.2
+    neither = TrackBatches([replace(given, confidence=confidence)], 30, 0.3, Augmentation())
+    assert neither.never_seen == ("neck", "left_ankle", "right_ankle")
+
+
 def test_a_joint_that_is_never_seen_has_standards():
     given = track()
     confidence = given.confidence.copy()
@@ -244,3 +279,15 @@ def test_bad_input_is_refused_in_a_sentence():
         Standards(np.zeros((2, 2)), np.ones((3, 2)))
     with pytest.raises(ValueError, match="deviation is -1 at its least, expected 0 or more"):
         Standards(np.zeros((2, 2)), np.array([[1.0, 1.0], [-1.0, 1.0]]))
+
+
+def test_no_window_is_drawn_in_which_nothing_is_seen():
+    """A pause in the middle: attention would have no frame to look at."""
+    paused = track(frames=60)
+    confidence = paused.confidence.copy()
+    confidence[10:50] = 0
+    paused = replace(paused, confidence=confidence)
+    never = replace(track(frames=30), confidence=np.zeros((30, paused.skeleton.n_joints)))
+    batches = TrackBatches([paused, never], 12, 0.3, Augmentation())
+    drawn = batches.draw(np.random.default_rng(0), 300)
+    assert drawn.valid.any(axis=1).all()

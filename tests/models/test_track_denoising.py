@@ -310,6 +310,22 @@ def test_a_joint_that_is_never_seen_is_made_up(
     assert np.sqrt(np.square(errors).mean()) < 0.5 * np.sqrt(np.square(spread).mean())
 
 
+@pytest.mark.parametrize(("scale", "offset"), [(183.0, 0.0), (183.0, 500.0), (1e3, 0.0), (1.0, 9)])
+def test_tracks_that_are_not_metres_about_the_root_are_refused(
+    prior: MotionDiffusion, came: list[KeypointTrack], scale: float, offset: float
+) -> None:
+    pixels = replace(came[0], keypoints=scale * came[0].keypoints + offset, name="film/0")
+    with pytest.raises(
+        ValueError,
+        match=r"^track film/0 spans .* root mean square, expected metres about the root, at most",
+    ):
+        denoise_track(pixels, prior, noise=NOISE)
+    # What is not believed does not count, and a body of twice the size is one.
+    unsure = np.where(np.arange(14) == 4, 0.1, came[0].confidence)
+    far = np.where((np.arange(14) == 4)[:, np.newaxis], 1e6, 2 * came[0].keypoints)
+    denoise_track(replace(came[0], keypoints=far, confidence=unsure), prior, noise=NOISE)
+
+
 def test_bad_input_is_one_sentence(prior: MotionDiffusion, came: list[KeypointTrack]) -> None:
     track = came[0]
     coco = Skeleton.preset("coco17")

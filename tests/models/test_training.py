@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from torch import nn
 
 from probmotion.models.checkpoints import CheckpointError, load_checkpoint
 from probmotion.models.training import Diverged, check_device, train
+from probmotion.models.training_runs import steps_taken
 from probmotion.models.training_settings import TrainingSettings
 
 CPU = torch.device("cpu")
@@ -247,6 +249,42 @@ def test_a_finished_run_does_nothing_more(tmp_path):
     assert second.history == first.history
 
 
+@pytest.mark.parametrize("steps", [15, 30, 40])
+@pytest.mark.parametrize("harm", ["missing", "cut", "rubbish"])
+def test_a_model_that_is_missing_or_damaged_is_written_anew_from_the_state(tmp_path, harm, steps):
+    train(Curve(), SETTINGS, tmp_path / "run", progress=False)
+    model = tmp_path / "run" / "model.safetensors"
+    before = model.read_bytes()
+    if harm == "missing":
+        model.unlink()
+    else:
+        model.write_bytes(before[:-50] if harm == "cut" else b"mine")
+    asked = replace(SETTINGS, steps=steps)
+    train(Curve(), asked, tmp_path / "run", progress=False)
+    if steps <= 30:
+        assert model.read_bytes() == before
+    else:
+        train(Curve(), asked, tmp_path / "whole", progress=False)
+        assert_same(tmp_path / "whole", tmp_path / "run")
+
+
+def test_a_run_that_is_refused_writes_no_model(tmp_path):
+    train(Curve(), SETTINGS, tmp_path, progress=False)
+    (tmp_path / "model.safetensors").unlink()
+    with pytest.raises(ValueError, match="holds a run with batch "):
+        train(Curve(), replace(SETTINGS, batch=9), tmp_path, progress=False)
+    assert not (tmp_path / "model.safetensors").exists()
+
+
+def test_steps_taken_are_those_of_the_state(tmp_path):
+    assert steps_taken(tmp_path, "curve") == 0
+    train(Curve(), SETTINGS, tmp_path, progress=False)
+    (tmp_path / "model.safetensors").unlink()
+    assert steps_taken(tmp_path, "curve") == 30
+    with pytest.raises(CheckpointError, match="holds a curve in training, expected a line in"):
+        steps_taken(tmp_path, "line")
+
+
 def test_other_settings_or_data_are_refused(tmp_path):
     train(Curve(), SETTINGS, tmp_path, progress=False)
     for changed in ({"batch": 9}, {"seed": 1}, {"learning_rate": 0.1}, {"clip": np.inf}):
@@ -281,8 +319,14 @@ def test_divergence_is_said_and_the_last_good_checkpoint_stays(tmp_path, what):
             return loss + torch.sqrt(0 * network[0].weight.sum())
 
     said = "the loss is nan" if what == "loss" else "the gradient is not finite"
-    with pytest.raises(Diverged, match=f"training diverged at step 15: {said}; the last good"):
+    with pytest.raises(
+        Diverged, match=f"training diverged at step 15: {said}; the last good"
+    ) as stopped:
         train(Explodes(), SETTINGS, tmp_path, progress=False)
+    # This folder would refuse another rate; one without a checkpoint would not.
+    assert str(stopped.value).endswith("; try a smaller learning_rate in another folder")
+    with pytest.raises(ValueError, match="holds a run with learning_rate "):
+        train(Curve(), replace(SETTINGS, learning_rate=1e-4), tmp_path, progress=False)
     train(Curve(), replace(SETTINGS, steps=10), tmp_path / "good", progress=False)
     assert_same(tmp_path / "good", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == [
@@ -291,7 +335,7 @@ def test_divergence_is_said_and_the_last_good_checkpoint_stays(tmp_path, what):
         "state.safetensors",
     ]
     early = replace(SETTINGS, checkpoint_every=100)
-    with pytest.raises(Diverged, match="there is no checkpoint yet; try a smaller learning_rate"):
+    with pytest.raises(Diverged, match=r"no checkpoint yet; try a smaller learning_rate$"):
         train(Explodes(), early, tmp_path / "early", progress=False)
 
 
@@ -356,3 +400,15 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path):
             train(Curve(), SETTINGS, tmp_path / "new", device="cuda")
         assert not (tmp_path / "new").exists()
     assert check_device("cpu") == CPU
+
+
+def test_a_validation_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path):
+    class Blind(Curve):
+        def validation_loss(self, network, device):
+            self.asked = getattr(self, "asked", 0) + 1
+            return math.nan if self.asked > 1 else super().validation_loss(network, device)
+
+    with pytest.raises(Diverged, match="diverged at step 20: the validation loss is nan; the last"):
+        train(Blind(), SETTINGS, tmp_path, progress=False)
+    train(Curve(), replace(SETTINGS, steps=10), tmp_path / "good", progress=False)
+    assert_same(tmp_path / "good", tmp_path)

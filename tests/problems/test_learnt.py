@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from probmotion import compare, models
+from probmotion import Cameras, Keypoints2D, MotionPosterior, compare, models
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.data.projections import centre_motion
-from probmotion.data.walks import walk_clips
+from probmotion.data.walks import made_walks, walk_clips
 from probmotion.metrics import measure
 from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
 from probmotion.problems import load_problem
@@ -123,3 +124,21 @@ def test_a_network_is_told_from_another_by_its_weights(problem):
     with_torch = next(other._network.parameters())
     with_torch.data[0, 0] += 1
     assert fingerprint(other) != before
+
+
+def test_evidence_of_a_motion_that_travels_is_refused(problem):
+    """The prior's pelvis is at the origin in every frame, because its pictures were centred so."""
+    prior = problem.posterior.prior
+    walk = make_walks_on(prior)
+    camera = Cameras.ring(1, elevation=0.2)
+    evidence = Keypoints2D.observe(centre_motion(walk), camera, noise=0.02, seed=0)
+    assert MotionPosterior(prior, evidence).likelihood is evidence
+    travelling = replace(walk, positions=walk.positions + np.linspace(0, 2, 40)[:, None, None])
+    wrong = Keypoints2D.observe(travelling.centred(), camera, noise=0.02, seed=0)
+    with pytest.raises(ValueError, match=r"likelihood has the pelvis up to \d+ standard"):
+        MotionPosterior(prior, wrong)
+
+
+def make_walks_on(prior):
+    """Return a made walk on the prior's joints, as long as its motions."""
+    return made_walks(1)[0].retarget(prior.skeleton).resample(prior.fps).window(0, prior.frames)

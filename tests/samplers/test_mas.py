@@ -422,3 +422,9 @@ def test_two_views_stand_120_degrees_apart():
     ring = Cameras.ring(5, elevation=0.3, perspective=True, distance=4.0)
     np.testing.assert_array_equal(five.rotation, ring.rotation)
     np.testing.assert_array_equal(five.focal, ring.focal)
+
+
+def test_level_views_are_warned_of(lively):
+    sampler = MultiViewAncestral(steps=2, elevation=0.0)
+    with pytest.warns(UserWarning, match="elevation is 0: .* that mas cannot resolve"):
+        sampler.sample(MotionPosterior(lively), draws=1, progress=False)

@@ -95,6 +95,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:elevation is 0")
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_mas_takes_a_network_with_every_option(prior, options):
     sampler = MultiViewAncestral(**FEW, **options)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Joints3D, MotionPosterior, UnsupportedPosterior
+from probmotion.problems import load_problem
 from probmotion.samplers import ScoreDistillation
 from probmotion.samplers.sds import _Adam, score_distillation_gradient
 from probmotion.samplers.views import Views
@@ -129,3 +130,22 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     ):
         with pytest.raises(ValueError, match=message):
             ScoreDistillation(**wrong)
+
+
+def test_the_reference_code_sees_a_radian_of_the_circle(monkeypatch):
+    sampler = ScoreDistillation.reference_code()
+    assert (sampler.iterations, sampler.weighting, sampler.arc) == (1000, "residual", 1.0)
+    seen = []
+    around = Cameras.around
+
+    def watched(azimuth, elevation, **options):
+        seen.extend(np.atleast_1d(azimuth))
+        return around(azimuth, elevation, **options)
+
+    monkeypatch.setattr(Cameras, "around", watched)
+    few = replace(sampler, iterations=200)
+    few.sample(load_problem("gait").posterior, draws=1, progress=False)
+    assert 0 <= min(seen) < 0.1
+    assert 0.9 < max(seen) < 1
+    with pytest.raises(ValueError, match=r"arc is 7.0, expected at most the circle, 2 pi"):
+        ScoreDistillation(arc=7.0)
