@@ -273,7 +273,7 @@ draw_skeletons(
 Image("guided_side.png")
 
 # %% [markdown]
-# The answers are near the truth also in the direction that the camera does not see. Look at the
+# Most answers are near the truth also in the direction that the camera does not see. Look at the
 # first line before you believe any: guidance is an approximation, and the denoiser one too, so that
 # a draw can be caught in something else. Without knowing the truth, it is told by missing what was
 # seen by far more than the detector errs, which is here 63 mm on average. The worst stands last.

@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from probmotion import seeds
+from probmotion.cameras import Cameras
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.data.learning import (
     LearningTracks,
@@ -323,7 +324,16 @@ class Predictions:
         return self.motions
 
 
-def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions]:
+class Flat:
+    """The negative control: a lifter to which everything is as far away as the root."""
+
+    def lift(self, views: np.ndarray) -> np.ndarray:
+        """Return pictures that stand in space, turned to the camera."""
+        camera = Cameras.ring(1, elevation=math.pi / 16)
+        return views @ camera.rotation[0, :2]
+
+
+def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
     """Return what lifts pictures, (n, L, J, 2) → (n, L, J, 3)."""
     flow_trainee = PoseFlowTrainee(
         study.tracks.train,
@@ -340,7 +350,7 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions]:
         LifterSettings.tiny() if study.quick else LifterSettings.small(),
     )
     lifter = PoseLifter.load(study.trained("lifter", trainee, settings))
-    found: dict[str, PoseLifter | Predictions] = {"lifter": lifter}
+    found: dict[str, PoseLifter | Predictions | Flat] = {"lifter": lifter, "lifter, flat": Flat()}
     if study.predictions is not None:
         read = read_predictions(study.predictions, PERSON, frames=study.frames, fps=FPS)
         found[study.predictions.stem] = Predictions(read)
