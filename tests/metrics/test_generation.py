@@ -179,7 +179,7 @@ def made(rng, n):
 @pytest.fixture
 def reference(rng):
     views = film_motions(made(rng, 200), rng, elevation=0.2, distance=9.0, root=2)
-    return GenerationReference(Plain(), Plain().features(views), 0.2, 9.0)
+    return GenerationReference(Plain(), Plain().features(views), elevation=0.2, distance=9.0)
 
 
 def test_real_motions_score_better_than_others(rng, reference):
@@ -238,3 +238,16 @@ def test_bad_input(rng):
     with pytest.raises(ValueError, match="repeats is 1, expected an integer of at least 2"):
         score_generation(np.negative, lambda g, n: np.zeros((9, 2)), np.zeros((9, 2)),
                          seed=0, repeats=1)  # fmt: skip
+
+
+def test_the_learnt_clips_are_another_reference():
+    rng = np.random.default_rng(0)
+    held_out, learnt = rng.normal(size=(2, 50, 3)) + np.array([[[0.0]], [[5.0]]])
+    both = GenerationReference(Plain(), held_out, learnt, elevation=0.1)
+    again = both.of_learnt()
+    np.testing.assert_array_equal(again.held_out_features, learnt)
+    assert again.elevation == 0.1
+    with pytest.raises(ValueError, match="learnt_features is missing"):
+        GenerationReference(Plain(), held_out).of_learnt()
+    with pytest.raises(ValueError, match=r"learnt_features has shape \(50, 2\), expected \(M, 3\)"):
+        GenerationReference(Plain(), held_out, learnt[:, :2])
