@@ -28,6 +28,7 @@ __all__ = [
     "load_checkpoint",
     "load_weights",
     "save_checkpoint",
+    "weights_digest",
 ]
 
 MODEL = "model.safetensors"
@@ -164,6 +165,15 @@ def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> Non
         raise CheckpointError(
             "the checkpoint holds weights of another network than its settings say"
         ) from error
+
+
+def weights_digest(network: nn.Module) -> str:
+    """Return what tells a network's weights from others', the same for half-precision copies."""
+    tensors = {
+        name: tensor.detach().cpu().half() if tensor.is_floating_point() else tensor.cpu()
+        for name, tensor in network.state_dict().items()
+    }
+    return _digest({}, tensors)
 
 
 def _find(source: str | Path, kind: str) -> Path:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from probmotion.models.training_settings import TrainingSettings
 from probmotion.sampling import progress_bar
 
 __all__ = [
+    "Anneals",
     "Diverged",
     "Trainee",
     "TrainingResult",
@@ -58,6 +59,14 @@ class Trainee(Protocol):
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
         """Return the loss on data that is not learnt from; the same call gives the same number."""
+
+
+@runtime_checkable
+class Anneals(Protocol):
+    """A trainee whose loss changes over a run."""
+
+    def anneal(self, step: int) -> None:
+        """Be at a step, counted from 1; called before its loss is asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +141,8 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     run = _start(trainee, settings, place)
     described = {"network": dict(trainee.settings), "training": asdict(settings)}
+    # As JSON gives them back.
+    described["training"]["halve_at"] = list(settings.halve_at)
     if math.isinf(settings.clip):
         described["training"]["clip"] = None
     if (folder / STATE).exists():
@@ -141,7 +152,7 @@ def train(
         progress_bar(settings.steps, f"train {trainee.kind}", progress) as bar,
     ):
         bar.update(min(run.step, settings.steps))
-        while run.step < settings.steps:
+        while run.step < settings.steps and not _waited_enough(run, settings):
             begun = time.perf_counter()
             loss = _take_step(run, trainee, settings, place, folder)
             run.seconds += time.perf_counter() - begun
@@ -151,9 +162,10 @@ def train(
                 bar.set_postfix(loss=f"{np.mean(run.recent[-100:]):.4f}", refresh=False)
             if run.step % settings.checkpoint_every == 0 or run.step == settings.steps:
                 _validate(run, trainee, place, folder)
-                keep_run(run, trainee.kind, described, folder)
+                best = settings.patience == 0 or _since_best(run) == 0
+                keep_run(run, trainee.kind, described, folder, model=best)
             if stop():
-                keep_run(run, trainee.kind, described, folder)
+                keep_run(run, trainee.kind, described, folder, model=settings.patience == 0)
                 raise KeyboardInterrupt(
                     f"stopped at step {run.step} of {settings.steps}, which is kept in {folder}; "
                     "the same command goes on from there"
@@ -164,8 +176,10 @@ def train(
 def _start(trainee: Trainee, settings: TrainingSettings, device: torch.device) -> Run:
     network = trainee.network.to(device)
     average = copy.deepcopy(network).requires_grad_(False)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    kinds = {"adamw": torch.optim.AdamW, "adamax": torch.optim.Adamax}
+    learnt = [weights for weights in network.parameters() if weights.requires_grad]
+    optimiser = kinds[settings.optimiser](
+        learnt, lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     return Run(network, average, optimiser)
 
@@ -183,6 +197,8 @@ def _take_step(
         _dropout_of(settings.seed, step, device),
         torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"),
     ):
+        if isinstance(trainee, Anneals):
+            trainee.anneal(step)
         rng = seeds.generator(settings.seed, "step", step)
         loss = trainee.training_loss(run.network, rng, settings.batch, device)
     loss.backward()
@@ -202,6 +218,16 @@ def _take_step(
             kept.copy_(new)
     run.step = step
     return value
+
+
+def _since_best(run: Run) -> int:
+    """Return how many checkpoints ago the validation loss was lowest."""
+    losses = [row["validation_loss"] for row in run.history]
+    return len(losses) - 1 - int(np.argmin(losses))
+
+
+def _waited_enough(run: Run, settings: TrainingSettings) -> bool:
+    return 0 < settings.patience <= len(run.history) and _since_best(run) >= settings.patience
 
 
 def _diverged(step: int, what: str, folder: Path) -> str:

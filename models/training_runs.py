@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from probmotion.models.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
+from probmotion.models.training_settings import TrainingSettings
 
 __all__ = ["LOSSES", "STATE", "Run", "keep_run", "resume_run", "steps_taken"]
 
@@ -41,10 +43,16 @@ class Run:
     recent: list[float] = field(default_factory=list)
 
 
-def keep_run(run: Run, kind: str, described: dict[str, Any], folder: Path) -> None:
-    """Write the model, its losses and, last, the state to go on from."""
+def keep_run(
+    run: Run, kind: str, described: dict[str, Any], folder: Path, *, model: bool = True
+) -> None:
+    """Write the model, its losses and, last, the state to go on from.
+
+    ``model`` false leaves the model that is there, if there is one.
+    """
     card = described | {"step": run.step, "seconds": run.seconds, "history": run.history}
-    save_checkpoint(folder / MODEL, Checkpoint(kind, card, run.average.state_dict()))
+    if model or not (folder / MODEL).exists():
+        save_checkpoint(folder / MODEL, Checkpoint(kind, card, run.average.state_dict()))
     with (
         written_whole(folder / LOSSES) as path,
         open(path, "w", newline="", encoding="utf-8") as file,
@@ -87,9 +95,11 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
         If the run has other settings or data; nothing is written then.
     """
     kept = load_checkpoint(folder / STATE, _state_of(kind))
+    # A run that was kept before there was a setting ran with what is now the usual one.
+    usual = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part in ("network", "training"):
         for name, wanted in described[part].items():
-            got = kept.settings[part].get(name)
+            got = kept.settings[part].get(name, usual[part].get(name))
             # Checkpoints may come more often and the end later: no step is changed by it.
             if got != wanted and name not in ("steps", "checkpoint_every"):
                 known = f"{name} {got}, expected {wanted}"

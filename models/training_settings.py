@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from probmotion.checks import check_count, check_positive
 
@@ -12,7 +13,7 @@ __all__ = ["TrainingSettings"]
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a network is trained: AdamW at a constant rate after a linear warm-up.
+    """How a network is trained: at a constant rate after a linear warm-up, halved where asked.
 
     Parameters
     ----------
@@ -21,11 +22,11 @@ class TrainingSettings:
     batch : int
         Sequences per step.
     learning_rate : float
-        Of AdamW.
+        Of the optimiser.
     warmup : int
         Steps over which the rate rises from 0.
     weight_decay : float
-        Of AdamW.
+        Of the optimiser.
     ema : float
         Decay of the moving average of the weights, which is what is kept and validated; 0: none.
     clip : float
@@ -34,6 +35,13 @@ class TrainingSettings:
         Steps between two checkpoints, each with a validation loss.
     seed : int
         Of weights, batches and noise.
+    optimiser : {"adamw", "adamax"}
+        Adam's kind.
+    halve_at : tuple of int
+        Steps after which the rate is halved.
+    patience : int
+        Checkpoints without a lower validation loss after which a run ends; the model is then that
+        of the lowest. 0: it takes all steps, and the model is the last.
 
     Raises
     ------
@@ -50,11 +58,18 @@ class TrainingSettings:
     clip: float = 1.0
     checkpoint_every: int = 500
     seed: int = 0
+    optimiser: Literal["adamw", "adamax"] = "adamw"
+    halve_at: tuple[int, ...] = ()
+    patience: int = 0
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every"):
             check_count(name, getattr(self, name))
-        for name in ("warmup", "seed"):
+        if self.optimiser not in ("adamw", "adamax"):
+            raise ValueError(f"optimiser is {self.optimiser!r}, expected adamw or adamax")
+        for step in self.halve_at:
+            check_count("halve_at", step)
+        for name in ("warmup", "seed", "patience"):
             check_count(name, getattr(self, name), least=0)
         check_positive("learning_rate", self.learning_rate)
         if not 0 <= self.ema < 1:
@@ -68,7 +83,8 @@ class TrainingSettings:
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step, which counts from 1."""
-        return self.learning_rate * min(1.0, step / max(1, self.warmup))
+        halved = 0.5 ** sum(step > mark for mark in self.halve_at)
+        return self.learning_rate * halved * min(1.0, step / max(1, self.warmup))
 
     def decay(self, step: int) -> float:
         """Return the moving average's decay after a step: smaller at first, so that it catches up.

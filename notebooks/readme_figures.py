@@ -28,7 +28,8 @@ ADVICE = {
     "ancestral3d": "there is a 3D denoiser",
     "mvpc": "there is a 2D denoiser only",
     "mas": "to compare with the published method; `mvpc` costs the same",
-    "sds": "one plausible motion is enough: it does not sample, and takes no evidence",
+    "dvae": "a network that reads the evidence comes with the prior; else it trains one first",
+    "sds": "one plausible motion is enough: it does not sample",
 }
 """When to take which sampler, from the surest down."""
 

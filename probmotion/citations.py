@@ -42,6 +42,12 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Phan, Pradhan, Jankowiak (2019). Composable effects for flexible and accelerated "
         "probabilistic programming in NumPyro. arXiv:1912.11554.",
     ),
+    "dvae": (
+        "Fiche, Leglaive, Alameda-Pineda, Séguier (2023). Motion-DVAE: unsupervised learning for "
+        "fast human motion denoising. MIG.",
+        "Sohn, Yan, Lee (2015). Learning structured output representation using deep conditional "
+        "generative models. NeurIPS.",
+    ),
     "ensemble": (
         "Goodman, Weare (2010). Ensemble samplers with affine invariance. CAMCoS 5.",
         "Foreman-Mackey, Hogg, Lang, Goodman (2013). emcee: the MCMC hammer. PASP 125.",

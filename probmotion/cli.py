@@ -103,8 +103,9 @@ class Compare:
     quality_against_cost.png."""
 
     prior: str | None = None
-    """Also draw from a prior of your own: the folder of a run of probmotion train diffusion. There
-    is no evidence, and nothing to measure draws by but what they cost; they are in --out."""
+    """Also draw from a prior of your own: the folder of a run of probmotion train diffusion or
+    dvae. There is no evidence, and nothing to measure draws by but what they cost; they are in
+    --out."""
 
     own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 
@@ -186,15 +187,25 @@ def problem_from(own: Clips) -> Problem:
 
 def problem_of_prior(source: str) -> Problem:
     """Return the problem to draw from a prior that a user trained, called as its folder."""
-    from probmotion.models.motion_diffusion import MotionDiffusion
+    from probmotion.models import motion_diffusion, motion_dvae
     from probmotion.posterior import MotionPosterior
     from probmotion.problems import Problem
+    from probmotion.summaries import kind_of_network
 
-    posterior = MotionPosterior(MotionDiffusion.load(source))
+    known: dict[str, Any] = {
+        motion_diffusion.KIND: motion_diffusion.MotionDiffusion,
+        motion_dvae.KIND: motion_dvae.MotionDVAE,
+    }
+    kind = kind_of_network(_file_called(Path(source)))
+    if kind not in known:
+        raise ValueError(
+            f"prior is {source}, which holds a {kind}, expected a {' or a '.join(known)}"
+        )
+    posterior = MotionPosterior(known[kind].load(source))
     path = Path(source).resolve()
     name = path.parent.name if path.name == "model.safetensors" else path.name
     name = name.removesuffix(".safetensors")
-    return Problem(name, "a prior that was trained on tracks of one's own: generation", posterior)
+    return Problem(name, "a prior that was trained on data of one's own: generation", posterior)
 
 
 @dataclass(frozen=True)

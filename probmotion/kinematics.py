@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import Any
+
 import numpy as np
+from array_api_compat import device, is_jax_array
 
 from probmotion.arrays import Array, array_namespace
 from probmotion.checks import check_finite, check_shape
@@ -33,8 +37,9 @@ def forward_kinematics(
         Each joint's rotation in its parent's frame.
     root_translations : Array, (…, L, R, 3)
         Positions of the roots in the order of ``skeleton.roots``, metres.
-    rest_offsets : Array, (J, 3)
-        Each joint's offset from its parent in the rest pose, metres. A root's is not used.
+    rest_offsets : Array, (…, J, 3)
+        Each joint's offset from its parent in the rest pose, metres. A root's is not used. Batch
+        axes broadcast: one body for all motions, or one for each.
 
     Returns
     -------
@@ -50,28 +55,51 @@ def forward_kinematics(
     """
     check_shape("rotations", rotations, ("…", "L", skeleton.n_joints, 3, 3))
     check_shape("root_translations", root_translations, ("…", "L", len(skeleton.roots), 3))
-    check_shape("rest_offsets", rest_offsets, (skeleton.n_joints, 3))
+    check_shape("rest_offsets", rest_offsets, ("…", skeleton.n_joints, 3))
     xp = array_namespace(rotations, root_translations, rest_offsets)
-    positions: dict[int, Array] = {}
-    turns: dict[int, Array] = {}
-    for joint in skeleton.topological_order:
-        parent = skeleton.parents[joint]
-        local = rotations[..., joint, :, :]
-        if parent < 0:
-            turns[joint] = local
-            positions[joint] = root_translations[..., skeleton.roots.index(joint), :]
-        else:
-            bone = xp.sum(turns[parent] * rest_offsets[joint, :], axis=-1)
-            turns[joint] = xp.matmul(turns[parent], local)
-            positions[joint] = positions[parent] + bone
-    joints = range(skeleton.n_joints)
+    levels = _levels(skeleton)
+    # Joints equally far from a root are one step: a body has many joints and few such steps.
+    turns = [_at(xp, rotations, levels[0], -3)]
+    positions = [root_translations]
+    for above, level in pairwise(levels):
+        parents = [above.index(skeleton.parents[joint]) for joint in level]
+        over = _at(xp, turns[-1], parents, -3)
+        offsets = _at(xp, rest_offsets, level, -2)[..., None, :, None, :]
+        positions.append(_at(xp, positions[-1], parents, -2) + xp.sum(over * offsets, axis=-1))
+        turns.append(_product(xp, over, _at(xp, rotations, level, -3)))
+    order = [joint for level in levels for joint in level]
+    back = [order.index(joint) for joint in range(skeleton.n_joints)]
     return (
-        xp.stack([positions[joint] for joint in joints], axis=-2),
-        xp.stack([turns[joint] for joint in joints], axis=-3),
+        _at(xp, xp.concat(positions, axis=-2), back, -2),
+        _at(xp, xp.concat(turns, axis=-3), back, -3),
     )
 
 
-def fit_rotations(skeleton: Skeleton, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _levels(skeleton: Skeleton) -> list[list[int]]:
+    """Return the joints by how many bones they are from a root; roots in their own order."""
+    depths = [len(skeleton.ancestors(joint)) for joint in range(skeleton.n_joints)]
+    return [
+        [joint for joint, depth in enumerate(depths) if depth == level]
+        for level in range(max(depths) + 1)
+    ]
+
+
+def _product(xp: Any, first: Array, second: Array) -> Array:
+    if is_jax_array(first):
+        # XLA cannot compile a batch of matrix products behind a choice of joints.
+        return xp.sum(first[..., None] * second[..., None, :, :], axis=-2)
+    return xp.matmul(first, second)
+
+
+def _at(xp: Any, values: Array, joints: list[int], axis: int) -> Array:
+    """Return the entries of some joints along an axis of joints."""
+    where = {} if is_jax_array(values) else {"device": device(values)}
+    return xp.take(values, xp.asarray(joints, **where), axis=axis)
+
+
+def fit_rotations(
+    skeleton: Skeleton, positions: np.ndarray, rest_offsets: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return joint rotations and a rest pose that reproduce positions as well as they can.
 
     With the roots' positions as translations, :func:`forward_kinematics` of the result gives the
@@ -90,14 +118,15 @@ def fit_rotations(skeleton: Skeleton, positions: np.ndarray) -> tuple[np.ndarray
         J joints.
     positions : ndarray, (L, J, 3)
         Metres.
+    rest_offsets : ndarray, (J, 3), optional
+        The rest pose that rotations are from; by default one is fitted, near the first frame.
 
     Returns
     -------
     rotations : ndarray, (L, J, 3, 3)
         Each joint's rotation in its parent's frame.
     rest_offsets : ndarray, (J, 3)
-        Each joint's offset from its parent in the rest pose, metres; 0 for roots. The rest pose is
-        near the first frame.
+        Each joint's offset from its parent in the rest pose, metres; of a fitted one 0 for roots.
 
     Raises
     ------
@@ -112,9 +141,13 @@ def fit_rotations(skeleton: Skeleton, positions: np.ndarray) -> tuple[np.ndarray
     children: dict[int, list[int]] = {}
     for joint, parent in skeleton.bones:
         children.setdefault(parent, []).append(joint)
-    offsets = np.zeros((skeleton.n_joints, 3))
-    for joint, below in children.items():
-        offsets[below] = _rest_offsets(positions[:, below] - positions[:, joint, None])
+    if rest_offsets is None:
+        offsets = np.zeros((skeleton.n_joints, 3))
+        for joint, below in children.items():
+            offsets[below] = _rest_offsets(positions[:, below] - positions[:, joint, None])
+    else:
+        check_shape("rest_offsets", rest_offsets, (skeleton.n_joints, 3))
+        offsets = np.asarray(rest_offsets, dtype=np.float64)
 
     frames = len(positions)
     turns = np.zeros((frames, skeleton.n_joints, 3, 3))

@@ -404,6 +404,7 @@ def _entry_noise(
     degrees_of_freedom: float | None,
     shape: tuple[int, ...],
 ) -> EntryNoise:
+    check_positive("noise", noise)
     shown = np.ones(shape) if confidence is None else np.asarray(confidence, dtype=np.float64)
     check_shape("confidence", shown, shape)
     return EntryNoise(float(noise), shown, degrees_of_freedom)

@@ -198,12 +198,12 @@ class KeypointTrack:
 
 
 def load_motion(path: str | Path, fps: float | None = None) -> Motion:
-    """Read one motion from a ``.bvh`` or ``.npz`` file.
+    """Read one motion from a ``.bvh``, ``.npz`` or ``.amc`` file.
 
     Parameters
     ----------
     path : str or Path
-        The file.
+        The file; an ``.amc`` has the ``.asf`` of its skeleton beside it.
     fps : float, optional
         Resample to this rate; the file's own rate is kept by default.
 

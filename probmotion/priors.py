@@ -6,7 +6,7 @@ other. Diffusion works in normalised units: a motion in metres divided by the pr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,12 +24,16 @@ __all__ = [
     "DenoiserCovariance3D",
     "Denoises2D",
     "Denoises3D",
+    "DenoisesCoordinates",
     "ExactPosterior",
     "HasCoordinateSpeeds",
     "HasExactPosterior",
+    "HasInferenceNetwork",
     "HasLogDensity",
     "HasSeeds",
+    "InferenceNetwork",
     "Marginalises",
+    "MotionInference",
     "MotionPrior",
     "NotConjugate",
     "Samplable",
@@ -172,6 +176,20 @@ class Denoises3D(Protocol):
 
 
 @runtime_checkable
+class DenoisesCoordinates(HasLogDensity, Protocol):
+    """The posterior mean of θ, given a noisy θ; and a log density in the same coordinates.
+
+    A prior with θ ~ N(0, I) has it exactly: √ᾱ θ_t.
+    """
+
+    def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
+        """Return E[θ | θ_t], θ_t = √ᾱ θ + √(1−ᾱ) ε: ``(…, dim) → (…, dim)``.
+
+        NumPy or torch arrays; ᾱ is in (0, 1].
+        """
+
+
+@runtime_checkable
 class DenoiserCovariance2D(Protocol):
     """Products with Cov[x₀ | x_t], which is the 2D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
 
@@ -199,6 +217,52 @@ class ExactPosterior(Protocol):
 
     def log_density(self, positions: Array) -> Array:
         """Return the normalised log density: ``(…, L, J, 3) → (…)``."""
+
+
+class MotionInference(Protocol):
+    """Networks that have read one recording, and may be fitted to it alone."""
+
+    def parameters(self) -> list[Any]:
+        """Return the torch parameters that may be fitted."""
+
+    def loss(self, rng: np.random.Generator, *, initial_entropy: bool, latent_weight: float) -> Any:
+        """Return minus the evidence lower bound, summed over windows, at one draw: a tensor."""
+
+    def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return draws (n, L, J, 3), metres, and their θ (n, dim) where they have one.
+
+        The i-th draw uses the i-th rows of what ``streams`` gives, and nothing else.
+        """
+
+    def predict(self, rng: np.random.Generator, *, average: bool) -> np.ndarray:
+        """Return the predicted motion (L, J, 3), metres; of q's means where not ``average``."""
+
+
+@runtime_checkable
+class InferenceNetwork(Protocol):
+    """Networks trained to infer motion from evidence, in one prior."""
+
+    def reads(self, likelihood: Likelihood | None) -> bool:
+        """Whether evidence of this kind can be read."""
+
+    def on(
+        self,
+        prior: Any,
+        likelihood: Any,
+        *,
+        degrees_of_freedom: float | None,
+        overlap: int,
+    ) -> MotionInference:
+        """Return the inference of one recording; ``prior`` may be of its length and body."""
+
+
+@runtime_checkable
+class HasInferenceNetwork(Protocol):
+    """A prior beside which an inference network was trained."""
+
+    @property
+    def inference_network(self) -> InferenceNetwork | None:
+        """The network, if there is one."""
 
 
 @runtime_checkable

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from types import UnionType
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
@@ -33,11 +34,13 @@ class Sampler(Protocol):
     """A frozen dataclass of settings that draws from a posterior.
 
     ``name`` is what tables call it; ``requires`` lists the protocols of
-    :mod:`probmotion.priors` that the posterior's prior must implement.
+    :mod:`probmotion.priors` that the posterior's prior must implement. Where one of two is enough
+    it holds their union, ``A | B``.
     """
 
     name: ClassVar[str]
-    requires: ClassVar[tuple[type, ...]]
+    # Of type | UnionType; Any, because a sampler that needs no union may say tuple[type, ...].
+    requires: ClassVar[tuple[Any, ...]]
 
     def sample(
         self,
@@ -98,8 +101,11 @@ class Interrupted(KeyboardInterrupt):
         self.draws = draws
 
 
-def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[type]:
-    """Return the protocols that ``sampler`` requires and the posterior's prior lacks."""
+def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[type | UnionType]:
+    """Return the protocols that ``sampler`` requires and the posterior's prior lacks.
+
+    A union is lacking where none of its protocols is there.
+    """
     return [needed for needed in sampler.requires if not isinstance(posterior.prior, needed)]
 
 
@@ -107,11 +113,12 @@ def require(sampler: Sampler, posterior: MotionPosterior) -> None:
     """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires."""
     lacking = missing(sampler, posterior)
     if lacking:
-        names = " and ".join(protocol.__name__ for protocol in lacking)
+        names = [[one.__name__ for one in get_args(needed) or (needed,)] for needed in lacking]
         raise UnsupportedPosterior(
             sampler.name,
-            f"needs a prior with {names}, which {type(posterior.prior).__name__} is not",
-            word=lacking[0].__name__,
+            f"needs a prior with {' and '.join(map(' or '.join, names))}, which "
+            f"{type(posterior.prior).__name__} is not",
+            word=names[0][0],
             others=suited(posterior),
         )
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from probmotion.draws import MotionDraws
 from probmotion.motion import KeypointTrack, Motion
 from probmotion.skeleton import Skeleton
+from probmotion.training_options import listed
 
-__all__ = ["Summary", "summarise"]
+__all__ = ["Summary", "kind_of_network", "summarise"]
 
 
 _MODEL = "model.safetensors"
@@ -97,6 +99,25 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
     return _of_motion(path, read_motion(path))
 
 
+def kind_of_network(path: Path) -> str:
+    """Return the kind of the trained network in a file, or in the folder of its training run.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no checkpoint.
+    FileNotFoundError
+        If there is no such file.
+    """
+    file = path / _MODEL if path.is_dir() else path
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"there is no network {file}, expected a file, the folder of a training run or the "
+            "name of one in the package"
+        )
+    return str(_header(file)["kind"])
+
+
 def _holds_keypoints(path: Path) -> bool:
     if path.suffix == ".npz":
         from zipfile import BadZipFile, ZipFile
@@ -153,36 +174,83 @@ def _of_draws(path: Path, draws: MotionDraws) -> Summary:
 
 
 def _of_checkpoint(path: Path) -> Summary:
-    from safetensors import SafetensorError, safe_open
-
-    from probmotion.formats import MotionFileError
-
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
+    header = _header(path)
+    try:
+        kind, card = header["kind"], header["settings"]
+        # A denoiser has the joints and the size of the prior that it was trained beside.
+        network = card["network"].get("prior", card["network"])
+        skeleton = Skeleton(network["joint_names"], network["parents"])
+        shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
+        text = [
+            f"{path}: a {kind} of {header['numbers']} numbers",
+            f"  {shape}",
+            _joints(skeleton),
+            *_learnt_from(kind, card["network"]),
+            _progress(card),
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise _no_checkpoint(path) from error
+    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint's file says of itself, with the number of its ``numbers``."""
+    from safetensors import SafetensorError, safe_open
+
     try:
         with safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {})["probmotion"])
             sizes = [np.prod(file.get_slice(name).get_shape()) for name in file.keys()]  # noqa: SIM118
-        card = header["settings"]
-        network, training = card["network"], card["training"]
-        last = card["history"][-1] if card["history"] else {}
-        skeleton = Skeleton(network["joint_names"], network["parents"])
+        return {"kind": header["kind"], **header, "numbers": sum(map(int, sizes))}
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise MotionFileError(
-            f"{path} is damaged or of another program, expected a checkpoint of this one"
-        ) from error
-    shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
-    losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
+        raise _no_checkpoint(path) from error
+
+
+def _no_checkpoint(path: Path) -> ValueError:
+    from probmotion.formats import MotionFileError
+
+    return MotionFileError(
+        f"{path} is damaged or of another program, expected a checkpoint of this one"
+    )
+
+
+def _learnt_from(kind: str, network: dict[str, Any]) -> list[str]:
+    """Return what a network learnt from, in lines."""
+    if kind == "motion-dvae":
+        data = network["data"]
+        learnt_from = f"  learnt from {data['frames']} frames of {_clips(data['clips'])}"
+        return [_windows(network), learnt_from]
+    if kind == "motion-denoiser":
+        noise = network["noise"]
+        return [
+            _windows(network["prior"]),
+            f"  learnt from noisy joints of {_clips(network['clips'])}",
+            f"  noise of {noise['least']:g} to {noise['most']:g} m, outliers in "
+            f"{noise['outliers']:.0%} of windows, hidden joints in {noise['hidden']:.0%}",
+        ]
     data = network["data"]
-    text = [
-        f"{path}: a {header['kind']} of {sum(map(int, sizes))} numbers",
-        f"  {shape}",
-        _joints(skeleton),
-        f"  learnt from {data['tracks']} tracks of {', '.join(data['clips'])}",
+    return [f"  learnt from {data['tracks']} tracks of {', '.join(data['clips'])}"]
+
+
+def _windows(network: dict[str, Any]) -> str:
+    frames, fps = network["size"]["frames"], network["fps"]
+    return f"  windows of {frames} frames at {fps:g} fps, {(frames - 1) / fps:.2f} s"
+
+
+def _clips(names: list[str]) -> str:
+    return f"{len(names)} clips: {listed(names)}"
+
+
+def _progress(card: dict[str, Any]) -> str:
+    """Return how long a network was trained, and its last losses."""
+    last, training = card["history"][-1] if card["history"] else {}, card["training"]
+    losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
+    return (
         f"  step {card['step']} of {training['steps']}, batches of {training['batch']}, "
-        f"{card['seconds']:.0f} s{losses}",
-    ]
-    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+        f"{card['seconds']:.0f} s{losses}"
+    )
 
 
 def _length(frames: int, fps: float) -> str:

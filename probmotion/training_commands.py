@@ -1,19 +1,27 @@
-"""The command ``probmotion train diffusion | evaluator | lifter``.
+"""The command ``probmotion train``: what can be trained, and what learns from 2D tracks.
 
-Each is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
+Each kind is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
+from probmotion.body_training_commands import TrainDenoiser, TrainDVAE
+from probmotion.training_options import (
+    Steps,
+    check_enough_clips,
+    check_out,
+    listed,
+    run_training,
+)
+
 if TYPE_CHECKING:
     from probmotion.data.learning import LearningTracks
-    from probmotion.models.training_settings import TrainingSettings
 
 __all__ = ["TRAINABLE", "TrainDiffusion", "TrainEvaluator", "TrainLifter"]
 
@@ -65,41 +73,6 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """How long and how fast to learn; by default as the size was tried."""
-
-    steps: int | None = None
-    """Gradient steps."""
-
-    batch: int | None = None
-    """Sequences per step."""
-
-    learning_rate: float | None = None
-    """Of AdamW, after a linear warm-up."""
-
-    checkpoint_every: int = 500
-    """Steps between two checkpoints, each with a validation loss."""
-
-    seed: int = 0
-    """Of the first weights, batches and noise."""
-
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute; mixed precision on cuda."""
-
-    def settings(self, usual: TrainingSettings) -> TrainingSettings:
-        """Return the usual settings of a size with what was asked for in their place."""
-        from probmotion.models.training import check_device
-
-        check_device(self.device)  # here, because preparing data takes minutes
-        asked = {
-            name: value
-            for name, value in asdict(self).items()
-            if value is not None and name != "device"
-        }
-        return replace(usual, **asked)
-
-
-@dataclass(frozen=True)
 class TrainDiffusion:
     """Learn a 2D motion diffusion model, a prior that mas, mvpc and sds draw 3D motion from.
 
@@ -143,7 +116,7 @@ class TrainDiffusion:
             augmentation=Augmentation(shift=shift),
             seed=self.training.seed,
         )
-        _train(trainee, settings, self.out, self.training.device)
+        run_training(trainee, settings, self.out, self.training.device)
 
 
 @dataclass(frozen=True)
@@ -192,7 +165,7 @@ class TrainEvaluator:
             threshold=self.threshold,
             seed=self.training.seed,
         )
-        _train(trainee, settings, self.out, self.training.device)
+        run_training(trainee, settings, self.out, self.training.device)
 
 
 @dataclass(frozen=True)
@@ -237,7 +210,7 @@ class TrainLifter:
                 threshold=self.threshold,
                 seed=settings.seed,
             )
-            _train(flow, settings, self.out / "flow", device)
+            run_training(flow, settings, self.out / "flow", device)
         lifter = LifterTrainee(
             found.train,
             found.validation,
@@ -246,7 +219,7 @@ class TrainLifter:
             threshold=self.threshold,
             seed=settings.seed,
         )
-        _train(lifter, settings, self.out / "lifter", device)
+        run_training(lifter, settings, self.out / "lifter", device)
 
 
 def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
@@ -290,25 +263,15 @@ def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
         )
     print(prepared)
     if not (data.validation or data.test):
-        _check_clips({clip_of(track.name) for track in prepared.tracks})
+        check_enough_clips(clip_of(track.name) for track in prepared.tracks)
     found = split_tracks(
         prepared.tracks, validation=data.validation, test=data.test, seed=data.data_seed
     )
     for part in ("train", "validation", "test"):
         names = getattr(found.split, part)
-        listed = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
-        print(f"{part}: {len(getattr(found, part))} tracks of {len(names)} clips: {listed}")
+        count = len(getattr(found, part))
+        print(f"{part}: {count} tracks of {len(names)} clips: {listed(names)}")
     return found
-
-
-def _check_clips(clips: set[str]) -> None:
-    # Fewer have no tenth: half a clip is rounded to none.
-    if len(clips) < 6:
-        listed = ", ".join(sorted(clips))
-        raise ValueError(
-            f"the number of clips is {len(clips)} ({listed}), too few to keep out a tenth twice, "
-            "expected at least 6, or --validation NAME and --test NAME to say which are kept out"
-        )
 
 
 def _check_options(out: Path, threshold: float) -> None:
@@ -316,34 +279,14 @@ def _check_options(out: Path, threshold: float) -> None:
     from probmotion.checks import check_positive
 
     check_positive("threshold", threshold)
-    standing = next((place for place in (out, *out.parents) if place.exists()), out)
-    if standing.is_file():
-        where = "" if standing == out else f" below {standing}"
-        raise ValueError(f"out is {out},{where} which is a file, expected a folder")
-
-
-def _train(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
-    from probmotion.models.checkpoints import MODEL, load_checkpoint
-    from probmotion.models.training import train
-    from probmotion.models.training_runs import steps_taken
-
-    before = steps_taken(out, trainee.kind)
-    if not before and (out / MODEL).exists():
-        load_checkpoint(out / MODEL, trainee.kind)  # another network's is not written over
-    result = train(trainee, settings, out, device=device)
-    if before >= settings.steps:
-        print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}")
-        return
-    last = result.history[-1]
-    print(
-        f"wrote {result.model}: step {last['step']:.0f}, loss {last['loss']:.4f}, validation loss "
-        f"{last['validation_loss']:.4f}, {last['seconds']:.0f} s of steps"
-    )
+    check_out(out)
 
 
 TRAINABLE: dict[str, type[Any]] = {
     "diffusion": TrainDiffusion,
     "evaluator": TrainEvaluator,
     "lifter": TrainLifter,
+    "dvae": TrainDVAE,
+    "denoiser": TrainDenoiser,
 }
 """What can be trained, by name."""

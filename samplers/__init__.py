@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from probmotion.samplers.ancestral3d import Ancestral3D
+    from probmotion.samplers.dvae import DVAEInference
     from probmotion.samplers.ensemble import Ensemble
     from probmotion.samplers.exact import ExactSampler
     from probmotion.samplers.mas import MultiViewAncestral
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "NUTS": "nuts",
     "Ancestral3D": "ancestral3d",
+    "DVAEInference": "dvae",
     "Ensemble": "ensemble",
     "ExactSampler": "exact",
     "MetropolisHastings": "metropolis",
@@ -29,6 +31,7 @@ _HOMES = {
 __all__ = [
     "NUTS",
     "Ancestral3D",
+    "DVAEInference",
     "Ensemble",
     "ExactSampler",
     "MetropolisHastings",

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from probmotion.arrays import to_numpy
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.sampling import Interrupted, Sampler, batches, progress_bar
 from probmotion.seeds import NormalStreams
 
-__all__ = ["DrawBatch", "draw_independently", "refuse_initial"]
+__all__ = ["DrawBatch", "draw_independently", "refuse_initial", "with_coordinates"]
 
 DrawBatch = Callable[[NormalStreams, Callable[[], Any]], np.ndarray]
 """(streams, tick) → motions (B, L, J, 3) in normalised units; calls ``tick()`` once per step."""
@@ -94,6 +96,34 @@ def draw_independently(
             raise
         raise Interrupted(result()) from interrupt
     return result()
+
+
+def with_coordinates(
+    found: MotionDraws, posterior: MotionPosterior, batches_of_theta: Sequence[np.ndarray]
+) -> MotionDraws:
+    """Return draws with their θ and log density.
+
+    Parameters
+    ----------
+    found : MotionDraws
+        What :func:`draw_independently` gave.
+    posterior : MotionPosterior
+        Whose density.
+    batches_of_theta : sequence of ndarray, (B, dim)
+        θ of every batch, as ``draw_batch`` was called.
+    """
+    sizes = found.dataset.sizes
+    # Draw by draw, as the batches were made.
+    shape = (sizes["draw"], sizes["chain"])
+    theta = np.concatenate(batches_of_theta)[: math.prod(shape)]
+    theta = theta.reshape(*shape, -1).swapaxes(0, 1)
+    log_density = to_numpy(posterior.log_density(theta))
+    return MotionDraws(
+        found.dataset.assign(
+            theta=(("chain", "draw", "coordinate"), theta),
+            log_density=(("chain", "draw"), log_density),
+        )
+    )
 
 
 def refuse_initial(sampler: Sampler, initial: object) -> None:

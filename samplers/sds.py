@@ -2,7 +2,8 @@
 
 The motion is optimised directly: see it from a random view, add noise, ask the 2D denoiser what
 the noise was, and descend w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
-It seeks modes rather than drawing from the prior.
+It seeks modes rather than drawing from the prior. A prior that denoises its own coordinates is
+optimised in those, with evidence or without (:mod:`~probmotion.samplers.coordinate_distillation`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from probmotion.checks import check_count, check_positive
 from probmotion.diffusion import NoiseSchedule
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
-from probmotion.priors import Denoises2D
+from probmotion.priors import Denoises2D, DenoisesCoordinates
+from probmotion.samplers.adam import Adam
+from probmotion.samplers.coordinate_distillation import distil_coordinates
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.views import Views
 from probmotion.sampling import UnsupportedPosterior, require
@@ -34,10 +37,14 @@ Weighting = Literal["constant", "variance", "residual"]
 
 @dataclass(frozen=True)
 class ScoreDistillation:
-    """Score distillation sampling with a 2D denoiser.
+    """Score distillation sampling with a 2D denoiser, or one of the prior's own coordinates.
 
     Every draw has its own start and its own noise. The level t and the views of an iteration are
-    those of all draws of a run, because a denoiser takes one level at a time.
+    those of all draws of a run, because a denoiser takes one level at a time. It seeks modes: draws
+    of a posterior huddle at its modes, and their spread is far too small (over-confident).
+
+    In coordinates there are no views: ``n_views``, ``elevation``, ``azimuths``, ``arc`` and
+    ``shared_noise`` are of a 2D denoiser only.
 
     Parameters
     ----------
@@ -60,7 +67,7 @@ class ScoreDistillation:
         w(t): 1; 1 − ᾱ_t (DreamFusion); √(1−ᾱ_t)/√ᾱ_t, with which the gradient is the residual
         p(X) − x̂₀, that of MAS's loss (appendix B).
     learning_rate : float
-        Of Adam, normalised units.
+        Of Adam, normalised units; in coordinates, units of θ.
     steps : int
         T of the cosine schedule.
     schedule_power : int
@@ -75,7 +82,7 @@ class ScoreDistillation:
     """
 
     name: ClassVar[str] = "sds"
-    requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    requires: ClassVar[tuple[Any, ...]] = (Denoises2D | DenoisesCoordinates,)
 
     iterations: int = 10_000
     n_views: int = 1
@@ -134,10 +141,16 @@ class ScoreDistillation:
         Raises
         ------
         UnsupportedPosterior
-            If the prior has no 2D denoiser, or there is evidence.
+            If the prior has neither denoiser; if there is evidence, and the prior's denoiser is of
+            2D views, or the log likelihood has no gradient by torch.
         """
         require(self, posterior)
         refuse_initial(self, initial)
+        prior = posterior.prior
+        if not isinstance(prior, Denoises2D):
+            return distil_coordinates(
+                self, posterior, draws=draws, chains=chains, seed=seed, progress=progress
+            )
         if posterior.likelihood is not None:
             raise UnsupportedPosterior(
                 self.name,
@@ -145,8 +158,6 @@ class ScoreDistillation:
                 word="evidence",
                 others=("mas", "mvpc"),
             )
-        prior = posterior.prior
-        assert isinstance(prior, Denoises2D)
         counts = {"denoiser": 0}
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
 
@@ -197,7 +208,7 @@ class ScoreDistillation:
     ) -> np.ndarray:
         schedule = self.schedule
         motions = streams.normal(*shape)
-        adam = _Adam(motions, self.learning_rate)
+        adam = Adam(motions, self.learning_rate)
         for t, numbers in zip(*self.plan(seed), strict=True):
             azimuth = self.arc * numbers / self.azimuths
             views = Views(Cameras.around(azimuth, np.full(self.n_views, self.elevation)))
@@ -234,27 +245,3 @@ def score_distillation_gradient(
     noisy = signal * views.project(motions) + spread * noise
     clean = prior.denoise(noisy, alpha_bar, views.cameras)
     return views.scatter((noisy - signal * clean) / spread - noise)
-
-
-class _Adam:
-    """Adam (Kingma and Ba 2015, algorithm 1), which changes the parameters in place."""
-
-    def __init__(self, parameters: np.ndarray, learning_rate: float) -> None:
-        self.parameters = parameters
-        self.learning_rate = learning_rate
-        self.mean = np.zeros_like(parameters)
-        self.square = np.zeros_like(parameters)
-        self.n_steps = 0
-
-    def descend(self, gradient: np.ndarray) -> None:
-        """Take one step."""
-        self.n_steps += 1
-        self.mean *= 0.9
-        self.mean += 0.1 * gradient
-        self.square *= 0.999
-        self.square += 0.001 * gradient**2
-        # Both means start at 0, which the two divisors make good.
-        size = np.sqrt(self.square / (1 - 0.999**self.n_steps))
-        size += 1e-8
-        step = self.learning_rate / (1 - 0.9**self.n_steps)
-        self.parameters -= step * self.mean / size

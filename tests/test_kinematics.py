@@ -101,7 +101,7 @@ def test_wrong_shapes_are_refused() -> None:
         forward_kinematics(TANGLED, rotations[:, :5], translations, offsets)
     with pytest.raises(ValueError, match=r"root_translations has shape .*expected \(…, L, 2, 3\)"):
         forward_kinematics(TANGLED, rotations, translations[:, :1], offsets)
-    with pytest.raises(ValueError, match=r"rest_offsets has shape .*expected \(6, 3\)"):
+    with pytest.raises(ValueError, match=r"rest_offsets has shape .*expected \(…, 6, 3\)"):
         forward_kinematics(TANGLED, rotations, translations, offsets[:5])
     with pytest.raises(ValueError, match=r"positions has shape .*expected \(L, 6, 3\)"):
         fit_rotations(TANGLED, np.zeros((2, 5, 3)))

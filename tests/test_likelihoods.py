@@ -243,9 +243,10 @@ def test_bad_evidence_is_refused_in_one_sentence() -> None:
         Joints3D(blank[0], 0.1)
     with pytest.raises(ValueError, match=r"confidence has shape \(4, 3\), expected \(2, 4, 3\)"):
         Keypoints2D(blank, cameras, 0.1, np.ones(SHAPE))
-    for noise in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match=r"noise is .*expected a finite number above 0"):
-            joints(noise=noise)
+    for noise in (0.0, -1.0, np.nan, np.inf, None, "0.1", np.ones(3)):
+        for make in (joints, keypoints):
+            with pytest.raises(ValueError, match=r"noise is .*expected a finite number above 0"):
+                make(noise=noise)
     for freedom in (0.0, -2.0, np.nan, np.inf):
         with pytest.raises(
             ValueError, match=r"degrees_of_freedom is .*expected a finite number ab"

@@ -105,3 +105,24 @@ def test_motion_from_2d(tmp_path, monkeypatch):
     assert caught.sum() <= 3
     wrong = np.array(numbers("misses the truth by, mm: "))
     assert wrong[~caught].max() < 0.5 * numbers("without evidence: ")[0]
+
+
+@pytest.mark.filterwarnings("default")
+def test_denoising(tmp_path, monkeypatch):
+    monkeypatch.delenv("PROBMOTION_DATA", raising=False)
+    printed = run("04_denoising.py", tmp_path, 1, monkeypatch)
+    assert "walk-0: 75 frames at 30 fps, 14 joints" in printed
+    numbers = r"\s+([\d.]+)" * 4
+    rows = {
+        name: [float(number) for number in re.search(re.escape(name) + numbers, printed).groups()]
+        for name in (
+            "Savitzky-Golay filter",
+            "Kalman smoother",
+            "Motion-DVAE, regression",
+            "Motion-DVAE, optimization",
+        )
+    }
+    for name in ("Savitzky-Golay filter", "Kalman smoother"):
+        assert rows["Motion-DVAE, optimization"][2] < rows[name][2]  # hidden joints
+    assert rows["Motion-DVAE, optimization"][0] < rows["Motion-DVAE, regression"][0]
+    assert "denoised.html" in {path.name for path in tmp_path.iterdir()}

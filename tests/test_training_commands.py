@@ -29,6 +29,7 @@ from probmotion.models.pose_flow import PoseFlow
 PERSON = Skeleton.preset("person14")
 PROGRAM = [sys.executable, "-c", "import sys; from probmotion.cli import main; sys.exit(main())"]
 ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+KINDS = ("diffusion", "evaluator", "lifter", "dvae", "denoiser")
 # Of three clips, one is watched and one kept.
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
@@ -319,8 +320,8 @@ def test_wrong_words_are_one_sentence(
     filmed_or_not = ["train", "diffusion", "--size", "tiny", "--out", str(out)]
     made = [*filmed_or_not, "--views", "1"]
     cases = {
-        ("train",): "what to train is missing, expected one of diffusion, evaluator, lifter",
-        ("train", "vae"): "what to train is 'vae', expected one of diffusion, evaluator, lifter",
+        ("train",): f"what to train is missing, expected one of {', '.join(KINDS)}",
+        ("train", "vae"): f"what to train is 'vae', expected one of {', '.join(KINDS)}",
         (*made, "--clips", walks, "--tracks", "a.json"): "clips and tracks are both given, "
         "expected one of them",
         (*made, "--clips", str(tmp_path / "no.bvh")): f"{tmp_path / 'no.bvh'}: No such file or "
@@ -423,7 +424,7 @@ def test_help_lists_the_kinds_and_every_option(capsys: pytest.CaptureFixture[str
             main(["train", word])
         assert end.value.code == 0
         said = capsys.readouterr().out
-        for kind in ("diffusion", "evaluator", "lifter"):
+        for kind in KINDS:
             assert f"\n  {kind} " in said
     for kind, own in (("diffusion", "--frames"), ("evaluator", "--frames"), ("lifter", "--size")):
         with pytest.raises(SystemExit) as end:

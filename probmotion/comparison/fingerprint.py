@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import PurePath
 from typing import Any
 
@@ -67,7 +67,9 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
             if field.init:
                 parts += [field.name, getattr(value, field.name)]
     elif getattr(value, "__dict__", None):
-        parts.append(vars(value))
+        held = vars(value).items()
+        # What was computed from the rest, once asked for, says nothing new.
+        parts.append({name: part for name, part in held if not _computed(kind, name)})
     elif not _plain(kind):
         raise ValueError(
             f"value holds a {kind.__name__}, which cannot be told from another, expected numbers, "
@@ -76,6 +78,10 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     for part in parts:
         _add(digest, part, (*above, id(value)))
     digest.update(b"</>")
+
+
+def _computed(kind: type, name: str) -> bool:
+    return isinstance(getattr(kind, name, None), cached_property)
 
 
 def _plain(kind: type) -> bool:

@@ -10,7 +10,10 @@ from probmotion.sampling import Sampler, load_sampler, sampler_names
 
 __all__ = ["QUICK", "quick_samplers"]
 
-QUICK: Mapping[str, Mapping[str, Any]] = {"sds": {"iterations": 2000}}
+QUICK: Mapping[str, Mapping[str, Any]] = {
+    "sds": {"iterations": 2000},
+    "dvae": {"training_steps": 600, "training_pairs": 8000},
+}
 """By sampler: the settings that differ from its own defaults."""
 
 

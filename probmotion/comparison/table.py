@@ -39,6 +39,18 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         },
     ),
     (
+        "in the world, mm",
+        {
+            "seconds": "seconds",
+            "g_mpjpe_visible_mm": "visible",
+            "g_mpjpe_hidden_mm": "hidden",
+            "g_mpjpe_mean_mm": "of mean",
+            "g_mpjpe_mean_visible_mm": "its visible",
+            "g_mpjpe_mean_hidden_mm": "its hidden",
+            "acceleration_ratio": "acceleration",
+        },
+    ),
+    (
         "held-out poses",
         {
             "seconds": "seconds",
@@ -84,6 +96,9 @@ exact (1; below: over-confident); mean: error of the mean / √tr (0); off: vari
 manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
 styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
 The frame and table.csv hold more measures."""
+_WORLD_LEGEND = """\
+in the world: G-MPJPE, without alignment, of the draws and of their mean; acceleration: mean size of
+a joint's acceleration over the truth's (0.5 to 2 is plausible)."""
 _COVERAGE_LEGEND = """\
 D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
 joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
@@ -122,6 +137,8 @@ class ComparisonTable(pd.DataFrame):
         parts = [self._problem(problem) for problem in problems]
         if any(self["metric"] == "swd"):
             parts.append(_LEGEND)
+        if any(self["metric"] == "g_mpjpe_mean_mm"):
+            parts.append(_WORLD_LEGEND)
         if any(self["metric"] == "coverage_cartesian"):
             parts.append(_COVERAGE_LEGEND)
         if any(self["metric"] == "fid"):

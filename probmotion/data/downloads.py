@@ -25,6 +25,7 @@ __all__ = [
     "SALSA_TRIALS",
     "DownloadError",
     "data_folder",
+    "data_places",
     "download",
     "salsa_pairs",
 ]
@@ -83,6 +84,23 @@ def data_folder() -> Path:
     return Path(os.environ.get(_FOLDER_VARIABLE) or pooch.os_cache("probmotion"))
 
 
+def data_places(folder: str | Path | None = None) -> list[Path]:
+    """Return where clips of known names are looked for, the first place first.
+
+    Parameters
+    ----------
+    folder : str or Path, optional
+        Looked at and nothing else, if given. By default: the folder that the environment variable
+        ``PROBMOTION_DATA`` names; ``../shared/data`` beside the current directory; the cache of
+        :func:`download`.
+    """
+    if folder is not None:
+        return [Path(folder)]
+    named = os.environ.get(_FOLDER_VARIABLE)
+    places = [*([Path(named)] if named else []), Path("../shared/data"), data_folder()]
+    return list(dict.fromkeys(places))
+
+
 def download(
     dataset: str = "cmu-salsa",
     names: Sequence[str] | None = None,
@@ -131,11 +149,9 @@ def download(
 def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     """Return CMU's ten salsa clips of two people, from where they are found first.
 
-    Looked at, in this order: ``folder`` and nothing else, if given; the folder that the
-    environment variable ``PROBMOTION_DATA`` names; ``../shared/data`` beside the current
-    directory; the cache of :func:`download`. A folder holds the clips
-    if all ten are there, as archives (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or as
-    pairs of BVH files (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``).
+    Looked at are the folders of :func:`data_places`. One holds the clips if all ten are there, as
+    archives (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or as pairs of BVH files
+    (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``).
 
     Parameters
     ----------
@@ -152,13 +168,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     FileNotFoundError
         If they are nowhere; the message says how to get them. Nothing is fetched.
     """
-    if folder is not None:
-        places = [Path(folder)]
-    else:
-        places = [Path("../shared/data")]
-        if os.environ.get(_FOLDER_VARIABLE):
-            places.insert(0, Path(os.environ[_FOLDER_VARIABLE]))
-        places.append(data_folder())
+    places = data_places(folder)
     for place in places:
         for archives in (place / "cmu_salsa_pairs", place):
             paths = [archives / f"cmu_60_61_{trial}.npz" for trial in SALSA_TRIALS]
@@ -171,10 +181,10 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
             ]
             if all(path.is_file() for couple in couples for path in couple):
                 return [read_salsa_bvh(lead, follow) for lead, follow in couples]
-    looked = ", ".join(dict.fromkeys(str(place) for place in places))
     raise FileNotFoundError(
-        f"the ten salsa clips are not in {looked}; probmotion.data.downloads.download"
-        '("cmu-salsa") fetches them, or give the folder that holds them'
+        f"the ten salsa clips are not in {', '.join(map(str, places))}; "
+        'probmotion.data.downloads.download("cmu-salsa") fetches them, or give the folder that '
+        "holds them"
     )
 
 

@@ -1,9 +1,12 @@
-"""Reading and writing motion files: BVH, npz, keypoint JSON, DeepLabCut tables, predictions."""
+"""Reading and writing motion files: BVH, AMC, npz, keypoint JSON, DeepLabCut, predictions."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+from probmotion.formats.amc import read_amc
+from probmotion.formats.asf import read_asf
 from probmotion.formats.bvh import read_bvh
 from probmotion.formats.bvh_writing import write_bvh
 from probmotion.formats.deeplabcut import read_deeplabcut
@@ -17,6 +20,8 @@ from probmotion.skeleton import Skeleton
 __all__ = [
     "MotionFileError",
     "MotionFileWarning",
+    "read_amc",
+    "read_asf",
     "read_bvh",
     "read_keypoints",
     "read_motion",
@@ -27,7 +32,7 @@ __all__ = [
 
 
 def read_motion(path: str | Path) -> Motion:
-    """Read a motion; the file's ending chooses the format: ``.bvh`` or ``.npz``.
+    """Read a motion; the file's ending chooses the format: ``.bvh``, ``.npz`` or ``.amc``.
 
     Parameters
     ----------
@@ -37,9 +42,9 @@ def read_motion(path: str | Path) -> Motion:
     Returns
     -------
     motion : Motion
-        In metres, Y up, at the file's own rate. Where a unit had to be inferred or joints had to
-        be left out, a :class:`MotionFileWarning` says so in one sentence; see :func:`read_bvh`
-        and :func:`~probmotion.formats.npz.read_npz`.
+        In metres, Y up, at the file's own rate. Where a unit had to be inferred, a rate assumed
+        or joints left out, a :class:`MotionFileWarning` says so in one sentence; see
+        :func:`read_bvh`, :func:`read_amc` and :func:`~probmotion.formats.npz.read_npz`.
 
     Raises
     ------
@@ -49,15 +54,27 @@ def read_motion(path: str | Path) -> Motion:
         If there is no such file.
     """
     path = Path(path)
-    readers = {".bvh": read_bvh, ".npz": read_npz}
+    readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": _read_amc_at_usual_rate}
     if path.suffix.lower() not in readers:
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
         raise MotionFileError(
-            f"{path} ends in {path.suffix!r}, expected a motion in .bvh or .npz (2D keypoints: "
-            "read_keypoints)"
+            f"{path} ends in {path.suffix!r}, expected a motion in .bvh or .npz, or in .amc beside "
+            "its .asf (2D keypoints: read_keypoints)"
         )
     return readers[path.suffix.lower()](path)
+
+
+def _read_amc_at_usual_rate(path: Path) -> Motion:
+    """Return the motion of an AMC file, and warn of the rate."""
+    motion = read_amc(path)
+    warnings.warn(
+        f"{path} is taken to have {motion.fps:g} frames per second, as most of the CMU database "
+        "has; read_amc(path, fps=…) takes another rate",
+        MotionFileWarning,
+        stacklevel=4,
+    )
+    return motion
 
 
 def save_motion(motion: Motion, path: str | Path) -> None:

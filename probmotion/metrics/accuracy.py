@@ -10,6 +10,7 @@ from probmotion.checks import check_positive, check_shape
 
 __all__ = [
     "acceleration_error",
+    "acceleration_ratio",
     "aligned_by_root",
     "aligned_by_similarity",
     "joint_errors",
@@ -86,11 +87,39 @@ def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
 
     Second differences; the motions need at least three frames.
     """
-    xp = array_namespace(motions, truth)
     check_positive("fps", fps)
+    _refuse_few_frames(motions, truth)
+    return _mean_bend(motions - truth) * fps**2
+
+
+def acceleration_ratio(motions: Array, truth: Array) -> Array:
+    """Return the mean size of accelerations over the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
+
+    Second differences of joints' positions, at any frame rate. A motion is plausible between a
+    half and two (paper 001, appendix H.1): below it is smoothed, above it trembles.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than three frames, or the truth moves without any acceleration.
+    """
+    _refuse_few_frames(motions, truth)
+    size = float(_mean_bend(truth))
+    if size == 0:
+        raise ValueError(
+            "truth has no acceleration in any frame, expected a motion to compare with"
+        )
+    return _mean_bend(motions) / size
+
+
+def _refuse_few_frames(motions: Array, truth: Array) -> None:
     check_shape("motions", motions, ("…", *truth.shape))
     if truth.shape[-3] < 3:
         raise ValueError(f"truth has {truth.shape[-3]} frames, expected at least 3")
-    apart = motions - truth
-    bend = apart[..., 2:, :, :] - 2 * apart[..., 1:-1, :, :] + apart[..., :-2, :, :]
-    return xp.mean(xp.sqrt(xp.sum(bend**2, axis=-1)), axis=(-2, -1)) * fps**2
+
+
+def _mean_bend(paths: Array) -> Array:
+    """Return the mean length of second differences, ``(…, L, J, 3) → (…)``."""
+    xp = array_namespace(paths)
+    bend = paths[..., 2:, :, :] - 2 * paths[..., 1:-1, :, :] + paths[..., :-2, :, :]
+    return xp.mean(xp.sqrt(xp.sum(bend**2, axis=-1)), axis=(-2, -1))

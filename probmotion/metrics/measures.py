@@ -206,30 +206,40 @@ def accuracy_of(
     - ``mpjpe``: after aligning the root in every frame, mean over draws: what to expect of one
     - ``mpjpe_mean``: of the mean of all draws; ``mpjpe_best``: of the best draw
     - ``mpjpe_visible``, ``mpjpe_hidden``: like ``mpjpe``, where the evidence saw the joint or not
-    - ``g_mpjpe``: without alignment; ``pa_mpjpe``: after the best similarity per frame
-    - ``acceleration_error``: mean over draws
+    - ``g_mpjpe``, ``g_mpjpe_mean`` and each with ``_visible``, ``_hidden``: without alignment
+    - ``pa_mpjpe``: after the best similarity per frame
+    - ``acceleration_error``: mean over draws; ``acceleration_ratio``: mean size of a draw's over
+      the truth's, where that has any; plausible between a half and two
     """
     root = posterior.skeleton.roots[0]
     target = accuracy.aligned_by_root(truth, root)
     errors = accuracy.joint_errors(accuracy.aligned_by_root(positions, root), target)
     middle = accuracy.aligned_by_root(positions.mean(axis=0), root)
     per_draw = accuracy.mean_over(errors)
+    far = accuracy.joint_errors(positions, truth)
+    far_mean = accuracy.joint_errors(positions.mean(axis=0), truth)
     metres = {
         "mpjpe": per_draw.mean(),
         "mpjpe_mean": accuracy.joint_errors(middle, target).mean(),
         "mpjpe_best": per_draw.min(),
     }
+    metres |= {"g_mpjpe": far.mean(), "g_mpjpe_mean": far_mean.mean()}
     seen = _visible(posterior)
     if seen is not None and not seen.all() and seen.any():
-        metres["mpjpe_visible"] = accuracy.mean_over(errors, seen).mean()
-        metres["mpjpe_hidden"] = accuracy.mean_over(errors, ~seen).mean()
-    metres["g_mpjpe"] = accuracy.joint_errors(positions, truth).mean()
+        for where, mask in (("visible", seen), ("hidden", ~seen)):
+            metres[f"mpjpe_{where}"] = accuracy.mean_over(errors, mask).mean()
+            metres[f"g_mpjpe_{where}"] = accuracy.mean_over(far, mask).mean()
+            metres[f"g_mpjpe_mean_{where}"] = accuracy.mean_over(far_mean, mask)
     nearest = accuracy.aligned_by_similarity(positions, truth)
     metres["pa_mpjpe"] = accuracy.joint_errors(nearest, truth).mean()
     found = {f"{name}_mm": float(value) * _MILLIMETRES for name, value in metres.items()}
     if len(truth) >= 3:
         bend = accuracy.acceleration_error(positions, truth, posterior.fps)
         found["acceleration_error"] = float(bend.mean())
+        if np.diff(truth, 2, axis=0).any():
+            found["acceleration_ratio"] = float(
+                accuracy.acceleration_ratio(positions, truth).mean()
+            )
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from probmotion.problems.clips import clips_problem
+from probmotion.problems.denoising import DENOISING_PROBLEMS
 from probmotion.problems.gait import GAIT_PROBLEMS
 from probmotion.problems.learnt import LEARNT_PROBLEMS
 from probmotion.problems.pairs import PAIR_PROBLEMS, pairs_problem
@@ -20,7 +21,7 @@ __all__ = [
     "problem_names",
 ]
 
-_PROBLEMS = {**GAIT_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS}
+_PROBLEMS = {**GAIT_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
 
 
 def problem_names() -> list[str]:

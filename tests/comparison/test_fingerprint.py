@@ -6,7 +6,7 @@ import copy
 import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -108,6 +108,21 @@ def test_a_network_is_its_weights():
     assert fingerprint(one) != fingerprint(two)
     two.load_state_dict(one.state_dict())
     assert fingerprint(one) == fingerprint(two)
+
+
+class Computes:
+    def __init__(self, value):
+        self.value = value
+
+    @cached_property
+    def half(self):
+        return self.value / 2
+
+
+def test_what_an_object_computed_from_the_rest_does_not_count():
+    fresh, used = Computes(3.0), Computes(3.0)
+    assert used.half == 1.5
+    assert fingerprint(used) == fingerprint(fresh) != fingerprint(Computes(4.0))
 
 
 def test_an_object_that_holds_itself_ends():

@@ -188,7 +188,12 @@ def test_a_bare_posterior_and_other_names():
     ("problems", "samplers", "settings", "sentence"),
     [
         ("gate", None, {}, "problem is 'gate', expected one of gait, gait-monocular"),
-        ("gait", "hamster", {}, "sampler is 'hamster', expected one of ancestral3d, ensemble"),
+        (
+            "gait",
+            "hamster",
+            {},
+            "sampler is 'hamster', expected one of ancestral3d, dvae",
+        ),
         (3, None, {}, "problems has a int, expected names, Problem or MotionPosterior objects"),
         ("gait", PriorDraws, {}, "samplers has PriorDraws, expected names or objects with name"),
         ("gait", [3], {}, "samplers has int, expected names or objects with name"),

@@ -59,6 +59,9 @@ def test_it_prints_means_and_deviations_with_cost_beside_quality(folder):
     assert text.index("generation: no evidence") < text.index("monocular: one camera")
     assert ["wide", "evidence"] in [line.split() for line in text.splitlines()]
     assert "wide ran with spread=2.0; its other settings are its defaults" in text
+    world = next(line for line in text.splitlines() if line.startswith("in the world, mm"))
+    assert world.split()[4:] == ["seconds", "of", "mean", "acceleration"]
+    assert "(0.5 to 2 is plausible)" in text
     assert max(map(len, text.splitlines())) < 160
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from probmotion.arrays import to_numpy
 from probmotion.metrics.accuracy import (
     acceleration_error,
+    acceleration_ratio,
     aligned_by_root,
     aligned_by_similarity,
     joint_errors,
@@ -106,6 +107,26 @@ def test_acceleration_of_a_parabola(truth):
         acceleration_error(truth[:2], truth[:2], 30.0)
 
 
+def test_acceleration_ratio_by_hand(truth):
+    time = np.arange(L)[:, None, None] / 30.0
+    falls = 0.5 * time**2 * np.array([[0, -9.81, 0], [3, 0, 4]])  # 9.81 and 5 m/s²
+    steady = np.array([1.0, 2.0, 3.0]) * time + 4
+    # The size of accelerations is compared, whatever way they point.
+    motions = np.stack([falls, steady + 2 * falls, -0.5 * falls, falls[:, ::-1], 0 * falls])
+    np.testing.assert_allclose(acceleration_ratio(motions, falls), [1, 2, 0.5, 1, 0], atol=1e-10)
+    one = np.stack([falls[:, 0], steady[:, 0]], axis=1)
+    assert acceleration_ratio(one, falls) == pytest.approx(9.81 / 14.81)
+    # A jump to and fro in one frame of one joint: second differences 1, 2 and 1.
+    jump = np.zeros((5, 1, 3))
+    jump[2, 0, 0] = 1
+    curve = np.arange(5.0)[:, None, None] ** 2 * [0, 0, 0.5]
+    assert acceleration_ratio(jump, curve) == pytest.approx((1 + 2 + 1) / 3)
+    with pytest.raises(ValueError, match="truth has no acceleration in any frame"):
+        acceleration_ratio(falls, np.zeros_like(falls))
+    with pytest.raises(ValueError, match="truth has 2 frames, expected at least 3"):
+        acceleration_ratio(truth[:2], truth[:2])
+
+
 @pytest.mark.parametrize("library", ["strict", "torch", "jax"])
 @pytest.mark.parametrize("batch", [(3,), (0,), ()])
 def test_every_library_computes_the_same(truth, rng, library, batch):
@@ -121,6 +142,7 @@ def test_every_library_computes_the_same(truth, rng, library, batch):
         lambda x, y: aligned_by_root(x),
         lambda x, y: mean_over(joint_errors(x, y), np.eye(L, J) > 0),
         lambda x, y: acceleration_error(x, y, 30.0),
+        acceleration_ratio,
     ]
     with jax.enable_x64(True):
         for function in functions:

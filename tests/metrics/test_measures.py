@@ -170,6 +170,42 @@ def test_accuracy_by_hand(occluded):
     assert found["pa_mpjpe_mm"] < away / 2
 
 
+def test_global_errors_and_acceleration_by_hand(occluded):
+    truth, posterior = occluded.truth, occluded.posterior
+    hidden = ~posterior.likelihood.entries.visible[0]
+    # Two draws: one 10 cm off to the side, the other 10 cm off to the other; where hidden both
+    # are 40 cm further down.
+    draws = np.stack([truth, truth])
+    draws[0, ..., 0] += 0.1
+    draws[1, ..., 0] -= 0.1
+    draws[:, hidden, 1] -= 0.4
+    found = accuracy_of(draws, truth, posterior)
+    n_hidden = hidden.sum()
+    below = 1000 * np.hypot(0.1, 0.4)
+    assert found["g_mpjpe_visible_mm"] == pytest.approx(100)
+    assert found["g_mpjpe_hidden_mm"] == pytest.approx(below)
+    total = (100 * (L * J - n_hidden) + below * n_hidden) / (L * J)
+    assert found["g_mpjpe_mm"] == pytest.approx(total)
+    assert found["g_mpjpe_mean_visible_mm"] == pytest.approx(0, abs=1e-9)
+    assert found["g_mpjpe_mean_hidden_mm"] == pytest.approx(400)
+    assert found["g_mpjpe_mean_mm"] == pytest.approx(400 * n_hidden / (L * J))
+    # Twice the truth's accelerations and half of them: 1.25 on average.
+    middle = truth.mean(axis=0)
+    scaled = np.stack([middle + 2 * (truth - middle), middle + 0.5 * (truth - middle)])
+    assert accuracy_of(scaled, truth, posterior)["acceleration_ratio"] == pytest.approx(1.25)
+
+
+def test_what_does_not_apply_is_left_out(prior, occluded):
+    truth = occluded.truth
+    everything = MotionPosterior(prior)
+    found = accuracy_of(truth[None], truth, everything)
+    assert {"g_mpjpe_mm", "g_mpjpe_mean_mm", "acceleration_ratio"} < set(found)
+    assert not any(name.endswith(("_hidden_mm", "_visible_mm")) for name in found)
+    still = np.zeros_like(truth)
+    assert "acceleration_ratio" not in accuracy_of(truth[None], still, everything)
+    assert "acceleration_error" in accuracy_of(truth[None], still, everything)
+
+
 def test_a_joint_counts_as_visible_if_any_camera_sees_it(prior, occluded):
     from probmotion import Cameras
 

@@ -140,6 +140,106 @@ def test_weight_decay_shrinks_and_clipping_and_warm_up_are_as_said(tmp_path):
     np.testing.assert_allclose(tensors(tmp_path / "c", "model", "line")["weight"], 0.95, rtol=1e-6)
 
 
+class Overfits(Line):
+    """Its validation loss is least after four steps, at a weight that the run leaves behind."""
+
+    def validation_loss(self, network, device):
+        return abs(float(network.weight[0, 0]) - self.best)
+
+    best = 0.4
+
+
+def test_a_run_that_no_longer_improves_ends_with_its_best_model(tmp_path):
+    settings = TrainingSettings(
+        steps=100, learning_rate=0.1, warmup=0, ema=0.0, checkpoint_every=1, patience=3
+    )
+    whole = train(Overfits(), settings, tmp_path / "run", progress=False)
+    losses = [row["validation_loss"] for row in whole.history]
+    assert len(losses) == np.argmin(losses) + 1 + 3 < 100
+    kept = load_checkpoint(whole.model, "line")
+    assert kept.settings["step"] == np.argmin(losses) + 1
+    assert abs(float(kept.tensors["weight"][0, 0]) - Overfits.best) == pytest.approx(min(losses))
+    # Asked again, it has ended; stopped on the way and gone on, it ends the same.
+    assert train(Overfits(), settings, tmp_path / "run", progress=False).history == whole.history
+    train(Overfits(), replace(settings, steps=3), tmp_path / "parts", progress=False)
+    again = train(Overfits(), settings, tmp_path / "parts", progress=False)
+    assert [row["validation_loss"] for row in again.history] == losses
+    assert again.model.read_bytes()[-16:] == whole.model.read_bytes()[-16:]
+
+
+def test_the_rate_is_halved_where_asked(tmp_path):
+    settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
+    found = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
+    assert found == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
+    # Under warm-up too, and marks in any order.
+    assert replace(settings, halve_at=(10, 2)).rate(3) == pytest.approx(0.3)
+    # A constant slope: Adam's steps are as long as the rate of each.
+    line = Line()
+    line.training_loss = lambda network, rng, batch, device: network.weight.sum()
+    plain = TrainingSettings(
+        steps=6, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0, halve_at=(2, 4)
+    )
+    train(line, plain, tmp_path / "run", progress=False)
+    moved = tensors(tmp_path / "run", "model", "line")["weight"]
+    np.testing.assert_allclose(moved, -2 * (0.1 + 0.05 + 0.025), rtol=1e-4)
+    # It is of the run: another is refused, the same goes on.
+    with pytest.raises(ValueError, match=r"holds a run with halve_at \[2, 4\], expected \[2\]"):
+        train(Line(), replace(plain, halve_at=(2,)), tmp_path / "run", progress=False)
+    train(Line(), replace(plain, steps=7), tmp_path / "run", progress=False)
+
+
+def test_adamax_divides_by_the_largest_gradient_and_resumes(tmp_path):
+    """u ← max(0.999 u, |g|), m ← 0.9 m + 0.1 g, θ ← θ − rate/(1 − 0.9ᵏ) m/u (Kingma and Ba)."""
+    slopes = [1.0, -4.0, 0.5]
+    line = Line()
+
+    def loss(network, rng, batch, device):
+        return slopes[loss.calls] * network.weight.sum()
+
+    def counted(*arguments):
+        found = loss(*arguments)
+        loss.calls += 1
+        return found
+
+    loss.calls = 0
+    line.training_loss = counted
+    settings = TrainingSettings(
+        steps=3, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0, clip=np.inf
+    )
+    train(line, replace(settings, optimiser="adamax"), tmp_path / "a", progress=False)
+    weight = largest = mean = 0.0
+    for step, slope in enumerate(slopes, start=1):
+        largest, mean = max(0.999 * largest, abs(slope)), 0.9 * mean + 0.1 * slope
+        weight -= 0.1 / (1 - 0.9**step) * mean / largest
+    moved = tensors(tmp_path / "a", "model", "line")["weight"]
+    np.testing.assert_allclose(moved, weight, rtol=1e-5)
+    asked = replace(SETTINGS, optimiser="adamax")
+    train(Curve(), asked, tmp_path / "whole", progress=False)
+    train(Curve(), replace(asked, steps=10), tmp_path / "parts", progress=False)
+    train(Curve(), asked, tmp_path / "parts", progress=False)
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    with pytest.raises(ValueError, match="holds a run with optimiser adamax, expected adamw"):
+        train(Curve(), SETTINGS, tmp_path / "whole", progress=False)
+
+
+def test_weights_that_are_frozen_stay_and_a_trainee_knows_the_step(tmp_path):
+    class Steps(Curve):
+        def __init__(self):
+            super().__init__()
+            self.network[0].requires_grad_(False)
+            self.asked = []
+
+        def anneal(self, step):
+            self.asked.append((step, self.calls))
+
+    made = Steps()
+    before = made.network[0].weight.clone()
+    train(made, SETTINGS, tmp_path, progress=False)
+    assert made.asked == [(step, step - 1) for step in range(1, 31)]
+    assert torch.equal(made.network[0].weight, before)
+    assert not torch.equal(made.network[4].weight, Curve().network[4].weight)
+
+
 def test_the_moving_average_is_the_one_made_by_hand(tmp_path):
     path, weights = tmp_path / "run", []
 
@@ -394,6 +494,8 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path):
         ("weight_decay", -0.1),
         ("weight_decay", float("inf")),
         ("seed", True),
+        ("optimiser", "sgd"),
+        ("halve_at", (10, 0)),
     ]:
         with pytest.raises(ValueError, match=f"^{name} is .*expected"):
             TrainingSettings(**{name: value})

@@ -24,7 +24,7 @@ from probmotion.sampling import (
 from probmotion.settings_options import object_from_text, text_of_object
 from probmotion.skeleton import Skeleton
 
-NAMES = ("exact", "ancestral3d", "mas", "mvpc", "sds", "mh", "nuts", "ensemble")
+NAMES = ("exact", "ancestral3d", "mas", "mvpc", "sds", "mh", "nuts", "ensemble", "dvae")
 QUICK = {
     "ancestral3d": {"steps": 5},
     "mas": {"steps": 5},
@@ -33,6 +33,7 @@ QUICK = {
     "mh": {"warmup": 20, "thin": 2},
     "nuts": {"warmup": 20},
     "ensemble": {"warmup": 20, "thin": 2},
+    "dvae": {"training_steps": 5, "training_pairs": 200},
 }
 CHAINS_THAT_GO_ON = ("mh", "nuts", "ensemble")
 
@@ -166,8 +167,10 @@ def test_what_does_not_fit_is_refused_in_one_sentence(sampler):
 
     posterior = MotionPosterior(Bare())
     assert suited(posterior) == []
+    protocols = r"\w+( or \w+)?"
     with pytest.raises(
-        UnsupportedPosterior, match=rf"^{sampler.name} needs a prior with \w+, which Bare is not$"
+        UnsupportedPosterior,
+        match=rf"^{sampler.name} needs a prior with {protocols}, which Bare is not$",
     ):
         sampler.sample(posterior, draws=1, progress=False)
 

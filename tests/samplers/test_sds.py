@@ -11,7 +11,8 @@ import pytest
 from probmotion import Cameras, Joints3D, MotionPosterior, UnsupportedPosterior
 from probmotion.problems import load_problem
 from probmotion.samplers import ScoreDistillation
-from probmotion.samplers.sds import _Adam, score_distillation_gradient
+from probmotion.samplers.adam import Adam
+from probmotion.samplers.sds import score_distillation_gradient
 from probmotion.samplers.views import Views
 
 
@@ -49,7 +50,7 @@ def test_adam_is_torch_adam():
     torch = pytest.importorskip("torch")
     rng = np.random.default_rng(1)
     start = rng.normal(size=(3, 4))
-    ours = _Adam(start.copy(), 0.05)
+    ours = Adam(start.copy(), 0.05)
     theirs = torch.nn.Parameter(torch.tensor(start))
     optimiser = torch.optim.Adam([theirs], lr=0.05)
     for gradient in rng.normal(size=(30, 3, 4)) * np.geomspace(1e-3, 10, 30)[:, None, None]:

@@ -1,0 +1,96 @@
+"""How fast Motion-DVAE denoises, at the published size on the CPU; prints ``name: value``.
+
+A motion of 300 frames is cut into overlapping windows that go through as one batch. Weights are
+fresh: what is computed does not depend on them.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from probmotion.data.walks import made_walks
+from probmotion.likelihoods import Joints3D
+from probmotion.models.body_states import BodyStates, rest_pose
+from probmotion.models.dvae_inference import DenoisingNetworks
+from probmotion.models.dvae_settings import DVAESettings
+from probmotion.models.dvae_training import DVAETrainee
+from probmotion.models.motion_denoiser import MotionDenoiser, NoisyMotion
+from probmotion.models.motion_dvae import MotionDVAE
+from probmotion.motion import Motion
+from probmotion.posterior import MotionPosterior
+from probmotion.samplers import DVAEInference
+from probmotion.skeleton import Skeleton
+
+FRAMES, WINDOW, ITERATIONS, SEQUENCES = 300, 30, 50, 64
+
+
+def main() -> None:
+    """Print every measurement."""
+    skeleton = Skeleton.preset("person14")
+    walks = [clip.retarget(skeleton) for clip in made_walks(3, skeleton, seconds=10.0)]
+    prior, denoiser = fresh_networks(walks)
+    whole = observed(walks[0], FRAMES)
+    posterior = MotionPosterior(prior.of(frames=FRAMES, inference_network=denoiser), whole)
+    regression = DVAEInference()
+    fit = DVAEInference(mode="optimization", iterations=ITERATIONS)
+
+    def predict(sampler: DVAEInference) -> Callable[[], object]:
+        return lambda: sampler.predict(posterior, progress=False)
+
+    report("regression_seconds_per_frame", fastest(predict(regression), 3) / FRAMES)
+    report("optimization_seconds_per_frame", fastest(predict(fit), 1) / FRAMES)
+    report("batch_throughput_ratio", throughput_ratio(prior, denoiser, walks[0]))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    report("memory_gib", peak / (2**30 if sys.platform == "darwin" else 2**20))
+
+
+def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
+    """Return a prior and its denoiser of the published size, with fresh weights."""
+    states = BodyStates(
+        walks[0].skeleton, rest_pose(walks[0].skeleton, [w.positions for w in walks])
+    )
+    trainee = DVAETrainee(walks, walks, DVAESettings.paper(), states)
+    prior = MotionDVAE(
+        trainee.network, trainee.size, states, walks[0].fps, card={"network": trainee.settings}
+    )
+    return prior, MotionDenoiser(DenoisingNetworks(prior), prior)
+
+
+def observed(motion: Motion, frames: int) -> Joints3D:
+    """Return noisy joints of a motion's first frames."""
+    return Joints3D.observe(motion.window(0, frames), 0.03, seed=0)
+
+
+def throughput_ratio(prior: MotionDVAE, denoiser: MotionDenoiser, motion: Motion) -> float:
+    """Return how many times more sequences a second go through at once than one by one."""
+    one = denoiser.on(prior, observed(motion, WINDOW))
+    many = NoisyMotion(one.denoiser, one.windows.repeated(SEQUENCES), one.stitching)
+    rng = np.random.default_rng(0)
+    alone = fastest(lambda: one.bound(rng), 5)
+    together = fastest(lambda: many.bound(rng), 3)
+    return SEQUENCES * alone / together
+
+
+def fastest(work: Callable[[], object], times: int) -> float:
+    """Return the least seconds of several runs, after one that warms up."""
+    work()
+    seconds = []
+    for _ in range(times):
+        begun = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - begun)
+    return min(seconds)
+
+
+def report(name: str, value: float) -> None:
+    """Print one measurement."""
+    print(f"{name}: {value:.4g}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

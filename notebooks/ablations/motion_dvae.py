@@ -1,0 +1,425 @@
+"""Denoising by Motion-DVAE: its ablations (table 2 of the paper), filters, accuracy against speed.
+
+    python notebooks/ablations/motion_dvae.py --out dvae
+    python notebooks/ablations/motion_dvae.py --quick --out quick    (made clips, tiny networks)
+
+Parts: table, speed, recording, posterior; ``--parts`` chooses. Recordings are made of clips that
+were held out whole: noise, outliers, limbs that hide. The prior and its denoiser come with the
+package; the networks of the ablations "no prior" and "no noisy training" are trained here, as long
+as the shipped one was. Clips are looked for in ``--data``, by default ../shared/data beside the
+repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+from probmotion import seeds
+from probmotion.data.denoising_clips import denoising_clips, made_denoising_clips
+from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
+from probmotion.data.recordings import read_recording
+from probmotion.files import written_whole
+from probmotion.likelihoods import Joints3D
+from probmotion.metrics import accuracy
+from probmotion.models import GaussianMixtureMotion
+from probmotion.models.body_states import BodyStates, rest_pose
+from probmotion.models.denoiser_training import DenoiserTrainee, usual_denoiser_training
+from probmotion.models.dvae_settings import DVAESettings
+from probmotion.models.dvae_training import DVAETrainee, usual_dvae_training
+from probmotion.models.joint_noise import JointNoise
+from probmotion.models.motion_denoiser import MotionDenoiser
+from probmotion.models.motion_dvae import MotionDVAE
+from probmotion.models.noisy_windows import Stitching
+from probmotion.models.training import train
+from probmotion.motion import Motion
+from probmotion.posterior import MotionPosterior
+from probmotion.problems.denoising import body_of, body_prior, gaussian_noise, limbs_hidden
+from probmotion.samplers import NUTS, DVAEInference
+
+FRAMES = 60
+BALANCING = "S00_P00_T01_BalancingTrial_multiview.npz"
+KINDS: Mapping[str, tuple[float, float | None, str]] = {
+    "noise": (0.04, None, "nothing"),
+    "outliers": (0.03, 3.0, "nothing"),
+    "occluded": (0.04, None, "for a while"),
+    "cut off": (0.04, None, "from the ends"),
+}
+"""Scale of the noise in metres, degrees of freedom, and whether limbs hide."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Noisy joints of a held-out motion, and the motion."""
+
+    truth: Motion
+    evidence: Joints3D
+    hidden: np.ndarray
+
+
+Estimate = Callable[[Recording], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Study:
+    """The clips, the networks, and how many recordings of each."""
+
+    out: Path
+    data: Path
+    quick: bool
+    per_clip: int
+    seed: int = 0
+
+    @cached_property
+    def clips(self) -> dict[str, list[Motion]]:
+        """3D clips by part."""
+        return made_denoising_clips(24) if self.quick else denoising_clips(self.data)
+
+    @cached_property
+    def prior(self) -> MotionDVAE:
+        """The prior, with the denoiser that was trained beside it."""
+        if not self.quick:
+            return body_prior()
+        skeleton = self.clips["train"][0].skeleton
+        rest = rest_pose(skeleton, [clip.positions for clip in self.clips["train"]])
+        settings, annealing = usual_dvae_training("tiny")
+        trainee = DVAETrainee(
+            self.clips["train"],
+            self.clips["validation"],
+            DVAESettings.tiny(),
+            BodyStates(skeleton, rest),
+            annealing=annealing,
+        )
+        train(trainee, settings, self.out / "networks" / "dvae", progress=False)
+        prior = MotionDVAE.load(self.out / "networks" / "dvae")
+        return prior.of(inference_network=self.trained("full", prior))
+
+    def trained(self, name: str, prior: MotionDVAE, **changes: object) -> MotionDenoiser:
+        """Return a denoiser trained here, as long as the usual one of its size."""
+        settings, annealing = usual_denoiser_training("tiny" if self.quick else "small")
+        trainee = DenoiserTrainee(
+            self.clips["train"],
+            self.clips["validation"],
+            prior,
+            annealing=annealing,
+            **changes,  # type: ignore[arg-type]
+        )
+        folder = self.out / "networks" / name
+        train(trainee, settings, folder, progress=not self.quick)
+        return MotionDenoiser.load(folder, prior)
+
+    def recordings(self, kind: str) -> list[Recording]:
+        """Return recordings of a kind, evenly over every test clip."""
+        noise, freedom, hides = KINDS[kind]
+        made = []
+        for clip in self.clips["test"]:
+            frames = min(FRAMES, clip.frames)
+            room = clip.frames - frames
+            # A clip that is no longer than a recording gives one.
+            count = min(self.per_clip, room // (frames // 2) + 1)
+            for start in np.linspace(0, room, count).astype(int):
+                truth = replace(clip.window(int(start), frames), name=f"{clip.name}/{start}")
+                hidden = limbs_hidden(truth, cut_off=hides == "from the ends")
+                hidden &= hides != "nothing"
+                evidence = Joints3D.observe(
+                    truth,
+                    noise,
+                    seeds.integer(self.seed, kind, truth.name) % 2**31,
+                    hidden=hidden,
+                    degrees_of_freedom=freedom,
+                )
+                made.append(Recording(truth, evidence, hidden))
+        return made
+
+    def posterior(
+        self, recording: Recording, network: MotionDenoiser | None = None
+    ) -> MotionPosterior:
+        """Return what is believed after a recording; its body is estimated from it."""
+        prior = self.prior.of(
+            frames=recording.truth.frames,
+            body=body_of(recording.evidence, self.prior),
+            inference_network=network,
+        )
+        return MotionPosterior(prior, recording.evidence)
+
+    def dvae(
+        self, sampler: DVAEInference, network: MotionDenoiser | None = None, average: bool = True
+    ) -> Estimate:
+        """Return the estimate of Motion-DVAE."""
+
+        def estimate(recording: Recording) -> np.ndarray:
+            posterior = self.posterior(recording, network)
+            return sampler.predict(posterior, average=average, progress=False).positions
+
+        return estimate
+
+
+def noisy(recording: Recording) -> np.ndarray:
+    """Return the recording itself; what hides is between where it was seen."""
+    return filled_between(recording.evidence.joints, ~recording.hidden)
+
+
+def filtered(recording: Recording) -> np.ndarray:
+    """Return a Savitzky-Golay filter's estimate."""
+    return savitzky_golay(recording.evidence.joints, ~recording.hidden, fps=recording.truth.fps)
+
+
+def smoothed(recording: Recording) -> np.ndarray:
+    """Return a Kalman smoother's mean; heavy tails count as Gaussian noise of their variance."""
+    evidence = recording.evidence
+    mean, _ = kalman_smooth(
+        evidence.joints,
+        evidence.entries.confidence,
+        noise=gaussian_noise(evidence),
+        fps=recording.truth.fps,
+    )
+    return mean
+
+
+def mixture(study: Study) -> Estimate:
+    """Return the exact posterior mean under a Gaussian mixture of the learnt clips' windows."""
+    frames = study.prior.settings.frames
+    clips = [clip for clip in study.clips["train"] if clip.frames >= frames]
+    order = list(clips[0].skeleton.mirrored_order)
+    # Mirrored too, as the DVAE saw them.
+    mirrored = [replace(c, positions=c.positions[:, order] * [-1.0, 1.0, 1.0]) for c in clips]
+    known = GaussianMixtureMotion.fit(
+        [*clips, *mirrored], frames, rank=20, styles=4 if study.quick else 6, seed=study.seed
+    )
+    root = known.skeleton.roots[0]
+
+    def estimate(recording: Recording) -> np.ndarray:
+        evidence = recording.evidence
+        stitching = Stitching(recording.truth.frames, frames, frames // 3)
+        found = []
+        for joints, confidence in zip(
+            stitching.cut(evidence.joints), stitching.cut(evidence.entries.confidence), strict=True
+        ):
+            # The mixture is of motions whose root is centred.
+            seen = confidence[:, root] > 0
+            centre = joints[seen, root].mean(axis=0)
+            here = Joints3D(joints - centre, gaussian_noise(evidence), confidence)
+            found.append(known.exact_posterior(here).mean() + centre)
+        return stitching.mean(np.stack(found))
+
+    return estimate
+
+
+def estimates(study: Study) -> dict[str, Estimate]:
+    """Return every way of denoising, by name."""
+    fit = DVAEInference(mode="optimization")
+    regression = DVAEInference()
+    known = mixture(study)
+    blind = study.trained("no prior", study.prior, latent_weight=0.0)
+    clean = study.trained("no noisy training", study.prior, noise=JointNoise.hardly_any())
+    free = replace(fit, latent_weight=0.0)
+    return {
+        "noisy input": noisy,
+        "Savitzky-Golay": filtered,
+        "Kalman smoother": smoothed,
+        "Gaussian mixture, exact mean": known,
+        "regression": study.dvae(regression),
+        "optimization": study.dvae(fit),
+        "NN output, regression": study.dvae(regression, average=False),
+        "NN output, optimization": study.dvae(fit, average=False),
+        "no prior, regression": study.dvae(regression, blind),
+        "no prior, optimization": study.dvae(free, blind),
+        "no noisy training, regression": study.dvae(regression, clean),
+        "no noisy training, optimization": study.dvae(fit, clean),
+        "Gaussian noise, optimization": study.dvae(replace(fit, degrees_of_freedom=math.inf)),
+        "Student-t noise, optimization": study.dvae(replace(fit, degrees_of_freedom=4.0)),
+        "as published, optimization": study.dvae(DVAEInference.paper()),
+    }
+
+
+def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
+    """Return errors of one estimate, mm, and its acceleration over the truth's."""
+    truth = recording.truth.positions
+    root = recording.truth.skeleton.roots[0]
+    local = accuracy.joint_errors(
+        accuracy.aligned_by_root(found, root), accuracy.aligned_by_root(truth, root)
+    )
+    world = accuracy.joint_errors(found, truth)
+    row = {"mpjpe": local.mean(), "g_mpjpe": world.mean()}
+    if recording.hidden.any():
+        for name, mask in (("visible", ~recording.hidden), ("hidden", recording.hidden)):
+            row[f"mpjpe_{name}"] = accuracy.mean_over(local, mask)
+            row[f"g_mpjpe_{name}"] = accuracy.mean_over(world, mask)
+    row = {name: 1000 * float(value) for name, value in row.items()}
+    row["acceleration_ratio"] = float(accuracy.acceleration_ratio(found, truth))
+    return row
+
+
+def table(study: Study) -> pd.DataFrame:
+    """Return mean errors of every way of denoising, by kind of recording."""
+    ways = estimates(study)
+    rows = []
+    for kind in KINDS:
+        recordings = study.recordings(kind)
+        for name, estimate in ways.items():
+            begun = time.perf_counter()
+            found = [estimate(recording) for recording in recordings]
+            seconds = time.perf_counter() - begun
+            errors = pd.DataFrame([measured(*pair) for pair in zip(recordings, found, strict=True)])
+            frames = sum(recording.truth.frames for recording in recordings)
+            row = {"kind": kind, "estimate": name, **errors.mean().to_dict()}
+            # Recordings of one clip are alike: clips are what varies.
+            clips = errors.groupby([one.truth.name.partition("/")[0] for one in recordings]).mean()
+            row["g_mpjpe_error"] = clips["g_mpjpe"].std() / math.sqrt(len(clips))
+            row["g_mpjpe_median"] = errors["g_mpjpe"].median()
+            rows.append(row | {"seconds_per_frame": seconds / frames, "recordings": len(errors)})
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def speed(study: Study) -> pd.DataFrame:
+    """Return errors and seconds by the number of iterations, of recordings with hidden limbs."""
+    recordings = study.recordings("occluded")
+    rows = []
+    for iterations in (0, 10, 25, 50, 100) if study.quick else (0, 10, 25, 50, 100, 200):
+        sampler = (
+            DVAEInference(mode="optimization", iterations=iterations)
+            if iterations
+            else DVAEInference()
+        )
+        estimate = study.dvae(sampler)
+        begun = time.perf_counter()
+        found = [estimate(recording) for recording in recordings]
+        seconds = time.perf_counter() - begun
+        errors = pd.DataFrame([measured(*pair) for pair in zip(recordings, found, strict=True)])
+        frames = sum(recording.truth.frames for recording in recordings)
+        rows.append(
+            {
+                "iterations": iterations,
+                "seconds_per_frame": seconds / frames,
+                **errors.mean().to_dict(),
+            }
+        )
+        print(rows[-1], flush=True)
+    made = pd.DataFrame(rows)
+    figure, left = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_hidden", "hidden joints")):
+        left.plot(made["seconds_per_frame"], made[name], "o-", label=label)
+    for _, row in made.iterrows():
+        left.annotate(f"{row['iterations']:.0f}", (row["seconds_per_frame"], row["g_mpjpe"]))
+    left.set(xscale="log", xlabel="seconds per frame", ylabel="G-MPJPE, mm")
+    left.legend()
+    with written_whole(study.out / "speed.png") as path:
+        figure.savefig(path, format="png", dpi=150)
+    plt.close(figure)
+    return made
+
+
+def recording(study: Study) -> pd.DataFrame:
+    """Return distances to the filtered joints of the real recording of four cameras.
+
+    Its noisy input is triangulated frame by frame; the filtered joints are the authors' and no
+    truth. Limbs hide as in the made recordings, because nothing does in this one.
+    """
+    found = read_recording(study.data / "pose2sim_multiview" / BALANCING)
+    # What is compared with says how large the noise is: the rms of a coordinate's difference is
+    # 1.8 cm, which Student-t noise with four degrees of freedom has at this scale.
+    scale = 0.0126
+    rows = []
+    for hides in (False, True):
+        truth = Motion(found.filtered, found.skeleton, found.fps, name=found.name)
+        hidden = (limbs_hidden(truth) & hides) | ~found.seen
+        evidence = Joints3D(
+            found.joints, scale, (~hidden).astype(float), 4.0, found.skeleton, found.fps
+        )
+        one = Recording(truth, evidence, hidden)
+        fit = DVAEInference(mode="optimization")
+        ways = {
+            "noisy input": noisy,
+            "Savitzky-Golay": filtered,
+            "Kalman smoother": smoothed,
+            "regression": study.dvae(DVAEInference()),
+            "optimization": study.dvae(fit),
+            "optimization, 200 iterations": study.dvae(replace(fit, iterations=200)),
+        }
+        for name, estimate in ways.items():
+            rows.append({"hidden": hides, "estimate": name, **measured(one, estimate(one))})
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def posterior(study: Study) -> pd.DataFrame:
+    """Return how honest draws are: spread against error, share of the truth inside 90 %.
+
+    Of one window of a held-out clip, where NUTS is affordable; it starts at draws of the DVAE.
+    """
+    recording = study.recordings("occluded")[0]
+    frames = study.prior.settings.frames
+    truth = recording.truth.window(0, frames)
+    hidden = limbs_hidden(truth)
+    evidence = Joints3D.observe(truth, KINDS["occluded"][0], study.seed, hidden=hidden)
+    asked = study.posterior(Recording(truth, evidence, hidden))
+    fit = DVAEInference(mode="optimization", iterations=50 if study.quick else 200)
+    runs = {
+        "dvae, regression": DVAEInference().sample(asked, draws=200, progress=False),
+        "dvae, optimization": fit.sample(asked, draws=200, progress=False),
+    }
+    begun = runs["dvae, optimization"].dataset["theta"].values[0, :1]
+    nuts = NUTS(warmup=10 if study.quick else 150, max_tree_depth=3 if study.quick else 6)
+    runs["nuts"] = nuts.sample(
+        asked, draws=10 if study.quick else 100, initial=begun, progress=not study.quick
+    )
+    rows = []
+    for name, draws in runs.items():
+        row = {"sampler": name, **honesty(draws.flat(), truth, hidden)}
+        row["log_density"] = float(draws.dataset["log_density"].mean())
+        rows.append(row | {"seconds": float(draws.dataset.attrs["seconds"])})
+        print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, float]:
+    """Return spread and error of draws, mm, and the share of the truth inside the central 90 %."""
+    middle = drawn.mean(axis=0)
+    spread = np.sqrt(((drawn - middle) ** 2).sum(axis=-1).mean(axis=0))
+    error = np.linalg.norm(middle - truth.positions, axis=-1)
+    low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
+    inside = (truth.positions >= low) & (truth.positions <= high)
+    row = {}
+    for name, which in (("seen", ~hidden), ("hidden", hidden)):
+        if which.any():
+            row[f"spread_{name}_mm"] = 1000 * float(spread[which].mean())
+            row[f"error_{name}_mm"] = 1000 * float(error[which].mean())
+            row[f"inside_{name}"] = float(inside[which].mean())
+    return row
+
+
+PARTS = {"table": table, "speed": speed, "recording": recording, "posterior": posterior}
+
+
+def main() -> None:
+    """Make the parts that are asked for, each a table in ``--out``."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--quick", action="store_true", help="made clips and tiny networks")
+    parser.add_argument("--per-clip", type=int, default=6, help="recordings of a test clip")
+    asked = parser.parse_args()
+    study = Study(asked.out, asked.data, asked.quick, 2 if asked.quick else asked.per_clip)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for part in asked.parts:
+        if part == "recording" and study.quick:
+            continue  # it is of the real recording
+        made = PARTS[part](study)
+        with written_whole(asked.out / f"{part}.csv") as path:
+            made.to_csv(path, index=False)
+        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,299 @@
+"""Filters of noisy 3D joints that know nothing of bodies: what a learnt prior has to beat."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import savgol_filter
+
+from probmotion.checks import check_count, check_finite, check_positive, check_shape
+
+__all__ = ["filled_between", "fit_acceleration", "kalman_smooth", "log_evidence", "savitzky_golay"]
+
+_FIRST_POSITION = 10.0
+"""Standard deviation of a joint's first position about the mean of its seen entries, metres."""
+_FIRST_SPEED = 10.0
+"""Standard deviation of its first velocity about 0, metres per second."""
+_LEAST, _MOST = 1e-3, 1e3
+"""Between which accelerations the fit looks, m/s^1.5."""
+
+
+def savitzky_golay(
+    joints: np.ndarray,
+    seen: np.ndarray,
+    *,
+    fps: float,
+    window_seconds: float = 0.5,
+    order: int = 3,
+) -> np.ndarray:
+    """Return joints whose coordinates are each replaced by a polynomial's value in a window.
+
+    Hidden entries are first filled joint by joint: linear interpolation over time between seen
+    ones, and the first (last) seen entry before (after) it. The filter then weighs filled and
+    seen entries alike. Within half a window of either end the polynomial of the first (last)
+    whole window is read (Savitzky and Golay 1964; SciPy's ``mode="interp"``).
+
+    Parameters
+    ----------
+    joints : ndarray, (L, J, 3)
+        Metres. Entries that are not seen are not read and may be NaN.
+    seen : ndarray of bool, (L, J)
+        Which entries are observed.
+    fps : float
+        Frames per second.
+    window_seconds : float
+        Length of the window, rounded to the nearest odd number of frames.
+    order : int
+        Degree of the polynomial, at least 0.
+
+    Returns
+    -------
+    ndarray, (L, J, 3)
+        Metres.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a joint is hidden in all frames, a seen entry is not finite, the
+        window is longer than the motion, or ``order`` is not below the window's frames.
+    """
+    check_positive("fps", fps)
+    check_positive("window_seconds", window_seconds)
+    check_count("order", order, least=0)
+    seen = np.asarray(seen, dtype=bool)
+    joints = _seen_joints(joints, seen, "seen")
+    frames = 2 * round((window_seconds * fps - 1) / 2) + 1
+    if frames > len(joints):
+        raise ValueError(
+            f"window_seconds is {window_seconds:g}, {frames} frames at {fps:g} fps, expected at "
+            f"most the motion's {len(joints)} frames"
+        )
+    if order >= frames:
+        raise ValueError(
+            f"order is {order}, expected less than the {frames} frames of a window of "
+            f"{window_seconds:g} s"
+        )
+    return savgol_filter(filled_between(joints, seen), frames, order, axis=0, mode="interp")
+
+
+def kalman_smooth(
+    joints: np.ndarray,
+    confidence: np.ndarray,
+    *,
+    noise: float,
+    fps: float,
+    acceleration: float | np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return each joint's posterior under a constant-velocity model with white acceleration.
+
+    Every coordinate of every joint is a process of its own: its acceleration is white noise of
+    spectral density q = ``acceleration``², so that over a time d the state (position, velocity)
+    moves by F and gathers noise of covariance Q,
+
+        F = [1 d; 0 1],  Q = q [d³/3 d²/2; d²/2 d].
+
+    An entry is seen with Gaussian noise of variance ``noise``² / confidence, and not at all where
+    the confidence is 0. A first position is normal about the mean of the joint's seen entries,
+    10 m wide, a first velocity about 0, 10 m/s wide. Kalman's filter and the backward pass of
+    Rauch, Tung and Striebel (1965, "Maximum likelihood estimates of linear dynamic systems") give
+    the posterior exactly, hidden spans included.
+
+    Parameters
+    ----------
+    joints : ndarray, (L, J, 3)
+        Metres. Entries of confidence 0 are not read and may be NaN.
+    confidence : ndarray, (L, J)
+        Multiplies the precision; 0 hides an entry.
+    noise : float
+        Standard deviation of a coordinate of confidence 1, metres.
+    fps : float
+        Frames per second.
+    acceleration : float or ndarray, (J,), optional
+        √q of all joints or of each, m/s^1.5: a velocity changes by about √(q · seconds). By
+        default those of :func:`fit_acceleration`.
+
+    Returns
+    -------
+    mean : ndarray, (L, J, 3)
+        Posterior means of the positions, metres.
+    deviation : ndarray, (L, J, 3)
+        Their posterior standard deviations, metres.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a joint is hidden in all frames, a seen entry is not finite, or a
+        number is out of range.
+    """
+    if acceleration is None:
+        acceleration = fit_acceleration(joints, confidence, noise=noise, fps=fps)
+    problem = _Problem.of(joints, confidence, noise, fps, acceleration)
+    passes = _forward(problem)
+    mean, covariance = passes.mean[-1], passes.covariance[-1]
+    means, variances = np.empty_like(problem.joints), np.empty(problem.variance.shape)
+    for frame in range(len(means) - 1, -1, -1):
+        if frame < len(means) - 1:
+            # Gᵀ = P⁻¹ F C, with C filtered and P predicted.
+            ahead = passes.predicted_covariance[frame + 1]
+            moved = problem.step @ passes.covariance[frame]
+            gain = np.swapaxes(np.linalg.solve(ahead, moved), -1, -2)
+            mean = passes.mean[frame] + gain @ (mean - passes.predicted[frame + 1])
+            change = gain @ (covariance - ahead) @ np.swapaxes(gain, -1, -2)
+            covariance = passes.covariance[frame] + change
+        means[frame] = mean[:, 0]
+        variances[frame] = covariance[:, 0, 0]
+    deviation = np.sqrt(variances)[..., None]
+    return means + problem.centre, np.broadcast_to(deviation, means.shape).copy()
+
+
+def log_evidence(
+    joints: np.ndarray,
+    confidence: np.ndarray,
+    *,
+    noise: float,
+    fps: float,
+    acceleration: float | np.ndarray,
+) -> np.ndarray:
+    """Return log p(seen entries) of each joint, (J,), given what :func:`kalman_smooth` is."""
+    return _forward(_Problem.of(joints, confidence, noise, fps, acceleration)).log_evidence
+
+
+def fit_acceleration(
+    joints: np.ndarray, confidence: np.ndarray, *, noise: float, fps: float
+) -> np.ndarray:
+    """Return the accelerations under which each joint's seen entries are most probable, (J,).
+
+    For each joint the maximum of :func:`log_evidence` between 0.001 and 1000 m/s^1.5, found by
+    Brent's method on the logarithm. A joint that does not move is taken to the lower end.
+    """
+    joints, confidence = np.asarray(joints), np.asarray(confidence)
+    log_evidence(joints, confidence, noise=noise, fps=fps, acceleration=1.0)  # refuses bad input
+
+    def cost(exponent: float, one: slice) -> float:
+        given = {"noise": noise, "fps": fps, "acceleration": 10.0**exponent}
+        return -float(log_evidence(joints[:, one], confidence[:, one], **given)[0])
+
+    bounds = (math.log10(_LEAST), math.log10(_MOST))
+    found = []
+    for joint in range(joints.shape[1]):
+        one = (slice(joint, joint + 1),)
+        best = minimize_scalar(cost, bounds=bounds, args=one, method="bounded")
+        found.append(10.0**best.x)
+    return np.array(found)
+
+
+class _Problem(NamedTuple):
+    """What a pass over the frames reads."""
+
+    joints: np.ndarray  # (L, J, 3) less the centre, 0 where hidden
+    variance: np.ndarray  # (L, J) of the noise, infinite where hidden
+    centre: np.ndarray  # (J, 3) means of the seen entries
+    step: np.ndarray  # (2, 2) F
+    process: np.ndarray  # (2, 2) or (J, 2, 2) Q
+
+    @classmethod
+    def of(
+        cls,
+        joints: np.ndarray,
+        confidence: np.ndarray,
+        noise: float,
+        fps: float,
+        acceleration: float | np.ndarray,
+    ) -> _Problem:
+        check_positive("noise", noise)
+        check_positive("fps", fps)
+        confidence = np.asarray(confidence, dtype=np.float64)
+        check_finite("confidence", confidence)
+        if confidence.size and confidence.min() < 0:
+            raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
+        seen = confidence > 0
+        joints = _seen_joints(joints, seen, "confidence")
+        centre = joints.sum(axis=0) / seen.sum(axis=0)[:, None]
+        spread = np.asarray(acceleration, dtype=np.float64)
+        if spread.ndim:
+            check_shape("acceleration", spread, (joints.shape[1],))
+        for value in spread.flat:
+            check_positive("acceleration", float(value))
+        with np.errstate(divide="ignore"):
+            variance = noise**2 / confidence
+        d = 1 / fps
+        return cls(
+            joints=np.where(seen[..., None], joints - centre, 0.0),
+            variance=variance,
+            centre=centre,
+            step=np.array([[1.0, d], [0.0, 1.0]]),
+            process=spread[..., None, None] ** 2 * np.array([[d**3 / 3, d**2 / 2], [d**2 / 2, d]]),
+        )
+
+
+class _Passes(NamedTuple):
+    """States after (and, ``predicted``, before) each frame's entries; axes share covariances."""
+
+    mean: np.ndarray  # (L, J, 2, 3)
+    covariance: np.ndarray  # (L, J, 2, 2)
+    predicted: np.ndarray  # (L, J, 2, 3)
+    predicted_covariance: np.ndarray  # (L, J, 2, 2)
+    log_evidence: np.ndarray  # (J,)
+
+
+def _forward(problem: _Problem) -> _Passes:
+    """Kalman's filter, all joints and axes at once."""
+    L, J, _ = problem.joints.shape
+    means, covariances = np.empty((2, L, J, 2, 3)), np.empty((2, L, J, 2, 2))
+    mean = np.zeros((J, 2, 3))
+    covariance = np.tile(np.diag([_FIRST_POSITION**2, _FIRST_SPEED**2]), (J, 1, 1))
+    log_evidence = np.zeros(J)
+    for frame in range(L):
+        if frame > 0:
+            mean = problem.step @ mean
+            covariance = problem.step @ covariance @ problem.step.T + problem.process
+        means[1, frame], covariances[1, frame] = mean, covariance
+        variance = problem.variance[frame]
+        seen = np.isfinite(variance)
+        total = covariance[:, 0, 0] + variance
+        innovation = problem.joints[frame] - mean[:, 0]
+        # Infinite variance has a gain of 0: a hidden entry changes nothing.
+        gain = covariance[:, :, :1] / total[:, None, None]
+        mean = mean + gain * innovation[:, None]
+        # Joseph's form: the covariance stays positive definite.
+        kept = np.eye(2) - gain * np.array([1.0, 0.0])
+        added = np.where(seen, variance, 0.0)[:, None, None] * (gain @ np.swapaxes(gain, -1, -2))
+        covariance = kept @ covariance @ np.swapaxes(kept, -1, -2) + added
+        means[0, frame], covariances[0, frame] = mean, covariance
+        square = (innovation[seen] ** 2).sum(axis=-1) / total[seen]
+        log_evidence[seen] -= 0.5 * (square + 3 * np.log(2 * math.pi * total[seen]))
+    return _Passes(means[0], covariances[0], means[1], covariances[1], log_evidence)
+
+
+def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
+    """Return the joints with 0 where hidden; refuse a joint that is never seen."""
+    joints = np.asarray(joints, dtype=np.float64)
+    check_shape("joints", joints, ("L", "J", 3))
+    check_shape(name, seen, joints.shape[:2])
+    if len(joints) == 0:
+        raise ValueError("joints has no frame, expected at least one")
+    never = np.flatnonzero(~seen.any(axis=0))
+    if len(never):
+        raise ValueError(
+            f"{name} hides joint {never[0]} in all {len(joints)} frames, expected every joint to "
+            "be seen in at least one"
+        )
+    check_finite("joints", joints[seen])
+    return np.where(seen[..., None], joints, 0.0)
+
+
+def filled_between(joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the joints with hidden entries interpolated over time, held at the ends.
+
+    It is a ValueError if a joint is hidden in all frames, or a seen entry is not finite.
+    """
+    seen = np.asarray(seen, dtype=bool)
+    joints = _seen_joints(joints, seen, "seen")
+    frames, filled = np.arange(len(joints)), np.empty_like(joints)
+    for joint, known in enumerate(map(np.flatnonzero, seen.T)):
+        for axis in range(3):
+            filled[:, joint, axis] = np.interp(frames, known, joints[known, joint, axis])
+    return filled

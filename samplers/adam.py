@@ -1,0 +1,31 @@
+"""`Adam`: the optimiser of samplers that descend."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["Adam"]
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015, algorithm 1), which changes the parameters in place."""
+
+    def __init__(self, parameters: np.ndarray, learning_rate: float) -> None:
+        self.parameters = parameters
+        self.learning_rate = learning_rate
+        self.mean = np.zeros_like(parameters)
+        self.square = np.zeros_like(parameters)
+        self.n_steps = 0
+
+    def descend(self, gradient: np.ndarray) -> None:
+        """Take one step."""
+        self.n_steps += 1
+        self.mean *= 0.9
+        self.mean += 0.1 * gradient
+        self.square *= 0.999
+        self.square += 0.001 * gradient**2
+        # Both means start at 0, which the two divisors make good.
+        size = np.sqrt(self.square / (1 - 0.999**self.n_steps))
+        size += 1e-8
+        step = self.learning_rate / (1 - 0.9**self.n_steps)
+        self.parameters -= step * self.mean / size

@@ -1,0 +1,148 @@
+"""A conditional VAE of motions in principal coordinates, given the evidence in its own.
+
+    p(x, z | y) = p(z | y) N(x; μ(z, y), S),   r(z | x, y) = N(z; a(x, y), b(x, y)²)
+
+x are a motion's coordinates, y the evidence's. p(z | y) is a mixture of Gaussians, because a
+posterior over motions has modes; μ is a mixture of linear maps, because many posteriors are
+nearly linear around each mode, plus a bounded network. Learnt from simulated pairs by
+max E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015), it needs no density of either.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+__all__ = ["ConditionalVAE"]
+
+# Logarithms of scales stay within these, so that no early step can explode.
+_LEAST, _MOST = -7.0, 2.0
+
+
+class ConditionalVAE(nn.Module):
+    """The three networks; the first weights come from torch's current random numbers.
+
+    Parameters
+    ----------
+    coordinates : int
+        C, of motions.
+    evidence : int
+        E, of evidence; 0 for generation.
+    latent : int
+        Length of z.
+    components : int
+        K, Gaussians of p(z | y).
+    experts : int
+        Linear maps that μ mixes.
+    hidden : int
+        Width of every network.
+    """
+
+    def __init__(
+        self,
+        coordinates: int,
+        evidence: int,
+        latent: int,
+        components: int,
+        experts: int,
+        hidden: int,
+    ) -> None:
+        super().__init__()
+        self.latent = latent
+        self.encoder = nn.Sequential(
+            nn.Linear(coordinates + evidence, hidden), nn.SiLU(),
+            nn.Linear(hidden, hidden), nn.SiLU(),
+            nn.Linear(hidden, 2 * latent),
+        )  # fmt: skip
+        self.prior = _MixtureOfGaussians(evidence, latent, components, hidden)
+        self.decoder = _MixtureOfLinearMaps(latent + evidence, coordinates, experts, hidden)
+        self.log_scale = nn.Parameter(torch.zeros(coordinates))
+
+    def encode(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return a and log b of r(z | x, y): ``(B, C), (B, E) → (B, latent)`` twice."""
+        mean, log_scale = self.encoder(torch.cat([x, y], dim=1)).chunk(2, dim=1)
+        return mean, log_scale.clamp(_LEAST, _MOST)
+
+    def decode(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Return μ(z, y): ``(B, latent), (B, E) → (B, C)``."""
+        return self.decoder(torch.cat([z, y], dim=1))
+
+    def loss(
+        self, x: torch.Tensor, y: torch.Tensor, noise: torch.Tensor, weight: float
+    ) -> torch.Tensor:
+        """Return −E[log N(x; μ, S)] + ``weight`` · KL(r ‖ p) but for a constant, mean over pairs.
+
+        S is diagonal here; both expectations are over the one z = a + b · ``noise``.
+        """
+        mean, log_scale = self.encode(x, y)
+        z = mean + log_scale.exp() * noise
+        log_r = (-0.5 * noise**2 - log_scale).sum(dim=1)
+        apart = (x - self.decode(z, y)) * torch.exp(-self.log_scale)
+        misfit = 0.5 * (apart**2).sum(dim=1) + self.log_scale.sum()
+        return (misfit + weight * (log_r - self.prior.log_density(z, y))).mean()
+
+    @torch.no_grad()
+    def misfits(self, x: torch.Tensor, y: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Return x − μ(z, y) with z = a + b · ``noise`` from r(z | x, y), (B, C)."""
+        mean, log_scale = self.encode(x, y)
+        return x - self.decode(mean + log_scale.exp() * noise, y)
+
+
+class _MixtureOfGaussians(nn.Module):
+    """p(z | y) = Σ_k π_k(y) N(m_k + m(y), (s_k s(y))²): the evidence weighs, moves and scales."""
+
+    def __init__(self, evidence: int, latent: int, components: int, hidden: int) -> None:
+        super().__init__()
+        self.sizes = [components, latent, latent]
+        self.log_weight = nn.Parameter(torch.zeros(components))
+        self.mean = nn.Parameter(torch.randn(components, latent))
+        self.log_scale = nn.Parameter(torch.full((components, latent), -0.5))
+        self.network = None
+        if evidence:
+            self.network = nn.Sequential(
+                nn.Linear(evidence, hidden), nn.SiLU(),
+                nn.Linear(hidden, hidden), nn.SiLU(),
+                nn.Linear(hidden, sum(self.sizes)),
+            )  # fmt: skip
+
+    def forward(self, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return log π, means and log scales: (B, K), (B, K, latent) twice."""
+        log_weight, mean = self.log_weight[None], self.mean[None]
+        log_scale = self.log_scale[None]
+        if self.network is None:
+            log_weight, mean, log_scale = (
+                part.expand(len(y), *part.shape[1:]) for part in (log_weight, mean, log_scale)
+            )
+        else:
+            weighs, moves, scales = self.network(y).split(self.sizes, dim=1)
+            log_weight = log_weight + weighs
+            mean, log_scale = mean + moves[:, None], log_scale + scales[:, None]
+        return torch.log_softmax(log_weight, dim=1), mean, log_scale.clamp(_LEAST, _MOST)
+
+    def log_density(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Return log p(z | y) but for a constant: ``(B, latent), (B, E) → (B,)``."""
+        log_weight, mean, log_scale = self(y)
+        apart = (z[:, None] - mean) * torch.exp(-log_scale)
+        each = log_weight - (0.5 * apart**2 + log_scale).sum(dim=2)
+        return torch.logsumexp(each, dim=1)
+
+
+class _MixtureOfLinearMaps(nn.Module):
+    """f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v), with g and h of one network."""
+
+    def __init__(self, inputs: int, outputs: int, experts: int, hidden: int) -> None:
+        super().__init__()
+        self.trunk = nn.Sequential(
+            nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU()
+        )
+        self.gate = nn.Linear(hidden, experts)
+        self.bounded = nn.Linear(hidden, outputs)
+        self.maps = nn.Parameter(0.02 * torch.randn(experts * (inputs + 1), outputs))
+
+    def forward(self, v: torch.Tensor) -> torch.Tensor:
+        """Return f(v): ``(B, inputs) → (B, outputs)``."""
+        features = self.trunk(v)
+        gate = torch.softmax(self.gate(features), dim=1)
+        with_one = torch.cat([v, torch.ones_like(v[:, :1])], dim=1)
+        mixed = (gate[:, :, None] * with_one[:, None, :]).flatten(1) @ self.maps
+        return mixed + self.bounded(features)
