@@ -23,6 +23,8 @@ DIM = 6
 # Mean and variance of all coordinates by each sampler: by chance one in a thousand seeds fails.
 LIMIT = norm.isf(1e-3 / (2 * DIM * len(CHAINS)) / 2)
 
+pytestmark = pytest.mark.slow  # chains long enough to compare their moments
+
 
 class DecodedMotion:
     """θ ~ N(0, I), and a multi-layer perceptron from θ to the positions of three joints."""
