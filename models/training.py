@@ -79,10 +79,17 @@ class TrainingResult:
         The network's checkpoint, with the moving average of the weights.
     history : list of dict
         Per checkpoint: step, loss (mean since the last), validation_loss, seconds.
+    kept : dict
+        The checkpoint's row whose weights the model has: with ``patience`` the one of the lowest
+        validation loss, else the last.
+    steps : int
+        Steps that this call took: 0 where the run had ended before.
     """
 
     model: Path
     history: list[dict[str, float]]
+    kept: dict[str, float]
+    steps: int
 
 
 def check_device(device: str) -> torch.device:
@@ -151,7 +158,8 @@ def train(
         _asked_to_stop() as stop,
         progress_bar(settings.steps, f"train {trainee.kind}", progress) as bar,
     ):
-        bar.update(min(run.step, settings.steps))
+        before = run.step
+        bar.update(min(before, settings.steps))
         while run.step < settings.steps and not _waited_enough(run, settings):
             begun = time.perf_counter()
             loss = _take_step(run, trainee, settings, place, folder)
@@ -170,7 +178,8 @@ def train(
                     f"stopped at step {run.step} of {settings.steps}, which is kept in {folder}; "
                     "the same command goes on from there"
                 )
-    return TrainingResult(folder / MODEL, run.history)
+    kept = run.history[-1 - _since_best(run)] if settings.patience else run.history[-1]
+    return TrainingResult(folder / MODEL, run.history, kept, run.step - before)
 
 
 def _start(trainee: Trainee, settings: TrainingSettings, device: torch.device) -> Run:

@@ -76,17 +76,18 @@ def main() -> None:
     readme.write_text(text, encoding="utf-8")
 
     PICTURES.mkdir(exist_ok=True)
-    comparison.plot(PICTURES / "quality_against_cost.png")
+    drawn = [PICTURES / name for name in ("quality_against_cost.png", "gait-monocular.png")]
+    comparison.plot(drawn[0])
     problem = load_problem("gait-monocular")
     rows = {name: comparison.draws(problem.name, name).flat()[25::50] for name in SHOWN}
     draw_skeletons(
         rows,
         problem.posterior.skeleton,
-        PICTURES / "gait-monocular.png",
+        drawn[1],
         azimuth=np.pi / 2,
         truth=problem.truth,
     )
-    for path in PICTURES.glob("*.png"):
+    for path in drawn:
         save_small(path)
 
 

@@ -88,11 +88,14 @@ def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: st
     if not before and (out / MODEL).exists():
         load_checkpoint(out / MODEL, trainee.kind)  # another network's is not written over
     result = train(trainee, settings, out, device=device)
-    if before >= settings.steps:
-        print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}")
+    last, kept = result.history[-1], result.kept
+    ended = ""
+    if last["step"] < settings.steps:
+        ended = f"; it ended at step {last['step']:.0f}, as the validation loss fell no more"
+    if not result.steps:
+        print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}{ended}")
         return
-    last = result.history[-1]
     print(
-        f"wrote {result.model}: step {last['step']:.0f}, loss {last['loss']:.4f}, validation loss "
-        f"{last['validation_loss']:.4f}, {last['seconds']:.0f} s of steps"
+        f"wrote {result.model}: step {kept['step']:.0f}, loss {kept['loss']:.4f}, validation loss "
+        f"{kept['validation_loss']:.4f}, {last['seconds']:.0f} s of steps{ended}"
     )

@@ -14,18 +14,26 @@ from probmotion.files import written_whole
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CYCLE", "GREY", "INK", "LEFT", "MARKERS", "RIGHT", "save_figure"]
+__all__ = ["CYCLE", "GREY", "INK", "LEFT", "RIGHT", "save_figure", "style_of"]
 
 LEFT = "#0072B2"
 RIGHT = "#D55E00"
 INK = "#333333"
 GREY = "#C4C4C4"
 
-CYCLE = ("#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A")
+CYCLE = (
+    "#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A",
+    "#7A7A7A",
+)  # fmt: skip
 """One colour per sampler, in the order in which they are first seen."""
 
-MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p", "<", ">")
 """One shape per sampler, for prints without colour."""
+
+
+def style_of(place: int) -> tuple[str, str]:
+    """Return colour and shape of the sampler at a place in the order; 90 places differ."""
+    return CYCLE[place % len(CYCLE)], _MARKERS[place % len(_MARKERS)]
 
 
 def save_figure(figure: Figure, path: str | Path, dots_per_inch: int = 150) -> None:

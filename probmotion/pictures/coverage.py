@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probmotion.checks import check_count, check_finite, check_shape
-from probmotion.pictures.colours import CYCLE, GREY, INK, LEFT, MARKERS, save_figure
+from probmotion.pictures.colours import GREY, INK, LEFT, save_figure, style_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,8 +191,9 @@ def _draw_line(axes: Axes, rows: pd.DataFrame, density: str, place: int) -> None
     found = rows.groupby("draws")["coverage"].agg(["mean", "min", "max"])
     counts, mean = found.index.to_numpy(dtype=float), found["mean"].to_numpy()
     bars = np.stack([mean - found["min"], found["max"] - mean])
+    colour, marker = style_of(place)
     axes.errorbar(
-        counts, mean, bars, label=density, color=CYCLE[place % 8], marker=MARKERS[place % 8],
+        counts, mean, bars, label=density, color=colour, marker=marker,
         markersize=5, linewidth=1.6, elinewidth=1.0,
     )  # fmt: skip
 

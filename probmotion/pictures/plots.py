@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probmotion.pictures.colours import CYCLE, GREY, INK, MARKERS, save_figure
+from probmotion.pictures.colours import GREY, INK, save_figure, style_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,7 +65,7 @@ def plot_quality_against_cost(
             f"table has no sampler with both {quality!r} and {cost!r}, expected at least one"
         )
     samplers = [str(name) for name in dict.fromkeys(table["sampler"])]
-    styles = {name: (CYCLE[i % 8], MARKERS[i % 8]) for i, name in enumerate(samplers)}
+    styles = {name: style_of(place) for place, name in enumerate(samplers)}
     columns = min(len(problems), 3)
     lines = -(-len(problems) // columns)
     figure = Figure(figsize=(0.5 + 4.2 * columns, 0.2 + 3.9 * lines), layout="constrained")

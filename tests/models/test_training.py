@@ -140,33 +140,6 @@ def test_weight_decay_shrinks_and_clipping_and_warm_up_are_as_said(tmp_path):
     np.testing.assert_allclose(tensors(tmp_path / "c", "model", "line")["weight"], 0.95, rtol=1e-6)
 
 
-class Overfits(Line):
-    """Its validation loss is least after four steps, at a weight that the run leaves behind."""
-
-    def validation_loss(self, network, device):
-        return abs(float(network.weight[0, 0]) - self.best)
-
-    best = 0.4
-
-
-def test_a_run_that_no_longer_improves_ends_with_its_best_model(tmp_path):
-    settings = TrainingSettings(
-        steps=100, learning_rate=0.1, warmup=0, ema=0.0, checkpoint_every=1, patience=3
-    )
-    whole = train(Overfits(), settings, tmp_path / "run", progress=False)
-    losses = [row["validation_loss"] for row in whole.history]
-    assert len(losses) == np.argmin(losses) + 1 + 3 < 100
-    kept = load_checkpoint(whole.model, "line")
-    assert kept.settings["step"] == np.argmin(losses) + 1
-    assert abs(float(kept.tensors["weight"][0, 0]) - Overfits.best) == pytest.approx(min(losses))
-    # Asked again, it has ended; stopped on the way and gone on, it ends the same.
-    assert train(Overfits(), settings, tmp_path / "run", progress=False).history == whole.history
-    train(Overfits(), replace(settings, steps=3), tmp_path / "parts", progress=False)
-    again = train(Overfits(), settings, tmp_path / "parts", progress=False)
-    assert [row["validation_loss"] for row in again.history] == losses
-    assert again.model.read_bytes()[-16:] == whole.model.read_bytes()[-16:]
-
-
 def test_the_rate_is_halved_where_asked(tmp_path):
     settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
     found = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]

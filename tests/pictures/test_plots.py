@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from probmotion.pictures import plot_quality_against_cost
+from probmotion.pictures.colours import style_of
 
 SAMPLERS = {
     "exact": (0.01, 1.0), "ancestral3d": (3.0, 1.03), "mas": (4.0, 1.6), "mvpc": (4.2, 1.1),
@@ -25,6 +26,10 @@ def table(problems=("gait",), seeds=3, spread=0.1):
                 )
                 rows.append((problem, name, seed, "swd", swd * np.exp(spread * rng.normal())))
     return pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"])
+
+
+def test_a_dozen_samplers_have_a_dozen_styles():
+    assert len({style_of(place) for place in range(12)}) == 12
 
 
 def words(axes):
