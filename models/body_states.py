@@ -27,6 +27,7 @@ __all__ = [
     "check_bones",
     "heading_of",
     "rest_pose",
+    "trunk_joints",
     "turned_about_vertical",
 ]
 
@@ -106,10 +107,7 @@ class BodyStates:
 
     @cached_property
     def _trunks(self) -> tuple[int, ...]:
-        """Joints at the end of a trunk: unpaired, on a joint that has paired children too."""
-        paired = {joint for pair in self.skeleton.mirrored_pairs for joint in pair}
-        limbed = {parent for joint, parent in self.skeleton.bones if joint in paired}
-        return tuple(j for j, parent in self.skeleton.bones if parent in limbed and j not in paired)
+        return trunk_joints(self.skeleton)
 
     @cached_property
     def _rig(self) -> Skeleton:
@@ -252,6 +250,13 @@ class BodyStates:
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), rest)
         still = np.zeros((len(positions), 1, 3))
         return forward_kinematics(self._rig, rotations, still, rest)[1]
+
+
+def trunk_joints(skeleton: Skeleton) -> tuple[int, ...]:
+    """Return joints at the end of a trunk: unpaired, on a joint that has paired children too."""
+    paired = {joint for pair in skeleton.mirrored_pairs for joint in pair}
+    limbed = {parent for joint, parent in skeleton.bones if joint in paired}
+    return tuple(j for j, parent in skeleton.bones if parent in limbed and j not in paired)
 
 
 def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:

@@ -86,6 +86,24 @@ def _h36m17() -> Skeleton:
     )  # fmt: skip
 
 
+def _quadruped21() -> Skeleton:
+    """A four-legged animal as motion capture has it, hocks and all.
+
+    ``tail`` is where the tail begins, ``head`` where the skull joins the neck, ``wrist`` the carpus
+    and ``ankle`` the hock. It has what ``apt36k17`` has but the nose and the eyes.
+    """
+    return _tree(
+        "pelvis", "tail pelvis", "chest pelvis", "neck chest", "head neck",
+        "left_shoulder chest", "left_elbow left_shoulder", "left_wrist left_elbow",
+        "left_front_paw left_wrist",
+        "right_shoulder chest", "right_elbow right_shoulder", "right_wrist right_elbow",
+        "right_front_paw right_wrist",
+        "left_hip pelvis", "left_knee left_hip", "left_ankle left_knee", "left_back_paw left_ankle",
+        "right_hip pelvis", "right_knee right_hip", "right_ankle right_knee",
+        "right_back_paw right_ankle",
+    )  # fmt: skip
+
+
 def _smpl22() -> Skeleton:
     """The body of SMPL without its hands."""
     return _tree(
@@ -157,6 +175,7 @@ PRESETS: Mapping[str, Callable[[], Skeleton]] = {
     "pair17": _pair17,
     "person14": _person14,
     "person17": _person17,
+    "quadruped21": _quadruped21,
     "smpl22": _smpl22,
 }
 """Functions that make each skeleton, by name."""

@@ -5,71 +5,20 @@ Each kind is a dataclass whose fields are its options, as in :mod:`probmotion.cl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
 from probmotion.body_training_commands import TrainDenoiser, TrainDVAE
-from probmotion.training_options import (
-    Steps,
-    check_enough_clips,
-    check_out,
-    listed,
-    run_training,
-)
-
-if TYPE_CHECKING:
-    from probmotion.data.learning import LearningTracks
+from probmotion.motion_vae_commands import TrainMotionVAE
+from probmotion.track_options import TrackData, learning_tracks
+from probmotion.training_options import Steps, check_out, run_training
 
 __all__ = ["TRAINABLE", "TrainDiffusion", "TrainEvaluator", "TrainLifter"]
 
 Size = Literal["tiny", "small", "paper", "reference-code"]
-
-
-@dataclass(frozen=True)
-class Data:
-    """What is learnt from: clips that are filmed, or tracks; people made to walk by default."""
-
-    clips: tuple[str, ...] = ()
-    """3D motion files, .npz or .bvh, or quoted patterns. They are filmed by cameras around them,
-    and a detector with errors finds the joints: only these pictures are learnt from."""
-
-    tracks: tuple[str, ...] = ()
-    """Files of 2D keypoints (.json, .npz, .csv), folders of a video's frames as OpenPose writes
-    them (--tracks op/video0 op/video1), or quoted patterns. Their names are those of clips. Of
-    other bodies than people, --skeleton must be named."""
-
-    tracks_fps: float | None = None
-    """Frames per second of keypoints in files that do not hold it."""
-
-    layout: str | None = None
-    """What keypoints in JSON are (see probmotion list), where their number does not tell."""
-
-    people: int | None = None
-    """How many people to follow in JSON that does not say who is who."""
-
-    skeleton: str = "person14"
-    """The joints to learn (see probmotion list), which clips or tracks must have."""
-
-    fps: float = 20.0
-    """Frames per second to learn at."""
-
-    validation: tuple[str, ...] = ()
-    """Names of clips (files without ending) on which the loss is watched; a tenth by default."""
-
-    test: tuple[str, ...] = ()
-    """Names of clips that are kept for measuring; a tenth by default."""
-
-    views: int | None = None
-    """Cameras around each 3D clip; 64 by default."""
-
-    centre: Literal["frame", "sequence"] = "frame"
-    """Whether the root is at the origin in every frame, or on average."""
-
-    data_seed: int = 0
-    """Seed of cameras, detection errors and, where no clips are named, of the split."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +42,7 @@ class TrainDiffusion:
     """Least confidence of a joint that is learnt from: .3 for people, .5 for horses, .01 with a
     ball."""
 
-    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
     def run(self) -> None:
@@ -138,7 +87,7 @@ class TrainEvaluator:
     threshold: float = 0.3
     """Least confidence of a joint that is learnt from."""
 
-    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
     def run(self) -> None:
@@ -185,7 +134,7 @@ class TrainLifter:
     threshold: float = 0.3
     """Least confidence of every joint of a pose that is learnt from."""
 
-    data: OmitArgPrefixes[Data] = field(default_factory=Data)
+    data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
     def run(self) -> None:
@@ -222,58 +171,6 @@ class TrainLifter:
         run_training(lifter, settings, self.out / "lifter", device)
 
 
-def learning_tracks(data: Data, threshold: float = 0.3) -> LearningTracks:
-    """Return the tracks that the options name, and print what preparing them dropped."""
-    from probmotion.data.learning import film_clips, read_tracks, split_tracks
-    from probmotion.data.projections import Filming
-    from probmotion.data.splits import clip_of
-    from probmotion.data.walks import made_walks
-    from probmotion.motion import files_named, load_motion
-    from probmotion.skeleton import Skeleton
-
-    if data.clips and data.tracks:
-        raise ValueError("clips and tracks are both given, expected one of them")
-    for name in ("tracks_fps", "layout", "people"):
-        if getattr(data, name) is not None and not data.tracks:
-            raise ValueError(f"{name} is given without tracks, expected --tracks FILE… beside it")
-    if data.tracks and data.views is not None:
-        raise ValueError("views is given with tracks, expected it only where clips are filmed")
-    skeleton = Skeleton.preset(data.skeleton)
-    if data.tracks:
-        prepared = read_tracks(
-            data.tracks,
-            skeleton,
-            data.fps,
-            file_fps=data.tracks_fps,
-            layout=data.layout,
-            people=data.people,
-            threshold=threshold,
-            centre=data.centre,
-        )
-    else:
-        # A file may hold another name; options name clips by their files.
-        clips = [replace(load_motion(path), name=path.stem) for path in files_named(data.clips)]
-        prepared = film_clips(
-            clips or made_walks(skeleton=skeleton),
-            skeleton,
-            data.fps,
-            views=64 if data.views is None else data.views,
-            seed=data.data_seed,
-            filming=Filming(centre=data.centre),
-        )
-    print(prepared)
-    if not (data.validation or data.test):
-        check_enough_clips(clip_of(track.name) for track in prepared.tracks)
-    found = split_tracks(
-        prepared.tracks, validation=data.validation, test=data.test, seed=data.data_seed
-    )
-    for part in ("train", "validation", "test"):
-        names = getattr(found.split, part)
-        count = len(getattr(found, part))
-        print(f"{part}: {count} tracks of {len(names)} clips: {listed(names)}")
-    return found
-
-
 def _check_options(out: Path, threshold: float) -> None:
     """Refuse at once what would be refused after minutes of preparing data."""
     from probmotion.checks import check_positive
@@ -288,5 +185,6 @@ TRAINABLE: dict[str, type[Any]] = {
     "lifter": TrainLifter,
     "dvae": TrainDVAE,
     "denoiser": TrainDenoiser,
+    "motion-vae": TrainMotionVAE,
 }
 """What can be trained, by name."""

@@ -119,6 +119,7 @@ def test_the_language_imports_neither_below_its_upper_floors() -> None:
             "cli.py",
             "training_commands.py",
             "body_training_commands.py",
+            "motion_vae_commands.py",
             "training_options.py",
         )
         and not package.startswith("probmotion.problems")

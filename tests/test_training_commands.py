@@ -29,7 +29,7 @@ from probmotion.models.pose_flow import PoseFlow
 PERSON = Skeleton.preset("person14")
 PROGRAM = [sys.executable, "-c", "import sys; from probmotion.cli import main; sys.exit(main())"]
 ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-KINDS = ("diffusion", "evaluator", "lifter", "dvae", "denoiser")
+KINDS = ("diffusion", "evaluator", "lifter", "dvae", "denoiser", "motion-vae")
 # Of three clips, one is watched and one kept.
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from probmotion.data.animals import ANIMAL_SKELETON, made_animals
 from probmotion.data.gaits import make_gait, make_gaits
 from probmotion.motion import Motion, load_motion
 from probmotion.skeleton import Skeleton
@@ -73,6 +74,8 @@ def made_walks(
     for style in _STYLES:
         if wanted <= set(make_gait(style).skeleton.canonical_names):
             return make_gaits(n, styles={style: 1.0}, frames=round(seconds * fps), fps=fps)
+    if wanted <= set(ANIMAL_SKELETON.canonical_names):
+        return made_animals(n, round(seconds * fps), fps)
     raise ValueError(
         f"skeleton has the joints {', '.join(sorted(wanted))}, expected those of a person or a "
         "quadruped: bodies are made of no others"

@@ -1,0 +1,338 @@
+"""Learning a motion VAE from 2D tracks in two phases (Ponymation, sections 3.2 and 3.3).
+
+First a network that sees one frame at a time learns what bodies do in pictures; then the VAE learns
+to say it with one latent code a sequence, with the first network as its teacher.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from probmotion import seeds
+from probmotion.models.articulated_body import ArticulatedBody
+from probmotion.models.checkpoints import load_checkpoint, load_weights
+from probmotion.models.motion_vae_losses import (
+    best_guess,
+    guess_terms,
+    reconstruction,
+    roughness,
+    weighted_sum,
+)
+from probmotion.models.motion_vae_model import KIND, MotionVAEModel, description_of
+from probmotion.models.motion_vae_network import MotionVAENetwork
+from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.pose_network import PoseGuesses, PoseNetwork
+from probmotion.models.track_batches import Augmentation, TrackBatches
+from probmotion.models.training_settings import TrainingSettings
+from probmotion.models.variational_terms import gaussian_kl
+from probmotion.motion import KeypointTrack
+
+__all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
+
+_VALIDATION_BATCH = 256
+# Of the hypotheses that are not chosen, so that none is left behind for good.
+_OTHERS = 0.05
+
+
+class _LearnsFromTracks:
+    """What both phases share: 2D tracks cut into sequences of one length, and a body."""
+
+    kind: str
+    network: nn.Module
+    settings: Mapping[str, Any]
+
+    def __init__(
+        self,
+        tracks: Sequence[KeypointTrack],
+        validation: Sequence[KeypointTrack],
+        size: MotionVAESettings,
+        body: ArticulatedBody,
+        distance: float | None,
+        threshold: float,
+        seed: int,
+    ) -> None:
+        # The mirror image of a body without pairs is another body.
+        whole = Augmentation(shortest=1.0, mirror=body.symmetric)
+        self.size = size
+        self.body = body
+        self.distance = distance
+        self.batches = TrackBatches(
+            _long_enough("tracks", tracks, size.frames), size.frames, threshold, whole
+        )
+        self.held_out = TrackBatches(
+            _long_enough("validation", validation, size.frames),
+            size.frames,
+            threshold,
+            Augmentation.none(),
+        )
+        for name, batches in (("tracks", self.batches), ("validation", self.held_out)):
+            if batches.skeleton != body.skeleton:
+                raise ValueError(
+                    f"{name} has the joints {', '.join(batches.skeleton.joint_names)}, expected "
+                    f"those of the body: {', '.join(body.skeleton.joint_names)}"
+                )
+        if self.held_out.fps != self.batches.fps:
+            raise ValueError(
+                f"validation is at {self.held_out.fps:g} frames per second, expected tracks' "
+                f"{self.batches.fps:g}"
+            )
+        if unseen := self.batches.never_seen:
+            raise ValueError(
+                f"tracks never shows {', '.join(unseen)} with a confidence of {threshold:g} or "
+                "more, expected every joint to be seen somewhere; choose a skeleton without them"
+            )
+        if not body.symmetric:
+            warnings.warn(
+                "body has no left-right pairs: no bone is as long as its mirror image, and no "
+                "track is mirrored",
+                stacklevel=3,
+            )
+        self._seed = seed
+        self.settings = {
+            **description_of(size, body, self.batches.fps),
+            "distance": distance,
+            "threshold": threshold,
+            "data": self.batches.description,
+            "validation_data": self.held_out.description,
+        }
+
+    def training_loss(
+        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
+    ) -> torch.Tensor:
+        """Return the loss of fresh sequences, a mean over them."""
+        return self._loss(network, self.batches, rng, batch, device)
+
+    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
+        """Return the loss on held-out sequences that never change."""
+        rng = seeds.generator(self._seed, "validation")
+        return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
+
+    def _loss(
+        self,
+        network: nn.Module,
+        batches: TrackBatches,
+        rng: np.random.Generator,
+        n: int,
+        device: torch.device,
+    ) -> torch.Tensor:
+        raise NotImplementedError
+
+    def _drawn(
+        self, batches: TrackBatches, rng: np.random.Generator, n: int, device: torch.device
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return keypoints (n, L, J, 2), what is seen (n, L, J), the rest pose (J, 3)."""
+        drawn = batches.draw(rng, n)
+        return (
+            torch.as_tensor(drawn.keypoints, device=device),
+            torch.as_tensor(drawn.seen, dtype=torch.float32, device=device),
+            torch.as_tensor(self.body.rest_positions, dtype=torch.float32, device=device),
+        )
+
+
+class PoseTrainee(_LearnsFromTracks):
+    """The first phase: rigid poses and bones, frame by frame, under several view hypotheses.
+
+    The loss is that of the best hypothesis of each sequence: its pictures' squared error, and how
+    far it moves from frame to frame, bends joints beyond their ranges and stretches bones.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Prepared: metres, centred, of one skeleton and frame rate. Nothing else is learnt from.
+    validation : sequence of KeypointTrack
+        Of clips that are not among those of ``tracks``.
+    size : MotionVAESettings
+        The networks'.
+    body : ArticulatedBody
+        What moves; its rest pose may be estimated from the tracks, see
+        :func:`~probmotion.rest_poses.estimate_rest_pose`.
+    distance : float, optional
+        Of the cameras from the subject, metres; by default rays are parallel.
+    threshold : float
+        Least confidence of a joint that is learnt from.
+    seed : int
+        Of the first weights and the validation's sequences.
+
+    Raises
+    ------
+    ValueError
+        If no track is as long as a sequence, tracks differ in skeleton or frame rate, their
+        skeleton is not the body's, or a joint is never seen.
+    """
+
+    kind = "motion-vae-poses"
+
+    def __init__(
+        self,
+        tracks: Sequence[KeypointTrack],
+        validation: Sequence[KeypointTrack],
+        size: MotionVAESettings,
+        body: ArticulatedBody,
+        *,
+        distance: float | None = None,
+        threshold: float = 0.3,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(tracks, validation, size, body, distance, threshold, seed)
+        self.network = PoseNetwork(
+            size, body.skeleton.n_joints, len(body.bones), body.n_groups, seed
+        )
+
+    def learnt(self, folder: str | Path) -> PoseNetwork:
+        """Return the network that a run has trained.
+
+        Raises
+        ------
+        CheckpointError
+            If the file is damaged or of another network.
+        FileNotFoundError
+            If there is none.
+        """
+        size, body = self.size, self.body
+        found = PoseNetwork(size, body.skeleton.n_joints, len(body.bones), body.n_groups)
+        load_weights(found, load_checkpoint(folder, self.kind).tensors)
+        return found
+
+    def _loss(
+        self,
+        network: nn.Module,
+        batches: TrackBatches,
+        rng: np.random.Generator,
+        n: int,
+        device: torch.device,
+    ) -> torch.Tensor:
+        keypoints, seen, rest = self._drawn(batches, rng, n, device)
+        guesses = network(keypoints, seen, rest)
+        terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
+        losses = weighted_sum(terms, self.size)
+        return losses.min(dim=1).values.mean() + _OTHERS * losses.mean()
+
+
+class MotionVAETrainee(_LearnsFromTracks):
+    """The second phase: one latent code for the bones of a whole sequence (equations 2 to 7).
+
+    Rigid poses stay those of the first phase's network, which is kept as it is.
+
+    Parameters
+    ----------
+    tracks, validation, size, body, distance, threshold, seed
+        As for the first phase.
+    pose_network : PoseNetwork
+        What the first phase has learnt.
+
+    Raises
+    ------
+    ValueError
+        As for the first phase.
+    """
+
+    kind = KIND
+
+    def __init__(
+        self,
+        tracks: Sequence[KeypointTrack],
+        validation: Sequence[KeypointTrack],
+        size: MotionVAESettings,
+        body: ArticulatedBody,
+        pose_network: PoseNetwork,
+        *,
+        distance: float | None = None,
+        threshold: float = 0.3,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(tracks, validation, size, body, distance, threshold, seed)
+        vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), seed)
+        teacher = pose_network.eval().requires_grad_(False)
+        self.network = MotionVAEModel(vae, teacher)
+
+    def _loss(
+        self,
+        network: nn.Module,
+        batches: TrackBatches,
+        rng: np.random.Generator,
+        n: int,
+        device: torch.device,
+    ) -> torch.Tensor:
+        assert isinstance(network, MotionVAEModel)
+        keypoints, seen, rest = self._drawn(batches, rng, n, device)
+        guess = self._taught(network.pose, keypoints, seen, rest)
+        vae = network.vae
+        mean, log_variance = vae.encode(keypoints, seen, rest)
+        noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
+        latent = mean + (0.5 * log_variance).exp() * torch.as_tensor(noise, device=device)
+        turns = vae.decode(latent)
+        translation = nn.functional.pad(guess.translation, (0, 1))
+        positions = self.body.positions(turns, guess.rotation, translation, guess.log_lengths)
+        zero = torch.zeros_like(mean)
+        terms = {
+            "reconstruction": reconstruction(positions, keypoints, seen, self.distance),
+            "smoothness": roughness(turns, guess.rotation, guess.translation),
+            "ranges": self.body.range_excess(turns).sum(dim=-1),
+            # Equation 6 prints it with σ where σ² belongs.
+            "kl": gaussian_kl(mean, 0.5 * log_variance, zero, zero),
+            "teacher": (turns - guess.turns).square().sum(dim=(-3, -2, -1)),
+        }
+        return weighted_sum(terms, self.size).mean()
+
+    @torch.no_grad()
+    def _taught(
+        self,
+        pose_network: nn.Module,
+        keypoints: torch.Tensor,
+        seen: torch.Tensor,
+        rest: torch.Tensor,
+    ) -> PoseGuesses:
+        """Return the best view hypothesis of the first phase, (B, L, …)."""
+        pose_network.eval()
+        guesses = pose_network(keypoints, seen, rest)
+        terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
+        return best_guess(guesses, weighted_sum(terms, self.size))
+
+
+def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSettings]:
+    """Return how the two phases of a size are trained: ``tiny``, ``small`` or ``paper``.
+
+    The paper counts 120 and 180 epochs of its own data; ``paper`` is as many steps of ours.
+
+    Raises
+    ------
+    ValueError
+        If the size is unknown.
+    """
+    known = {
+        "tiny": (
+            TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
+            TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
+        ),
+        "small": (
+            TrainingSettings(steps=6000, learning_rate=5e-4),
+            TrainingSettings(steps=10_000, learning_rate=5e-4),
+        ),
+        "paper": (
+            TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000),
+            TrainingSettings(steps=180_000, learning_rate=1e-4, warmup=1000),
+        ),
+    }
+    if size not in known:
+        raise ValueError(f"size is {size!r}, expected one of {', '.join(known)}")
+    return known[size]
+
+
+def _long_enough(
+    name: str, tracks: Sequence[KeypointTrack], frames: int
+) -> Sequence[KeypointTrack]:
+    """Return the tracks that hold a sequence."""
+    found = [track for track in tracks if track.frames >= frames]
+    if tracks and not found:
+        raise ValueError(
+            f"{name} has at most {max(track.frames for track in tracks)} frames a track, expected "
+            f"a sequence's {frames} or more"
+        )
+    return found

@@ -1,0 +1,133 @@
+"""`ReducedLatent`: the few directions of a latent code along which the motion changes most.
+
+Walkers that propose blindly lose their way in hundreds of dimensions; along these directions a
+prior of k dimensions keeps most of what its decoder can do.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from probmotion import seeds
+from probmotion.arrays import Array, array_namespace, constant
+from probmotion.checks import check_count, check_shape
+from probmotion.skeleton import Skeleton
+
+__all__ = ["ReducedLatent"]
+
+_ROWS = 64
+
+
+class ReducedLatent:
+    """A prior whose z = U θ, θ ~ N(0, I_k), and 0 along all other directions.
+
+    U (Z, k) holds the leading eigenvectors of E[JᵀJ], J = ∂X/∂z the decoder's Jacobian at draws of
+    the prior. It is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one pull-back per draw of z, so
+    that no Jacobian is ever held.
+
+    Parameters
+    ----------
+    prior : MotionVAE
+        Any prior with θ ~ N(0, I) whose motion torch differentiates.
+    k : int
+        Number of directions, at most the prior's ``dim``.
+    seed : int
+        Of the draws.
+
+    Raises
+    ------
+    ValueError
+        If k is out of range.
+    """
+
+    def __init__(self, prior: Any, k: int, seed: int = 0) -> None:
+        check_count("k", k)
+        if k > prior.dim:
+            raise ValueError(f"k is {k}, expected at most the prior's {prior.dim} dimensions")
+        self.prior = prior
+        self.seed = seed
+        values, vectors = np.linalg.eigh(_mean_square(prior, seeds.generator(seed, "directions")))
+        leading = np.argsort(values)[::-1][:k]
+        # Eigenvectors have no sign: the largest entry is positive.
+        chosen = vectors[:, leading]
+        largest = np.abs(chosen).argmax(axis=0)
+        self.directions = chosen * np.sign(chosen[largest, np.arange(k)])
+
+    @cached_property
+    def kept(self) -> float:
+        """Share of the motion's mean squared change, tr E[JᵀJ], that is along the directions.
+
+        What is lost is one less this share. It is estimated when it is asked for.
+        """
+        # On draws of their own: the directions suit those that chose them better than any others.
+        other = _mean_square(self.prior, seeds.generator(self.seed, "kept"))
+        along = np.einsum("zk,zy,yk->", self.directions, other, self.directions)
+        return float(along / np.trace(other))
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The J joints."""
+        return self.prior.skeleton
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return self.prior.frames
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.prior.fps
+
+    @property
+    def dim(self) -> int:
+        """Length k of θ."""
+        return self.directions.shape[1]
+
+    def latent(self, theta: Array) -> Array:
+        """Return z = U θ, ``(…, k) → (…, Z)``."""
+        check_shape("theta", theta, ("…", self.dim))
+        return theta @ constant(self.directions.T, theta)
+
+    def motion(self, theta: Array) -> Array:
+        """Return the prior's motion at U θ, ``(…, k) → (…, L, J, 3)``, metres."""
+        return self.prior.motion(self.latent(theta))
+
+    def log_density(self, theta: Array) -> Array:
+        """Return log N(θ; 0, I): ``(…, k) → (…)``."""
+        check_shape("theta", theta, ("…", self.dim))
+        xp = array_namespace(theta)
+        return -0.5 * (xp.sum(theta**2, axis=-1) + self.dim * math.log(2 * math.pi))
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n draws of θ, (n, k)."""
+        return rng.standard_normal((n, self.dim))
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n motions, (n, L, J, 3), metres."""
+        return self.motion(self.initial(rng, n))
+
+    def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
+        """Return E[θ | θ_t] = √ᾱ θ_t, exactly, since θ ~ N(0, I)."""
+        return math.sqrt(alpha_bar) * theta_t
+
+
+def _mean_square(prior: Any, rng: np.random.Generator) -> np.ndarray:
+    """Return an estimate of E[JᵀJ], (Z, Z), from eight draws per dimension and 512 at least."""
+    n = max(512, 8 * prior.dim)
+    total = np.zeros((prior.dim, prior.dim))
+    for begun in range(0, n, _ROWS):
+        rows = min(_ROWS, n - begun)
+        z = torch.as_tensor(rng.standard_normal((rows, prior.dim)), dtype=torch.float32)
+        z.requires_grad_(True)
+        motion = prior.motion(z)
+        across = torch.as_tensor(rng.standard_normal(tuple(motion.shape)), dtype=motion.dtype)
+        (pulled,) = torch.autograd.grad(motion, z, across)
+        found = pulled.double().numpy()
+        total += found.T @ found
+    return total / n

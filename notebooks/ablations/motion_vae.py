@@ -1,0 +1,315 @@
+"""A motion VAE learnt from 2D alone: its ablations, and generation beside MAS and SDS.
+
+    python notebooks/ablations/motion_vae.py --out vae
+    python notebooks/ablations/motion_vae.py --quick --out quick    (made walks, tiny networks)
+
+Parts: views (how often the right view hypothesis wins), table (the shapes of tables 3, 4, 6, 7 and
+8 of the paper), generation (beside MAS and SDS on the same 2D data); ``--parts`` chooses. All
+variants learn here, from the same tracks, as long as ``--steps`` says; what is left in
+``--out/networks`` is not learnt again. Clips are looked for in ``--data``, by default
+../shared/data beside the repository. 3D clips are filmed to be learnt from, and measured against.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from probmotion import seeds
+from probmotion.data.learning import film_clips
+from probmotion.data.projections import Filming, centre_motion
+from probmotion.data.walks import made_walks, walk_clips
+from probmotion.files import written_whole
+from probmotion.metrics.filming import film_motions
+from probmotion.metrics.keypoints import (
+    percentage_of_correct_keypoints,
+    picture_size,
+    velocity_error,
+)
+from probmotion.metrics.motion_chamfer import motion_chamfer_distance
+from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
+from probmotion.models.articulated_body import ArticulatedBody
+from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.models.motion_vae import MotionVAE
+from probmotion.models.motion_vae_losses import best_guess, guess_terms, pictured, weighted_sum
+from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.motion_vae_training import (
+    MotionVAETrainee,
+    PoseTrainee,
+    usual_motion_vae_training,
+)
+from probmotion.models.pose_network import PoseNetwork
+from probmotion.models.training import train
+from probmotion.models.view_hypotheses import judge_hypotheses
+from probmotion.motion import KeypointTrack, Motion
+from probmotion.posterior import MotionPosterior
+from probmotion.rest_poses import estimate_rest_pose
+from probmotion.samplers import MultiViewAncestral, ScoreDistillation
+from probmotion.skeleton import Skeleton
+
+FPS = 10.0
+FRAMES = 10
+PERSON = Skeleton.preset("person14")
+VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "final": {},
+    "20 frames": {"frames": 20},
+    "50 frames": {"frames": 50},
+    "no spatial transformer": {"spatial": False},
+    "KL 0.01": {"kl": 0.01},
+    "KL 0.0001": {"kl": 0.0001},
+    "no smoothness": {"smoothness": 0.0},
+}
+OF_POSES = ("smoothness", "hypotheses")
+SEEDS = 3
+
+
+@dataclass(frozen=True)
+class Study:
+    """The clips, how they are filmed, and how long networks learn."""
+
+    out: Path
+    data: Path
+    quick: bool
+    steps: int | None
+    draws: int
+    seed: int = 0
+
+    @cached_property
+    def clips(self) -> dict[str, list[Motion]]:
+        """3D clips by part."""
+        if not self.quick:
+            return walk_clips(self.data)
+        made = made_walks(18, PERSON)
+        return {"train": made[:12], "validation": made[12:15], "test": made[15:]}
+
+    @cached_property
+    def tracks(self) -> dict[str, list[KeypointTrack]]:
+        """What is learnt from, by part: prepared 2D tracks."""
+        views = {"train": 4 if self.quick else 64}
+        return {
+            part: film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
+            for part, clips in self.clips.items()
+        }
+
+    @cached_property
+    def body(self) -> ArticulatedBody:
+        """The body that moves, known from the tracks."""
+        return ArticulatedBody(PERSON, estimate_rest_pose(self.tracks["train"]))
+
+    def size(self, changes: Mapping[str, Any]) -> MotionVAESettings:
+        """Return the size of a variant."""
+        usual = MotionVAESettings.tiny() if self.quick else MotionVAESettings.small()
+        return replace(usual, **changes)
+
+    def poses(self, changes: Mapping[str, Any]) -> PoseNetwork:
+        """Return the first phase's network; variants share it unless its own loss is another's."""
+        own = {name: value for name, value in changes.items() if name in OF_POSES}
+        trainee = self._trainee(PoseTrainee, self.size(own))
+        folder = self.out / "networks" / " ".join(["poses", *map(str, own.values())])
+        self._train(trainee, 0, folder)
+        return trainee.learnt(folder)
+
+    def variant(self, name: str) -> MotionVAE:
+        """Return the prior of a variant, learnt here."""
+        changes = VARIANTS[name]
+        trainee = self._trainee(MotionVAETrainee, self.size(changes), self.poses(changes))
+        folder = self.out / "networks" / name
+        self._train(trainee, 1, folder)
+        return MotionVAE.load(folder)
+
+    def _trainee(self, kind: Any, size: MotionVAESettings, *more: Any) -> Any:
+        return kind(
+            self.tracks["train"],
+            self.tracks["validation"],
+            size,
+            self.body,
+            *more,
+            distance=Filming().distance,
+            seed=self.seed,
+        )
+
+    def _train(self, trainee: Any, phase: int, folder: Path) -> None:
+        settings = usual_motion_vae_training("tiny" if self.quick else "small")[phase]
+        if self.steps is not None:
+            settings = replace(settings, steps=self.steps)
+        train(trainee, settings, folder, progress=not self.quick)
+
+    def real_windows(self, part: str, frames: int, fps: float = FPS) -> np.ndarray:
+        """Return every window of a part's 3D clips about the root, (N, frames, J, 3)."""
+        motions = [centre_motion(c.retarget(PERSON).resample(fps)) for c in self.clips[part]]
+        return np.concatenate(
+            [windows(motion.positions, frames) for motion in motions if motion.frames >= frames]
+        )
+
+    def real_views(self, part: str, n: int) -> np.ndarray:
+        """Return windows of clips filmed anew without a detector's errors, (n, frames, J, 2)."""
+        rng = seeds.generator(self.seed, "real views", part)
+        every = self.real_windows(part, FRAMES)
+        return film_motions(every[rng.integers(0, len(every), n)], rng)
+
+
+def views(study: Study) -> pd.DataFrame:
+    """Return how often the right view hypothesis wins, by their number."""
+    rows = []
+    for hypotheses in (1, 2, 4):
+        changes = {} if hypotheses == 4 else {"hypotheses": hypotheses}
+        network, size = study.poses(changes), study.size(changes)
+        for part in ("train", "test"):
+            judged = judge_hypotheses(network, size, study.body, study.clips[part], fps=FPS)
+            rows.append(
+                {
+                    "hypotheses": hypotheses,
+                    "clips": part,
+                    "right": judged.right,
+                    "depth_right": judged.depth_right,
+                    "mpjpe": 1000 * judged.error,
+                    "least_mpjpe": 1000 * judged.least_error,
+                }
+            )
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def reconstructed(study: Study, prior: MotionVAE | None, poses: PoseNetwork) -> dict[str, float]:
+    """Return PCK@0.1 and velocity error, both %, of held-out tracks; of poses alone without VAE."""
+    size = study.size({}) if prior is None else prior.settings
+    tracks = study.tracks["test"]
+    cut = [windows(track.keypoints, size.frames, size.frames) for track in tracks]
+    seen = [windows(track.confidence, size.frames, size.frames) >= 0.3 for track in tracks]
+    keypoints, visible = np.concatenate(cut), np.concatenate(seen)
+    shown = np.where(visible[..., None], keypoints, 0.0)
+    given = torch.as_tensor(shown, dtype=torch.float32)
+    weight = torch.as_tensor(visible, dtype=torch.float32)
+    rest = torch.as_tensor(study.body.rest_positions, dtype=torch.float32)
+    distance = Filming().distance
+    with torch.no_grad():
+        guesses = poses.eval()(given, weight, rest)
+        terms = guess_terms(study.body, guesses, given, weight, distance)
+        guess = best_guess(guesses, weighted_sum(terms, size))
+        turns = guess.turns
+        if prior is not None:
+            turns = prior.model.vae.decode(prior.model.vae.encode(given, weight, rest)[0])
+        place = torch.nn.functional.pad(guess.translation, (0, 1))
+        joints = study.body.positions(turns, guess.rotation, place, guess.log_lengths)
+        found = pictured(joints, distance).numpy()
+    sizes = picture_size(shown, visible)
+    return {
+        "pck": percentage_of_correct_keypoints(found, shown, sizes, visible=visible),
+        "pck_0.05": percentage_of_correct_keypoints(
+            found, shown, sizes, visible=visible, share=0.05
+        ),
+        "velocity_error": 100 * velocity_error(found, shown, visible),
+    }
+
+
+def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
+    """Return how near pictures of motions are to real ones, cm², and motions to real ones, mm."""
+    rng = seeds.generator(study.seed, "film", seed)
+    pictures = film_motions(motions, rng)
+    row = {}
+    for part in ("test", "train"):
+        found = motion_chamfer_distance(pictures, study.real_views(part, study.draws))
+        row[f"mcd_{part}"] = 1e4 * found.mean
+        row[f"mcd_{part}_of_generated"] = 1e4 * found.of_generated
+    return row
+
+
+def table(study: Study) -> pd.DataFrame:
+    """Return what each variant reconstructs and generates."""
+    rows = []
+    for name, changes in VARIANTS.items():
+        begun = time.perf_counter()
+        prior, poses = study.variant(name), study.poses(changes)
+        row = {"variant": name, "seconds": time.perf_counter() - begun}
+        row |= reconstructed(study, prior, poses)
+        repeats = pd.DataFrame(
+            [
+                generated(study, prior.sample(seeds.generator(seed, "draws"), study.draws), seed)
+                for seed in range(SEEDS)
+            ]
+        )
+        row |= repeats.mean().to_dict() | {"mcd_test_sd": repeats["mcd_test"].std()}
+        rows.append(row)
+        print(row, flush=True)
+    rows.append({"variant": "no motion VAE"} | reconstructed(study, None, study.poses({})))
+    rng = seeds.generator(study.seed, "real draws")
+    every = study.real_windows("train", FRAMES)
+    real = every[rng.integers(0, len(every), study.draws)]
+    rows.append({"variant": "real motion that was learnt from"} | generated(study, real, 0))
+    for row in rows[-2:]:
+        print(row, flush=True)
+    return pd.DataFrame(rows)
+
+
+def generation(study: Study) -> pd.DataFrame:
+    """Return generation beside MAS and SDS, which draw from a diffusion model of the same clips."""
+    other = MotionDiffusion.load("walk2d")
+    step, per_motion = round(other.fps / FPS), other.frames // round(other.fps / FPS) // FRAMES
+    n = max(2, study.draws // 10)
+    posterior = MotionPosterior(other)
+    ways: dict[str, np.ndarray] = {
+        "motion VAE": study.variant("final").sample(seeds.generator(0, "draws"), n * per_motion)
+    }
+    samplers = {
+        "MAS": MultiViewAncestral(),
+        "SDS": ScoreDistillation(iterations=50 if study.quick else 1000),
+    }
+    seconds = {}
+    for name, sampler in samplers.items():
+        begun = time.perf_counter()
+        drawn = sampler.sample(posterior, draws=n, seed=0, progress=False).flat()
+        seconds[name] = time.perf_counter() - begun
+        thinned = drawn[:, ::step][:, : per_motion * FRAMES]
+        ways[name] = thinned.reshape(n * per_motion, FRAMES, *drawn.shape[2:])
+    rng = seeds.generator(study.seed, "real draws")
+    every = study.real_windows("train", FRAMES)
+    ways["real motion that was learnt from"] = every[rng.integers(0, len(every), n * per_motion)]
+    truth = {part: study.real_windows(part, FRAMES)[::3] for part in ("test", "train")}
+    rows = []
+    for name, motions in ways.items():
+        centred = motions - motions[:, :, :1]
+        row = {"way": name, "sequences": len(motions), "seconds": seconds.get(name)}
+        row |= generated(study, centred, 0)
+        for part, real in truth.items():
+            near = nearest_distances(centred, real)
+            row |= {f"to_{part}_mm": 1000 * near[0], f"of_{part}_mm": 1000 * near[1]}
+        row["mirrored"] = mirror_share(centred, truth["test"])
+        rows.append(row)
+        print(row, flush=True)
+    return pd.DataFrame(rows)
+
+
+PARTS = {"views": views, "table": table, "generation": generation}
+
+
+def main() -> None:
+    """Make the parts that are asked for, each a table in ``--out``."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--quick", action="store_true", help="made walks and tiny networks")
+    parser.add_argument("--steps", type=int, help="of each phase, in place of the size's own")
+    parser.add_argument("--draws", type=int, help="sequences that are generated, 1400 by default")
+    asked = parser.parse_args()
+    draws = asked.draws or (60 if asked.quick else 1400)
+    study = Study(asked.out, asked.data, asked.quick, asked.steps, draws)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    for part in asked.parts:
+        made = PARTS[part](study)
+        with written_whole(asked.out / f"{part}.csv") as path:
+            made.to_csv(path, index=False)
+        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""What ``probmotion train motion-vae`` does: a motion VAE from 2D tracks alone, in two phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import OmitArgPrefixes
+
+from probmotion.track_options import TrackData, learning_tracks
+from probmotion.training_options import Steps, check_out, run_training
+
+if TYPE_CHECKING:
+    from probmotion.data.learning import LearningTracks
+    from probmotion.models.articulated_body import ArticulatedBody
+
+__all__ = ["TrainMotionVAE"]
+
+
+@dataclass(frozen=True)
+class TrainMotionVAE:
+    """Learn a motion VAE, a prior of short 3D motions, from 2D tracks: first poses, then the VAE.
+
+    The same command goes on where it was stopped. More steps are steps of the VAE alone: the poses
+    that it has begun to learn from stay as they are.
+    """
+
+    out: Path
+    """Folder for the folders poses and vae, each with model.safetensors and losses.csv."""
+
+    size: Literal["tiny", "small", "paper"] = "small"
+    """tiny: seconds, for trying out; small: an hour on two cores; paper: a GPU."""
+
+    frames: int | None = None
+    """Frames of a motion; by default the size's own, 10."""
+
+    threshold: float = 0.3
+    """Least confidence of a joint that is learnt from: .3 for people, .5 for horses."""
+
+    rest: Path | None = None
+    """A motion file whose first frame is the body's rest pose, looking along +Z; by default the
+    mean pose is estimated from the tracks."""
+
+    front: str | None = None
+    """A joint that lies ahead of the root, where the body's joints do not say what is in front."""
+
+    distance: float | None = None
+    """Of the cameras from the subject, metres: 7 where clips are filmed; by default rays of tracks
+    are parallel."""
+
+    data: OmitArgPrefixes[TrackData] = field(default_factory=lambda: TrackData(fps=10.0))
+    training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
+
+    def run(self) -> None:
+        """Train the poses, then the VAE."""
+        from probmotion.checks import check_positive
+        from probmotion.data.projections import Filming
+        from probmotion.models.motion_vae_settings import MotionVAESettings
+        from probmotion.models.motion_vae_training import (
+            MotionVAETrainee,
+            PoseTrainee,
+            usual_motion_vae_training,
+        )
+        from probmotion.models.training_runs import STATE
+
+        preset = getattr(MotionVAESettings, self.size)()
+        size = preset if self.frames is None else replace(preset, frames=self.frames)
+        poses, vae = (
+            self.training.settings(usual) for usual in usual_motion_vae_training(self.size)
+        )
+        check_positive("threshold", self.threshold)
+        if self.distance is not None:
+            check_positive("distance", self.distance)
+        check_out(self.out)
+        found = learning_tracks(self.data, self.threshold)
+        filmed = None if self.data.tracks else Filming().distance
+        shared = {
+            "distance": filmed if self.distance is None else self.distance,
+            "threshold": self.threshold,
+            "seed": self.training.seed,
+        }
+        body = self._body(found)
+        device = self.training.device
+        first = PoseTrainee(found.train, found.validation, size, body, **shared)
+        if not (self.out / "vae" / STATE).exists():
+            run_training(first, poses, self.out / "poses", device)
+        teacher = first.learnt(self.out / "poses")
+        trainee = MotionVAETrainee(found.train, found.validation, size, body, teacher, **shared)
+        run_training(trainee, vae, self.out / "vae", device)
+
+    def _body(self, found: LearningTracks) -> ArticulatedBody:
+        """Return the body that moves, and print where its rest pose is from."""
+        from probmotion.models.articulated_body import ArticulatedBody
+        from probmotion.motion import load_motion
+        from probmotion.rest_poses import estimate_rest_pose
+
+        skeleton = found.train[0].skeleton
+        if self.rest is None:
+            rest = estimate_rest_pose(found.train, self.threshold, self.front)
+            print("the rest pose is the mean pose, estimated from the tracks")
+        else:
+            pose = load_motion(self.rest).retarget(skeleton).positions[0]
+            parents = [max(parent, 0) for parent in skeleton.parents]
+            rest = pose - pose[parents]
+            print(f"the rest pose is the first frame of {self.rest}")
+        return ArticulatedBody(skeleton, rest)

@@ -1,0 +1,213 @@
+"""A motion VAE learnt from 2D tracks: which view is right, what is learnt from, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion import seeds
+from probmotion.data.gaits import make_gaits
+from probmotion.data.learning import film_clips
+from probmotion.data.projections import DetectorNoise, Filming
+from probmotion.models.articulated_body import ArticulatedBody
+from probmotion.models.motion_vae import MotionVAE
+from probmotion.models.motion_vae_model import MotionVAEModel
+from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.motion_vae_training import (
+    MotionVAETrainee,
+    PoseTrainee,
+    usual_motion_vae_training,
+)
+from probmotion.models.training import train
+from probmotion.models.variational_terms import gaussian_kl
+from probmotion.models.view_hypotheses import judge_hypotheses
+from probmotion.motion import KeypointTrack, Motion
+from probmotion.rest_poses import estimate_rest_pose
+from probmotion.skeleton import Skeleton
+
+CPU = torch.device("cpu")
+PERSON = Skeleton.preset("person14")
+TINY = MotionVAESettings.tiny()
+
+
+def walks(n: int, seed: int = 0) -> list[Motion]:
+    return make_gaits(n, styles={"walk": 1.0}, frames=90, seed=seed)
+
+
+def filmed(clips: list[Motion], views: int = 8) -> list[KeypointTrack]:
+    return film_clips(clips, PERSON, 10.0, views=views, noise=DetectorNoise(share=0.0)).tracks
+
+
+@pytest.fixture(scope="module")
+def tracks() -> list[KeypointTrack]:
+    return filmed(walks(12))
+
+
+@pytest.fixture(scope="module")
+def validation() -> list[KeypointTrack]:
+    return filmed(walks(3, seed=1), views=4)
+
+
+@pytest.fixture(scope="module")
+def body(tracks: list[KeypointTrack]) -> ArticulatedBody:
+    return ArticulatedBody(PERSON, estimate_rest_pose(tracks))
+
+
+@pytest.fixture(scope="module")
+def first(tracks, validation, body) -> PoseTrainee:
+    return PoseTrainee(tracks, validation, TINY, body, distance=7.0)
+
+
+@pytest.fixture(scope="module")
+def poses(first: PoseTrainee, tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("poses")
+    return folder, train(first, usual_motion_vae_training("tiny")[0], folder, progress=False)
+
+
+@pytest.fixture(scope="module")
+def learnt(tracks, validation, body, first, poses, tmp_path_factory):
+    teacher = first.learnt(poses[0])
+    trainee = MotionVAETrainee(tracks, validation, TINY, body, teacher, distance=7.0)
+    folder = tmp_path_factory.mktemp("vae")
+    settings = replace(usual_motion_vae_training("tiny")[1], checkpoint_every=10)
+    result = train(trainee, settings, folder, progress=False)
+    return trainee, result, MotionVAE.load(folder)
+
+
+def test_the_first_phase_learns_which_view_is_right(poses, first, body) -> None:
+    judged = judge_hypotheses(first.learnt(poses[0]), TINY, body, walks(6, seed=2), n=200, fps=10.0)
+    # By chance a fourth of the views would be right, and half of the depths.
+    assert judged.right > 0.6
+    assert judged.depth_right > 0.6
+
+
+def test_the_second_phase_learns_and_leaves_the_first_as_it_is(learnt, poses, first) -> None:
+    trainee, result, prior = learnt
+    losses = [row["validation_loss"] for row in result.history]
+    assert losses[-1] < 0.8 * losses[0]
+    kept = first.learnt(poses[0]).state_dict()
+    for name, value in prior.model.pose.state_dict().items():
+        np.testing.assert_array_equal(value, kept[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_minutes_of_learning_give_3d_walks(tracks, validation, body, tmp_path) -> None:
+    size = MotionVAESettings.small()
+    poses, vae = usual_motion_vae_training("small")
+    first = PoseTrainee(tracks, validation, size, body, distance=7.0)
+    train(first, replace(poses, steps=800), tmp_path / "poses", progress=False)
+    teacher = first.learnt(tmp_path / "poses")
+    judged = judge_hypotheses(teacher, size, body, walks(6, seed=2), n=500, fps=10.0)
+    assert judged.right > 0.95
+    assert judged.depth_right > 0.95
+    assert judged.error < 0.09
+    second = MotionVAETrainee(tracks, validation, size, body, teacher, distance=7.0)
+    train(second, replace(vae, steps=800), tmp_path / "vae", progress=False)
+    drawn = MotionVAE.load(tmp_path / "vae").sample(np.random.default_rng(0), 100)
+    ankles = [PERSON.index("left_ankle"), PERSON.index("right_ankle")]
+    apart = drawn[:, :, ankles[0], 2] - drawn[:, :, ankles[1], 2]
+    # One foot and then the other is in front, some decimetres; and the left stays left.
+    assert 0.15 < apart.std() < 0.5
+    assert (np.ptp(apart, axis=1) > 0.2).mean() > 0.8
+    assert (drawn[..., ankles[0], 0] > drawn[..., ankles[1], 0]).mean() > 0.9
+
+
+def test_a_second_phase_s_loss_is_the_sum_of_its_terms(learnt, monkeypatch) -> None:
+    trainee, _, prior = learnt
+    network = prior.model
+    assert isinstance(network, MotionVAEModel)
+    only = {"reconstruction": 0.0, "smoothness": 0.0, "ranges": 0.0, "teacher": 0.0}
+    found = {}
+    taught = trainee._taught
+
+    def by_the_usual_weights(*given):
+        asked, trainee.size = trainee.size, TINY
+        try:
+            return taught(*given)
+        finally:
+            trainee.size = asked
+
+    # Which view is best is chosen by the weights, too.
+    monkeypatch.setattr(trainee, "_taught", by_the_usual_weights)
+    for name in (*only, "kl"):
+        weights = {**only, "kl": 0.0, name: 1.0}
+        trainee.size = replace(TINY, **weights)
+        found[name] = trainee.validation_loss(network, CPU)
+    trainee.size = TINY
+    total = sum(getattr(TINY, name) * value for name, value in found.items())
+    assert trainee.validation_loss(network, CPU) == pytest.approx(total, rel=1e-5)
+    assert all(value > 0 for name, value in found.items() if name != "ranges")
+
+
+def test_the_divergence_is_that_of_equation_6_put_right() -> None:
+    rng = np.random.default_rng(0)
+    mean, log_variance = torch.tensor(rng.normal(size=(2, 5, 4)))
+    zero = torch.zeros_like(mean)
+    found = gaussian_kl(mean, 0.5 * log_variance, zero, zero)
+    expected = -0.5 * (log_variance - log_variance.exp() - mean**2 + 1).sum(dim=-1)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_nothing_is_learnt_from_the_third_dimension() -> None:
+    """Bodies that are flat to the camera give the same pictures, and the same loss."""
+    filming = Filming(elevation=0.0, tilt=0.0, perspective=False)
+    clips = walks(6)
+    flat = []
+    for clip in clips:
+        away = filming.cameras(seeds.generator(0, "filming", clip.name), 1).rotation[0, 2]
+        positions = clip.positions - (clip.positions @ away)[..., None] * away
+        flat.append(replace(clip, positions=positions))
+    for clip, other in zip(clips, flat, strict=True):
+        assert np.linalg.norm(clip.positions - other.positions, axis=-1).max() > 0.2
+    losses = []
+    for motions in (clips, flat):
+        pictures = film_clips(
+            motions, PERSON, 10.0, views=1, filming=filming, noise=DetectorNoise.none()
+        ).tracks
+        held_out, seen = pictures[:2], pictures[2:]
+        given = ArticulatedBody(PERSON, estimate_rest_pose(seen))
+        trainee = PoseTrainee(seen, held_out, TINY, given)
+        loss = trainee.training_loss(trainee.network, np.random.default_rng(0), 8, CPU)
+        with torch.no_grad():
+            held = trainee.validation_loss(trainee.network.eval(), CPU)
+        losses.append((float(loss.detach()), held))
+    np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+
+
+def test_a_body_without_pairs_is_said_to_have_none() -> None:
+    arm = Skeleton(["root", "elbow", "hand"], [-1, 0, 1])
+    rng = np.random.default_rng(0)
+    keypoints = 0.3 * rng.normal(size=(20, 3, 2))
+    track = KeypointTrack(keypoints, np.ones((20, 3)), arm, 10.0, "arm/0")
+    body = ArticulatedBody(arm, np.array([[0, 0, 0], [0, 0.3, 0], [0, 0.2, 0.1]]))
+    with pytest.warns(UserWarning, match="body has no left-right pairs"):
+        trainee = PoseTrainee([track], [track], TINY, body)
+    assert not trainee.batches.augmentation.mirror
+
+
+def test_bad_input_is_refused_in_a_sentence(tracks, validation, body) -> None:
+    short = [replace(t, keypoints=t.keypoints[:6], confidence=t.confidence[:6]) for t in tracks]
+    with pytest.raises(ValueError, match="tracks has at most 6 frames a track, expected a seq"):
+        PoseTrainee(short, validation, TINY, body)
+    blind = []
+    for track in tracks:
+        confidence = track.confidence.copy()
+        confidence[:, [PERSON.index("left_ankle"), PERSON.index("right_ankle")]] = 0
+        blind.append(replace(track, confidence=confidence))
+    with pytest.raises(ValueError, match="tracks never shows left_ankle, right_ankle"):
+        PoseTrainee(blind, validation, TINY, body)
+    faster = [replace(track, fps=20.0) for track in validation]
+    with pytest.raises(ValueError, match="validation is at 20 frames per second, expected"):
+        PoseTrainee(tracks, faster, TINY, body)
+    order = [*range(1, 14), 0]
+    names = Skeleton([PERSON.joint_names[j] for j in order],
+                     [order.index(PERSON.parents[j]) if PERSON.parents[j] >= 0 else -1
+                      for j in order])  # fmt: skip
+    other = ArticulatedBody(names, body.rest[order])
+    with pytest.raises(ValueError, match="tracks has the joints pelvis, "):
+        PoseTrainee(tracks, validation, TINY, other)
+    with pytest.raises(ValueError, match="size is 'huge', expected one of tiny, small, paper"):
+        usual_motion_vae_training("huge")

@@ -1,0 +1,95 @@
+"""``probmotion train motion-vae``: from files that hold 2D alone to a prior over 3D motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probmotion import Skeleton
+from probmotion.cli import main
+from probmotion.data.gaits import make_gaits
+from probmotion.data.projections import DetectorNoise, project_clips
+from probmotion.models.motion_vae import MotionVAE
+from probmotion.motion import KeypointTrack
+
+PERSON = Skeleton.preset("person14")
+
+
+def keep(track: KeypointTrack, path: Path) -> None:
+    np.savez(
+        path,
+        keypoints=track.keypoints,
+        confidence=track.confidence,
+        joint_names=np.array(track.skeleton.joint_names),
+        parents=np.array(track.skeleton.parents),
+        fps=track.fps,
+    )
+
+
+@pytest.fixture(scope="module")
+def tracks(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A pattern of files of 2D tracks: five clips, each from six sides."""
+    folder = tmp_path_factory.mktemp("tracks")
+    clips = [clip.retarget(PERSON) for clip in make_gaits(5, styles={"walk": 1.0}, frames=60)]
+    for track in project_clips(clips, views=6, noise=DetectorNoise.none()):
+        keep(track, folder / f"{track.name.replace('/', '-')}.npz")
+    return str(folder / "walk-*.npz")
+
+
+def words(tracks: str, out: Path, *more: object) -> list[str]:
+    parts = ["--validation", "walk-3-0", "walk-3-1", "--test", "walk-4-0"]
+    given = ["train", "motion-vae", "--tracks", tracks, "--size", "tiny", *parts]
+    return [*given, "--out", str(out), *map(str, more)]
+
+
+def test_a_prior_of_3d_motion_comes_from_files_of_2d_tracks(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert main(words(tracks, out, "--steps", 4)) == 0
+    said = capsys.readouterr().out
+    assert "the rest pose is the mean pose, estimated from the tracks" in said
+    assert f"wrote {out / 'poses' / 'model.safetensors'}: step 4" in said
+    prior = MotionVAE.load(out / "vae")
+    assert (prior.skeleton, prior.fps, prior.frames) == (PERSON, 10.0, 10)
+    assert prior.sample(np.random.default_rng(0), 2).shape == (2, 10, 14, 3)
+    assert prior.card["network"]["distance"] is None
+    # More steps are steps of the VAE; the poses stay.
+    poses = (out / "poses" / "model.safetensors").read_bytes()
+    assert main(words(tracks, out, "--steps", 6)) == 0
+    assert "step 6, loss" in capsys.readouterr().out
+    assert (out / "poses" / "model.safetensors").read_bytes() == poses
+
+
+def test_a_rest_pose_may_be_given(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk = make_gaits(1, styles={"walk": 1.0}, frames=2)[0]
+    pose = tmp_path / "rest.npz"
+    walk.save(pose)
+    assert main(words(tracks, tmp_path / "run", "--steps", 2, "--rest", pose)) == 0
+    assert f"the rest pose is the first frame of {pose}" in capsys.readouterr().out
+    body = MotionVAE.load(tmp_path / "run" / "vae").body
+    expected = walk.retarget(PERSON).positions[0]
+    np.testing.assert_allclose(body.rest_positions, expected - expected[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--frames", "80"], "tracks has at most "),
+        (["--distance", "0"], "distance is 0.0, expected a finite number above 0"),
+        (["--threshold", "0"], "threshold is 0.0, expected a finite number above 0"),
+        (["--rest", "no.npz"], "no.npz"),
+    ],
+)
+def test_wrong_options_are_one_sentence(
+    tracks: str, tmp_path: Path, more: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words(tracks, tmp_path / "run", "--steps", 2, *more)) == 2
+    (line,) = (
+        part for part in capsys.readouterr().err.splitlines() if part.startswith("probmotion: ")
+    )
+    assert said in line
