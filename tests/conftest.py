@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Let torch use one thread in every test and its fixtures.
+
+    Numba's first kernel on threads sets OpenMP's number of them, which is torch's too, whatever
+    OMP_NUM_THREADS says; on small tensors threads that wait for each other cost ten times as much.
+    """
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.set_num_threads(1)
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,7 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     assert wide.loc["mh", "rhat"] > 1.05
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_pose_pairs(tmp_path, monkeypatch):
     from probmotion import load_motion
@@ -74,6 +75,7 @@ def test_pose_pairs(tmp_path, monkeypatch):
     assert float(drawn) < float(seed)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_motion_from_2d(tmp_path, monkeypatch):
     printed = run("03_motion_from_2d.py", tmp_path, 5, monkeypatch)
