@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from probmotion.models.gaussian_mixture import GaussianMixtureMotion
     from probmotion.models.motion_diffusion import MotionDiffusion
+    from probmotion.models.motion_dvae import MotionDVAE
+    from probmotion.models.motion_vae import MotionVAE
 
-_HOMES = {"GaussianMixtureMotion": "gaussian_mixture", "MotionDiffusion": "motion_diffusion"}
+_HOMES = {
+    "GaussianMixtureMotion": "gaussian_mixture",
+    "MotionDVAE": "motion_dvae",
+    "MotionDiffusion": "motion_diffusion",
+    "MotionVAE": "motion_vae",
+}
 
-__all__ = ["GaussianMixtureMotion", "MotionDiffusion"]
+__all__ = ["GaussianMixtureMotion", "MotionDVAE", "MotionDiffusion", "MotionVAE"]
 
 
 def __getattr__(name: str) -> Any:

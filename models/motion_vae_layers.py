@@ -22,6 +22,7 @@ __all__ = [
     "ImageFeatures",
     "Readout",
     "TransformerLayer",
+    "body_size",
     "check_frames",
     "mixed_precision",
 ]
@@ -175,9 +176,9 @@ class FrameEncoder(nn.Module):
         check_frames(keypoints, confidence, rest, features, len(self.joints), self.features)
         seen = confidence > 0
         parts = [
-            torch.where(seen[..., None], keypoints, 0.0),
+            torch.where(seen[..., None], keypoints, 0.0) / body_size(rest),
             confidence[..., None],
-            rest.expand(*seen.shape, 3),
+            (rest / body_size(rest)).expand(*seen.shape, 3),
         ]
         if features is not None:
             # A joint that is not seen has no place in the image whose feature could be read.
@@ -254,6 +255,14 @@ def _working(tokens: torch.Tensor) -> torch.Tensor:
     if not torch.is_autocast_enabled(kind):
         return tokens
     return tokens.to(torch.get_autocast_dtype(kind))
+
+
+def body_size(rest: torch.Tensor) -> torch.Tensor:
+    """Return the mean distance of joints from the root, metres: what descriptors are units of.
+
+    In metres, keypoints would be drowned by what says which joint they are of.
+    """
+    return torch.linalg.norm(rest, dim=-1).mean()
 
 
 def check_frames(

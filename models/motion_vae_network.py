@@ -18,6 +18,7 @@ from probmotion.models.motion_vae_layers import (
     ImageFeatures,
     Readout,
     TransformerLayer,
+    body_size,
     check_frames,
     mixed_precision,
 )
@@ -25,6 +26,7 @@ from probmotion.models.motion_vae_settings import MotionVAESettings
 
 __all__ = ["FrameMap", "MotionVAENetwork", "TimeDecoder", "TimeEncoder"]
 
+_FIRST_LOG_VARIANCE = -4.0
 _LOG_VARIANCE_BOUND = 10.0
 
 
@@ -55,8 +57,8 @@ class FrameMap(nn.Module):
     ) -> torch.Tensor:
         """Return the vectors of frames, (B, T, width); arguments as `MotionVAENetwork.encode`'s."""
         check_frames(keypoints, confidence, rest, features, self.n_joints, self.features)
-        shown = torch.where(confidence[..., None] > 0, keypoints, 0.0)
-        known = rest.flatten().expand(*confidence.shape[:2], -1)
+        shown = torch.where(confidence[..., None] > 0, keypoints, 0.0) / body_size(rest)
+        known = (rest / body_size(rest)).flatten().expand(*confidence.shape[:2], -1)
         parts = [shown.flatten(2), confidence, known]
         if features is not None:
             parts.append(features[0])
@@ -80,7 +82,10 @@ class TimeEncoder(nn.Module):
         self.layers = nn.ModuleList(TransformerLayer(size) for _ in range(size.layers))
         self.norm = nn.LayerNorm(size.width)
         self.mean = Readout(size.width, size.latent, quiet=False)
-        self.log_variance = Readout(size.width, size.latent, quiet=False)
+        self.log_variance = Readout(size.width, size.latent)
+        # Codes begin sharp: what a decoder hears through noise of the prior's size it does not
+        # learn to listen to for thousands of steps.
+        nn.init.constant_(self.log_variance.bias, _FIRST_LOG_VARIANCE)
         places = sinusoids(torch.arange(size.frames + 2), size.width)
         self.register_buffer("places", places, persistent=False)
 

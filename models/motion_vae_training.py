@@ -312,8 +312,8 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
             TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
         ),
         "small": (
-            TrainingSettings(steps=6000, learning_rate=5e-4),
-            TrainingSettings(steps=10_000, learning_rate=5e-4),
+            TrainingSettings(steps=3000, batch=32, learning_rate=1e-3, ema=0.995),
+            TrainingSettings(steps=8000, batch=32, learning_rate=1e-3, ema=0.995),
         ),
         "paper": (
             TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000),

@@ -26,6 +26,8 @@ from probmotion.files import written_whole
 from probmotion.models.checkpoints import WEIGHTS
 from probmotion.models.evaluator import TrackEvaluator
 from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.models.motion_vae import MotionVAE
+from probmotion.motion import Motion
 
 ROOT = Path(__file__).parents[1]
 WINDOWS = 1000
@@ -57,7 +59,7 @@ def main() -> None:
     evaluator.save(WEIGHTS / "walk2d-evaluator.safetensors", half=True)
     # As they will be loaded: features of half-precision weights.
     evaluator = TrackEvaluator.load("walk2d-evaluator")
-    write_features(evaluator, prior, asked.data)
+    write_features("walk2d", evaluator, prior, walk_clips(asked.data))
     lines = card_lines(prior.card, evaluator.card)
     if asked.table is not None:
         lines += measured(pd.read_csv(asked.table))
@@ -74,18 +76,22 @@ def listed(part: str, data: Path) -> list[str]:
     return [Path(name).name for name in WALK_CLIPS[part]]
 
 
-def write_features(evaluator: TrackEvaluator, prior: MotionDiffusion, data: Path) -> None:
+def write_features(
+    name: str,
+    evaluator: TrackEvaluator,
+    prior: MotionDiffusion | MotionVAE,
+    clips: dict[str, list[Motion]],
+) -> None:
     """Write the features of random windows of test and training clips, and how they were filmed."""
-    filming, clips = Filming(), walk_clips(data)
-    found = {}
-    for seed, (name, part) in enumerate((("held_out", "test"), ("learnt", "train")), start=1):
+    filming, found = Filming(), {}
+    for seed, (part, of) in enumerate((("test", "held_out"), ("train", "learnt")), start=1):
         views = film_windows(
             clips[part], prior.skeleton, prior.fps, prior.frames, WINDOWS, seed=seed
         )
-        found[name] = evaluator.features(views).astype(np.float16)
+        found[of] = evaluator.features(views).astype(np.float16)
     held = io.BytesIO()
     np.savez_compressed(held, elevation=filming.elevation, distance=filming.distance, **found)
-    with written_whole(WEIGHTS / "walk2d-features.npz") as path:
+    with written_whole(WEIGHTS / f"{name}-features.npz") as path:
         path.write_bytes(held.getvalue())
 
 

@@ -220,10 +220,15 @@ def _read_clips(paths: tuple[str, ...]) -> list[Motion]:
 
 def _long_clips(clips: list[Motion], skeleton: Skeleton, fps: float, frames: int) -> list[Motion]:
     """Return clips on the skeleton at the frame rate, without those shorter than a window."""
+    from probmotion.models.body_states import check_bones
+
     rates = Counter(clip.fps for clip in clips if clip.fps != fps)
     found = [_on(skeleton, clip).resample(fps) for clip in clips]
     for rate, count in sorted(rates.items()):
         print(f"resampled to {fps:g} fps: {count} clips at {rate:g} fps")
+    for clip in found:
+        parents = [max(parent, 0) for parent in skeleton.parents]
+        check_bones(clip.name, clip.positions[0] - clip.positions[0, parents], skeleton)
     long = [clip for clip in found if clip.frames >= frames]
     if not long:
         raise ValueError(

@@ -15,6 +15,8 @@ from probmotion.skeleton import Skeleton
 
 __all__ = ["noisy_joints"]
 
+# Mean cosine with an axis from which a body is thought to stand along it.
+_UPRIGHT = 0.8
 _SIZES = (0.5, 3.0)
 """Metres, the longest chain of bones. A person of ``person14`` has .95 (a child of three .5) from
 the pelvis to an ankle and 1.15 to a wrist; a joint more or less at the ends changes little."""
@@ -76,7 +78,8 @@ def noisy_joints(
     -----
     UserWarning
         If no joint is seen in some frames, the body is of no size in metres, or it is and the
-        noise is above a metre or the lowest joints are far from the prior's floor.
+        noise is above a metre or the lowest joints are far from the prior's floor, or the body
+        stands along another axis than Y.
 
     Raises
     ------
@@ -117,6 +120,7 @@ def noisy_joints(
     if _check_size(joints, weight, prior.skeleton):
         _check_noise(noise)
         _check_floor(joints, weight, getattr(prior, "floor", None))
+    _check_upright(joints, weight, prior.skeleton)
     return Joints3D(joints, noise, weight, degrees_of_freedom, prior.skeleton, prior.fps)
 
 
@@ -195,6 +199,28 @@ def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float | None
         warnings.warn(
             f"the lowest joints are at {lowest:.2g} m, and the prior's floor is at {floor:g}; is "
             f"the world's Y up, its floor at {floor:g}?",
+            stacklevel=3,
+        )
+
+
+def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> None:
+    """Warn if the neck is along another axis from the ankles than Y, all the time."""
+    names = skeleton.canonical_names
+    if not {"neck", "left_ankle", "right_ankle"} <= set(names):
+        return
+    neck, *ankles = (names.index(name) for name in ("neck", "left_ankle", "right_ankle"))
+    seen = (confidence[:, [neck, *ankles]] > 0).all(axis=1)
+    if not seen.any():
+        return
+    bodies = joints[seen, neck] - joints[seen][:, ankles].mean(axis=1)
+    size = np.linalg.norm(bodies, axis=-1, keepdims=True)
+    along = (bodies / np.where(size > 0, size, 1.0)).mean(axis=0)
+    axis = int(np.abs(along).argmax())
+    if abs(along[axis]) > _UPRIGHT and not (axis == 1 and along[1] > 0):
+        sign = "" if along[axis] > 0 else "-"
+        warnings.warn(
+            f"joints has a body that stands along {sign}{'XYZ'[axis]}, expected Y to be up; does "
+            "it lie?",
             stacklevel=3,
         )
 

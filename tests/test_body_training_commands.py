@@ -355,6 +355,9 @@ def test_wrong_words_are_one_sentence(
     twins = sorted([str(twin), clips.replace("*", "1")])
     still = tmp_path / "still.npz"
     replace(make_gait("walk", 0, frames=40).window(0, 1), name="still").save(still)
+    large = tmp_path / "large.npz"
+    walk = make_gait("walk", 0, frames=40)
+    replace(walk, positions=1000 * walk.positions, name="large").save(large)
     named = "is given without clips, expected --clips FILE… beside it"
     both = "expected clips for both or neither"
     none = "clips has none of 12 frames or more at 30 frames per second, expected some; the longest"
@@ -380,6 +383,8 @@ def test_wrong_words_are_one_sentence(
         ("--clips", clips, str(twin)): f"clips has {' and '.join(twins)}, expected "
         "files of other names: a clip is called as its file",
         ("--clips", str(tmp_path / "no.npz")): f"{tmp_path / 'no.npz'}: No such file or directory",
+        ("--clips", clips, str(large)): "large has a bone of length 500, to neck, expected "
+        "metres, at most 3",
         ("--steps", "0"): "steps is 0, expected an integer of at least 1",
         ("--data-seed", "-1"): "data_seed is -1, expected an integer of at least 0",
     }

@@ -254,3 +254,13 @@ def test_no_gap_is_as_long_as_the_networks_window() -> None:
     for options in ({"longest_gap": 13}, {"prior": Prior()}):
         with pytest.warns(UserWarning, match="12 of 40 frames"):
             evidence(joints, **({"prior": Standing()} | options))
+
+
+@pytest.mark.parametrize(("axes", "named"), [([0, 2, 1], "Z"), ([1, 0, 2], "X")])
+def test_a_body_that_stands_along_another_axis_is_said(axes: list[int], named: str) -> None:
+    joints = walk().positions[..., axes]
+    with pytest.warns(UserWarning, match=f"stands along {named}, expected Y to be up"):
+        found = evidence(joints)
+    np.testing.assert_array_equal(found.joints, joints)
+    with pytest.warns(UserWarning, match="stands along -Y"):
+        evidence(walk().positions * [1, -1, 1])

@@ -33,6 +33,7 @@ from probmotion.likelihoods import Joints3D
 from probmotion.metrics import accuracy
 from probmotion.models import GaussianMixtureMotion
 from probmotion.models.body_states import BodyStates, rest_pose
+from probmotion.models.checkpoints import weights_digest
 from probmotion.models.denoiser_training import DenoiserTrainee, usual_denoiser_training
 from probmotion.models.dvae_settings import DVAESettings
 from probmotion.models.dvae_training import DVAETrainee, usual_dvae_training
@@ -260,25 +261,62 @@ def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
 
 
 def table(study: Study) -> pd.DataFrame:
-    """Return mean errors of every way of denoising, by kind of recording."""
+    """Return mean errors of every way of denoising, by kind of recording.
+
+    Rows that are left in ``--out/table.csv`` are not made again; those of other networks or
+    another number of recordings are refused.
+    """
+    place = study.out / "table.csv"
+    rows = pd.read_csv(place).to_dict("records") if place.exists() else []
+    made_of = {"per_clip": study.per_clip, "weights": weights_digest(study.prior.model)[:12]}
+    for row in rows:
+        if any(str(row.get(name)) != str(value) for name, value in made_of.items()):
+            raise ValueError(f"out has {place} of other recordings or networks, expected a new one")
+    made = {(row["kind"], row["estimate"]) for row in rows}
     ways = estimates(study)
-    rows = []
     for kind in KINDS:
         recordings = study.recordings(kind)
         for name, estimate in ways.items():
-            begun = time.perf_counter()
-            found = [estimate(recording) for recording in recordings]
-            seconds = time.perf_counter() - begun
-            errors = pd.DataFrame([measured(*pair) for pair in zip(recordings, found, strict=True)])
-            frames = sum(recording.truth.frames for recording in recordings)
-            row = {"kind": kind, "estimate": name, **errors.mean().to_dict()}
-            # Recordings of one clip are alike: clips are what varies.
-            clips = errors.groupby([one.truth.name.partition("/")[0] for one in recordings]).mean()
-            row["g_mpjpe_error"] = clips["g_mpjpe"].std() / math.sqrt(len(clips))
-            row["g_mpjpe_median"] = errors["g_mpjpe"].median()
-            rows.append(row | {"seconds_per_frame": seconds / frames, "recordings": len(errors)})
+            # Noise that is Gaussian is believed to be, unless told otherwise.
+            same = name.startswith("Gaussian") and KINDS[kind][1] is None
+            if same or (kind, name) in made:
+                continue
+            found = table_row(recordings, estimate)
+            rows.append({"kind": kind, "estimate": name, **found, **made_of})
             print(rows[-1], flush=True)
+            with written_whole(place) as path:
+                pd.DataFrame(rows).to_csv(path, index=False)
     return pd.DataFrame(rows)
+
+
+def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, float]:
+    """Return mean errors of one way of denoising; a recording where it fails is counted, no more.
+
+    What is compared with another row has to be compared on the same recordings: a row with
+    failures says nothing but that.
+    """
+    begun = time.perf_counter()
+    found, failed = [], 0
+    for recording in recordings:
+        try:
+            found.append((recording, estimate(recording)))
+        except ValueError as error:
+            failed += 1
+            print(f"{recording.truth.name}: {error}", flush=True)
+    seconds = time.perf_counter() - begun
+    row: dict[str, float] = {"recordings": len(recordings), "failed": failed}
+    if failed:
+        return row
+    errors = pd.DataFrame([measured(*pair) for pair in found])
+    # Recordings of one clip are alike: clips are what varies.
+    clips = errors.groupby([one.truth.name.partition("/")[0] for one in recordings]).mean()
+    frames = sum(recording.truth.frames for recording in recordings)
+    return row | {
+        **errors.mean().to_dict(),
+        "g_mpjpe_error": clips["g_mpjpe"].std() / math.sqrt(len(clips)),
+        "g_mpjpe_median": errors["g_mpjpe"].median(),
+        "seconds_per_frame": seconds / frames,
+    }
 
 
 def speed(study: Study) -> pd.DataFrame:

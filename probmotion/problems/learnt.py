@@ -1,5 +1,5 @@
 """Problems whose prior was learnt from 2D tracks: no one knows the posterior, but what it films
-like can be compared with real 2D motion that was held out."""
+like can be compared with real 2D motion that was held out, and draws from it with what was seen."""
 
 from __future__ import annotations
 
@@ -9,17 +9,25 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion import models
+from probmotion import models, seeds
+from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics.generation import GenerationReference
 from probmotion.models.evaluator import TrackEvaluator
 from probmotion.models.motion_diffusion import MotionDiffusion
+from probmotion.models.motion_vae import MotionVAE
+from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
+from probmotion.problems.evidence import observe
 from probmotion.problems.problem import Problem
 
-__all__ = ["LEARNT_PROBLEMS", "learnt_problem"]
+__all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
+
+_NOISE = 0.02
 
 
-def learnt_problem(name: str, description: str) -> Problem:
+def learnt_problem(
+    name: str, description: str, prior: type[MotionDiffusion] | type[MotionVAE] = MotionDiffusion
+) -> Problem:
     """Return the generation problem of a prior that comes with the package.
 
     Beside the prior's weights lie those of the evaluator, ``<name>-evaluator``, and the features
@@ -40,15 +48,57 @@ def learnt_problem(name: str, description: str) -> Problem:
             float(kept["elevation"]),
             float(kept["distance"]),
         )
-    posterior = MotionPosterior(MotionDiffusion.load(name))
-    return Problem(name, description, posterior, generation=reference)
+    return Problem(name, description, MotionPosterior(prior.load(name)), generation=reference)
 
 
-def _named(name: str, description: str) -> tuple[str, tuple[str, Callable[[], Problem]]]:
-    return name, (description, partial(learnt_problem, name, description))
+def seen_draw_problem(name: str, description: str, prior: str, how: str, seed: int = 0) -> Problem:
+    """Return the problem of a motion VAE's draw that one camera sees; the draw is the truth.
+
+    Parameters
+    ----------
+    name, description : str
+        As in tables.
+    prior : str
+        A motion VAE that comes with the package.
+    how : str
+        What is seen; see :func:`~probmotion.problems.evidence.observe`.
+    seed : int
+        Of the draw and its noise.
+    """
+    vae = MotionVAE.load(prior)
+    truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
+    seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
+    assert isinstance(seen, Keypoints2D)
+    return Problem(name, description, MotionPosterior(vae, seen), truth=truth)
 
 
-LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = dict(
-    [_named("walk2d", "people who walk, a prior learnt from 2D tracks alone: generation")]
-)
+LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
+    name: (description, partial(make, name, description, *more))
+    for name, description, make, *more in (
+        (
+            "walk2d",
+            "people who walk, a prior learnt from 2D tracks alone: generation",
+            learnt_problem,
+        ),
+        (
+            "walk-vae",
+            "people who walk, a motion VAE learnt from 2D tracks alone: generation",
+            learnt_problem,
+            MotionVAE,
+        ),
+        (
+            "animal-vae",
+            "four-legged animals, a motion VAE learnt from 2D tracks alone: generation",
+            learnt_problem,
+            MotionVAE,
+        ),
+        (
+            "walk-vae-monocular",
+            "a draw of walk-vae, 2D keypoints of one camera (σ 2 cm)",
+            seen_draw_problem,
+            "walk-vae",
+            "monocular",
+        ),
+    )
+}
 """What each problem is, and the function that makes it, by name."""

@@ -156,7 +156,7 @@ def test_without_the_prior_s_weight_a_fit_finds_the_best_motion():
     """The bound is then E_q[log p(y | θ)], largest where q is a point at the likelihood's mode."""
     network = GaussianNetwork()
     posterior = one_direction(network)
-    run(replace(FIT, latent_weight=0.0), posterior)
+    run(replace(FIT, latent_weight=0.0, iterations=1200), posterior)
     m, log_s = network.begun[0].numbers.detach().numpy()
     mean, deviation, _ = posterior.prior.exact(posterior.likelihood)
     # Posterior precision is 1 + that of the likelihood.
