@@ -313,7 +313,7 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
         ),
         "small": (
             TrainingSettings(steps=3000, batch=32, learning_rate=1e-3, ema=0.995),
-            TrainingSettings(steps=8000, batch=32, learning_rate=1e-3, ema=0.995),
+            TrainingSettings(steps=5000, batch=32, learning_rate=1e-3, ema=0.995),
         ),
         "paper": (
             TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000),

@@ -1,4 +1,4 @@
-"""What walk-vae and animal-vae ship with: trains them from 2D tracks, writes weights and cards.
+"""What motion VAEs ship with: trains them from 2D tracks, writes weights and cards.
 
     python notebooks/ship_motion_vae.py walk-vae --runs runs
     python notebooks/ship_motion_vae.py animal-vae --runs runs
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ship_walk2d import write_features
@@ -56,6 +56,8 @@ class Kind:
     clips: Callable[[Path], dict[str, list[Motion]]]
     views: Mapping[str, int]
     """Cameras around a clip of a data set whose name begins so."""
+    steps: int
+    """Of the second phase."""
     provenance: str
 
 
@@ -65,6 +67,7 @@ KINDS = {
         Skeleton.preset("person14"),
         walk_clips,
         {"": 64},
+        5000,
         "humanoid3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng. cmu_*: "
         "mocap.cs.cmu.edu, free for research and commercial use; the database was created with "
         "funding from NSF EIA-0196217.",
@@ -74,6 +77,7 @@ KINDS = {
         ANIMAL_SKELETON,
         animal_clips,
         {"": 16, "dog3d": 128},
+        3500,
         "dog3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng; they look like dog motion "
         "capture that its authors offer for non-commercial use, and should be treated so in doubt. "
         "quadruped-*: made by this project.",
@@ -130,7 +134,7 @@ def trained(kind: Kind, tracks: dict[str, list[KeypointTrack]], folder: Path) ->
     first = PoseTrainee(*given, distance=Filming().distance)
     train(first, poses, folder / "poses")
     second = MotionVAETrainee(*given, first.learnt(folder / "poses"), distance=Filming().distance)
-    train(second, vae, folder / "vae")
+    train(second, replace(vae, steps=kind.steps), folder / "vae")
     return MotionVAE.load(folder / "vae")
 
 

@@ -59,7 +59,7 @@ class DVAEInference:
     mode : {"regression", "optimization"}
         Draw from what the network answers, or fit it to this evidence first.
     iterations : int
-        Of the fit: 50 to 200 as published.
+        Of the fit; 50 to 200 as published.
     learning_rate : float
         Of Adam at the fit's beginning; it falls to 0 by half a cosine. Chosen, with that, on the
         clips that ``body-dvae`` was watched on.
@@ -90,7 +90,7 @@ class DVAEInference:
 
     network: InferenceNetwork | None = None
     mode: Mode = "regression"
-    iterations: int = 50
+    iterations: int = 100
     learning_rate: float = 2e-3
     degrees_of_freedom: float | None = None
     initial_entropy: bool = True
@@ -118,7 +118,9 @@ class DVAEInference:
     @classmethod
     def paper(cls) -> DVAEInference:
         """Return the optimisation as published: robust noise, no entropy of the first pose."""
-        return cls(mode="optimization", degrees_of_freedom=4.0, initial_entropy=False)
+        return cls(
+            mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
+        )
 
     def sample(
         self,

@@ -71,7 +71,9 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
     data = {"py.typed", "data/registry.csv", "pictures/playing.js"}
     learnt = ("joint_limits.npz", "walk2d.md", "walk2d.safetensors", "walk2d-evaluator.safetensors")
     body = ("body-dvae.md", "body-dvae.safetensors", "body-dvae-denoiser.safetensors")
-    data |= {f"models/weights/{name}" for name in (*learnt, *body, "walk2d-features.npz")}
+    vae = ("walk-vae.md", "walk-vae.safetensors", "walk-vae-evaluator.safetensors")
+    features = ("walk2d-features.npz", "walk-vae-features.npz")
+    data |= {f"models/weights/{name}" for name in (*learnt, *body, *vae, *features)}
     assert held == wanted | {f"probmotion/{name}" for name in data}
 
 

@@ -217,7 +217,7 @@ def mixture(study: Study) -> Estimate:
 
 def estimates(study: Study) -> dict[str, Estimate]:
     """Return every way of denoising, by name."""
-    fit = DVAEInference(mode="optimization")
+    fit = DVAEInference(mode="optimization", iterations=50)
     regression = DVAEInference()
     known = mixture(study)
     blind = study.trained("no prior", study.prior, latent_weight=0.0)
@@ -230,6 +230,7 @@ def estimates(study: Study) -> dict[str, Estimate]:
         "Gaussian mixture, exact mean": known,
         "regression": study.dvae(regression),
         "optimization": study.dvae(fit),
+        "optimization, 100 iterations": study.dvae(replace(fit, iterations=100)),
         "NN output, regression": study.dvae(regression, average=False),
         "NN output, optimization": study.dvae(fit, average=False),
         "no prior, regression": study.dvae(regression, blind),
@@ -375,7 +376,7 @@ def recording(study: Study) -> pd.DataFrame:
             found.joints, scale, (~hidden).astype(float), 4.0, found.skeleton, found.fps
         )
         one = Recording(truth, evidence, hidden)
-        fit = DVAEInference(mode="optimization")
+        fit = DVAEInference(mode="optimization", iterations=50)
         ways = {
             "noisy input": noisy,
             "Savitzky-Golay": filtered,
