@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
@@ -75,7 +75,7 @@ class TrainMotionVAE:
         check_out(self.out)
         found = learning_tracks(self.data, self.threshold)
         filmed = None if self.data.tracks else Filming().distance
-        shared = {
+        shared: dict[str, Any] = {
             "distance": filmed if self.distance is None else self.distance,
             "threshold": self.threshold,
             "seed": self.training.seed,
