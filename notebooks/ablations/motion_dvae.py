@@ -23,6 +23,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import NullFormatter
 
 from probmotion import seeds
 from probmotion.data.denoising_clips import denoising_clips, made_denoising_clips
@@ -351,6 +352,8 @@ def speed(study: Study) -> pd.DataFrame:
     for _, row in made.iterrows():
         left.annotate(f"{row['iterations']:.0f}", (row["seconds_per_frame"], row["g_mpjpe"]))
     left.set(xscale="log", xlabel="seconds per frame", ylabel="G-MPJPE, mm")
+    left.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    left.xaxis.set_minor_formatter(NullFormatter())
     left.legend()
     with written_whole(study.out / "speed.png") as path:
         figure.savefig(path, format="png", dpi=150)
