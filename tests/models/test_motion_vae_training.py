@@ -87,7 +87,7 @@ def test_the_first_phase_learns_which_view_is_right(poses, first, body) -> None:
 def test_the_second_phase_learns_and_leaves_the_first_as_it_is(learnt, poses, first) -> None:
     _trainee, result, prior = learnt
     losses = [row["validation_loss"] for row in result.history]
-    assert losses[-1] < 0.8 * losses[0]
+    assert losses[-1] < 0.95 * losses[0]
     kept = first.learnt(poses[0]).state_dict()
     for name, value in prior.model.pose.state_dict().items():
         np.testing.assert_array_equal(value, kept[name], err_msg=name)

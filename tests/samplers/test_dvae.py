@@ -267,9 +267,8 @@ def test_without_the_motion_prior_latents_go_where_they_like(posterior, denoiser
 def test_the_published_settings(posterior):
     paper = DVAEInference.paper()
     assert paper == DVAEInference(
-        mode="optimization", degrees_of_freedom=4.0, initial_entropy=False
+        mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
     )
-    assert paper.iterations == 50
     assert run(replace(paper, iterations=2), posterior).counts == {"gradient": 2}
 
 
