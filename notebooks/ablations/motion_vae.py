@@ -94,7 +94,7 @@ class Study:
     @cached_property
     def tracks(self) -> dict[str, list[KeypointTrack]]:
         """What is learnt from, by part: prepared 2D tracks."""
-        views = {"train": 4 if self.quick else 64}
+        views = dict.fromkeys(("train", "validation"), 4 if self.quick else 64)
         return {
             part: film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
             for part, clips in self.clips.items()
@@ -183,9 +183,10 @@ def reconstructed(study: Study, prior: MotionVAE | None, poses: PoseNetwork) -> 
     """Return PCK@0.1 and velocity error, both %, of held-out tracks; of poses alone without VAE."""
     size = study.size({}) if prior is None else prior.settings
     tracks = study.tracks["test"]
-    cut = [windows(track.keypoints, size.frames, size.frames) for track in tracks]
-    seen = [windows(track.confidence, size.frames, size.frames) >= 0.3 for track in tracks]
-    keypoints, visible = np.concatenate(cut), np.concatenate(seen)
+    keypoints = np.concatenate([pieces(track.keypoints, size.frames) for track in tracks])
+    visible = np.concatenate([pieces(track.confidence, size.frames) for track in tracks]) >= 0.3
+    whole = visible.any(axis=(1, 2))
+    keypoints, visible = keypoints[whole], visible[whole]
     shown = np.where(visible[..., None], keypoints, 0.0)
     given = torch.as_tensor(shown, dtype=torch.float32)
     weight = torch.as_tensor(visible, dtype=torch.float32)
@@ -209,6 +210,12 @@ def reconstructed(study: Study, prior: MotionVAE | None, poses: PoseNetwork) -> 
         ),
         "velocity_error": 100 * velocity_error(found, shown, visible),
     }
+
+
+def pieces(values: np.ndarray, frames: int) -> np.ndarray:
+    """Return what fits of (L, …) as sequences one after the other, (n, frames, …)."""
+    n = len(values) // frames
+    return values[: n * frames].reshape(n, frames, *values.shape[1:])
 
 
 def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
