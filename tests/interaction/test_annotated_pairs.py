@@ -72,12 +72,12 @@ def test_fresh_views_estimate_the_integral_without_bias(drawn, poses):
     """
     few = AnnotatedPairs(drawn.annotations, n_views=4, n_near=8, noise=0.1)
     many = AnnotatedPairs(drawn.annotations, n_views=40_000, n_near=8, noise=0.1)
-    generators = [np.random.default_rng(k) for k in range(1000)]
-    log_density, closest = few.evaluate(np.repeat(poses[:1], 1000, axis=0), generators)
-    assert closest.shape == (1000, 4)
+    generators = [np.random.default_rng(k) for k in range(4000)]
+    log_density, closest = few.evaluate(np.repeat(poses[:1], 4000, axis=0), generators)
+    assert closest.shape == (4000, 4)
     estimates = np.exp(log_density)
     truth = np.exp(many.log_density(poses[:1]))[0]
-    error = np.hypot(estimates.std() / np.sqrt(1000), estimates.std() * 2 / np.sqrt(40_000))
+    error = np.hypot(estimates.std() / np.sqrt(4000), estimates.std() * 2 / np.sqrt(40_000))
     assert abs(estimates.mean() - truth) < 4 * error
     assert abs(np.exp(log_density.mean()) - truth) > 4 * error
 

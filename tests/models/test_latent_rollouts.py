@@ -146,11 +146,11 @@ def test_any_other_q_has_a_lower_bound(name, frame, change):
 def test_gradient_ascent_on_the_bound_finds_log_evidence_and_posterior():
     rng = np.random.default_rng(2)
     numbers = [torch.zeros(T, 2, dtype=torch.float64, requires_grad=True) for _ in range(3)]
-    optimiser = torch.optim.Adam(numbers, lr=0.1)
-    steps = 300
+    optimiser = torch.optim.Adam(numbers, lr=0.05)
+    steps = 600
     for step in range(steps):
         for group in optimiser.param_groups:
-            group["lr"] = 0.1 * (1 - step / steps)
+            group["lr"] = 0.05 * (1 - step / steps)
         loss = -bounds(Linear(*numbers), torch.tensor(rng.standard_normal((200, T, 2)))).mean()
         optimiser.zero_grad()
         loss.backward()

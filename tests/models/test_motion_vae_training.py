@@ -68,13 +68,17 @@ def poses(first: PoseTrainee, tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def learnt(tracks, validation, body, first, poses, tmp_path_factory):
+def learnt(tracks, body, first, poses, tmp_path_factory):
+    """The second phase on four sequences, which the tiny size can learn by heart in seconds."""
+    few = [replace(t, keypoints=t.keypoints[:10], confidence=t.confidence[:10]) for t in tracks[:4]]
     teacher = first.learnt(poses[0])
-    trainee = MotionVAETrainee(tracks, validation, TINY, body, teacher, distance=7.0)
+    trainee = MotionVAETrainee(few, few, TINY, body, teacher, distance=7.0)
+    with torch.no_grad():
+        begun = trainee.validation_loss(trainee.network.eval(), CPU)
     folder = tmp_path_factory.mktemp("vae")
-    settings = replace(usual_motion_vae_training("tiny")[1], checkpoint_every=10)
+    settings = replace(usual_motion_vae_training("tiny")[1], steps=600, checkpoint_every=600)
     result = train(trainee, settings, folder, progress=False)
-    return trainee, result, MotionVAE.load(folder)
+    return trainee, begun, result, MotionVAE.load(folder)
 
 
 def test_the_first_phase_learns_which_view_is_right(poses, first, body) -> None:
@@ -85,9 +89,8 @@ def test_the_first_phase_learns_which_view_is_right(poses, first, body) -> None:
 
 
 def test_the_second_phase_learns_and_leaves_the_first_as_it_is(learnt, poses, first) -> None:
-    _trainee, result, prior = learnt
-    losses = [row["validation_loss"] for row in result.history]
-    assert losses[-1] < 0.95 * losses[0]
+    _, begun, result, prior = learnt
+    assert result.kept["validation_loss"] < 0.25 * begun
     kept = first.learnt(poses[0]).state_dict()
     for name, value in prior.model.pose.state_dict().items():
         np.testing.assert_array_equal(value, kept[name], err_msg=name)
@@ -120,7 +123,7 @@ def test_minutes_of_learning_give_3d_walks(tracks, validation, body, tmp_path) -
 
 
 def test_a_second_phase_s_loss_is_the_sum_of_its_terms(learnt, monkeypatch) -> None:
-    trainee, _, prior = learnt
+    trainee, _, _, prior = learnt
     network = prior.model
     assert isinstance(network, MotionVAEModel)
     only = {"reconstruction": 0.0, "smoothness": 0.0, "ranges": 0.0, "teacher": 0.0}

@@ -136,7 +136,7 @@ def test_it_learns_a_mixture(tmp_path: Path) -> None:
 
     before = divergence(trainee.network)
     run = TrainingSettings(
-        steps=200, batch=128, learning_rate=5e-3, warmup=20, weight_decay=0.0, ema=0.98, clip=10.0
+        steps=350, batch=128, learning_rate=5e-3, warmup=20, weight_decay=0.0, ema=0.98, clip=10.0
     )
     result = train(trainee, run, tmp_path, progress=False)
     flow = PoseFlow.load(result.model)

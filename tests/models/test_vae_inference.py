@@ -174,13 +174,16 @@ def test_a_fit_lowers_the_loss_and_leaves_the_prior_alone(prior):
         with torch.no_grad():
             return np.mean([float(inference.loss(np.random.default_rng(i))) for i in range(20)])
 
+    # From a wrong place: what the encoder answers may be near already.
+    with torch.no_grad():
+        inference.mean += 2.0
     begun = mean_loss()
     adam = torch.optim.Adam(inference.parameters(), lr=0.05)
     for step in range(60):
         adam.zero_grad()
         inference.loss(np.random.default_rng(step)).backward()
         adam.step()
-    assert mean_loss() < begun - 0.1
+    assert mean_loss() < begun - 1
     for name, value in prior.model.state_dict().items():
         assert torch.equal(value, before[name])
     torch.testing.assert_close(inferred(prior).mean, untouched.mean, rtol=0, atol=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,11 +18,17 @@ from probmotion.samplers import DVAEInference
 FRAMES, NOISE = 60, 0.04
 
 
-@pytest.mark.slow
-def test_it_beats_the_filters_on_hidden_joints_and_in_all(real_data):
+FILTERS = ("Savitzky-Golay", "Kalman")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def errors(real_data) -> dict[str, tuple[float, float]]:
+    """Mean error of all joints and of hidden ones, by estimate, metres."""
     prior = body_prior()
     fit = DVAEInference(mode="optimization")
-    errors: dict[str, list[tuple[float, float]]] = {}
+    found: dict[str, list[tuple[float, float]]] = {}
     for number, clip in enumerate(denoising_clips(real_data)["test"]):
         frames = min(FRAMES, clip.frames)
         truth = clip.window((clip.frames - frames) // 2, frames)
@@ -29,17 +37,35 @@ def test_it_beats_the_filters_on_hidden_joints_and_in_all(real_data):
         believed = prior.of(frames=frames, body=body_of(evidence, prior))
         posterior = MotionPosterior(believed, evidence)
         seen = evidence.entries.confidence
-        found = {
+        estimates = {
             "Savitzky-Golay": savitzky_golay(evidence.joints, seen > 0, fps=truth.fps),
             "Kalman": kalman_smooth(evidence.joints, seen, noise=NOISE, fps=truth.fps)[0],
+            "regression": replace(fit, mode="regression").predict(posterior).positions,
             "optimization": fit.predict(posterior, progress=False).positions,
         }
-        for name, positions in found.items():
+        for name, positions in estimates.items():
             error = accuracy.joint_errors(positions, truth.positions)
-            errors.setdefault(name, []).append((error.mean(), error[hidden].mean()))
-    total, of_hidden = {}, {}
-    for name, rows in errors.items():
-        total[name], of_hidden[name] = np.mean(rows, axis=0)
-    filters = ("Savitzky-Golay", "Kalman")
-    assert total["optimization"] < min(total[name] for name in filters)
-    assert of_hidden["optimization"] < 0.9 * min(of_hidden[name] for name in filters)
+            found.setdefault(name, []).append((error.mean(), error[hidden].mean()))
+    return {name: tuple(np.mean(rows, axis=0)) for name, rows in found.items()}
+
+
+def of_filters(errors: dict[str, tuple[float, float]], which: int) -> float:
+    return min(errors[name][which] for name in FILTERS)
+
+
+def test_a_fit_beats_the_filters_on_hidden_joints(errors):
+    assert errors["optimization"][1] < 0.9 * of_filters(errors, 1)
+
+
+def test_a_fit_is_level_with_the_filters_in_all(errors):
+    assert errors["optimization"][0] < of_filters(errors, 0)
+
+
+@pytest.mark.xfail(strict=True, reason="29.5 mm against 30.8: half an hour of motion was learnt")
+def test_a_fit_beats_the_filters_in_all(errors):
+    assert errors["optimization"][0] < 0.9 * of_filters(errors, 0)
+
+
+@pytest.mark.xfail(strict=True, reason="the networks answer poorly to actions they never saw")
+def test_regression_beats_the_filters_on_hidden_joints(errors):
+    assert errors["regression"][1] < 0.9 * of_filters(errors, 1)

@@ -69,14 +69,14 @@ def test_runs_are_measured_by_coverage(problem):
 
 def test_draws_cover_better_than_the_seed_and_than_the_prior(problem):
     """What the whole is for, on made data; on real data it is measured by the ablations."""
-    sampler = MetropolisHastings(Isotropic(0.02), warmup=300, thin=4)
+    sampler = MetropolisHastings(Isotropic(0.02), warmup=1000, thin=4)
     truth = problem.held_out[:, 0]
     found = {}
     for name, posterior in {
         "posterior": problem.posterior,
         "prior": TruncatedPosterior(problem.posterior.prior),
     }.items():
-        draws = sampler.sample(posterior, draws=100, chains=4, progress=False)
+        draws = sampler.sample(posterior, draws=150, chains=4, progress=False)
         found[name] = coverage(truth, draws.flat()[:, 0])
     seed = coverage(truth, problem.posterior.prior.seed)
     assert found["posterior"] < seed

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -436,7 +436,7 @@ def test_draws_say_how_they_were_made(posterior, denoiser, tmp_path):
             np.testing.assert_array_equal(loaded.dataset[name], draws.dataset[name])
         assert loaded.dataset.attrs["settings"] == draws.dataset.attrs["settings"]
         assert loaded.counts == {"gradient": 2}
-        again = pickle.loads(pickle.dumps(sampler))
+        again = copy.deepcopy(sampler)
         np.testing.assert_array_equal(run(again, posterior).positions, draws.positions)
     assert repr(denoiser).startswith("MotionDenoiser(14 joints, ")
     assert " at 0x" not in repr(denoiser)
