@@ -8,7 +8,6 @@ frame's latent z_t.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
@@ -17,10 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from array_api_compat import is_jax_array, is_numpy_array, is_torch_array
 
-from probmotion.arrays import Array, array_namespace, to_numpy
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.arrays import Array
+from probmotion.checks import check_count, check_positive
 from probmotion.models.body_states import BodyStates, check_bones, turned_about_vertical
 from probmotion.models.checkpoints import (
     Checkpoint,
@@ -32,6 +30,8 @@ from probmotion.models.checkpoints import (
 from probmotion.models.dvae_network import DVAEModel
 from probmotion.models.dvae_settings import DVAESettings
 from probmotion.models.latent_rollouts import rollout
+from probmotion.models.row_decoding import decode_rows
+from probmotion.models.standard_normal import StandardNormalPrior
 from probmotion.priors import InferenceNetwork
 from probmotion.skeleton import Skeleton
 
@@ -43,7 +43,7 @@ _PLACE = 4
 _CHUNK = 256
 
 
-class MotionDVAE:
+class MotionDVAE(StandardNormalPrior):
     """What a body does next, learnt from motion capture.
 
     θ holds, all N(0, 1): the ground position of the first root in units of ``spread`` (2), two
@@ -212,39 +212,8 @@ class MotionDVAE:
 
     def motion(self, theta: Array) -> Array:
         """Return M_β(μ_x) at θ, ``(…, dim) → (…, L, J, 3)``, metres; NumPy or torch, not JAX."""
-        if not (is_numpy_array(theta) or is_torch_array(theta)):
-            kind = "JAX array" if is_jax_array(theta) else type(theta).__name__
-            raise TypeError(
-                f"theta is a {kind}, expected NumPy's or torch's: this prior is torch's"
-            )
-        check_shape("theta", theta, ("…", self.dim))
-        shape = (*theta.shape[:-1], self._frames, self.skeleton.n_joints, 3)
-        if is_numpy_array(theta):
-            check_finite("theta", theta)
-            kept = theta.dtype if theta.dtype == np.float32 else np.float64
-            with torch.no_grad():
-                rows = torch.as_tensor(np.ascontiguousarray(theta, kept)).reshape(-1, self.dim)
-                found = [to_numpy(self._motion(some)) for some in rows.split(_CHUNK)]
-            return np.concatenate(found).reshape(shape)
-        return self._motion(theta.reshape(-1, self.dim)).reshape(shape)
-
-    def log_density(self, theta: Array) -> Array:
-        """Return log N(θ; 0, I): ``(…, dim) → (…)``."""
-        check_shape("theta", theta, ("…", self.dim))
-        xp = array_namespace(theta)
-        return -0.5 * (xp.sum(theta**2, axis=-1) + self.dim * math.log(2 * math.pi))
-
-    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n draws of θ, (n, dim)."""
-        return rng.standard_normal((n, self.dim))
-
-    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n motions, (n, L, J, 3), metres."""
-        return self.motion(self.initial(rng, n))
-
-    def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
-        """Return E[θ | θ_t] = √ᾱ θ_t, exactly, since θ ~ N(0, I)."""
-        return math.sqrt(alpha_bar) * theta_t
+        shape = (self._frames, self.skeleton.n_joints, 3)
+        return decode_rows(self._motion, theta, self.dim, shape, _CHUNK)
 
     def coordinates(
         self, ground: np.ndarray, heading: np.ndarray, first: np.ndarray, innovations: np.ndarray

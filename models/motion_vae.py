@@ -7,17 +7,15 @@ pose, where the body is and how it is turned, is not in the code: it is a path b
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from array_api_compat import is_jax_array, is_numpy_array, is_torch_array
 
-from probmotion.arrays import Array, array_namespace, to_numpy
+from probmotion.arrays import Array
 from probmotion.checks import check_finite, check_positive, check_shape
 from probmotion.likelihoods import Keypoints2D, Likelihood
 from probmotion.models.articulated_body import ArticulatedBody
@@ -27,6 +25,8 @@ from probmotion.models.motion_vae_network import MotionVAENetwork
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.pose_network import PoseNetwork
 from probmotion.models.rigid_paths import RigidPath, see_body
+from probmotion.models.row_decoding import decode_rows
+from probmotion.models.standard_normal import StandardNormalPrior
 from probmotion.models.vae_inference import VAEEncoder
 from probmotion.priors import InferenceNetwork
 from probmotion.skeleton import Skeleton
@@ -36,7 +36,7 @@ __all__ = ["KIND", "MotionVAE", "MotionVAEModel", "description_of"]
 _ROWS = 64
 
 
-class MotionVAE:
+class MotionVAE(StandardNormalPrior):
     """Motions of an articulated body, as learnt from 2D tracks alone.
 
     θ is the latent code z, all of it N(0, 1). The rigid path is given: by default the body stands
@@ -70,6 +70,12 @@ class MotionVAE:
     ValueError
         If a shape disagrees or a number is out of range.
     """
+
+    stand_ins: ClassVar[Mapping[str, str]] = {
+        "Denoises2D": "probmotion.models.projected_denoiser.denoiser_of makes a prior of its "
+        "pictures that is"
+    }
+    """How to get what the prior lacks, as samplers that need it say when they refuse."""
 
     def __init__(
         self,
@@ -218,11 +224,13 @@ class MotionVAE:
 
     def motion(self, theta: Array) -> Array:
         """Return FK(D(θ)), ``(…, dim) → (…, L, J, 3)``, metres, world Y up; NumPy or torch."""
-        return self._by_rows(theta, self._motion, (self.frames, self.skeleton.n_joints, 3))
+        shape = (self.frames, self.skeleton.n_joints, 3)
+        return decode_rows(self._motion, theta, self.dim, shape, _ROWS)
 
     def turns(self, theta: Array) -> Array:
         """Return D(θ), ``(…, dim) → (…, L, bones, 3)``: rotation vectors in parents' frames."""
-        return self._by_rows(theta, self._turns, (self.frames, len(self.body.bones), 3))
+        shape = (self.frames, len(self.body.bones), 3)
+        return decode_rows(self._turns, theta, self.dim, shape, _ROWS)
 
     def row_by_row(self, theta: np.ndarray) -> np.ndarray:
         """Return :meth:`motion`, ``(n, dim) → (n, L, J, 3)``, whose bits are each row's own.
@@ -237,41 +245,9 @@ class MotionVAE:
             found.append(self.motion(rows)[: len(some)])
         return np.concatenate(found)
 
-    def log_density(self, theta: Array) -> Array:
-        """Return log N(θ; 0, I): ``(…, dim) → (…)``."""
-        check_shape("theta", theta, ("…", self.dim))
-        xp = array_namespace(theta)
-        return -0.5 * (xp.sum(theta**2, axis=-1) + self.dim * math.log(2 * math.pi))
-
-    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n draws of θ, (n, dim)."""
-        return rng.standard_normal((n, self.dim))
-
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n motions, (n, L, J, 3), metres; decoded in single precision."""
         return self.row_by_row(self.initial(rng, n).astype(np.float32)).astype(np.float64)
-
-    def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
-        """Return E[θ | θ_t] = √ᾱ θ_t, exactly, since θ ~ N(0, I)."""
-        return math.sqrt(alpha_bar) * theta_t
-
-    def _by_rows(self, theta: Array, decode: Any, shape: tuple[int, ...]) -> Array:
-        """Return what ``decode`` makes of rows of θ, of its kind of array and precision."""
-        if not (is_numpy_array(theta) or is_torch_array(theta)):
-            kind = "JAX array" if is_jax_array(theta) else type(theta).__name__
-            raise TypeError(
-                f"theta is a {kind}, expected NumPy's or torch's: this prior is torch's"
-            )
-        check_shape("theta", theta, ("…", self.dim))
-        whole = (*theta.shape[:-1], *shape)
-        if is_torch_array(theta):
-            return decode(theta.reshape(-1, self.dim)).reshape(whole)
-        check_finite("theta", theta)
-        kept = theta.dtype if theta.dtype == np.float32 else np.float64
-        with torch.no_grad():
-            rows = torch.as_tensor(np.ascontiguousarray(theta, kept)).reshape(-1, self.dim)
-            found = [to_numpy(decode(some)) for some in rows.split(_ROWS)]
-        return np.concatenate(found).reshape(whole)
 
     def _turns(self, theta: torch.Tensor) -> torch.Tensor:
         """Return the turns of rows, ``(B, dim) → (B, L, bones, 3)``."""

@@ -6,7 +6,6 @@ prior of k dimensions keeps most of what its decoder can do.
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
 from typing import Any
 
@@ -14,8 +13,9 @@ import numpy as np
 import torch
 
 from probmotion import seeds
-from probmotion.arrays import Array, array_namespace, constant
+from probmotion.arrays import Array, constant
 from probmotion.checks import check_count, check_shape
+from probmotion.models.standard_normal import StandardNormalPrior
 from probmotion.skeleton import Skeleton
 
 __all__ = ["ReducedLatent"]
@@ -23,7 +23,7 @@ __all__ = ["ReducedLatent"]
 _ROWS = 64
 
 
-class ReducedLatent:
+class ReducedLatent(StandardNormalPrior):
     """A prior whose z = U θ, θ ~ N(0, I_k), and 0 along all other directions.
 
     U (Z, k) holds the leading eigenvectors of E[JᵀJ], J = ∂X/∂z the decoder's Jacobian at draws of
@@ -97,24 +97,6 @@ class ReducedLatent:
     def motion(self, theta: Array) -> Array:
         """Return the prior's motion at U θ, ``(…, k) → (…, L, J, 3)``, metres."""
         return self.prior.motion(self.latent(theta))
-
-    def log_density(self, theta: Array) -> Array:
-        """Return log N(θ; 0, I): ``(…, k) → (…)``."""
-        check_shape("theta", theta, ("…", self.dim))
-        xp = array_namespace(theta)
-        return -0.5 * (xp.sum(theta**2, axis=-1) + self.dim * math.log(2 * math.pi))
-
-    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n draws of θ, (n, k)."""
-        return rng.standard_normal((n, self.dim))
-
-    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n motions, (n, L, J, 3), metres."""
-        return self.motion(self.initial(rng, n))
-
-    def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
-        """Return E[θ | θ_t] = √ᾱ θ_t, exactly, since θ ~ N(0, I)."""
-        return math.sqrt(alpha_bar) * theta_t
 
 
 def _mean_square(prior: Any, rng: np.random.Generator) -> np.ndarray:

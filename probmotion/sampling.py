@@ -110,14 +110,19 @@ def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[ty
 
 
 def require(sampler: Sampler, posterior: MotionPosterior) -> None:
-    """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires."""
+    """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires.
+
+    A prior that another can be made from says how in a mapping ``stand_ins``, by protocol's name.
+    """
     lacking = missing(sampler, posterior)
     if lacking:
         names = [[one.__name__ for one in get_args(needed) or (needed,)] for needed in lacking]
+        stand_ins = getattr(posterior.prior, "stand_ins", {})
+        hints = [f"; {stand_ins[one]}" for some in names for one in some if one in stand_ins]
         raise UnsupportedPosterior(
             sampler.name,
             f"needs a prior with {' and '.join(map(' or '.join, names))}, which "
-            f"{type(posterior.prior).__name__} is not",
+            f"{type(posterior.prior).__name__} is not{''.join(hints)}",
             word=names[0][0],
             others=suited(posterior),
         )

@@ -353,6 +353,7 @@ def test_mas_needs_a_denoiser_and_says_who_would_do(prior):
     ) as refused:
         MultiViewAncestral().sample(MotionPosterior(prior), progress=False)
     assert refused.value.word == "Denoises2D"
+    assert "; probmotion.models.projected_denoiser.denoiser_of makes" in str(refused.value)
 
 
 SAMPLERS = {
