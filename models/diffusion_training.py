@@ -14,7 +14,7 @@ from torch import nn
 from probmotion import seeds
 from probmotion.models.diffusion_settings import DiffusionSettings
 from probmotion.models.motion_diffusion import KIND
-from probmotion.models.track_batches import Augmentation, TrackBatches
+from probmotion.models.track_batches import Augmentation, TrackBatches, learning_and_held_out
 from probmotion.models.training_settings import TrainingSettings
 from probmotion.motion import KeypointTrack
 
@@ -66,21 +66,11 @@ class DiffusionTrainee:
     ) -> None:
         varied = Augmentation() if augmentation is None else augmentation
         self.size = size
-        self.batches = TrackBatches(tracks, size.frames, threshold, varied)
-        self.held_out = TrackBatches(validation, size.frames, threshold, Augmentation.none())
+        self.batches, self.held_out = learning_and_held_out(
+            tracks, validation, size.frames, threshold, varied
+        )
+        self.batches.check_all_seen()
         skeleton = self.batches.skeleton
-        if self.held_out.skeleton != skeleton:
-            raise ValueError("validation has another skeleton than tracks, expected the same")
-        if self.held_out.fps != self.batches.fps:
-            raise ValueError(
-                f"validation is at {self.held_out.fps:g} frames per second, expected tracks' "
-                f"{self.batches.fps:g}"
-            )
-        if unseen := self.batches.never_seen:
-            raise ValueError(
-                f"tracks never shows {', '.join(unseen)} with a confidence of {threshold:g} or "
-                "more, expected every joint to be seen somewhere; choose a skeleton without them"
-            )
         self.standards = self.batches.standards
         self.network = size.network(skeleton.n_joints, seed)
         self._seed = seed

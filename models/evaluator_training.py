@@ -13,7 +13,7 @@ from torch import nn
 from probmotion import seeds
 from probmotion.models.evaluator import KIND
 from probmotion.models.track_autoencoder import EvaluatorSettings, TrackAutoencoder
-from probmotion.models.track_batches import Augmentation, TrackBatches
+from probmotion.models.track_batches import Augmentation, TrackBatches, learning_and_held_out
 from probmotion.motion import KeypointTrack
 
 __all__ = ["EvaluatorTrainee"]
@@ -63,11 +63,10 @@ class EvaluatorTrainee:
     ) -> None:
         varied = Augmentation() if augmentation is None else augmentation
         self.size = size
-        self.batches = TrackBatches(tracks, size.frames, threshold, varied)
-        self.held_out = TrackBatches(validation, size.frames, threshold, Augmentation.none())
+        self.batches, self.held_out = learning_and_held_out(
+            tracks, validation, size.frames, threshold, varied
+        )
         skeleton = self.batches.skeleton
-        if self.held_out.skeleton != skeleton:
-            raise ValueError("validation has another skeleton than tracks, expected the same")
         self.standards = self.batches.standards
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))

@@ -29,7 +29,7 @@ from probmotion.models.motion_vae_model import KIND, MotionVAEModel, description
 from probmotion.models.motion_vae_network import MotionVAENetwork
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.pose_network import PoseGuesses, PoseNetwork
-from probmotion.models.track_batches import Augmentation, TrackBatches
+from probmotion.models.track_batches import Augmentation, TrackBatches, learning_and_held_out
 from probmotion.models.training_settings import TrainingSettings
 from probmotion.models.variational_terms import gaussian_kl
 from probmotion.motion import KeypointTrack
@@ -63,31 +63,19 @@ class _LearnsFromTracks:
         self.size = size
         self.body = body
         self.distance = distance
-        self.batches = TrackBatches(
-            _long_enough("tracks", tracks, size.frames), size.frames, threshold, whole
-        )
-        self.held_out = TrackBatches(
+        self.batches, self.held_out = learning_and_held_out(
+            _long_enough("tracks", tracks, size.frames),
             _long_enough("validation", validation, size.frames),
             size.frames,
             threshold,
-            Augmentation.none(),
+            whole,
         )
-        for name, batches in (("tracks", self.batches), ("validation", self.held_out)):
-            if batches.skeleton != body.skeleton:
-                raise ValueError(
-                    f"{name} has the joints {', '.join(batches.skeleton.joint_names)}, expected "
-                    f"those of the body: {', '.join(body.skeleton.joint_names)}"
-                )
-        if self.held_out.fps != self.batches.fps:
+        if self.batches.skeleton != body.skeleton:
             raise ValueError(
-                f"validation is at {self.held_out.fps:g} frames per second, expected tracks' "
-                f"{self.batches.fps:g}"
+                f"tracks has the joints {', '.join(self.batches.skeleton.joint_names)}, expected "
+                f"those of the body: {', '.join(body.skeleton.joint_names)}"
             )
-        if unseen := self.batches.never_seen:
-            raise ValueError(
-                f"tracks never shows {', '.join(unseen)} with a confidence of {threshold:g} or "
-                "more, expected every joint to be seen somewhere; choose a skeleton without them"
-            )
+        self.batches.check_all_seen()
         if not body.symmetric:
             warnings.warn(
                 "body has no left-right pairs: no bone is as long as its mirror image, and no "

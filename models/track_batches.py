@@ -14,7 +14,7 @@ from probmotion.models.standards import Standards
 from probmotion.motion import KeypointTrack
 from probmotion.skeleton import Skeleton
 
-__all__ = ["Augmentation", "Batch", "TrackBatches"]
+__all__ = ["Augmentation", "Batch", "TrackBatches", "describe_tracks", "learning_and_held_out"]
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ class TrackBatches:
         self.skeleton: Skeleton = tracks[0].skeleton
         self.fps = tracks[0].fps
         self.frames = frames
+        self.threshold = threshold
         self.augmentation = augmentation
         self._seen = [(track.confidence >= threshold) & (track.confidence > 0) for track in tracks]
         if not any(seen.any() for seen in self._seen):
@@ -134,6 +135,20 @@ class TrackBatches:
         return tuple(
             name for name, there in zip(self.skeleton.joint_names, seen, strict=True) if not there
         )
+
+    def check_all_seen(self) -> None:
+        """Refuse tracks that never show one of the joints: nothing would say where it is.
+
+        Raises
+        ------
+        ValueError
+            If there is such a joint.
+        """
+        if unseen := self.never_seen:
+            raise ValueError(
+                f"tracks never shows {', '.join(unseen)} with a confidence of {self.threshold:g} "
+                "or more, expected every joint to be seen somewhere; choose a skeleton without them"
+            )
 
     @property
     def standards(self) -> Standards:
@@ -191,6 +206,42 @@ class TrackBatches:
 
     def _mirrored(self, keypoints: np.ndarray) -> np.ndarray:
         return keypoints[:, self._order] * np.array([-1, 1], keypoints.dtype)
+
+
+def learning_and_held_out(
+    tracks: Sequence[KeypointTrack],
+    validation: Sequence[KeypointTrack],
+    frames: int,
+    threshold: float,
+    augmentation: Augmentation,
+) -> tuple[TrackBatches, TrackBatches]:
+    """Return batches to learn from and batches to watch learning by, which are not varied.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Of one skeleton and frame rate, metres, centred.
+    validation : sequence of KeypointTrack
+        As ``tracks``, of clips that are not among theirs.
+    frames, threshold
+        As for :class:`TrackBatches`.
+    augmentation : Augmentation
+        How ``tracks`` are varied.
+
+    Raises
+    ------
+    ValueError
+        If either cannot be batched, or they differ in skeleton or frame rate.
+    """
+    batches = TrackBatches(tracks, frames, threshold, augmentation)
+    held_out = TrackBatches(validation, frames, threshold, Augmentation.none())
+    if held_out.skeleton != batches.skeleton:
+        raise ValueError("validation has another skeleton than tracks, expected the same")
+    if held_out.fps != batches.fps:
+        raise ValueError(
+            f"validation is at {held_out.fps:g} frames per second, expected tracks' {batches.fps:g}"
+        )
+    return batches, held_out
 
 
 def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
