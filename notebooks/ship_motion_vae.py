@@ -13,7 +13,9 @@ else is used but to count, at the end, how often the right view is chosen.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -186,9 +188,9 @@ def card(
 
 - **Data**: {network["data"]["tracks"]} tracks of {network["data"]["frames"]} frames, filmed
   {network["distance"]:g} m away from random sides, of
-  {", ".join(network["data"]["clips"])};
+  {listed(network["data"]["clips"])};
   tracks are mirrored every other time. The loss is watched on
-  {", ".join(network["validation_data"]["clips"])}.
+  {listed(network["validation_data"]["clips"])}.
 - **Provenance**: {kind.provenance}
 - **Not for**: other skeletons or frame rates; motions unlike those named. The rigid pose is no
   part of the latent code: draws stay in place and look ahead.
@@ -209,6 +211,12 @@ a quarter and a half):
 
 Command: `python notebooks/ship_motion_vae.py {name} --runs runs`.
 """
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a row; made clips, which are numbered, are counted by kind."""
+    kinds = Counter(re.sub(r"-\d+$", "", name) for name in names)
+    return ", ".join(f"{kind} ({n} clips)" if n > 1 else kind for kind, n in kinds.items())
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ import pytest
 
 from probmotion import Skeleton
 from probmotion.cli import main
+from probmotion.data.animals import ANIMAL_SKELETON, made_animals
 from probmotion.data.gaits import make_gaits
 from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.models.motion_vae import MotionVAE
 from probmotion.motion import KeypointTrack
 
 PERSON = Skeleton.preset("person14")
+PARENTS = list(ANIMAL_SKELETON.parents[1:])
 
 
 def keep(track: KeypointTrack, path: Path) -> None:
@@ -74,6 +76,46 @@ def test_a_rest_pose_may_be_given(
     body = MotionVAE.load(tmp_path / "run" / "vae").body
     expected = walk.retarget(PERSON).positions[0]
     np.testing.assert_allclose(body.rest_positions, expected - expected[0], atol=1e-6)
+
+
+def table_of(track: KeypointTrack, path: Path) -> None:
+    """Write a track as DeepLabCut writes it: pixels, y down, nothing where nothing was found."""
+    names = [name for name in track.skeleton.joint_names for _ in range(3)]
+    lines = [
+        ",".join(["scorer", *["net"] * len(names)]),
+        ",".join(["bodyparts", *names]),
+        ",".join(["coords", *["x", "y", "likelihood"] * track.skeleton.n_joints]),
+    ]
+    pixels = 640 + 250 * track.keypoints
+    for frame, (points, trusted) in enumerate(zip(pixels, track.confidence, strict=True)):
+        found = [
+            f"{x:.2f},{y:.2f},{likelihood:.2f}" if np.isfinite(x) else ",,"
+            for (x, y), likelihood in zip(points, trusted, strict=True)
+        ]
+        lines.append(",".join([str(frame), *found]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_an_animal_of_one_s_own_comes_from_a_detector_s_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clips = [clip.retarget(ANIMAL_SKELETON) for clip in made_animals(4, seed=1)]
+    for track in project_clips(clips, views=3):
+        table_of(track, tmp_path / f"{track.name.replace('/', '-')}.csv")
+    names = sorted(path.stem for path in tmp_path.glob("*.csv"))
+    given = ["train", "motion-vae", "--tracks", str(tmp_path / "*.csv")]
+    given += ["--skeleton", "quadruped21"]
+    given += ["--tracks-fps", str(clips[0].fps), "--threshold", "0.5", "--size", "tiny"]
+    given += ["--validation", *names[-3:], "--test", names[0], "--out", str(tmp_path / "run")]
+    assert main([*given, "--steps", "3"]) == 0, capsys.readouterr().err
+    assert "the rest pose is the mean pose, estimated from the tracks" in capsys.readouterr().out
+    prior = MotionVAE.load(tmp_path / "run" / "vae")
+    assert prior.skeleton == ANIMAL_SKELETON
+    assert prior.sample(np.random.default_rng(0), 2).shape == (2, 10, 21, 3)
+    # Of pixels only proportions can be known.
+    shown = np.linalg.norm(prior.body.rest, axis=-1)[1:]
+    true = np.linalg.norm(clips[0].positions[0, 1:] - clips[0].positions[0, PARENTS], axis=-1)
+    np.testing.assert_allclose(shown / shown.sum(), true / true.sum(), atol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@
 
 Parts: views (how often the right view hypothesis wins), table (the shapes of tables 3, 4, 6, 7 and
 8 of the paper), generation (beside MAS and SDS on the same 2D data); ``--parts`` chooses. All
-variants learn here, from the same tracks, as long as ``--steps`` says; what is left in
-``--out/networks`` is not learnt again. Clips are looked for in ``--data``, by default
+variants learn here, from the same tracks, their second phase as long as ``--steps`` says; what is
+left in ``--out/networks`` is not learnt again. Clips are looked for in ``--data``, by default
 ../shared/data beside the repository. 3D clips are filmed to be learnt from, and measured against.
 """
 
@@ -139,7 +139,7 @@ class Study:
 
     def _train(self, trainee: Any, phase: int, folder: Path) -> None:
         settings = usual_motion_vae_training("tiny" if self.quick else "small")[phase]
-        if self.steps is not None:
+        if phase == 1 and self.steps is not None:
             settings = replace(settings, steps=self.steps)
         train(trainee, settings, folder, progress=not self.quick)
 
@@ -305,7 +305,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--quick", action="store_true", help="made walks and tiny networks")
-    parser.add_argument("--steps", type=int, help="of each phase, in place of the size's own")
+    parser.add_argument("--steps", type=int, help="of the second phase, in place of the size's own")
     parser.add_argument("--draws", type=int, help="sequences that are generated, 1400 by default")
     asked = parser.parse_args()
     draws = asked.draws or (60 if asked.quick else 1400)

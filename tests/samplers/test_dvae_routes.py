@@ -176,6 +176,79 @@ def test_a_fit_that_diverges_is_one_sentence(iterations, rate):
         run(sampler, one_direction(GaussianNetwork()))
 
 
+# --- the steps of a fit
+
+
+class Slopes(GaussianNetwork):
+    """Its loss at iteration t is g_t·x, and x is in two tensors."""
+
+    def __init__(self, gradients):
+        super().__init__()
+        self.gradients = torch.tensor(gradients)
+
+    def on(self, prior, likelihood, **options):
+        self.begun.append(SlopeInference(prior, likelihood, self.gradients))
+        return self.begun[-1]
+
+
+class SlopeInference(GaussianInference):
+    def __init__(self, prior, likelihood, gradients):
+        super().__init__(prior, likelihood)
+        self.gradients, self.asked = gradients, 0
+        self.x = [torch.zeros(2, 2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)]
+
+    def parameters(self):
+        return [part.requires_grad_() for part in self.x]
+
+    def loss(self, rng, *, initial_entropy, latent_weight):
+        # The last one asked for is the first again: whether the fit diverged.
+        gradient = self.gradients[self.asked % len(self.gradients)]
+        self.asked += 1
+        return gradient @ torch.cat([part.flatten() for part in self.x])
+
+
+def fitted_x(gradients, **settings):
+    """Return x, (7,), after as many iterations as there are gradients; it begins at 0."""
+    network = Slopes(gradients)
+    sampler = DVAEInference(mode="optimization", iterations=len(gradients), **settings)
+    sampler.predict(one_direction(network), progress=False)
+    return np.concatenate([part.detach().numpy().ravel() for part in network.begun[0].x])
+
+
+def adam(gradients, rate, greatest):
+    """Return x by Adam (Kingma & Ba, algorithm 1): norms bounded, a half cosine of rates to 0."""
+    x, m, v = np.zeros((3, gradients.shape[1]))
+    for t, g in enumerate(gradients):
+        g = g * min(1.0, greatest / np.sqrt((g**2).sum()))
+        m = 0.9 * m + 0.1 * g
+        v = 0.999 * v + 0.001 * g**2
+        step = (m / (1 - 0.9 ** (t + 1))) / (np.sqrt(v / (1 - 0.999 ** (t + 1))) + 1e-8)
+        x = x - rate * 0.5 * (1 + np.cos(np.pi * t / len(gradients))) * step
+    return x
+
+
+def test_a_fit_is_adam_with_bounded_gradients_and_a_rate_that_falls_by_half_a_cosine():
+    rng = np.random.default_rng(4)
+    sizes = rng.uniform(0.5, 20.0, 60)
+    sizes[0] = 2000.0
+    gradients = rng.normal(2.0, 1.0, (60, 7)) * sizes[:, None]
+    norms = np.linalg.norm(gradients, axis=1)
+    assert norms[0] > 5000
+    assert 10 < (norms > 30).sum() < 50
+    np.testing.assert_allclose(fitted_x(gradients), adam(gradients, 2e-3, 30.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.1, 5000.0])
+def test_under_a_constant_gradient_a_fit_moves_by_its_rates(size):
+    """Adam's step is then its rate, and a half cosine's T rates are (T + 1)/2 times the first."""
+    direction = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 1.5, -0.7])
+    moved = fitted_x(np.tile(size * direction, (40, 1)), learning_rate=0.01)
+    np.testing.assert_allclose(moved, -0.01 * 41 / 2 * np.sign(direction), rtol=1e-5)
+
+
+# --- what is kept
+
+
 def test_theta_is_kept_where_the_prior_has_a_density():
     class Undense(OneDirection):
         log_density = None
