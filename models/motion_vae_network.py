@@ -26,6 +26,7 @@ from probmotion.models.motion_vae_settings import MotionVAESettings
 
 __all__ = ["FrameMap", "MotionVAENetwork", "TimeDecoder", "TimeEncoder"]
 
+_FIRST_ASKED = 0.02
 _FIRST_LOG_VARIANCE = -4.0
 _LOG_VARIANCE_BOUND = 10.0
 
@@ -78,7 +79,8 @@ class TimeEncoder(nn.Module):
 
     def __init__(self, size: MotionVAESettings) -> None:
         super().__init__()
-        self.asked = nn.Parameter(torch.randn(2, size.width))
+        # Small: what they are asked in would else drown what they hear of the frames.
+        self.asked = nn.Parameter(_FIRST_ASKED * torch.randn(2, size.width))
         self.layers = nn.ModuleList(TransformerLayer(size) for _ in range(size.layers))
         self.norm = nn.LayerNorm(size.width)
         self.mean = Readout(size.width, size.latent, quiet=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 _VALIDATION_BATCH = 256
 # Of the hypotheses that are not chosen, so that none is left behind for good.
 _OTHERS = 0.05
+# Steps in which bones have no say in which hypothesis learns.
+_AT_REST = 500
 
 
 class _LearnsFromTracks:
@@ -127,8 +130,10 @@ class _LearnsFromTracks:
 class PoseTrainee(_LearnsFromTracks):
     """The first phase: rigid poses and bones, frame by frame, under several view hypotheses.
 
-    The loss is that of the best hypothesis of each sequence: its pictures' squared error, and how
-    far it moves from frame to frame, bends joints beyond their ranges and stretches bones.
+    The loss is that of one hypothesis of each sequence: its pictures' squared error, and how far it
+    moves from frame to frame, bends joints beyond their ranges and stretches bones. It is the
+    hypothesis of the least loss, but for the first 500 steps, in which it is the one that fits best
+    with the body at rest.
 
     Parameters
     ----------
@@ -172,6 +177,11 @@ class PoseTrainee(_LearnsFromTracks):
         self.network = PoseNetwork(
             size, body.skeleton.n_joints, len(body.bones), body.n_groups, seed
         )
+        self._step = 1
+
+    def anneal(self, step: int) -> None:
+        """Be at a step, counted from 1: how the hypothesis that learns is chosen depends on it."""
+        self._step = step
 
     def learnt(self, folder: str | Path) -> PoseNetwork:
         """Return the network that a run has trained.
@@ -200,13 +210,35 @@ class PoseTrainee(_LearnsFromTracks):
         guesses = network(keypoints, seen, rest)
         terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
         losses = weighted_sum(terms, self.size)
-        return losses.min(dim=1).values.mean() + _OTHERS * losses.mean()
+        at_rest = batches is self.batches and self._step <= _AT_REST
+        judged = self._at_rest(guesses, keypoints, seen) if at_rest else losses
+        best = judged.argmin(dim=1, keepdim=True)
+        return losses.gather(1, best).mean() + _OTHERS * losses.mean()
+
+    @torch.no_grad()
+    def _at_rest(
+        self, guesses: PoseGuesses, keypoints: torch.Tensor, seen: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the loss of every view if no bone turned or grew, (B, H).
+
+        Bones that bend can make up for a wrong view: chosen with them, whichever hypothesis learns
+        first wins pictures of other quarters and keeps them, and the rest are never chosen.
+        """
+        stiff = replace(
+            guesses,
+            turns=torch.zeros_like(guesses.turns),
+            log_lengths=torch.zeros_like(guesses.log_lengths),
+        )
+        terms = guess_terms(self.body, stiff, keypoints, seen, self.distance)
+        return weighted_sum(terms, self.size)
 
 
 class MotionVAETrainee(_LearnsFromTracks):
     """The second phase: one latent code for the bones of a whole sequence (equations 2 to 7).
 
-    Rigid poses stay those of the first phase's network, which is kept as it is.
+    E_s and D_s begin as what the first phase has learnt: what a frame's picture says of its bones
+    has not to be found again from a code through which at first nothing comes. Rigid poses stay
+    those of the first phase's network, which is kept as it is.
 
     Parameters
     ----------
@@ -238,6 +270,9 @@ class MotionVAETrainee(_LearnsFromTracks):
         super().__init__(tracks, validation, size, body, distance, threshold, seed)
         vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), seed)
         teacher = pose_network.eval().requires_grad_(False)
+        if size.spatial:
+            vae.frame_encoder.load_state_dict(teacher.frame_encoder.state_dict())
+            vae.bone_decoder.load_state_dict(teacher.bone_decoder.state_dict())
         self.network = MotionVAEModel(vae, teacher)
 
     def _loss(
@@ -300,8 +335,8 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
             TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
         ),
         "small": (
-            TrainingSettings(steps=3000, batch=32, learning_rate=1e-3, ema=0.995),
-            TrainingSettings(steps=5000, batch=32, learning_rate=1e-3, ema=0.995),
+            TrainingSettings(steps=2000, batch=32, learning_rate=1e-3, ema=0.995),
+            TrainingSettings(steps=2500, batch=32, learning_rate=1e-3, ema=0.995),
         ),
         "paper": (
             TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000),

@@ -16,7 +16,7 @@ import argparse
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from ship_walk2d import write_features
@@ -58,8 +58,6 @@ class Kind:
     clips: Callable[[Path], dict[str, list[Motion]]]
     views: Mapping[str, int]
     """Cameras around a clip of a data set whose name begins so."""
-    steps: int
-    """Of the second phase."""
     provenance: str
 
 
@@ -69,7 +67,6 @@ KINDS = {
         Skeleton.preset("person14"),
         walk_clips,
         {"": 64},
-        5000,
         "humanoid3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng. cmu_*: "
         "mocap.cs.cmu.edu, free for research and commercial use; the database was created with "
         "funding from NSF EIA-0196217.",
@@ -79,7 +76,6 @@ KINDS = {
         ANIMAL_SKELETON,
         animal_clips,
         {"": 16, "dog3d": 128},
-        3500,
         "dog3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng; they look like dog motion "
         "capture that its authors offer for non-commercial use, and should be treated so in doubt. "
         "quadruped-*: made by this project.",
@@ -136,7 +132,7 @@ def trained(kind: Kind, tracks: dict[str, list[KeypointTrack]], folder: Path) ->
     first = PoseTrainee(*given, distance=Filming().distance)
     train(first, poses, folder / "poses")
     second = MotionVAETrainee(*given, first.learnt(folder / "poses"), distance=Filming().distance)
-    train(second, replace(vae, steps=kind.steps), folder / "vae")
+    train(second, vae, folder / "vae")
     return MotionVAE.load(folder / "vae")
 
 

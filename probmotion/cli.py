@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from probmotion.reference_commands import Reference
+
 if TYPE_CHECKING:
     from probmotion.motion import Motion
     from probmotion.problems import Problem
@@ -27,11 +29,12 @@ _OVERVIEW = """usage: probmotion COMMAND [OPTIONS]
 One posterior over 3D motion, many samplers, and how wrong each of them is.
 
 commands:
-  compare   draw with several samplers from the same posteriors; print how far each is off
-  list      the problems, the samplers and the skeletons that are known by name
-  show      say what is in a file of motion, keypoints, draws or a network; draw it
-  convert   write a motion to another format, frame rate or skeleton
-  train     learn a prior, or what priors are measured with
+  compare    draw with several samplers from the same posteriors; print how far each is off
+  list       the problems, the samplers and the skeletons that are known by name
+  show       say what is in a file of motion, keypoints, draws or a network; draw it
+  convert    write a motion to another format, frame rate or skeleton
+  train      learn a prior, or what priors are measured with
+  reference  make reference draws of a problem, with a certificate of how right they are
 
 probmotion COMMAND --help lists the options of a command."""
 
@@ -98,6 +101,23 @@ class Compare:
     quick: bool = False
     """Begin from settings that cost less, as a demonstration wants; the table names them."""
 
+    evaluations: int | None = None
+    """What every sampler may spend on a cell: evaluations of a density or a denoiser, a gradient
+    counting as two. Pilot runs find the settings that do. By default samplers run as they are."""
+
+    seconds: float | None = None
+    """The same in seconds of this machine."""
+
+    time_limit: float | None = None
+    """Seconds after which a cell is ended, and a row that says so."""
+
+    calibrate: int = 0
+    """Also simulate every problem that can be so many times, and rank the truth among each
+    sampler's draws."""
+
+    report: bool = False
+    """Also write report.html: the table, the plots, and draws that play in a browser."""
+
     pictures: bool = False
     """Also write one picture of skeletons per problem and, where quality can be measured,
     quality_against_cost.png."""
@@ -128,14 +148,47 @@ class Compare:
             seeds=self.seeds,
             workers=self.workers,
             out=self.out,
+            budget=self._budget(),
+            time_limit=self.time_limit,
         )
         comparison.write(self.out)
         print(comparison.table())
         print(f"\ntable and draws are in {self.out}")
+        calibration = self._calibration(problems, samplers, chains) if self.calibrate else None
+        if self.report:
+            print(f"wrote {comparison.report(self.out / 'report.html', calibration)}")
         if self.pictures:
             from probmotion.pictures.comparisons import draw_comparison
 
             draw_comparison(comparison, problems, self.out)
+
+    def _budget(self) -> Any:
+        from probmotion.comparison import Budget
+
+        if self.evaluations is None and self.seconds is None:
+            return None
+        return Budget(evaluations=self.evaluations, seconds=self.seconds)
+
+    def _calibration(self, problems: list[Problem], samplers: dict[str, Any], chains: int) -> Any:
+        from probmotion.calibration import calibrate
+
+        simulated = [problem for problem in problems if problem.simulate is not None]
+        if not simulated:
+            raise ValueError("calibrate is given, but none of the problems can be simulated")
+        found = calibrate(
+            simulated,
+            samplers,
+            simulations=self.calibrate,
+            draws=self.draws,
+            chains=chains,
+            workers=self.workers,
+            out=self.out,
+            time_limit=self.time_limit,
+        )
+        for problem in simulated:
+            for sampler in samplers:
+                print(found.verdict(problem.name, sampler))
+        return found
 
     def _samplers(self) -> dict[str, Any]:
         from probmotion.sampling import sampler_names
@@ -335,6 +388,7 @@ class Convert:
 
 _COMMANDS: dict[str, type[Any]] = {
     "compare": Compare, "list": List, "show": Show, "convert": Convert,
+    "reference": Reference,
 }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -299,5 +300,10 @@ def _settings(sampler: Any) -> dict[str, Any]:
 
 def library_versions() -> dict[str, str]:
     """Return the versions of the packages that draws depend on."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     packages = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
     return {package: version(package) for package in packages}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["written_whole"]
+__all__ = ["writable_folder", "written_whole"]
 
 
 @contextmanager
@@ -34,3 +35,21 @@ def written_whole(path: Path) -> Iterator[Path]:
         # Where the folder is none, this fails as the writing did, and must not hide its message.
         with suppress(OSError):
             unfinished.unlink()
+
+
+def writable_folder(folder: Path) -> Path:
+    """Return ``out``, made where it is missing, once it is known that it can be written to.
+
+    Raises
+    ------
+    OSError
+        If it cannot.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OSError(f"out is {str(folder)!r}, {reason}; expected a writable folder") from error
+    return folder

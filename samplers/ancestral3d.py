@@ -29,6 +29,8 @@ __all__ = ["Ancestral3D"]
 class Ancestral3D:
     """Ancestral sampling (Ho et al. 2020, algorithm 2) of the 3D motion itself.
 
+    A budget sets ``steps`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     steps : int
@@ -46,6 +48,8 @@ class Ancestral3D:
 
     name: ClassVar[str] = "ancestral3d"
     requires: ClassVar[tuple[type, ...]] = (Denoises3D,)
+    effort: ClassVar[tuple[str, ...]] = ("steps",)
+    least_effort: ClassVar[int] = 2
 
     steps: int = 100
     trained_steps: int | None = None

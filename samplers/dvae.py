@@ -52,6 +52,8 @@ class DVAEInference:
     trained here first, on motions of the prior with evidence simulated of each
     (:mod:`~probmotion.samplers.amortised`), and not fitted: the settings of a fit have no say.
 
+    A budget sets ``training_steps`` and ``iterations`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     network : InferenceNetwork, optional
@@ -87,6 +89,8 @@ class DVAEInference:
 
     name: ClassVar[str] = "dvae"
     requires: ClassVar[tuple[Any, ...]] = (Samplable,)
+    effort: ClassVar[tuple[str, ...]] = ("training_steps", "iterations")
+    least_effort: ClassVar[int] = 100
 
     network: InferenceNetwork | None = None
     mode: Mode = "regression"

@@ -29,6 +29,8 @@ class Ensemble:
     in turn, one iteration after the other: walkers of one ensemble depend on each other, so that
     neither R-hat nor ESS of a chain is valid, and its autocorrelation time is stored instead.
 
+    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     walkers : int, optional
@@ -47,6 +49,7 @@ class Ensemble:
 
     name: ClassVar[str] = "ensemble"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+    effort: ClassVar[tuple[str, ...]] = ("thin", "warmup")
 
     walkers: int | None = None
     warmup: int = 1000

@@ -36,6 +36,8 @@ class MultiViewAncestral:
     With orthographic views and shared noise the V noisy views are projections of one noisy 3D
     motion, which is kept in their place.
 
+    A budget sets ``steps`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     steps : int
@@ -80,6 +82,8 @@ class MultiViewAncestral:
 
     name: ClassVar[str] = "mas"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    effort: ClassVar[tuple[str, ...]] = ("steps",)
+    least_effort: ClassVar[int] = 2
 
     steps: int = 100
     n_views: int = 5

@@ -26,6 +26,8 @@ __all__ = ["MetropolisHastings"]
 class MetropolisHastings:
     """Metropolis et al. (1953), Hastings (1970); one density evaluation per chain and step.
 
+    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     proposal : Proposal
@@ -44,6 +46,7 @@ class MetropolisHastings:
 
     name: ClassVar[str] = "mh"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+    effort: ClassVar[tuple[str, ...]] = ("thin", "warmup")
 
     proposal: Proposal = field(default_factory=AdaptiveCovariance)
     warmup: int = 5000

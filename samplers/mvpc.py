@@ -56,6 +56,8 @@ __all__ = ["MultiViewPredictorCorrector"]
 class MultiViewPredictorCorrector:
     """Multi-view predictor-corrector sampling with a 2D denoiser.
 
+    A budget sets ``steps`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     steps : int
@@ -91,6 +93,8 @@ class MultiViewPredictorCorrector:
 
     name: ClassVar[str] = "mvpc"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    effort: ClassVar[tuple[str, ...]] = ("steps",)
+    least_effort: ClassVar[int] = 2
 
     steps: int = 50
     corrector_steps: int = 1

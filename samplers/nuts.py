@@ -25,6 +25,8 @@ __all__ = ["NUTS"]
 class NUTS:
     """The No-U-Turn sampler (Hoffman and Gelman 2014), NumPyro's (Phan et al. 2019).
 
+    A budget sets ``warmup`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     warmup : int
@@ -45,6 +47,8 @@ class NUTS:
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
     needs_gradient: ClassVar[bool] = True
+    effort: ClassVar[tuple[str, ...]] = ("warmup",)
+    least_effort: ClassVar[int] = 50
 
     warmup: int = 500
     target_acceptance: float = 0.8

@@ -46,6 +46,8 @@ class ScoreDistillation:
     In coordinates there are no views: ``n_views``, ``elevation``, ``azimuths``, ``arc`` and
     ``shared_noise`` are of a 2D denoiser only.
 
+    A budget sets ``iterations`` (:mod:`probmotion.comparison.budgets`).
+
     Parameters
     ----------
     iterations : int
@@ -83,6 +85,7 @@ class ScoreDistillation:
 
     name: ClassVar[str] = "sds"
     requires: ClassVar[tuple[Any, ...]] = (Denoises2D | DenoisesCoordinates,)
+    effort: ClassVar[tuple[str, ...]] = ("iterations",)
 
     iterations: int = 10_000
     n_views: int = 1

@@ -127,9 +127,11 @@ class Study:
         return MotionVAE.load(folder)
 
     def _trainee(self, kind: Any, size: MotionVAESettings, *more: Any) -> Any:
+        # Where no clip that is watched is as long, those learnt from are: nothing is chosen by it.
+        long = [one for one in self.tracks["validation"] if one.frames >= size.frames]
         return kind(
             self.tracks["train"],
-            self.tracks["validation"],
+            long or self.tracks["train"],
             size,
             self.body,
             *more,

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+from probmotion.comparison.budgets import Budget
 from probmotion.comparison.grid import compare
-from probmotion.comparison.quick import QUICK, quick_samplers
+from probmotion.comparison.quick import QUICK, QUICK_BUDGET, QUICK_LIMIT, quick_samplers
 from probmotion.comparison.result import Comparison
 
-__all__ = ["QUICK", "Comparison", "compare", "quick_samplers"]
+__all__ = [
+    "QUICK",
+    "QUICK_BUDGET",
+    "QUICK_LIMIT",
+    "Budget",
+    "Comparison",
+    "compare",
+    "quick_samplers",
+]

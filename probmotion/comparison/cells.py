@@ -9,36 +9,36 @@ import json
 import math
 import os
 import shutil
-import traceback
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from probmotion import seeds
+from probmotion.comparison.budgets import Budget
+from probmotion.comparison.failures import CellNotKept, Failure, NotFinite
+from probmotion.comparison.time_limits import time_limit
 from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
 from probmotion.problems import Problem, load_problem
-from probmotion.sampling import Sampler, UnsupportedPosterior
+from probmotion.sampling import Sampler
 from probmotion.threads import one_thread
 
-__all__ = ["Cell", "CellResult", "Failure", "forget_unfinished", "read_result", "run_cell"]
+__all__ = ["Cell", "CellResult", "Failure", "forget_unfinished", "read_draws", "read_result"]
 
 _DRAWS, _RESULT = "draws.nc", "cell.json"
 _UNFINISHED = ".unfinished-"
 
 
 @dataclass(frozen=True)
-class Failure:
-    """Why a cell has no draws: one word for the table, one sentence, and where it happened."""
-
-    word: str
-    message: str
-    unsupported: bool
-    traceback: str = ""
-
-
-@dataclass(frozen=True)
 class CellResult:
-    """What is kept of a finished cell beside its draws."""
+    """What is kept of a finished cell beside its draws.
+
+    ``budget`` says what the cell was allowed, in the words of
+    :class:`~probmotion.comparison.budgets.Budget`, with which settings, and what it used.
+    """
 
     problem: str
     sampler: str
@@ -46,6 +46,7 @@ class CellResult:
     fingerprint: str
     metrics: dict[str, float]
     failure: Failure | None = None
+    budget: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,14 @@ class Cell:
         ``draws`` in all, spread evenly over ``chains``.
     fingerprint : str
         Digest of all that decides the result.
+    limit : float, optional
+        Seconds that it may take, the making of its problem not counted.
+    budget : Budget, optional
+        What it was allowed.
+    settings : dict, optional
+        The sampler's settings that spend it.
+    beforehand : Failure, optional
+        Why it cannot run within it; the cell then has this failure.
     """
 
     folder: Path
@@ -79,6 +88,13 @@ class Cell:
     draws: int
     chains: int
     fingerprint: str
+    limit: float | None = None
+    budget: Budget | None = None
+    settings: dict[str, int] | None = None
+    beforehand: Failure | None = None
+
+    def __str__(self) -> str:
+        return f"{self.problem}/{self.sampler}/{self.seed}"
 
     def finished(self) -> bool:
         """Whether its result is there, made with the same settings, and no accident."""
@@ -94,55 +110,87 @@ class Cell:
             result is not None and result.failure is None and result.fingerprint != self.fingerprint
         )
 
+    def prepare(self) -> None:
+        """Load what it needs."""
+        import probmotion.metrics  # noqa: F401
+
+        if isinstance(self.source, str):
+            load_problem(self.source)
+
     def fail(self, error: BaseException) -> None:
         """Keep an error as the cell's result."""
-        self._keep({}, None, _failure(error))
+        self._keep({}, None, Failure.of(error))
 
     def run(self, progress: bool) -> None:
-        """Draw, measure and keep; an error of the sampler's is kept as the cell's result."""
-        from probmotion.metrics import measure
+        """Draw, measure and keep; an error of the sampler's is kept as the cell's result.
 
+        Raises
+        ------
+        CellNotKept
+            If it cannot be written; nothing of it is left then.
+        """
+        if self.beforehand is not None:
+            self._keep({}, None, self.beforehand)
+            return
         try:
             with one_thread():
                 problem = load_problem(self.source) if isinstance(self.source, str) else self.source
-                draws = self.with_sampler.sample(
-                    problem.posterior,
-                    draws=self.draws // self.chains,
-                    chains=self.chains,
-                    seed=seeds.integer(self.seed, "cell", self.problem, self.sampler),
-                    progress=progress,
-                )
-                n = draws.positions.sizes["chain"] * draws.positions.sizes["draw"]
-                if n != self.draws:
-                    raise ValueError(f"{self.sampler} returned {n} draws, expected {self.draws}")
-                # All samplers of a problem and seed are judged by the same exact draws.
-                metrics = measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
-        except Exception as error:
+                with time_limit(self.limit):
+                    draws, metrics = self._measured(problem, progress)
+        # A sampler that asks the program to end must not end the grid.
+        except (Exception, SystemExit) as error:
             self.fail(error)
         else:
             self._keep(metrics, draws, None)
 
+    def _measured(self, problem: Problem, progress: bool) -> tuple[MotionDraws, dict[str, float]]:
+        from probmotion.metrics import measure
+
+        seed = seeds.integer(self.seed, "cell", self.problem, self.sampler)
+        draws = self._drawn(problem.posterior, seed, progress)
+        # All samplers of a problem and seed are judged by the same exact draws.
+        return draws, measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
+
+    def _drawn(self, posterior: MotionPosterior, seed: int, progress: bool) -> MotionDraws:
+        """Return what the sampler draws: as many as were asked for, all finite."""
+        draws = self.with_sampler.sample(
+            posterior,
+            draws=self.draws // self.chains,
+            chains=self.chains,
+            seed=seed,
+            progress=progress,
+        )
+        n = draws.positions.sizes["chain"] * draws.positions.sizes["draw"]
+        if n != self.draws:
+            raise ValueError(f"{self.sampler} returned {n} draws, expected {self.draws}")
+        if bad := int((~np.isfinite(draws.positions.values)).sum()):
+            raise NotFinite(f"{self.sampler} returned draws of which {bad} numbers are not finite")
+        return draws
+
     def _keep(
         self, metrics: dict[str, float], draws: MotionDraws | None, failure: Failure | None
     ) -> None:
-        result = CellResult(
-            self.problem, self.sampler, self.seed, self.fingerprint, metrics, failure
-        )
-        place = self.folder.parent
-        unfinished = place / f"{_UNFINISHED}{self.folder.name}-{os.getpid()}"
-        unfinished.mkdir(parents=True, exist_ok=True)
-        if draws is not None:
-            draws.save(unfinished / _DRAWS)
-        with open(unfinished / _RESULT, "w", encoding="utf-8") as file:
-            json.dump(_without_nan(asdict(result)), file, indent=1)
-        if self.folder.exists():
-            shutil.rmtree(self.folder)
-        unfinished.rename(self.folder)
-
-
-def run_cell(cell: Cell, progress: bool = False) -> None:
-    """Run a cell; what an executor is given."""
-    cell.run(progress)
+        spent = None
+        if self.budget is not None:
+            used = None if draws is None else self.budget.spent(draws)
+            spent = {"asked": str(self.budget), "settings": self.settings, "used": used}
+            metrics = metrics if used is None else {**metrics, "budget_used": used}
+        address = (self.problem, self.sampler, self.seed)
+        result = CellResult(*address, self.fingerprint, metrics, failure, spent)
+        _forget(self.folder.parent, self.folder.name)
+        unfinished = self.folder.parent / f"{_UNFINISHED}{self.folder.name}-{os.getpid()}"
+        try:
+            unfinished.mkdir(parents=True, exist_ok=True)
+            if draws is not None:
+                draws.save(unfinished / _DRAWS)
+            with open(unfinished / _RESULT, "w", encoding="utf-8") as file:
+                json.dump(_without_nan(asdict(result)), file, indent=1)
+            if self.folder.exists():
+                shutil.rmtree(self.folder)
+            unfinished.rename(self.folder)
+        except OSError as error:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise CellNotKept(error.strerror or str(error)) from error
 
 
 def read_result(folder: Path) -> CellResult | None:
@@ -167,18 +215,16 @@ def read_draws(folder: Path) -> MotionDraws:
     return MotionDraws.load(folder / _DRAWS)
 
 
-def forget_unfinished(cells: Path) -> None:
+def forget_unfinished(cells: Path, problems: Iterable[str]) -> None:
     """Remove what cells of a killed run left half-written below ``cells``."""
-    for left in cells.glob(f"*/*/{_UNFINISHED}*"):
+    for problem in problems:
+        for place in (cells / problem).glob("*/"):
+            _forget(place, "*")
+
+
+def _forget(place: Path, seed: str) -> None:
+    for left in place.glob(f"{_UNFINISHED}{seed}-*"):
         shutil.rmtree(left, ignore_errors=True)
-
-
-def _failure(error: BaseException) -> Failure:
-    message = " ".join(str(error).split()) or type(error).__name__
-    trace = "".join(traceback.format_exception(error))
-    if isinstance(error, UnsupportedPosterior):
-        return Failure(error.word, message, unsupported=True, traceback=trace)
-    return Failure(type(error).__name__, message, unsupported=False, traceback=trace)
 
 
 def _without_nan(value: Any) -> Any:

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
 
-from probmotion.checks import check_count
-from probmotion.comparison.cells import Cell, forget_unfinished
-from probmotion.comparison.fingerprint import fingerprint
-from probmotion.comparison.result import Comparison, Plan
-from probmotion.comparison.workers import run_cells
-from probmotion.draws import library_versions
-from probmotion.posterior import MotionPosterior
-from probmotion.problems import Problem, load_problem, problem_names
-from probmotion.sampling import Sampler, load_sampler, sampler_names
+from probmotion import seeds as addressed
+from probmotion.checks import check_count, check_positive
+from probmotion.comparison.budgets import Budget
+from probmotion.comparison.cells import forget_unfinished
+from probmotion.comparison.kept_problems import keep_problem
+from probmotion.comparison.locks import locked
+from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
+from probmotion.comparison.plan import Plan
+from probmotion.comparison.result import Comparison
+from probmotion.comparison.tasks import Grid, finished_kept, missing, refuse_taken
+from probmotion.comparison.workers import run_tasks
+from probmotion.files import writable_folder
+from probmotion.problems import load_problem
 
 __all__ = ["compare"]
 
 _FEWEST_DRAWS = 10
-_NAME = re.compile(r"\w[\w.,=+() -]*")
-
-AnyProblem = str | Problem | MotionPosterior
-AnySampler = str | Sampler
 
 
 def compare(
@@ -38,6 +36,8 @@ def compare(
     out: str | Path | None = None,
     workers: int = 1,
     executor: Executor | None = None,
+    budget: Budget | None = None,
+    time_limit: float | None = None,
     progress: bool = True,
 ) -> Comparison:
     """Run every sampler on every problem and measure what it drew.
@@ -65,16 +65,26 @@ def compare(
         Processes; 1 runs in this one.
     executor : concurrent.futures.Executor, optional
         Run the cells there; it must see the same ``out``.
+    budget : Budget, optional
+        What every sampler may spend on a cell, by the setting that it names as its ``effort``;
+        pilot runs, once per problem and sampler, find out how much of it that is, and cost about
+        as much as a cell. Their own settings by default.
+    time_limit : float, optional
+        Seconds that a cell may take, the making of its problem not counted; one that takes longer
+        is a failure. It is ended in time in processes of our own, and in the main thread of a
+        system with interval timers; elsewhere, as on an executor's threads, it runs to its end.
     progress : bool
         Show bars, of cells and (with one worker) of draws.
 
     Raises
     ------
     ValueError
-        If a problem or sampler is unknown, two have one name, a number is out of range, or
-        ``out`` holds finished cells of the same names that were made with other settings.
+        If a problem or sampler is unknown, two have one name, a number is out of range,
+        ``out`` holds finished cells of the same names that were made with other settings, was
+        written by another version, or another run is at work on one of the problems there.
     OSError
-        If ``out`` cannot be written to; said before anything is computed.
+        If ``out`` cannot be written to, said before anything is computed, or no longer, as when
+        the disk is full: finished cells are kept.
     KeyboardInterrupt
         At Ctrl-C; the message says how many cells are finished and where.
     """
@@ -84,134 +94,33 @@ def compare(
     check_count("workers", workers)
     if draws % chains:
         raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
-    chosen = _named_problems(problems)
-    used = _named_samplers(samplers)
-    folder = Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else _writable(Path(out))
-    plan = Plan.of(chosen, used, draws, chains, seeds)
-    cells = _cells(folder, plan, chosen, used)
-    if taken := [cell for cell in cells if cell.taken()]:
-        first = taken[0]
-        raise ValueError(
-            f"out is {folder}, which holds {len(taken)} finished cells made with other settings, "
-            f"evidence or library versions, the first {first.problem}/{first.sampler}/{first.seed};"
-            " expected a folder of its own for another comparison"
-        )
-    forget_unfinished(folder / "cells")
-    plan.save(folder)
-    missing = [cell for cell in cells if not cell.finished()]
-    try:
-        run_cells(missing, workers, executor, progress)
-    except KeyboardInterrupt:
-        finished = sum(cell.finished() for cell in cells)
-        raise KeyboardInterrupt(
-            f"interrupted with {finished} of {len(cells)} cells finished, which are kept in "
-            f"{folder}; the same command with that folder runs the others"
-        ) from None
-    comparison = Comparison.load(folder, temporary=out is None)
-    comparison.write(folder)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
+    if budget is not None and not isinstance(budget, Budget):
+        raise ValueError(f"budget is {budget!r}, expected a Budget")
+    chosen = named_problems(problems)
+    used = named_samplers(samplers)
+    folder = (
+        Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else writable_folder(Path(out))
+    )
+    Plan.check_folder(folder)
+    plan = Plan.of(chosen, used, draws, chains, seeds, budget)
+    with locked(folder, chosen):
+        grid = Grid(folder, plan, chosen, used, budget, time_limit)
+        refuse_taken(folder, [*grid.pilots(), *grid.cells()])
+        forget_unfinished(folder / "cells", chosen)
+        for name, source in chosen.items():
+            problem = load_problem(source) if isinstance(source, str) else source
+            # Pictures show reference draws that the first seed is measured against.
+            seed = addressed.integer(0, "exact", name)
+            keep_problem(problem, folder / "problems" / name, seed=seed)
+        plan.save(folder)
+        with finished_kept(grid):
+            where = (workers, executor, progress)
+            run_tasks(missing(grid.pilots()), *where, label="pilots")
+            run_tasks(missing(grid.cells()), *where)
+        # A run of other problems in this folder may have left its own plan.
+        plan.save(folder)
+        comparison = Comparison(folder, plan, temporary=out is None)
+        comparison.write(folder)
     return comparison
-
-
-def _cells(
-    folder: Path, plan: Plan, problems: Mapping[str, Any], samplers: Mapping[str, Sampler]
-) -> list[Cell]:
-    """The grid, all samplers of one problem and seed in a row: they share exact draws."""
-    asked = {
-        name: fingerprint(load_problem(source) if isinstance(source, str) else source)
-        for name, source in problems.items()
-    }
-    settings = {name: fingerprint(sampler) for name, sampler in samplers.items()}
-    versions = library_versions()
-    return [
-        Cell(
-            folder=plan.cell_folder(folder, problem, sampler, seed),
-            problem=problem,
-            sampler=sampler,
-            seed=seed,
-            source=problems[problem],
-            with_sampler=samplers[sampler],
-            draws=plan.draws,
-            chains=plan.chains,
-            fingerprint=fingerprint(
-                [
-                    *(problem, asked[problem], sampler, settings[sampler], seed),
-                    *(plan.draws, plan.chains, versions),
-                ]
-            ),
-        )
-        for problem, sampler, seed in plan.cells()
-    ]
-
-
-def _named_problems(problems: Any) -> dict[str, str | Problem]:
-    """The problems by what the table calls them; a registered name stands for itself."""
-    found: dict[str, str | Problem] = {}
-    for label, given in _labelled(problems, AnyProblem):
-        if isinstance(given, str):
-            load_problem(given)
-            _add("problems", found, label or given, given)
-        elif isinstance(given, Problem):
-            _add("problems", found, label or given.name, _registered_name(given) or given)
-        elif isinstance(given, MotionPosterior):
-            name = label or "posterior"
-            _add("problems", found, name, Problem(name, "a posterior of the caller's", given))
-        else:
-            raise ValueError(
-                f"problems has a {type(given).__name__}, expected names, Problem or "
-                "MotionPosterior objects"
-            )
-    return found
-
-
-def _registered_name(problem: Problem) -> str | None:
-    """A registered problem travels by its name: a process then makes it once for all cells."""
-    name = problem.name
-    return name if name in problem_names() and load_problem(name) is problem else None
-
-
-def _named_samplers(samplers: Any) -> dict[str, Sampler]:
-    found: dict[str, Sampler] = {}
-    for label, given in _labelled(sampler_names() if samplers is None else samplers, AnySampler):
-        if isinstance(given, str):
-            _add("samplers", found, label or given, load_sampler(given)())
-        elif isinstance(given, Sampler) and not isinstance(given, type):
-            _add("samplers", found, label or given.name, given)
-        else:
-            what = given.__name__ if isinstance(given, type) else type(given).__name__
-            raise ValueError(
-                f"samplers has {what}, expected names or objects with name, requires and sample()"
-            )
-    return found
-
-
-def _labelled(given: Any, one: Any) -> list[tuple[str | None, Any]]:
-    if isinstance(given, Mapping):
-        return list(given.items())
-    if isinstance(given, one) or not isinstance(given, Iterable):
-        return [(None, given)]
-    return [(None, item) for item in given]
-
-
-def _add(argument: str, found: dict[str, Any], name: str, value: Any) -> None:
-    if name in found:
-        raise ValueError(
-            f"{argument} has two called {name!r}, expected different names; give a mapping, such "
-            f"as {{'{name}-a': …, '{name}-b': …}}"
-        )
-    if not _NAME.fullmatch(name):
-        raise ValueError(
-            f"{argument} has the name {name!r}, expected letters, digits and . , = + ( ) - _ that "
-            "make a folder's name"
-        )
-    found[name] = value
-
-
-def _writable(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise OSError(f"out is {str(folder)!r}, {reason}; expected a writable folder") from error
-    return folder

@@ -6,15 +6,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from probmotion.comparison.budgets import Budget
 from probmotion.sampling import Sampler, load_sampler, sampler_names
 
-__all__ = ["QUICK", "quick_samplers"]
+__all__ = ["QUICK", "QUICK_BUDGET", "QUICK_LIMIT", "quick_samplers"]
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
     "sds": {"iterations": 2000},
     "dvae": {"training_steps": 600, "training_pairs": 8000},
 }
 """By sampler: the settings that differ from its own defaults."""
+
+QUICK_BUDGET = Budget(seconds=6.0)
+"""Of a cell of 40 draws, for a look at many problems."""
+
+QUICK_LIMIT = 60.0
+"""Seconds after which a cell of that grid, or its pilots, is given up (``time_limit``)."""
 
 
 def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:

@@ -5,98 +5,24 @@ from __future__ import annotations
 import json
 import shutil
 import weakref
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probmotion.comparison.cells import CellResult, read_draws, read_result
+from probmotion.comparison.plan import Plan
 from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
-from probmotion.problems import Problem, load_problem
-from probmotion.sampling import Sampler
 
 if TYPE_CHECKING:
+    from probmotion.calibration.result import Calibration
     from probmotion.comparison.table import ComparisonTable
 
 __all__ = ["Comparison", "Plan"]
 
-_PLAN, _TABLE, _FAILURES = "comparison.json", "table.csv", "failures.json"
+_TABLE, _FAILURES = "table.csv", "failures.json"
 _PICTURE = "quality_against_cost.png"
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The grid that was asked for.
-
-    Parameters
-    ----------
-    problems : dict of str
-        Descriptions by name.
-    samplers : dict of dict
-        By name: settings that differ from the class's defaults.
-    draws, chains, seeds : int
-        As given to :func:`~probmotion.comparison.compare`.
-    """
-
-    problems: dict[str, str]
-    samplers: dict[str, dict[str, str]]
-    draws: int
-    chains: int
-    seeds: int
-
-    @classmethod
-    def of(
-        cls,
-        problems: Mapping[str, str | Problem],
-        samplers: Mapping[str, Sampler],
-        draws: int,
-        chains: int,
-        seeds: int,
-    ) -> Plan:
-        """Return the plan of a grid of these objects."""
-        loaded = {
-            name: load_problem(source) if isinstance(source, str) else source
-            for name, source in problems.items()
-        }
-        return cls(
-            problems={name: problem.description for name, problem in loaded.items()},
-            samplers={name: _changed_settings(sampler) for name, sampler in samplers.items()},
-            draws=draws,
-            chains=chains,
-            seeds=seeds,
-        )
-
-    def cells(self) -> Iterator[tuple[str, str, int]]:
-        """Yield (problem, sampler, seed): all samplers of one problem and seed in a row."""
-        for problem in self.problems:
-            for seed in range(self.seeds):
-                for sampler in self.samplers:
-                    yield problem, sampler, seed
-
-    @staticmethod
-    def cell_folder(folder: Path, problem: str, sampler: str, seed: int) -> Path:
-        """Return where a cell is kept below ``folder``."""
-        return folder / "cells" / problem / sampler / str(seed)
-
-    def save(self, folder: Path) -> None:
-        """Write the plan into ``folder``."""
-        with written_whole(folder / _PLAN) as unfinished:
-            unfinished.write_text(json.dumps(asdict(self), indent=1), encoding="utf-8")
-
-    @classmethod
-    def load(cls, folder: Path) -> Plan:
-        """Read the plan in ``folder``."""
-        path = folder / _PLAN
-        try:
-            return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except OSError as error:
-            raise ValueError(
-                f"folder is {str(folder)!r}, which holds no {_PLAN}, expected one that compare() "
-                "wrote"
-            ) from error
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+_PROBLEMS = "problems"
 
 
 class Comparison:
@@ -138,8 +64,8 @@ class Comparison:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences to read with the table: settings that are not defaults, and failures."""
-        notes = []
+        """Sentences to read with the table: budget, settings other than defaults, failures."""
+        notes = list(self.plan.notes)
         for sampler, settings in self.plan.samplers.items():
             if settings:
                 listed = ", ".join(f"{name}={value}" for name, value in settings.items())
@@ -209,6 +135,12 @@ class Comparison:
         plot_quality_against_cost(self.table(), target)
         return target
 
+    def report(self, path: str | Path, calibration: Calibration | None = None) -> Path:
+        """Write one page, ``.html``, that opens offline: tables, plots, draws that play."""
+        from probmotion.report.page import write_report
+
+        return write_report(self, path, calibration)
+
     def write(self, folder: str | Path) -> None:
         """Write ``table.csv`` and ``failures.json``; into another folder, the cells as well."""
         folder = Path(folder)
@@ -221,6 +153,9 @@ class Comparison:
                     self.plan.cell_folder(folder, *address),
                     dirs_exist_ok=True,
                 )
+            for problem in self.plan.problems:
+                kept = Path(_PROBLEMS) / problem
+                shutil.copytree(self.folder / kept, folder / kept, dirs_exist_ok=True)
             self.plan.save(folder)
         with written_whole(folder / _TABLE) as unfinished:
             self.table().to_csv(unfinished, index=False)
@@ -235,19 +170,3 @@ class Comparison:
 
     def __repr__(self) -> str:
         return str(self.table())
-
-
-def _changed_settings(sampler: Any) -> dict[str, str]:
-    """The settings of a dataclass that differ from its class's defaults, as text."""
-    if not is_dataclass(sampler):
-        return {}
-    kind: Any = type(sampler)
-    try:
-        usual = kind()
-    except (TypeError, ValueError):  # a setting without a default
-        usual = None
-    return {
-        field.name: repr(getattr(sampler, field.name))
-        for field in fields(sampler)
-        if usual is None or getattr(sampler, field.name) != getattr(usual, field.name)
-    }

@@ -26,6 +26,10 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         },
     ),
     (
+        "tests of being alike",
+        {"seconds": "seconds", "c2st": "C2ST", "mmd": "MMD²", "ksd": "KSD²"},
+    ),
+    (
         "against the truth, mm",
         {
             "seconds": "seconds",
@@ -96,6 +100,9 @@ exact (1; below: over-confident); mean: error of the mean / √tr (0); off: vari
 manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
 styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
 The frame and table.csv hold more measures."""
+_TESTS_LEGEND = """\
+C2ST: how often a classifier tells a draw from an exact one (0.5: it guesses); MMD²: squared maximum
+mean discrepancy from exact draws (0); KSD²: squared kernel Stein discrepancy from density (0)."""
 _WORLD_LEGEND = """\
 in the world: G-MPJPE, without alignment, of the draws and of their mean; acceleration: mean size of
 a joint's acceleration over the truth's (0.5 to 2 is plausible)."""
@@ -137,6 +144,8 @@ class ComparisonTable(pd.DataFrame):
         parts = [self._problem(problem) for problem in problems]
         if any(self["metric"] == "swd"):
             parts.append(_LEGEND)
+        if self["metric"].isin(["c2st", "ksd"]).any():
+            parts.append(_TESTS_LEGEND)
         if any(self["metric"] == "g_mpjpe_mean_mm"):
             parts.append(_WORLD_LEGEND)
         if any(self["metric"] == "coverage_cartesian"):

@@ -1,39 +1,30 @@
-"""Running cells: here, in processes of our own, or on any executor."""
+"""Running tasks, cells or pilots: here, in processes of our own, or on any executor."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    as_completed,
-    wait,
-)
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from collections.abc import Sequence
+from concurrent.futures import Executor, as_completed
+from typing import Any
 
-from probmotion.comparison.cells import Cell, run_cell
+from probmotion.comparison.failures import CellNotKept
+from probmotion.comparison.processes import Done, Task, run_in_processes
 from probmotion.sampling import progress_bar
-from probmotion.threads import one_thread
 
-__all__ = ["run_cells"]
+__all__ = ["run_task", "run_tasks"]
 
 
-def run_cells(
-    cells: Sequence[Cell], workers: int, executor: Executor | None, progress: bool
+def run_tasks(
+    tasks: Sequence[Task],
+    workers: int,
+    executor: Executor | None,
+    progress: bool,
+    label: str = "cells",
 ) -> None:
-    """Run every cell; each keeps its own result, or its failure.
+    """Run every task; each keeps its own result, or its failure.
 
     Parameters
     ----------
-    cells : sequence of Cell
+    tasks : sequence of Task
         What to run.
     workers : int
         1: in this process, with a bar for the draws of each cell; more: that many processes.
@@ -41,36 +32,44 @@ def run_cells(
         Run there instead.
     progress : bool
         Show bars.
+    label : str
+        What the bar counts.
 
     Raises
     ------
     KeyboardInterrupt
-        At Ctrl-C, at once; finished cells are kept.
+        At Ctrl-C, at once; finished tasks are kept.
+    CellNotKept
+        If a result cannot be written, as on a full disk; finished tasks are kept.
     """
-    if not cells:
+    if not tasks:
         return
-    with progress_bar(len(cells), "cells", progress) as bar:
+    with progress_bar(len(tasks), label, progress) as bar:
 
-        def done(cell: Cell, error: BaseException | None) -> None:
+        def done(task: Any, error: BaseException | None) -> None:
+            if isinstance(error, CellNotKept):
+                raise error
             if error is not None:
-                cell.fail(error)
+                task.fail(error)
             bar.update(1)
 
         if executor is not None:
-            _run_on(executor, cells, done)
+            _run_on(executor, tasks, done)
         elif workers == 1:
-            for cell in cells:
-                run_cell(cell, progress)
-                done(cell, None)
+            for task in tasks:
+                run_task(task, progress)
+                done(task, None)
         else:
-            _run_in_processes(cells, workers, done)
+            run_in_processes(tasks, workers, done)
 
 
-Done = Callable[[Cell, BaseException | None], None]
+def run_task(task: Task, progress: bool = False) -> None:
+    """Run a task; what an executor is given."""
+    task.run(progress)
 
 
-def _run_on(executor: Executor, cells: Sequence[Cell], done: Done) -> None:
-    running = {executor.submit(run_cell, cell): cell for cell in cells}
+def _run_on(executor: Executor, tasks: Sequence[Task], done: Done) -> None:
+    running = {executor.submit(run_task, task): task for task in tasks}
     try:
         for future in as_completed(running):
             done(running[future], future.exception())
@@ -78,74 +77,3 @@ def _run_on(executor: Executor, cells: Sequence[Cell], done: Done) -> None:
         for future in running:
             future.cancel()
         raise
-
-
-def _run_in_processes(cells: Sequence[Cell], workers: int, done: Done) -> None:
-    waiting = list(reversed(cells))
-    while waiting:
-        ours_not = set(multiprocessing.active_children())
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
-        try:
-            # What a worker loads before its first cell must find one thread in the environment.
-            with one_thread():
-                _feed(pool, waiting, workers, done)
-            pool.shutdown()
-        except BrokenProcessPool:
-            pool.shutdown()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in set(multiprocessing.active_children()) - ours_not:
-                worker.terminate()
-            raise
-
-
-def _feed(pool: ProcessPoolExecutor, waiting: list[Cell], workers: int, done: Done) -> None:
-    """Keep as many cells in the pool as it has workers, so that a dead worker fails no others."""
-    running: dict[Future, Cell] = {}
-    broken: BaseException | None = None
-    while running or (waiting and broken is None):
-        while waiting and len(running) < workers and broken is None:
-            cell = waiting.pop()
-            with _born_deaf():
-                running[pool.submit(run_cell, cell)] = cell
-        finished, _ = wait(running, return_when=FIRST_COMPLETED)
-        for future in finished:
-            error = future.exception()
-            if isinstance(error, BrokenProcessPool):
-                broken = error
-                error = RuntimeError(
-                    "a worker process died while this cell ran, perhaps for want of memory; "
-                    "expected it to finish"
-                )
-            done(running.pop(future), error)
-    if broken is not None:
-        raise broken
-
-
-@contextmanager
-def _born_deaf() -> Iterator[None]:
-    """Processes that begin in the block do not hear Ctrl-C, not even while they load."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    # It unblocks Ctrl-C when it starts, so it is started first.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion import seeds
-from probmotion.arrays import to_numpy
 from probmotion.draws import MotionDraws
 from probmotion.metrics import accuracy, distribution
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.cost import costs
 from probmotion.metrics.generation import GenerationReference, diversity
+from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
 from probmotion.metrics.structure import HasManifold, HasStyles
-from probmotion.priors import HasExactPosterior
+from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
 
 if TYPE_CHECKING:
     from probmotion.posterior import MotionPosterior
@@ -30,13 +30,14 @@ _DIRECTIONS = 256
 _ENOUGH, _MOST_SETS = 4000, 8
 _MILLIMETRES = 1000.0
 _LOOKED_AT = 100
+_OF_DENSITY = 500
 _REAL_PAIRS = 5000
 
 
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
     """Return every measure that applies, by name.
 
-    Against exact draws, where the problem has them:
+    Against reference draws, exact ones or those that a long run left, where the problem has them:
 
     - ``swd``: sliced Wasserstein distance over that of two exact sets; 1 is right
     - ``tr``: trace of covariance over the exact one; < 1 is over-confident
@@ -45,6 +46,11 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     - ``log_density_gap``: mean log density less exact draws', nats; 0 is right
     - ``share_<style>`` and ``share_error``: styles, and their total variation from exact draws'
     - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
+    - ``mmd``: squared maximum mean discrepancy; 0 is right, and may be missed to either side
+    - ``c2st``: how often a classifier tells draws from reference draws; .5 is right
+
+    Against the density, where it has a gradient and the run keeps θ, ``ksd``: squared kernel Stein
+    discrepancy; 0 is right, and no number where all draws are one.
 
     Filmed, against held-out real 2D motion (MAS, section 6.3), mean over random views: ``fid``,
     ``diversity_ratio`` (over the real motion's), ``view_precision``, ``view_recall``, and from the
@@ -74,6 +80,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     positions = draws.flat()
     if problem.has_reference:
         found |= _against_reference(problem, positions, seed)
+    found |= _against_density(problem, draws)
     if problem.truth is not None:
         found |= accuracy_of(positions, problem.truth, problem.posterior)
     if problem.held_out is not None:
@@ -89,19 +96,20 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
 
 @dataclass(frozen=True, eq=False)
 class _Exact:
-    """Exact draws of one problem, and what is measured of them for every sampler alike."""
+    """Reference draws of one problem, and what is measured of them for every sampler alike."""
 
     sets: list[np.ndarray]
     flat: np.ndarray
     directions: np.ndarray
     off: float | None
-    log_density: float
+    log_density: float | None
     shares: dict[str, float]
 
 
 @lru_cache(maxsize=2)
 def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
-    n_sets = min(_MOST_SETS, max(2, _ENOUGH // n))
+    most = problem.most_reference
+    n_sets = min(_MOST_SETS, max(2, _ENOUGH // n), *([] if most is None else [most // n]))
     reference = problem.reference(seed, n_sets * n)
     flat = reference.reshape(len(reference), -1)
     rng = seeds.generator(seed, "directions")
@@ -117,26 +125,49 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
 
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
-    n = len(positions)
+    flat = positions.reshape(len(positions), -1)
+    # Of many draws as many are judged, evenly apart, as two sets of reference draws can have.
+    most = problem.most_reference
+    n = len(flat) if most is None else min(len(flat), most // 2)
+    some = flat[np.arange(n) * len(flat) // n]
     exact = _exact_draws(problem, seed, n)
-    flat = positions.reshape(n, -1)
     prior = problem.posterior.prior
     found = {
-        "swd": distribution.sliced_wasserstein_ratio(flat, exact.sets, exact.directions),
+        "swd": distribution.sliced_wasserstein_ratio(some, exact.sets, exact.directions),
         "tr": float(distribution.trace_ratio(flat, exact.flat)),
         "mean_error": float(distribution.mean_error(flat, exact.flat)),
     }
     off = _off_manifold(prior, positions)
     if off is not None and exact.off is not None:
         found["off"] = off / exact.off
-    found["log_density_gap"] = _log_density(problem, positions) - exact.log_density
+    log_density = _log_density(problem, positions)
+    if log_density is not None and exact.log_density is not None:
+        found["log_density_gap"] = log_density - exact.log_density
     shares = _shares(prior, positions)
     if shares:
         found |= {f"share_{style}": share for style, share in shares.items()}
         apart = [abs(share - exact.shares[style]) for style, share in shares.items()]
         found["share_error"] = 0.5 * sum(apart)
-    found["precision"], found["recall"] = distribution.precision_recall(flat, exact.sets[0])
+    found["precision"], found["recall"] = distribution.precision_recall(some, exact.sets[0])
+    found["mmd"] = maximum_mean_discrepancy(some, exact.sets[0])
+    found["c2st"] = classifier_two_sample(some, exact.sets[0], seed)
     return found
+
+
+def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:
+    if "theta" not in draws.dataset:
+        return {}
+    theta = draws.dataset["theta"].values
+    theta = theta.reshape(-1, theta.shape[-1])
+    n = min(len(theta), _OF_DENSITY)
+    chosen = theta[np.arange(n) * len(theta) // n]
+    try:
+        score = score_of(problem.posterior, chosen)
+    except NoGradient:
+        return {}
+    if (chosen == chosen[0]).all():
+        return {"ksd": math.nan}
+    return {"ksd": kernel_stein_discrepancy(chosen, score)}
 
 
 def _against_real_views(
@@ -168,10 +199,9 @@ def _off_manifold(prior: object, positions: np.ndarray) -> float | None:
     return float(prior.off_manifold(positions).mean())
 
 
-def _log_density(problem: Problem, positions: np.ndarray) -> float:
-    prior, likelihood = problem.posterior.prior, problem.posterior.likelihood
-    assert isinstance(prior, HasExactPosterior)
-    return float(np.mean(to_numpy(prior.exact_posterior(likelihood).log_density(positions))))
+def _log_density(problem: Problem, positions: np.ndarray) -> float | None:
+    value = problem.log_density_of(positions)
+    return None if value is None else float(np.mean(value))
 
 
 def _shares(prior: object, positions: np.ndarray) -> dict[str, float]:

@@ -8,11 +8,19 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from probmotion.cameras import Cameras
+from probmotion.checks import check_count
 from probmotion.likelihoods import Keypoints2D
 from probmotion.motion import Motion
 from probmotion.skeleton import Skeleton
 
-__all__ = ["OBSERVATIONS", "observe"]
+__all__ = [
+    "OBSERVATIONS",
+    "in_one_camera",
+    "limb_hidden",
+    "nearest_joints",
+    "observe",
+    "one_frame",
+]
 
 _ELEVATION = math.pi / 12
 _SPARSE_JOINTS = 6
@@ -42,8 +50,54 @@ def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | 
     hides = OBSERVATIONS[how]
     if hides is None:
         return None
+    return in_one_camera(motion, noise, seed, hides(motion))
+
+
+def in_one_camera(motion: Motion, noise: float, seed: int, hidden: np.ndarray) -> Keypoints2D:
+    """Return noisy keypoints as :func:`observe` does, but for those ``hidden`` (L, J)."""
     camera = Cameras.ring(1, elevation=_ELEVATION)
-    return Keypoints2D.observe(motion, camera, noise, seed, hidden=hides(motion))
+    return Keypoints2D.observe(motion, camera, noise, seed, hidden=hidden)
+
+
+def limb_hidden(motion: Motion, share: float) -> np.ndarray:
+    """Return what is hidden (L, J): the longest limb, in the middle ``share`` of the frames.
+
+    Raises
+    ------
+    ValueError
+        If the share is not between 0 and 1.
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"hidden is {share!r}, expected a share of the frames between 0 and 1")
+    hidden = _nothing(motion)
+    # As many as the share has, counted in whole frames; the start likewise.
+    start = int((1 - share) / 2 * motion.frames + 1e-9)
+    frames = slice(start, start + int(share * motion.frames + 1e-9))
+    for joint in _longest_limb(motion.skeleton):
+        hidden[frames, joint] = True
+    return hidden
+
+
+def nearest_joints(skeleton: Skeleton, n: int) -> list[int]:
+    """Return the n joints with the fewest ancestors, the root first.
+
+    Raises
+    ------
+    ValueError
+        If the skeleton has fewer.
+    """
+    check_count("joints", n)
+    if n > skeleton.n_joints:
+        raise ValueError(f"joints is {n}, expected at most the {skeleton.n_joints} there are")
+    order = sorted(range(skeleton.n_joints), key=lambda joint: len(skeleton.ancestors(joint)))
+    return order[:n]
+
+
+def one_frame(motion: Motion) -> np.ndarray:
+    """Return what of the motion is its middle frame, (L, J)."""
+    seen = _nothing(motion)
+    seen[motion.frames // 2] = True
+    return seen
 
 
 def _nothing(motion: Motion) -> np.ndarray:
@@ -51,19 +105,13 @@ def _nothing(motion: Motion) -> np.ndarray:
 
 
 def _limb_for_half(motion: Motion) -> np.ndarray:
-    hidden = _nothing(motion)
-    start = motion.frames // 4
-    frames = slice(start, start + motion.frames // 2)
-    for joint in _longest_limb(motion.skeleton):
-        hidden[frames, joint] = True
-    return hidden
+    return limb_hidden(motion, 0.5)
 
 
 def _all_but_a_few(motion: Motion) -> np.ndarray:
-    skeleton = motion.skeleton
-    nearest = sorted(range(skeleton.n_joints), key=lambda joint: len(skeleton.ancestors(joint)))
-    hidden = ~_nothing(motion)
-    hidden[motion.frames // 2, nearest[:_SPARSE_JOINTS]] = False
+    hidden = ~one_frame(motion)
+    shown = nearest_joints(motion.skeleton, min(_SPARSE_JOINTS, motion.skeleton.n_joints))
+    hidden[:, [j for j in range(motion.skeleton.n_joints) if j not in shown]] = True
     return hidden
 
 

@@ -18,7 +18,7 @@ from probmotion.models.motion_vae import MotionVAE
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
 from probmotion.problems.evidence import observe
-from probmotion.problems.problem import Problem
+from probmotion.problems.problem import Problem, simulated
 
 __all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
 
@@ -69,7 +69,7 @@ def seen_draw_problem(name: str, description: str, prior: str, how: str, seed: i
     truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
     seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
     assert isinstance(seen, Keypoints2D)
-    return Problem(name, description, MotionPosterior(vae, seen), truth=truth)
+    return simulated(Problem(name, description, MotionPosterior(vae, seen), truth=truth))
 
 
 LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from probmotion import seeds
+from probmotion.arrays import to_numpy
 from probmotion.checks import check_count, check_finite, check_shape
 from probmotion.metrics.generation import GenerationReference
 from probmotion.posterior import MotionPosterior
-from probmotion.priors import HasExactPosterior, NotConjugate
+from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate, Samplable
+from probmotion.problems.kept_references import (
+    HasPositionDensity,
+    KeptReference,
+    log_density_at,
+)
 
-__all__ = ["Problem"]
+__all__ = ["Problem", "simulated"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +41,17 @@ class Problem:
         Real motions of the kind, metres, that draws are to cover; nobody has learnt from them.
     generation : GenerationReference, optional
         Real 2D motion of the kind that draws, filmed, are to be like.
+    kept : KeptReference, optional
+        Draws of a long run, where nothing is exact.
+    simulate : callable, optional
+        ``simulate(k)`` is the same problem with another truth, drawn from the prior, and evidence
+        of it, both addressed by the seed k; see :func:`simulated`.
 
     Raises
     ------
     ValueError
         If the truth or a motion that was held out has another shape than the posterior's
-        motions, or is not finite.
+        motions, or is not finite, or what is kept was drawn from another posterior.
     """
 
     name: str
@@ -47,6 +60,8 @@ class Problem:
     truth: np.ndarray | None = None
     held_out: np.ndarray | None = None
     generation: GenerationReference | None = None
+    kept: KeptReference | None = None
+    simulate: Callable[[int], Problem] | None = None
 
     def __post_init__(self) -> None:
         shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
@@ -56,33 +71,83 @@ class Problem:
         if self.held_out is not None:
             check_shape("held_out", self.held_out, ("G", *shape))
             check_finite("held_out", self.held_out)
+        if self.kept is not None:
+            self.kept.check(self.name, self.posterior)
+
+    @property
+    def exact(self) -> ExactPosterior | None:
+        """The posterior in closed form, where it has one."""
+        prior = self.posterior.prior
+        if not isinstance(prior, HasExactPosterior):
+            return None
+        try:
+            return prior.exact_posterior(self.posterior.likelihood)
+        except NotConjugate:
+            return None
 
     @property
     def has_reference(self) -> bool:
-        """Whether exact reference draws can be had."""
-        prior = self.posterior.prior
-        if not isinstance(prior, HasExactPosterior):
-            return False
-        try:
-            prior.exact_posterior(self.posterior.likelihood)
-        except NotConjugate:
-            return False
-        return True
+        """Whether reference draws can be had, exact or kept."""
+        return self.kept is not None or self.exact is not None
+
+    @property
+    def most_reference(self) -> int | None:
+        """The most reference draws there are; None where any number can be had."""
+        return None if self.kept is None or self.exact is not None else self.kept.n
 
     def reference(self, seed: int, n: int) -> np.ndarray:
-        """Return n independent draws from the exact posterior, (n, L, J, 3), metres.
+        """Return n independent reference draws, (n, L, J, 3), metres.
+
+        Exact ones where the posterior has a closed form; else kept ones, chosen without
+        replacement.
 
         Raises
         ------
         ValueError
-            If the posterior has no closed form.
+            If there are none, or fewer than n are kept.
         """
         check_count("n", n)
-        prior = self.posterior.prior
-        if not isinstance(prior, HasExactPosterior):
-            raise ValueError(
-                f"problem {self.name} has no reference: {type(prior).__name__} has no exact "
-                "posterior"
-            )
-        exact = prior.exact_posterior(self.posterior.likelihood)
-        return exact.sample(seeds.generator(seed, "reference"), n)
+        exact = self.exact
+        if exact is not None:
+            return exact.sample(seeds.generator(seed, "reference"), n)
+        if self.kept is not None:
+            return self.kept.choose(seeds.generator(seed, "reference"), n)
+        raise ValueError(
+            f"problem {self.name} has no reference: {type(self.posterior.prior).__name__} has no "
+            f"exact posterior{self._why_not()}, and no long run is kept (probmotion reference)"
+        )
+
+    def log_density_of(self, positions: np.ndarray) -> np.ndarray | None:
+        """Return log p(X | y) up to a constant: ``(n, L, J, 3) → (n,)``; None if no one knows it.
+
+        Normalised where the posterior is exact.
+        """
+        if self.exact is not None:
+            return to_numpy(self.exact.log_density(positions))
+        if not isinstance(self.posterior.prior, HasPositionDensity):
+            return None
+        return log_density_at(self.posterior, positions)
+
+    def _why_not(self) -> str:
+        return " here" if isinstance(self.posterior.prior, HasExactPosterior) else ""
+
+
+def simulated(problem: Problem) -> Problem:
+    """Return the problem with ``simulate``: truths drawn from its prior, evidence of them.
+
+    The prior must be :class:`~probmotion.priors.Samplable`; where there is no evidence, only the
+    truth is drawn.
+    """
+    return replace(problem, simulate=partial(_another, problem))
+
+
+def _another(problem: Problem, k: int) -> Problem:
+    prior, likelihood = problem.posterior.prior, problem.posterior.likelihood
+    assert isinstance(prior, Samplable)
+    truth = to_numpy(prior.sample(seeds.generator(k, "simulated truth"), 1))[0]
+    if likelihood is not None:
+        likelihood = likelihood.simulate(seeds.generator(k, "simulated evidence"), truth)
+    again = replace(
+        problem, posterior=MotionPosterior(prior, likelihood), truth=truth, kept=None, simulate=None
+    )
+    return simulated(again)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,3 +143,101 @@ class Interrupting(PriorDraws):
         if len(Path(self.diary).read_text().split()) == 2:
             raise KeyboardInterrupt
         return draws
+
+
+@dataclass(frozen=True)
+class NotANumber(PriorDraws):
+    """Hands over draws that were spoilt after they were checked."""
+
+    name: ClassVar[str] = "not-a-number"
+
+    def sample(self, posterior, **settings):
+        found = super().sample(posterior, **settings)
+        found.dataset["positions"].values[0, 0, 0, 0, 0] = np.nan
+        return found
+
+
+@dataclass(frozen=True)
+class Unchecked(PriorDraws):
+    """Leaves it to MotionDraws to find out that a draw is infinite."""
+
+    name: ClassVar[str] = "unchecked"
+
+    def sample(self, posterior, *, draws=1000, chains=1, **settings):
+        x = np.full((chains, draws, posterior.frames, posterior.skeleton.n_joints, 3), np.inf)
+        return MotionDraws.of(posterior, self, x, seed=0, seconds=0.0)
+
+
+@dataclass(frozen=True)
+class Hungry(PriorDraws):
+    name: ClassVar[str] = "hungry"
+
+    def sample(self, posterior, **settings):
+        raise MemoryError
+
+
+@dataclass(frozen=True)
+class Quitting(PriorDraws):
+    name: ClassVar[str] = "quitting"
+
+    def sample(self, posterior, **settings):
+        raise SystemExit(3)
+
+
+@dataclass(frozen=True)
+class Endless(PriorDraws):
+    """Never returns; calls itself compiled code where it does not even hear alarms."""
+
+    name: ClassVar[str] = "endless"
+    deaf: bool = False
+
+    def sample(self, posterior, **settings):
+        if self.deaf:
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+        while True:
+            try:
+                time.sleep(30)
+            except Exception:  # as libraries do that wrap what they call
+                continue
+
+
+@dataclass(frozen=True)
+class Walking(PriorDraws):
+    """Its cost is a straight line in ``stride``, and nothing else comes of it."""
+
+    name: ClassVar[str] = "walking"
+    effort: ClassVar[tuple[str, ...]] = ("stride", "start")
+    least_effort: ClassVar[int] = 2
+
+    stride: int = 10
+    start: int = 100
+    most: int = 10**9
+
+    def __post_init__(self):
+        if self.stride > self.most:
+            raise ValueError(f"stride is {self.stride}, expected at most {self.most}")
+
+    def sample(self, posterior, *, draws=1000, chains=1, **settings):
+        found = super().sample(posterior, draws=draws, chains=chains, **settings)
+        cost = chains * (50 + self.start + draws * self.stride)
+        counts = {"evaluations_density": cost, "evaluations_gradient": chains * draws}
+        return MotionDraws(
+            found.dataset.drop_attrs(deep=False).assign_attrs(
+                {**found.dataset.attrs, "evaluations_denoiser": 0, **counts}
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Napping(PriorDraws):
+    """Takes a hundredth of a second per unit of effort."""
+
+    name: ClassVar[str] = "napping"
+    effort: ClassVar[tuple[str, ...]] = ("rounds",)
+
+    rounds: int = 4
+
+    def sample(self, posterior, **settings):
+        found = super().sample(posterior, **settings)
+        time.sleep(0.01 * self.rounds)
+        return MotionDraws(found.dataset.assign_attrs(seconds=0.01 * self.rounds))

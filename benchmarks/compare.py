@@ -1,0 +1,71 @@
+"""What two workers gain on a grid of equal cells: random walks on ``gait``.
+
+``efficiency_two_workers``: seconds with one worker over twice those with two, both from the call of
+``compare`` to its table, so that the start of processes and what they import is in it.
+``worker_import_seconds``, ``worker_problem_seconds``: what a worker does first. Run it on a
+machine with two idle cores.
+"""
+
+from __future__ import annotations
+
+import os
+
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[threads] = "1"
+
+import argparse
+import subprocess
+import sys
+import time
+
+from probmotion.comparison import compare
+from probmotion.samplers import MetropolisHastings
+
+_START = """
+import time
+start = time.perf_counter()
+import probmotion.comparison.processes, probmotion.comparison.cells, probmotion.metrics
+from probmotion.problems import load_problem
+import probmotion.samplers.metropolis
+imported = time.perf_counter()
+load_problem("gait")
+print(imported - start, time.perf_counter() - imported)
+"""
+
+
+def seconds(workers: int, cells: int, thin: int) -> float:
+    """Return how long the grid takes."""
+    sampler = MetropolisHastings(warmup=1000, thin=thin)
+    start = time.perf_counter()
+    found = compare(
+        "gait", sampler, draws=40, chains=4, seeds=cells, workers=workers, progress=False
+    )
+    taken = time.perf_counter() - start
+    if len(found.results) != cells or found.failures:
+        raise SystemExit("some cells failed, expected all to finish")
+    return taken
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", type=int, default=8)
+    parser.add_argument("--cell-seconds", type=float, default=3.0)
+    given = parser.parse_args()
+    # Everything is imported and the problem made before the clock of either run starts.
+    thin = 2000
+    one = seconds(1, cells=1, thin=thin)
+    one = seconds(1, cells=1, thin=thin)
+    thin = max(1, round(thin * given.cell_seconds / one))
+    start = subprocess.check_output([sys.executable, "-c", _START], text=True).split()
+    print(f"worker_import_seconds: {float(start[0]):.2f}")
+    print(f"worker_problem_seconds: {float(start[1]):.2f}")
+    alone = seconds(1, given.cells, thin)
+    together = seconds(2, given.cells, thin)
+    print(f"seconds_one_worker: {alone:.2f}")
+    print(f"seconds_two_workers: {together:.2f}")
+    print(f"efficiency_two_workers: {alone / (2 * together):.3f}")
+
+
+if __name__ == "__main__":
+    main()

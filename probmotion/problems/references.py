@@ -1,0 +1,228 @@
+"""`make_reference`: reference draws from two independent runs that agree.
+
+Both runs are the sampler's own, four chains each, started apart; their draws are kept only if each
+has mixed and they cannot be told apart. Of an exact posterior they are two sets of exact draws,
+which are measured the same way.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws, library_versions
+from probmotion.metrics.chains import chain_diagnostics
+from probmotion.metrics.distribution import random_directions
+from probmotion.problems.kept_references import KeptReference, fingerprint_of, log_density_at
+from probmotion.problems.outlier_gibbs import OutlierGibbs
+from probmotion.problems.problem import Problem
+from probmotion.sampling import Sampler, load_sampler
+
+__all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
+
+_CHAINS = 4
+_RHAT = 1.01
+_LEAST = 4000
+_DIRECTIONS = 128
+_SPREADS, _RATIO = 5.0, 1.5
+_LEVEL = 1e-3
+
+
+class ReferenceRefused(ValueError):  # noqa: N818 (a verdict, not a fault)
+    """Two runs that have not mixed, or do not agree: their draws are no reference."""
+
+
+def make_reference(
+    problem: str | Problem,
+    *,
+    draws: int = 4000,
+    seed: int = 0,
+    progress: bool = True,
+    sampler: Sampler | None = None,
+) -> KeptReference:
+    """Return reference draws of a problem with their certificate; nothing is written.
+
+    Parameters
+    ----------
+    problem : str or Problem
+        A name as :func:`~probmotion.problems.load_problem` takes it, or the problem.
+    draws : int
+        Draws to keep, half from each run: a multiple of 8, 4 chains each. The runs have 4000 at
+        least, because R-hat says little of short ones; of more, as many as asked for are kept,
+        evenly apart.
+    seed : int
+        Seed of both runs.
+    progress : bool
+        Show bars.
+    sampler : Sampler, optional
+        What draws where the posterior is not exact. By default
+        :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` where that can, else NUTS with a
+        longer warm-up.
+
+    Raises
+    ------
+    ValueError
+        If ``draws`` is not such a number, or the prior has no density of positions.
+    ReferenceRefused
+        If R-hat is above 1.01, or the runs disagree.
+    """
+    from probmotion.problems import problem_without_reference
+
+    asked = problem_without_reference(problem) if isinstance(problem, str) else problem
+    check_count("draws", draws, least=8 * _CHAINS)
+    if draws % (2 * _CHAINS):
+        raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
+    shape = (asked.posterior.frames, asked.posterior.skeleton.n_joints, 3)
+    log_density_at(asked.posterior, np.zeros((1, *shape)))  # says so before hours are spent
+    with_sampler = None if asked.exact is not None else sampler or _long_run(asked)
+    made = max(draws, _LEAST) // 2
+    runs = [_run(asked, with_sampler, made, seed, half, progress) for half in range(2)]
+    return certify(asked, runs, seed, draws)
+
+
+def _long_run(problem: Problem) -> Sampler:
+    gibbs = OutlierGibbs()
+    if gibbs.draws_from(problem.posterior):
+        return gibbs
+    return load_sampler("nuts")(warmup=1000, candidates=10_000)
+
+
+def _run(
+    problem: Problem, sampler: Sampler | None, n: int, seed: int, half: int, progress: bool
+) -> MotionDraws:
+    used = load_sampler("exact")() if sampler is None else sampler
+    return used.sample(
+        problem.posterior,
+        draws=n // _CHAINS,
+        chains=_CHAINS,
+        seed=seeds.integer(seed, "reference run", half),
+        progress=progress,
+    )
+
+
+def certify(
+    problem: Problem, runs: list[MotionDraws], seed: int, draws: int | None = None
+) -> KeptReference:
+    """Return the draws of two runs as a reference, if both have mixed and they agree.
+
+    ``draws`` of them are kept, evenly apart in every chain; all by default.
+
+    Raises
+    ------
+    ReferenceRefused
+        If they have not or do not; the message says how far.
+    """
+    measured = [chain_diagnostics(run) for run in runs]
+    worst = max((found["rhat"] for found in measured if "rhat" in found), default=None)
+    # Not-a-number is no R-hat that is small.
+    if worst is not None and not worst <= _RHAT:
+        raise ReferenceRefused(
+            f"the runs on {problem.name} have an R-hat of {worst:.3f}, expected at most {_RHAT}; "
+            "more draws may help, nothing was kept"
+        )
+    agreed = agreement(*(run.dataset["positions"].values for run in runs), seed=seed)
+    for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
+        if not agreed[measure] <= agreed[limit]:
+            raise ReferenceRefused(
+                f"two runs on {problem.name} disagree, {measure} is {agreed[measure]:.3g}, "
+                f"expected at most {agreed[limit]:.3g}; nothing was kept"
+            )
+    positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
+    first = runs[0].dataset.attrs
+    certificate: dict[str, Any] = {
+        "problem": problem.name,
+        "draws": len(positions),
+        "exact": problem.exact is not None,
+        "sampler": first["sampler"],
+        "settings": json.loads(first["settings"]),
+        "draws_made": sum(len(run.flat()) for run in runs),
+        "chains": len(runs) * runs[0].dataset.sizes["chain"],
+        "rhat": worst,
+        "ess_bulk": _least(measured, "ess_bulk"),
+        "ess_tail": _least(measured, "ess_tail"),
+        "agreement": agreed,
+        "seed": seed,
+        "versions": library_versions(),
+        "fingerprint": fingerprint_of(problem.posterior, positions),
+    }
+    return KeptReference(positions, certificate)
+
+
+def _evenly(run: MotionDraws, draws: int | None) -> np.ndarray:
+    positions = run.dataset["positions"].values
+    made = positions.shape[1]
+    n = made if draws is None else draws // (2 * len(positions))
+    chosen = positions[:, np.arange(n) * made // n]
+    return chosen.reshape(-1, *positions.shape[2:])
+
+
+def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, float]:
+    """Return how far two runs are apart, and how far two runs alike may be.
+
+    - ``swd_ratio``: their sliced Wasserstein distance over that of halves which take half of
+      the chains of each run, so that they differ as runs that agree do, slow mixing included;
+      ``swd_ratio_at_most`` is 1 and five of those halves' standard deviations, or 1.5
+    - ``mean_z``: the largest difference of means over coordinates, in standard errors that count
+      each run's effective draws; ``mean_z_at_most`` is exceeded once in a thousand times by
+      runs that agree
+
+    Parameters
+    ----------
+    first, second : ndarray, (chain, draw, L, J, 3)
+        Positions, metres; as many of both.
+    seed : int
+        Of the directions of projection.
+    """
+    from scipy.stats import norm
+
+    runs = [run.reshape(*run.shape[:2], -1) for run in (first, second)]
+    dim = runs[0].shape[-1]
+    directions = random_directions(seeds.generator(seed, "directions"), _DIRECTIONS, dim)
+    seen = np.concatenate([run @ directions.T for run in runs])
+    chains = len(runs[0])
+    halves = [_apart(seen, chosen) for chosen in _mixed_halves(chains)]
+    floor = float(np.mean(halves))
+    # A root whose center nothing moves has neither deviation nor difference.
+    spread = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > 1e-9
+    z = _standard_errors_apart(*(run[..., spread] for run in runs))
+    return {
+        "swd_ratio": _apart(seen, tuple(range(chains))) / floor,
+        "swd_ratio_at_most": max(_RATIO, 1 + _SPREADS * float(np.std(halves)) / floor),
+        "mean_z": float(np.abs(z).max()),
+        "mean_z_at_most": float(norm.isf(0.5 * _LEVEL / len(z))),
+    }
+
+
+def _mixed_halves(chains: int) -> list[tuple[int, ...]]:
+    """Chains of halves that take as many from each run; each of the two halves stands for both."""
+    own = list(combinations(range(chains), chains // 2))
+    return [(*a, *(chains + i for i in b)) for a in own for b in own if 0 in a]
+
+
+def _apart(seen: np.ndarray, chosen: tuple[int, ...]) -> float:
+    """The sliced Wasserstein distance of some chains to the others, all projected already."""
+    others = [chain for chain in range(len(seen)) if chain not in chosen]
+    x, y = (seen[list(some)].reshape(-1, seen.shape[-1]) for some in (chosen, others))
+    return float(np.sqrt(np.mean((np.sort(x, axis=0) - np.sort(y, axis=0)) ** 2)))
+
+
+def _standard_errors_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    from arviz_stats.base import array_stats
+
+    difference = first.mean(axis=(0, 1)) - second.mean(axis=(0, 1))
+    variance = np.zeros(len(difference))
+    for run in (first, second):
+        ess = array_stats.ess(run, method="mean", chain_axis=0, draw_axis=1)
+        variance += run.var(axis=(0, 1), ddof=1) / np.asarray(ess)
+    return difference / np.sqrt(variance)
+
+
+def _least(measured: list[dict[str, float]], name: str) -> float | None:
+    values = [found[name] for found in measured if name in found]
+    return min(values) if values and all(map(math.isfinite, values)) else None

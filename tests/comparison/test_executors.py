@@ -1,0 +1,77 @@
+"""Cells run on any executor, with the same table."""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pandas as pd
+import pytest
+from toy_samplers import Crashing, PriorDraws, generation, monocular
+
+from probmotion.comparison import Budget, compare
+from probmotion.comparison.failures import CellNotKept
+
+SMALL = {"draws": 20, "chains": 2, "seeds": 2, "progress": False}
+SAMPLERS = {"toy": PriorDraws(), "wide": PriorDraws(2.0), "crashing": Crashing()}
+
+
+def numbers(comparison):
+    table = pd.DataFrame(comparison.table())
+    return table[table["metric"] != "seconds"].to_csv(index=False)
+
+
+@pytest.fixture(scope="module")
+def here():
+    return numbers(compare([generation(), monocular()], SAMPLERS, **SMALL))
+
+
+# Its event loop and its lost connections are its own.
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_dask(here, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=None,
+        silence_logs=logging.CRITICAL,
+    )
+    with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
+        problems = [generation(), monocular()]
+        found = compare(problems, SAMPLERS, executor=executor, out=tmp_path, **SMALL)
+    assert numbers(found) == here
+
+
+def test_threads_with_a_limit_and_a_budget(here):
+    settings = {**SMALL, "budget": Budget(evaluations=500), "time_limit": 100.0}
+    with ThreadPoolExecutor(2) as executor:
+        there = compare(generation(), SAMPLERS, executor=executor, **settings)
+    assert numbers(there) == numbers(compare(generation(), SAMPLERS, **settings))
+
+
+class _Broken(ThreadPoolExecutor):
+    """Loses every task to an error of its own."""
+
+    error: Exception = OSError("the cluster is gone")
+
+    def submit(self, function, *arguments, **settings):
+        future = Future()
+        future.set_exception(self.error)
+        return future
+
+
+def test_what_an_executor_loses_is_a_row():
+    with _Broken() as executor:
+        found = compare(generation(), SAMPLERS, executor=executor, **SMALL)
+    assert {result.failure.message for result in found.results} == {"the cluster is gone"}
+    assert len(found.results) == 6
+
+
+def test_a_full_disk_on_an_executor_stops_the_run():
+    with _Broken() as executor:
+        executor.error = CellNotKept("No space left on device")
+        with pytest.raises(OSError, match="any more, No space left on device, with 0 of 6 cells"):
+            compare(generation(), SAMPLERS, executor=executor, **SMALL)

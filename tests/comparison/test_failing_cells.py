@@ -1,0 +1,214 @@
+"""A failing cell is a row with its reason, never a hole or a stop."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from toy_samplers import (
+    Dying,
+    Endless,
+    Hungry,
+    NotANumber,
+    PriorDraws,
+    Quitting,
+    Unchecked,
+    generation,
+)
+
+from probmotion.comparison import Comparison, compare
+from probmotion.comparison.failures import CellNotKept, Failure, TimeIsUp, WorkerDied
+from probmotion.comparison.time_limits import time_limit
+
+SMALL = {"draws": 20, "chains": 2, "progress": False}
+WORDS = {
+    NotANumber(): "nan",
+    Unchecked(): "nan",
+    Hungry(): "memory",
+    Quitting(): "SystemExit",
+}
+
+
+def test_every_failure_is_a_row_with_its_word(tmp_path):
+    comparison = compare(generation(), [*WORDS, PriorDraws()], out=tmp_path, **SMALL)
+    words = {each.sampler: each.failure and each.failure.word for each in comparison.results}
+    assert words == {sampler.name: word for sampler, word in WORDS.items()} | {"prior-draws": None}
+    table = comparison.table()
+    failed = table[table["metric"] == "failed"]
+    assert set(failed["sampler"]) == {sampler.name for sampler in WORDS}
+    for word in WORDS.values():
+        assert word in str(table)
+
+
+@pytest.mark.parametrize(
+    ("error", "word"),
+    [
+        (RuntimeError("RESOURCE_EXHAUSTED: out of memory"), "memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "memory"),
+        (type("OutOfMemoryError", (RuntimeError,), {})("CUDA"), "memory"),
+        (WorkerDied(killed=True), "memory"),
+        (WorkerDied(killed=False), "died"),
+        (ValueError("theta has 3 values that are NaN or infinite, the first"), "nan"),
+        (FloatingPointError("overflow"), "nan"),
+        (ValueError("theta is wrong"), "ValueError"),
+        (TimeIsUp(3.0), "time"),
+    ],
+)
+def test_the_word_of_an_error(error, word):
+    assert Failure.of(error).word == word
+
+
+def test_errors_travel_between_processes():
+    for error in (TimeIsUp(2.5), CellNotKept("the disk is full")):
+        assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_a_cell_that_takes_longer_than_its_limit_is_a_row():
+    samplers = [Endless(), PriorDraws()]
+    start = time.monotonic()
+    comparison = compare(generation(), samplers, time_limit=1.0, seeds=2, **SMALL)
+    assert time.monotonic() - start < 30
+    failures = {(each.sampler, each.seed): each.failure for each in comparison.results}
+    assert failures["endless", 0].word == failures["endless", 1].word == "time"
+    assert "took longer than time_limit, 1 seconds" in failures["endless", 0].message
+    assert failures["prior-draws", 0] is failures["prior-draws", 1] is None
+
+
+def test_processes_are_killed_where_an_alarm_is_not_heard():
+    samplers = {"deaf": Endless(deaf=True), "dying": Dying(), "right": PriorDraws()}
+    comparison = compare(generation(), samplers, time_limit=6.0, workers=2, seeds=2, **SMALL)
+    words = {(r.sampler, r.seed): r.failure and r.failure.word for r in comparison.results}
+    assert words == {
+        **{("deaf", seed): "time" for seed in (0, 1)},
+        **{("dying", seed): "died" for seed in (0, 1)},
+        # What one process dies of fails no other's cell.
+        **{("right", seed): None for seed in (0, 1)},
+    }
+
+
+def test_the_limit_is_no_part_of_the_question(tmp_path):
+    diary = tmp_path / "diary"
+    for limit in (None, 50.0, None):
+        sampler = PriorDraws(diary=str(diary))
+        compare(generation(), sampler, time_limit=limit, out=tmp_path, **SMALL)
+    assert len(diary.read_text().split()) == 1
+    with pytest.raises(ValueError, match="time_limit is 0, expected a finite number above 0"):
+        compare(generation(), PriorDraws(), time_limit=0, **SMALL)
+
+
+def test_a_limit_ends_a_block_and_leaves_the_caller_s_timer():
+    rung = []
+    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
+        start = time.monotonic()
+        with pytest.raises(TimeIsUp), time_limit(0.1):
+            time.sleep(20)
+        assert time.monotonic() - start < 10
+        with time_limit(60.0):
+            pass
+        time.sleep(max(0.0, 0.7 - (time.monotonic() - start)))
+        assert rung == [1]
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_limit_that_a_library_wraps_is_still_a_limit():
+    def library():
+        try:
+            time.sleep(20)
+        except BaseException as error:
+            raise ValueError("INTERNAL: callback") from error
+
+    with pytest.raises(TimeIsUp), time_limit(0.1):
+        library()
+    with pytest.raises(ValueError, match="its own"), time_limit(60.0):
+        raise ValueError("its own")
+
+
+def test_on_another_thread_a_limit_is_told_at_the_end():
+    found = []
+
+    def work():
+        try:
+            with time_limit(0.05):
+                time.sleep(0.2)
+                found.append("ended")
+        except TimeIsUp:
+            found.append("told")
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == ["ended", "told"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers):
+    script = tmp_path / "run.py"
+    script.write_text(FULL_DISK)
+    out = tmp_path / "out"
+    paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.run(
+        [sys.executable, str(script), str(out), str(workers)],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert run.returncode == 1
+    last = run.stderr.strip().splitlines()[-1]
+    assert "OSError: out cannot be written to any more" in last
+    finished = int(re.search(r"with (\d) of 4 cells finished, which are kept in", last)[1])
+    # Of two workers one may still be at its first cell when the other's disk is full.
+    assert finished == 2 if workers == 1 else 1 <= finished <= 2
+    assert len(Comparison.load(out).results) == finished
+    assert not list(out.glob("cells/*/*/.unfinished*"))
+    # On a disk with room the same command goes on.
+    subprocess.run(
+        [sys.executable, str(script), str(out), str(workers), "room"],
+        env={**os.environ, "PYTHONPATH": paths},
+        check=True,
+        timeout=200,
+    )
+    assert len(Comparison.load(out).results) == 4
+
+
+FULL_DISK = """
+import resource, sys
+from dataclasses import dataclass
+from typing import ClassVar
+from toy_samplers import PriorDraws, generation
+from probmotion.comparison import compare
+
+
+@dataclass(frozen=True)
+class Filling(PriorDraws):
+    # Until its third cell there is room.
+    room: ClassVar[bool] = len(sys.argv) > 3
+
+    def sample(self, posterior, **settings):
+        if self.spread > 1 and not self.room:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+        return super().sample(posterior, **settings)
+
+
+if __name__ == "__main__":
+    samplers = {"a": Filling(1.0), "b": Filling(2.0)}
+    names = list(samplers)
+    from probmotion.comparison import plan
+    # All cells of one sampler first.
+    plan.Plan.cells = lambda self: (("generation", s, k) for s in self.samplers for k in (0, 1))
+    out, workers, *_ = sys.argv[1:]
+    compare(generation(), samplers, seeds=2, draws=20, chains=2, out=out, workers=int(workers),
+            progress=False)
+"""

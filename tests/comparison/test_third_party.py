@@ -1,0 +1,123 @@
+"""A package of somebody else's, made on the fly, takes part by its entry point."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+SAMPLER = '''
+"""A sampler of another package's."""
+import time
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from probmotion import MotionDraws, seeds
+from probmotion.priors import HasLogDensity
+
+
+@dataclass(frozen=True)
+class Importance:
+    """Sampling-importance-resampling from the prior."""
+
+    name: ClassVar[str] = "importance"
+    requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+    effort: ClassVar[tuple[str, ...]] = ("candidates",)
+
+    candidates: int = 500
+
+    def sample(self, posterior, *, draws=1000, chains=1, seed=0, initial=None, progress=True):
+        start = time.perf_counter()
+        theta = []
+        for chain in range(chains):
+            rng = seeds.generator(seed, "importance", chain)
+            points = posterior.initial(rng, self.candidates)
+            weight = np.exp(posterior.log_likelihood(points))
+            theta.append(points[rng.choice(self.candidates, draws, p=weight / weight.sum())])
+        theta = np.stack(theta)
+        rng = seeds.generator(seed, "motions")
+        flat = posterior.complete(rng, theta.reshape(-1, posterior.dim))
+        return MotionDraws.of(
+            posterior, self, flat.reshape(chains, draws, *flat.shape[1:]), seed=seed,
+            seconds=time.perf_counter() - start, theta=theta,
+            counts={"density": chains * self.candidates},
+        )
+'''
+
+RUN = """
+import json, sys
+import numpy as np
+import probmotion as pm
+from probmotion.comparison import Budget, compare
+from probmotion.models import GaussianMixtureMotion
+from probmotion.sampling import load_sampler, sampler_names, suited
+
+if __name__ == "__main__":
+    rng = np.random.default_rng(0)
+    prior = GaussianMixtureMotion(
+        skeleton=pm.Skeleton(["root", "a", "b"], [-1, 0, 1]), fps=30.0,
+        means=rng.normal(size=(1, 4, 3, 3)), factors=0.4 * rng.normal(size=(1, 2, 4, 3, 3)),
+        noise=0.1, weights=np.ones(1), azimuths=1,
+    )
+    truth = pm.Motion(prior.sample(rng, 1)[0], prior.skeleton, 30.0)
+    seen = pm.Keypoints2D.observe(truth, pm.Cameras.ring(1, elevation=0.2), noise=0.5, seed=0)
+    posterior = pm.MotionPosterior(prior, seen)
+    found = compare(
+        {"mine": posterior}, ["importance", "exact"], draws=40, chains=2, workers=2,
+        budget=Budget(evaluations=3000), out=sys.argv[1], progress=False,
+    )
+    table = found.table()
+    print(json.dumps({
+        "listed": "importance" in sampler_names(),
+        "module": load_sampler("importance").__module__,
+        "words": table.attrs["words"],
+        "failures": [result.failure.message for result in found.failures],
+        "swd": dict(table[table["metric"] == "swd"].set_index("sampler")["value"]),
+        "settings": {r.sampler: r.budget["settings"] for r in found.results},
+        "suited": suited(posterior),
+    }))
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package as pip would leave it in a folder on the path."""
+    site = tmp_path / "site"
+    (site / "walkers_of_ours").mkdir(parents=True)
+    (site / "walkers_of_ours" / "__init__.py").write_text(SAMPLER)
+    information = site / "walkers_of_ours-0.3.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: walkers-of-ours\nVersion: 0.3\n"
+    )
+    (information / "entry_points.txt").write_text(
+        "[probmotion.samplers]\nimportance = walkers_of_ours:Importance\n"
+    )
+    return site
+
+
+def test_its_sampler_runs_beside_ours_on_a_posterior_of_one_s_own(package, tmp_path):
+    (tmp_path / "run.py").write_text(RUN)
+    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.run(
+        [sys.executable, "-W", "error", str(tmp_path / "run.py"), str(tmp_path / "out")],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert run.returncode == 0, run.stderr
+    found = json.loads(run.stdout)
+    assert found["listed"]
+    assert found["module"] == "walkers_of_ours"
+    assert found["failures"] == []
+    assert set(found["swd"]) == {"importance", "exact"}
+    assert found["swd"]["importance"] < 3
+    # Its effort is spent like that of our own samplers.
+    assert found["settings"] == {"importance": {"candidates": 1500}, "exact": {}}
+    assert "importance" in found["suited"]

@@ -1,0 +1,239 @@
+"""Reference draws of long runs: right where the answer is known, refused where they are wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from probmotion import Joints3D, Motion, MotionDraws, MotionPosterior, seeds
+from probmotion.models import GaussianMixtureMotion
+from probmotion.problems import KeptReference, Problem, kept_references, load_problem
+from probmotion.problems.outlier_gibbs import OutlierGibbs
+from probmotion.problems.references import (
+    ReferenceRefused,
+    agreement,
+    certify,
+    make_reference,
+)
+from probmotion.sampling import load_sampler
+from probmotion.skeleton import Skeleton
+
+
+def toy(
+    freedom: float | None = None,
+    styles: int = 2,
+    azimuths: int = 4,
+    coordinates: Literal["latent", "positions"] = "positions",
+) -> Problem:
+    """Two frames of a bone that sways, seen as noisy joints."""
+    rng = np.random.default_rng(0)
+    prior = GaussianMixtureMotion(
+        Skeleton(["hip", "knee"], [-1, 0]),
+        30.0,
+        means=rng.normal(size=(styles, 2, 2, 3)),
+        factors=0.4 * rng.normal(size=(styles, 2, 2, 2, 3)),
+        weights=np.full(styles, 1 / styles),
+        noise=0.2,
+        azimuths=azimuths,
+        coordinates=coordinates,
+    )
+    truth = prior.sample(rng, 1)[0]
+    evidence = Joints3D.observe(
+        Motion(truth, prior.skeleton, 30.0), 0.3, 1, degrees_of_freedom=freedom
+    )
+    return Problem("toy", "", MotionPosterior(prior, evidence), truth)
+
+
+def runs_of(positions: np.ndarray, problem: Problem, wrong: float = 1.0) -> list[MotionDraws]:
+    """Two runs of four chains; the second one's draws are spread ``wrong`` times as far."""
+    mean = positions.mean(axis=0)
+    runs = []
+    for half, factor in zip(np.split(positions, 2), (1.0, wrong), strict=True):
+        shaped = (mean + factor * (half - mean)).reshape(4, -1, *half.shape[1:])
+        sampler = OutlierGibbs()
+        runs.append(MotionDraws.of(problem.posterior, sampler, shaped, seed=0, seconds=0.0))
+    return runs
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return toy()
+
+
+@pytest.fixture(scope="module")
+def heavy():
+    return toy(freedom=3.0)
+
+
+@pytest.fixture(scope="module")
+def made(heavy):
+    gibbs = OutlierGibbs(thin=1)
+    return make_reference(heavy, draws=480, seed=1, progress=False, sampler=gibbs)
+
+
+def test_nuts_on_a_conjugate_posterior_agrees_with_exact_draws():
+    exact = toy(styles=1, azimuths=1, coordinates="latent")
+    prior = exact.posterior.prior
+    nuts = load_sampler("nuts")(warmup=200, candidates=1)
+    runs = [
+        nuts.sample(exact.posterior, draws=500, chains=4, seed=seed, progress=False)
+        for seed in (1, 2)
+    ]
+    kept = certify(exact, runs, 0)
+    assert kept.certificate["rhat"] <= 1.01
+    assert kept.certificate["ess_bulk"] > 400
+    drawn = prior.exact_posterior(exact.posterior.likelihood).sample(seeds.generator(5), 4000)
+    found = agreement(
+        kept.positions.reshape(4, 1000, 2, 2, 3), drawn.reshape(4, 1000, 2, 2, 3), seed=0
+    )
+    assert found["swd_ratio"] <= found["swd_ratio_at_most"]
+    assert found["mean_z"] <= found["mean_z_at_most"]
+
+
+def test_draws_of_exact_sets_agree_and_say_so(exact):
+    kept = make_reference(exact, draws=800, seed=2, progress=False)
+    told = kept.certificate
+    assert told["exact"]
+    assert (told["sampler"], told["rhat"], told["draws"]) == ("exact", None, 800)
+    json.dumps(told, allow_nan=False)
+
+
+@pytest.mark.parametrize("wrong", [0.9, 1.1])
+def test_a_run_that_is_too_narrow_or_too_wide_is_refused(exact, wrong):
+    drawn = exact.reference(0, 4000)
+    certify(exact, runs_of(drawn, exact), 0)
+    with pytest.raises(ReferenceRefused, match="runs on toy disagree, swd_ratio is"):
+        certify(exact, runs_of(drawn, exact, wrong), 0)
+
+
+def test_runs_whose_means_differ_are_refused(exact):
+    drawn = exact.reference(0, 2000)
+    moved = drawn + 0.15 * drawn.std(axis=0) * np.repeat([0, 1], 1000)[:, None, None, None]
+    with pytest.raises(ReferenceRefused, match="disagree"):
+        certify(exact, runs_of(moved, exact), 0)
+
+
+def test_chains_that_have_not_mixed_are_refused(exact):
+    drawn = exact.reference(0, 2000)
+    stuck = drawn + np.repeat([0.0, 0.3, 0.0, 0.3] * 2, 250)[:, None, None, None]
+    with pytest.raises(ReferenceRefused, match="R-hat of 1"):
+        certify(exact, runs_of(stuck, exact), 0)
+
+
+def test_agreeing_runs_are_seldom_refused():
+    """Both bounds hold for 20 pairs of sets that are alike."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        pair = rng.normal(size=(2, 4, 50, 2, 2, 3)) * np.linspace(0.1, 3, 12).reshape(2, 2, 3)
+        found = agreement(*pair, seed=0)
+        assert found["swd_ratio"] <= found["swd_ratio_at_most"]
+        assert found["mean_z"] <= found["mean_z_at_most"]
+
+
+def test_gibbs_draws_what_the_density_says(heavy):
+    """Importance weights from the exact posterior of Gaussian noise: another way to each mean."""
+    problem, posterior = heavy, heavy.posterior
+    run = OutlierGibbs(thin=2).sample(posterior, draws=1000, chains=2, seed=1, progress=False)
+    wide = replace(posterior.likelihood, degrees_of_freedom=None, noise=0.5)
+    proposal = posterior.prior.exact_posterior(wide)
+    some = proposal.sample(np.random.default_rng(0), 20_000)
+    log_weight = problem.log_density_of(some) - proposal.log_density(some)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    drawn = run.flat()
+    for power in (1, 2):
+        wanted = np.einsum("n,nljx->ljx", weight, some**power)
+        spread = (drawn**power).std(axis=0)
+        error = spread * np.sqrt(1 / 1000 + (weight**2).sum())
+        assert (np.abs((drawn**power).mean(axis=0) - wanted) < 5 * error).all()
+
+
+def test_gibbs_draws_from_nothing_else(exact):
+    with pytest.raises(ValueError, match="posterior has Joints3D evidence, expected Joints3D with"):
+        OutlierGibbs().sample(exact.posterior, draws=2)
+
+
+def test_what_was_saved_is_read_and_served(tmp_path, heavy, made):
+    problem = heavy
+    assert (made.n, made.certificate["draws_made"]) == (480, 4000)
+    folder = made.save(tmp_path / "toy")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "certificate.json", "draws.npz", "toy",
+    ]  # fmt: skip
+    kept = replace(problem, kept=KeptReference.load(folder))
+    assert kept.has_reference
+    assert not problem.has_reference
+    assert (kept.most_reference, problem.most_reference) == (480, None)
+    drawn = kept.reference(3, 480)
+    np.testing.assert_array_equal(drawn, kept.reference(3, 480))
+    assert len(np.unique(drawn.reshape(480, -1), axis=0)) == 480  # without replacement
+    assert (kept.reference(4, 5) != drawn[:5]).any()
+    with pytest.raises(ValueError, match="n is 481, expected at most the 480 reference draws"):
+        kept.reference(0, 481)
+    # What is there is replaced whole.
+    made.save(folder)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_reference_of_another_posterior_is_refused(made):
+    other = toy(freedom=4.0)
+    with pytest.raises(ValueError, match="certificate is of another posterior than toy's"):
+        replace(other, kept=made)
+
+
+def test_a_disk_that_fails_leaves_what_was_there(tmp_path, exact, monkeypatch):
+    made = make_reference(exact, draws=80, progress=False)
+    made.save(tmp_path / "toy")
+    before = (tmp_path / "toy/certificate.json").read_text()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(kept_references.np, "savez_compressed", full)
+    with pytest.raises(OSError, match=r"cannot write .*toy: No space left on device"):
+        made.save(tmp_path / "toy")
+    assert (tmp_path / "toy/certificate.json").read_text() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("certificate.json", b"{", "holds no reference"),
+        ("certificate.json", b"{}", "certificate lacks problem, draws"),
+        ("draws.npz", b"PK", "holds no reference"),
+    ],
+)
+def test_broken_files_are_told(tmp_path, exact, name, content, sentence):
+    folder = make_reference(exact, draws=80, progress=False).save(tmp_path / "toy")
+    (folder / name).write_bytes(content)
+    with pytest.raises(ValueError, match=sentence):
+        KeptReference.load(folder)
+
+
+def test_a_number_of_draws_that_chains_cannot_share_is_refused(exact):
+    with pytest.raises(ValueError, match="draws is 100, expected a multiple of 8"):
+        make_reference(exact, draws=100)
+
+
+def test_a_prior_without_density_of_positions_has_no_reference():
+    with pytest.raises(ValueError, match="prior MotionVAE has no density of positions"):
+        make_reference("walk-vae-monocular")
+
+
+def test_the_shipped_reference_is_of_its_problem_and_agrees_with_another_run(monkeypatch, tmp_path):
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    problem = load_problem("gait-noisy3d")
+    assert problem.has_reference
+    told = problem.kept.certificate
+    assert told["rhat"] <= 1.01
+    assert told["agreement"]["swd_ratio"] <= told["agreement"]["swd_ratio_at_most"]
+    run = OutlierGibbs(thin=1).sample(problem.posterior, draws=60, chains=2, seed=9, progress=False)
+    drawn, kept = run.flat(), problem.reference(0, problem.most_reference)
+    apart = np.abs(drawn.mean(axis=0) - kept.mean(axis=0)) / kept.std(axis=0)
+    assert np.sqrt((apart**2).mean()) < 2 / np.sqrt(60)
+    assert np.abs(drawn.std(axis=0) / kept.std(axis=0) - 1).mean() < 2 / np.sqrt(2 * 60)

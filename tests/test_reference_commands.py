@@ -1,0 +1,67 @@
+"""The command ``probmotion reference``: what it writes, and that it refuses."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from probmotion.cli import main
+from probmotion.problems import KeptReference, load_problem, references
+
+SMALL = "gait-sparse(frames=2, components=6)"
+
+
+def test_it_writes_draws_and_their_certificate(tmp_path, capsys):
+    words = ["reference", "gait-sparse(components=6,frames=2)", "--draws", "80"]
+    assert main([*words, "--out", str(tmp_path)]) == 0
+    assert "two runs apart: sliced Wasserstein ratio" in capsys.readouterr().out
+    kept = KeptReference.load(tmp_path / SMALL)
+    assert (kept.n, kept.certificate["exact"]) == (80, True)
+    assert json.loads((tmp_path / SMALL / "certificate.json").read_text())["problem"] == SMALL
+    kept.check(SMALL, load_problem(SMALL).posterior)
+    with pytest.raises(ValueError, match="another posterior"):
+        kept.check(SMALL, load_problem(SMALL, noise=0.04).posterior)
+
+
+def test_by_default_they_are_where_comparisons_look(tmp_path, monkeypatch):
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    assert main(["reference", SMALL, "--draws", "80"]) == 0
+    assert (tmp_path / "references" / SMALL / "draws.npz").is_file()
+
+
+def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys, monkeypatch):
+    made = references._run
+
+    def narrow(problem, sampler, n, seed, half, progress):
+        run = made(problem, sampler, n, seed, half, progress)
+        positions = run.dataset["positions"]
+        if half:
+            run.dataset["positions"] = positions.mean() + 0.9 * (positions - positions.mean())
+        return run
+
+    monkeypatch.setattr(references, "_run", narrow)
+    assert main(["reference", SMALL, "--draws", "80", "--out", str(tmp_path)]) == 2
+    assert "disagree" in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["gate"], "problem is 'gate', expected one of"),
+        ([SMALL, "--draws", "81"], "draws is 81, expected a multiple of 8"),
+        (["walk2d"], "has no density of positions"),
+    ],
+)
+def test_wrong_words_get_one_sentence(words, sentence, tmp_path, capsys):
+    assert main(["reference", *words, "--out", str(tmp_path)]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_draws_are_float32_numbers(tmp_path):
+    main(["reference", SMALL, "--draws", "80", "--out", str(tmp_path)])
+    with np.load(tmp_path / SMALL / "draws.npz", allow_pickle=False) as held:
+        assert held["positions"].dtype == np.float32
