@@ -34,6 +34,8 @@ __all__ = [
 _GUIDE = 0.07
 """How far up a trunk its guide is, as a share of the trunk."""
 _LONGEST = 3.0
+# A millionth of a metre: less points nowhere.
+_SHORTEST = 1e-6
 """Metres: longer bones are in another unit."""
 
 
@@ -265,7 +267,7 @@ def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
     check_finite(name, offsets)
     lengths = np.linalg.norm(offsets, axis=-1)
     for joint, _ in skeleton.bones:
-        if not lengths[joint] > 0:
+        if not lengths[joint] > _SHORTEST:
             raise ValueError(
                 f"{name} has a bone of no length, to {skeleton.joint_names[joint]}, expected all "
                 "bones to point somewhere"

@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from probmotion import seeds
+from probmotion.checks import check_positive
 from probmotion.models.articulated_body import ArticulatedBody
 from probmotion.models.checkpoints import load_checkpoint, load_weights
 from probmotion.models.motion_vae_losses import (
@@ -63,6 +64,18 @@ class _LearnsFromTracks:
     ) -> None:
         # The mirror image of a body without pairs is another body.
         whole = Augmentation(shortest=1.0, mirror=body.symmetric)
+        if size.image_features:
+            raise ValueError(
+                f"size has image_features={size.image_features}, expected 0: tracks have none; "
+                "networks read them, see MotionVAENetwork.encode"
+            )
+        if distance is not None:
+            check_positive("distance", distance)
+            reach = float(np.linalg.norm(body.rest_positions, axis=-1).max())
+            if distance <= reach:
+                raise ValueError(
+                    f"distance is {distance:g} m, expected more than the body's own {reach:.2g} m"
+                )
         self.size = size
         self.body = body
         self.distance = distance
@@ -250,7 +263,7 @@ class MotionVAETrainee(_LearnsFromTracks):
     Raises
     ------
     ValueError
-        As for the first phase.
+        As for the first phase, or if the pose network is of another size.
     """
 
     kind = KIND
@@ -269,6 +282,15 @@ class MotionVAETrainee(_LearnsFromTracks):
     ) -> None:
         super().__init__(tracks, validation, size, body, distance, threshold, seed)
         vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), seed)
+        own, theirs = (
+            (one.width, one.layers, one.heads, one.feedforward, one.image_features)
+            for one in (size, pose_network.settings)
+        )
+        if own != theirs:
+            raise ValueError(
+                f"pose_network has width, layers, heads, feedforward and image_features {theirs}, "
+                f"expected the size's {own}"
+            )
         teacher = pose_network.eval().requires_grad_(False)
         if size.spatial:
             vae.frame_encoder.load_state_dict(teacher.frame_encoder.state_dict())
@@ -357,5 +379,11 @@ def _long_enough(
         raise ValueError(
             f"{name} has at most {max(track.frames for track in tracks)} frames a track, expected "
             f"a sequence's {frames} or more"
+        )
+    if len(found) < len(tracks):
+        warnings.warn(
+            f"{len(tracks) - len(found)} of {len(tracks)} in {name} are shorter than a sequence's "
+            f"{frames} frames, and are left out",
+            stacklevel=4,
         )
     return found

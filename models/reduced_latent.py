@@ -6,6 +6,7 @@ prior of k dimensions keeps most of what its decoder can do.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -57,6 +58,11 @@ class ReducedLatent(StandardNormalPrior):
         chosen = vectors[:, leading]
         largest = np.abs(chosen).argmax(axis=0)
         self.directions = chosen * np.sign(chosen[largest, np.arange(k)])
+
+    @property
+    def stand_ins(self) -> Mapping[str, str]:
+        """How to get what the prior lacks, as samplers say when they refuse."""
+        return getattr(self.prior, "stand_ins", {})
 
     @cached_property
     def kept(self) -> float:

@@ -6,6 +6,7 @@ optimised so that their first and last frames agree with the neighbours.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -88,7 +89,14 @@ def long_motion(
             found.append((greatest_acceleration(_positions(prior, around)), whole))
             if found[-1][0] <= allowed:
                 break
-        _, whole = min(found, key=lambda one: one[0])
+        least, whole = min(found, key=lambda one: one[0])
+        if least > allowed:
+            warnings.warn(
+                f"a joint accelerates {least / allowed:.2f} times as much at the seam after "
+                f"segment {len(parts) // 2} as within any segment: no transition between these "
+                "codes is smoother",
+                stacklevel=2,
+            )
         parts += [whole[_SHARED:-_SHARED], neighbours[1]]
     return _positions(prior, torch.cat(parts))
 

@@ -39,8 +39,9 @@ class TrainMotionVAE:
     """Least confidence of a joint that is learnt from: .3 for people, .5 for horses."""
 
     rest: Path | None = None
-    """A motion file whose first frame is the body's rest pose, looking along +Z; by default the
-    mean pose is estimated from the tracks."""
+    """A motion file whose first frame is the body's rest pose, looking along +Z, arms and legs as
+    they hang on average: joints turn from it only so far. By default the mean pose is estimated
+    from the tracks."""
 
     front: str | None = None
     """A joint that lies ahead of the root, where the body's joints do not say what is in front."""

@@ -128,3 +128,21 @@ def test_denoising(tmp_path, monkeypatch):
         assert rows["Motion-DVAE, optimization"][2] < rows[name][2]  # hidden joints
     assert rows["Motion-DVAE, optimization"][0] < rows["Motion-DVAE, regression"][0]
     assert "denoised.html" in {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.filterwarnings("default")
+def test_animals(tmp_path, monkeypatch):
+    printed = run("05_animals.py", tmp_path, 1, monkeypatch)
+    assert "21 joints, 10 frames at 10.0 a second" in printed
+
+    def number(pattern: str) -> float:
+        return float(re.search(pattern, printed)[1])
+
+    assert number(r"bones are ([\d.]+) % off") < 10
+    assert number(r"depth is not mirrored in (\d+)%") > 95
+    assert number(r"joints are (\d+) mm from the truth") < 80
+    # As the prose says: at a seam no more than within the pieces.
+    assert number(r"greatest acceleration is ([\d.]+) of that within") <= 1
+    rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
+    assert rows["optimization"] < rows["regression"]
+    assert (tmp_path / "animals.html").exists()

@@ -76,7 +76,7 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
     body = ("body-dvae.md", "body-dvae.safetensors", "body-dvae-denoiser.safetensors")
     vae = [
         f"{name}{ending}"
-        for name in ("walk-vae",)
+        for name in ("walk-vae", "animal-vae")
         for ending in (".md", ".safetensors", "-evaluator.safetensors", "-features.npz")
     ]
     features = ("walk2d-features.npz",)

@@ -265,8 +265,9 @@ def generation(study: Study) -> pd.DataFrame:
     step, per_motion = round(other.fps / FPS), other.frames // round(other.fps / FPS) // FRAMES
     n = max(2, study.draws // 10)
     posterior = MotionPosterior(other)
+    ours = study.variant("final") if study.quick else MotionVAE.load("walk-vae")
     ways: dict[str, np.ndarray] = {
-        "motion VAE": study.variant("final").sample(seeds.generator(0, "draws"), n * per_motion)
+        "motion VAE": ours.sample(seeds.generator(0, "draws"), n * per_motion)
     }
     samplers = {
         "MAS": MultiViewAncestral(),

@@ -121,5 +121,9 @@ def _bare(name: str, scale: Scale) -> Problem:
     # Every process of a comparison must make the same problem to the last bit.
     with one_thread():
         if name in _GAITS:
-            return _GAITS[name](_called(name, scale), **dict(scale))
+            problem = _GAITS[name](_called(name, scale), **dict(scale))
+            if not scale:
+                return problem
+            numbers = ", ".join(f"{number}={value}" for number, value in scale)
+            return replace(problem, description=f"{problem.description}, but with {numbers}")
         return _OTHERS[name][1]()

@@ -87,6 +87,12 @@ LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
             MotionVAE,
         ),
         (
+            "animal-vae",
+            "four-legged animals, a motion VAE learnt from 2D tracks alone: generation",
+            learnt_problem,
+            MotionVAE,
+        ),
+        (
             "walk-vae-monocular",
             "a draw of walk-vae, 2D keypoints of one camera (σ 2 cm)",
             seen_draw_problem,

@@ -229,8 +229,35 @@ def test_nothing_is_learnt_from_the_third_dimension() -> None:
         loss = trainee.training_loss(trainee.network, np.random.default_rng(0), 8, CPU)
         with torch.no_grad():
             held = trainee.validation_loss(trainee.network.eval(), CPU)
-        losses.append((float(loss.detach()), held))
+        second = MotionVAETrainee(seen, held_out, TINY, given, copy.deepcopy(trainee.network))
+        said = second.training_loss(second.network, np.random.default_rng(0), 8, CPU)
+        losses.append((float(loss.detach()), held, float(said.detach())))
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+
+
+def test_what_cannot_be_learnt_with_is_refused_in_a_sentence(tracks, validation, body, first):
+    def asked(size=TINY, distance=7.0):
+        return PoseTrainee(tracks, validation, size, body, distance=distance)
+
+    with pytest.raises(ValueError, match="size has image_features=8, expected 0: tracks have none"):
+        asked(replace(TINY, image_features=8))
+    for distance in (-1.0, np.nan):
+        with pytest.raises(ValueError, match=r"distance is .*, expected a finite number above 0"):
+            asked(distance=distance)
+    with pytest.raises(ValueError, match=r"distance is 0\.1 m, expected more than the body's own"):
+        asked(distance=0.1)
+    wide = asked(replace(TINY, width=64)).network
+    with pytest.raises(ValueError, match=r"pose_network has width, .* expected the size's \(32, "):
+        MotionVAETrainee(tracks, validation, TINY, body, wide, distance=7.0)
+
+
+def test_short_tracks_among_long_ones_are_left_out_and_counted(tracks, validation, body) -> None:
+    short = replace(
+        tracks[0], keypoints=tracks[0].keypoints[:5], confidence=tracks[0].confidence[:5]
+    )
+    with pytest.warns(UserWarning, match="2 of .* in tracks are shorter than a sequence's 10 fram"):
+        trainee = PoseTrainee([*tracks, short, short], validation, TINY, body, distance=7.0)
+    assert trainee.settings["data"]["tracks"] == len(tracks)
 
 
 def test_a_body_without_pairs_is_said_to_have_none() -> None:
