@@ -130,6 +130,7 @@ def test_denoising(tmp_path, monkeypatch):
     assert "denoised.html" in {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_animals(tmp_path, monkeypatch):
     printed = run("05_animals.py", tmp_path, 1, monkeypatch)
@@ -146,3 +147,17 @@ def test_animals(tmp_path, monkeypatch):
     rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
     assert rows["optimization"] < rows["regression"]
     assert (tmp_path / "animals.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_compare_and_calibrate(tmp_path, monkeypatch):
+    printed = run("06_compare_and_calibrate.py", tmp_path, 3, monkeypatch)
+    assert "every sampler had 20 000 evaluations" in printed
+    table = Comparison.load(tmp_path / "comparison").table()
+    used = table[table["metric"] == "budget_used"].groupby("sampler")["value"].max()
+    assert (used[["mh", "mas"]] <= 20_000).all()
+    assert 1e4 < (tmp_path / "report.html").stat().st_size < 15e6
+    right, wrong = (line for line in printed.splitlines() if " on gait-monocular(" in line)
+    assert "no deviation found" in right
+    assert "too sure: 90 % intervals hold" in wrong
