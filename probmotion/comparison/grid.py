@@ -115,10 +115,15 @@ def compare(
             seed = addressed.integer(0, "exact", name)
             keep_problem(problem, folder / "problems" / name, seed=seed)
         plan.save(folder)
-        with finished_kept(grid):
-            where = (workers, executor, progress)
-            run_tasks(missing(grid.pilots()), *where, label="pilots")
-            run_tasks(missing(grid.cells()), *where)
+        try:
+            with finished_kept(grid):
+                where = (workers, executor, progress)
+                run_tasks(missing(grid.pilots()), *where, label="pilots")
+                run_tasks(missing(grid.cells()), *where)
+        finally:
+            # Of workers killed while they wrote; an executor's may still be at it.
+            if executor is None:
+                forget_unfinished(folder / "cells", chosen)
         # A run of other problems in this folder may have left its own plan.
         plan.save(folder)
         comparison = Comparison(folder, plan, temporary=out is None)

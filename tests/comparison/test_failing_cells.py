@@ -152,14 +152,14 @@ def test_on_another_thread_a_limit_is_told_at_the_end():
     assert found == ["ended", "told"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers):
+@pytest.mark.parametrize(("workers", "how"), [(1, ()), (2, ()), (2, ("slow",))])
+def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers, how):
     script = tmp_path / "run.py"
     script.write_text(FULL_DISK)
     out = tmp_path / "out"
     paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     run = subprocess.run(
-        [sys.executable, str(script), str(out), str(workers)],
+        [sys.executable, str(script), str(out), str(workers), *how],
         env={**os.environ, "PYTHONPATH": paths},
         capture_output=True,
         text=True,
@@ -172,6 +172,8 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers):
     # Of two workers one may still be at its first cell when the other's disk is full.
     assert finished == 2 if workers == 1 else 1 <= finished <= 2
     assert len(Comparison.load(out).results) == finished
+    # Not even what a worker was killed at while it wrote.
+    assert (out / "began to write").exists() == bool(how)
     assert not list(out.glob("cells/*/*/.unfinished*"))
     # On a disk with room the same command goes on.
     subprocess.run(
@@ -184,20 +186,35 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers):
 
 
 FULL_DISK = """
-import resource, sys
+import resource, sys, time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 from toy_samplers import PriorDraws, generation
 from probmotion.comparison import compare
+from probmotion.draws import MotionDraws
+
+if "slow" in sys.argv:
+    save = MotionDraws.save
+
+    def save_slowly(draws, path):
+        save(draws, path)
+        if path.parent.name.startswith(".unfinished-0"):
+            Path(sys.argv[1], "began to write").touch()
+            time.sleep(100)
+
+    MotionDraws.save = save_slowly
 
 
 @dataclass(frozen=True)
 class Filling(PriorDraws):
     # Until its third cell there is room.
-    room: ClassVar[bool] = len(sys.argv) > 3
+    room: ClassVar[bool] = "room" in sys.argv
 
     def sample(self, posterior, **settings):
         if self.spread > 1 and not self.room:
+            while "slow" in sys.argv and not Path(sys.argv[1], "began to write").exists():
+                time.sleep(0.01)
             resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
         return super().sample(posterior, **settings)
 

@@ -12,6 +12,7 @@ import pytest
 from probmotion import Keypoints2D, Motion, MotionDraws, MotionPosterior, Skeleton
 from probmotion.metrics import accuracy_of, measure
 from probmotion.metrics.measures import _exact_draws
+from probmotion.metrics.stein import kernel_stein_discrepancy, score_of
 from probmotion.models import GaussianMixtureMotion
 from probmotion.problems import Problem
 from probmotion.problems.evidence import observe
@@ -52,7 +53,7 @@ def occluded(prior):
     return Problem("occluded", "a limb hidden", MotionPosterior(prior, evidence), truth.positions)
 
 
-def run(problem, positions):
+def run(problem, positions, **more):
     return MotionDraws.of(
         problem.posterior,
         Named(),
@@ -61,6 +62,7 @@ def run(problem, positions):
         seconds=1.5,
         counts={"denoiser": 10},
         independent=True,
+        **more,
     )
 
 
@@ -76,6 +78,8 @@ def test_exact_draws_are_found_right(generation):
         "log_density_gap": 0,
         "share_calm": 0.7,
         "share_wild": 0.3,
+        "c2st": 0.5,
+        "mmd": 0,
     }.items():
         values = np.array([each[name] for each in found])
         spread = values.std(ddof=1) / math.sqrt(len(values))
@@ -112,6 +116,19 @@ def test_errors_are_found(generation, prior):
     assert found["calm"]["share_error"] == pytest.approx(0.3, abs=0.06)
     assert found["calm"]["recall"] < 0.8 < found["calm"]["precision"]
     assert found["calm"]["swd"] > 2
+    for wrong in found.values():
+        assert wrong["mmd"] > 0
+    assert found["rough"]["c2st"] > 0.7
+
+
+def test_draws_are_judged_by_the_density_where_they_keep_theta(occluded, prior):
+    exact = occluded.reference(4, N)
+    theta = np.random.default_rng(5).normal(size=(1, N, prior.dim))
+    found = measure(occluded, run(occluded, exact, theta=theta), 0)["ksd"]
+    score = score_of(occluded.posterior, theta[0])
+    assert found == pytest.approx(kernel_stein_discrepancy(theta[0], score))
+    assert math.isnan(measure(occluded, run(occluded, exact, theta=0 * theta), 0)["ksd"])
+    assert "ksd" not in measure(occluded, run(occluded, exact), 0)
 
 
 def test_samplers_of_one_seed_share_their_exact_draws(generation):

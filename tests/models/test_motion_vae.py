@@ -354,6 +354,8 @@ def test_mas_needs_a_denoiser_and_says_who_would_do(prior):
         MultiViewAncestral().sample(MotionPosterior(prior), progress=False)
     assert refused.value.word == "Denoises2D"
     assert "; probmotion.models.projected_denoiser.denoiser_of makes" in str(refused.value)
+    with pytest.raises(UnsupportedPosterior, match=r"ReducedLatent is not; .*denoiser_of makes"):
+        MultiViewAncestral().sample(MotionPosterior(ReducedLatent(prior, 2)), progress=False)
 
 
 SAMPLERS = {

@@ -13,10 +13,12 @@ from probmotion import seeds
 from probmotion.data.gaits import make_gaits
 from probmotion.data.learning import film_clips
 from probmotion.data.projections import DetectorNoise, Filming
+from probmotion.models import motion_vae_network
 from probmotion.models.articulated_body import ArticulatedBody
 from probmotion.models.motion_vae import MotionVAE
 from probmotion.models.motion_vae_losses import guess_terms, weighted_sum
 from probmotion.models.motion_vae_model import MotionVAEModel
+from probmotion.models.motion_vae_network import MotionVAENetwork
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.motion_vae_training import (
     MotionVAETrainee,
@@ -233,6 +235,29 @@ def test_nothing_is_learnt_from_the_third_dimension() -> None:
         said = second.training_loss(second.network, np.random.default_rng(0), 8, CPU)
         losses.append((float(loss.detach()), held, float(said.detach())))
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+
+
+def test_the_second_phase_begins_with_what_the_first_has_learnt(
+    tracks, validation, body, first
+) -> None:
+    network = MotionVAETrainee(
+        tracks, validation, TINY, body, copy.deepcopy(first.network), distance=7.0
+    ).network
+    for part in ("frame_encoder", "bone_decoder"):
+        ours = getattr(network.vae, part).state_dict()
+        for name, value in getattr(first.network, part).state_dict().items():
+            np.testing.assert_array_equal(ours[name], value, err_msg=f"{part} {name}")
+
+
+def test_codes_hear_more_of_the_frames_through_small_tokens(first, monkeypatch) -> None:
+    given = first._drawn(first.batches, np.random.default_rng(0), 32, CPU)
+    apart = []
+    for size in (motion_vae_network._FIRST_ASKED, 1.0):
+        monkeypatch.setattr(motion_vae_network, "_FIRST_ASKED", size)
+        network = MotionVAENetwork(TINY, PERSON.n_joints, len(first.body.bones))
+        with torch.no_grad():
+            apart.append(float(network.encode(*given)[0].std(dim=0).mean()))
+    assert apart[0] > 2 * apart[1]
 
 
 def test_what_cannot_be_learnt_with_is_refused_in_a_sentence(tracks, validation, body, first):

@@ -83,6 +83,17 @@ def test_nothing_accelerates_more_at_the_joins_than_within_segments(pace, seed):
     assert greatest_acceleration(found) <= allowed * (1 + 1e-9)
 
 
+def test_a_seam_that_no_transition_smooths_is_told():
+    """Bodies that stand still in poses far apart have to move from one to the other."""
+    still, z = mover(pace=0.01), 2 * codes(2)
+    with pytest.warns(
+        UserWarning, match=r"accelerates [\d.]+ times as much at the seam after segm"
+    ):
+        found = long_motion(still, z, iterations=3)
+    within = max(greatest_acceleration(part) for part in still.motion(z))
+    assert greatest_acceleration(found) > within
+
+
 def test_a_code_that_is_met_is_found(prior):
     """Between the ends of one motion of the prior that motion is the transition."""
     whole = codes(1, seed=3)
