@@ -31,7 +31,13 @@ from probmotion.models.motion_vae_model import KIND, MotionVAEModel, description
 from probmotion.models.motion_vae_network import MotionVAENetwork
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.pose_network import PoseGuesses, PoseNetwork
-from probmotion.models.track_batches import Augmentation, TrackBatches, learning_and_held_out
+from probmotion.models.taught_poses import TaughtPoses
+from probmotion.models.track_batches import (
+    Augmentation,
+    Batch,
+    TrackBatches,
+    learning_and_held_out,
+)
 from probmotion.models.training_settings import TrainingSettings
 from probmotion.models.variational_terms import gaussian_kl
 from probmotion.motion import KeypointTrack
@@ -128,11 +134,10 @@ class _LearnsFromTracks:
     ) -> torch.Tensor:
         raise NotImplementedError
 
-    def _drawn(
-        self, batches: TrackBatches, rng: np.random.Generator, n: int, device: torch.device
+    def _shown(
+        self, drawn: Batch, device: torch.device
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return keypoints (n, L, J, 2), what is seen (n, L, J), the rest pose (J, 3)."""
-        drawn = batches.draw(rng, n)
         return (
             torch.as_tensor(drawn.keypoints, device=device),
             torch.as_tensor(drawn.seen, dtype=torch.float32, device=device),
@@ -219,7 +224,7 @@ class PoseTrainee(_LearnsFromTracks):
         n: int,
         device: torch.device,
     ) -> torch.Tensor:
-        keypoints, seen, rest = self._drawn(batches, rng, n, device)
+        keypoints, seen, rest = self._shown(batches.draw(rng, n), device)
         guesses = network(keypoints, seen, rest)
         terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
         losses = weighted_sum(terms, self.size)
@@ -296,6 +301,8 @@ class MotionVAETrainee(_LearnsFromTracks):
             vae.frame_encoder.load_state_dict(teacher.frame_encoder.state_dict())
             vae.bone_decoder.load_state_dict(teacher.bone_decoder.state_dict())
         self.network = MotionVAEModel(vae, teacher)
+        self._teacher = teacher
+        self._poses: dict[TrackBatches, TaughtPoses] = {}
 
     def _loss(
         self,
@@ -306,8 +313,9 @@ class MotionVAETrainee(_LearnsFromTracks):
         device: torch.device,
     ) -> torch.Tensor:
         assert isinstance(network, MotionVAEModel)
-        keypoints, seen, rest = self._drawn(batches, rng, n, device)
-        guess = self._taught(network.pose, keypoints, seen, rest)
+        drawn = batches.draw(rng, n)
+        keypoints, seen, rest = self._shown(drawn, device)
+        guess = self._taught(batches, drawn, keypoints, seen, rest)
         vae = network.vae
         mean, log_variance = vae.encode(keypoints, seen, rest)
         noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
@@ -329,14 +337,16 @@ class MotionVAETrainee(_LearnsFromTracks):
     @torch.no_grad()
     def _taught(
         self,
-        pose_network: nn.Module,
+        batches: TrackBatches,
+        drawn: Batch,
         keypoints: torch.Tensor,
         seen: torch.Tensor,
         rest: torch.Tensor,
     ) -> PoseGuesses:
         """Return the best view hypothesis of the first phase, (B, L, …)."""
-        pose_network.eval()
-        guesses = pose_network(keypoints, seen, rest)
+        if batches not in self._poses:
+            self._poses[batches] = TaughtPoses(self._teacher, batches, rest)
+        guesses = self._poses[batches].of(drawn)
         terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
         return best_guess(guesses, weighted_sum(terms, self.size))
 

@@ -66,6 +66,10 @@ class Batch(NamedTuple):
     """(B, L, J) bool: joints whose confidence is not below the threshold."""
     valid: np.ndarray
     """(B, L) bool: frames that are there and in which something is seen."""
+    frames: np.ndarray
+    """(B, L): which of :meth:`TrackBatches.all_frames` it shows; -1 where not there."""
+    scale: np.ndarray
+    """(B,) float32: by which its tracks are scaled."""
 
 
 class TrackBatches:
@@ -123,6 +127,7 @@ class TrackBatches:
         windows = lengths / np.minimum(lengths, frames)
         windows *= [seen.any() for seen in self._seen]
         self._share = windows / windows.sum()
+        self._first = np.concatenate([[0], np.cumsum(lengths)])
         self._order = list(self.skeleton.mirrored_order)
         self.description = describe_tracks(tracks)
 
@@ -170,6 +175,17 @@ class TrackBatches:
         # A window is moved by U(-shift, shift) along each axis, whatever the track does.
         return Standards(mean, np.sqrt(squares + self.augmentation.shift**2 / 3))
 
+    def all_frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the keypoints, (2F, J, 2), and what is seen, (2F, J), of all tracks' F frames.
+
+        Those that are mirrored come after those that are not.
+        """
+        points, seen = np.concatenate(self._keypoints), np.concatenate(self._seen)
+        return (
+            np.concatenate([points, self._mirrored(points)]),
+            np.concatenate([seen, seen[:, self._order]]),
+        )
+
     def draw(self, rng: np.random.Generator, n: int) -> Batch:
         """Return n random windows."""
         check_count("n", n)
@@ -178,16 +194,15 @@ class TrackBatches:
             np.zeros((n, self.frames, J, 2), np.float32),
             np.zeros((n, self.frames, J), bool),
             np.zeros((n, self.frames), bool),
+            np.full((n, self.frames), -1),
+            np.ones(n, np.float32),
         )
         for row, track in enumerate(rng.choice(len(self._share), n, p=self._share)):
-            keypoints, seen = self._window(rng, int(track))
-            length = len(keypoints)
-            batch.keypoints[row, :length] = keypoints
-            batch.seen[row, :length] = seen
-            batch.valid[row, :length] = seen.any(axis=-1)
+            self._show(rng, int(track), batch, row)
         return batch
 
-    def _window(self, rng: np.random.Generator, track: int) -> tuple[np.ndarray, np.ndarray]:
+    def _show(self, rng: np.random.Generator, track: int, batch: Batch, row: int) -> None:
+        """Put a random window of a track into a row of a batch."""
         keypoints, seen = self._keypoints[track], self._seen[track]
         longest = min(self.frames, len(keypoints))
         shortest = max(1, int(np.ceil(self.augmentation.shortest * longest)))
@@ -197,12 +212,18 @@ class TrackBatches:
         while not seen[start : start + length].any():
             start = int(rng.integers(0, len(keypoints) - length + 1))
         keypoints, seen = keypoints[start : start + length], seen[start : start + length]
+        frames = self._first[track] + start + np.arange(length)
         factor = 1 + self.augmentation.scale * rng.uniform(-1, 1)
         moved = self.augmentation.shift * rng.uniform(-1, 1, 2)
         turned = rng.random() < 0.5
         if self.augmentation.mirror and turned:
             keypoints, seen = self._mirrored(keypoints), seen[:, self._order]
-        return np.where(seen[..., None], factor * keypoints + moved, 0.0), seen
+            frames += self._first[-1]
+        batch.keypoints[row, :length] = np.where(seen[..., None], factor * keypoints + moved, 0.0)
+        batch.seen[row, :length] = seen
+        batch.valid[row, :length] = seen.any(axis=-1)
+        batch.frames[row, :length] = frames
+        batch.scale[row] = factor
 
     def _mirrored(self, keypoints: np.ndarray) -> np.ndarray:
         return keypoints[:, self._order] * np.array([-1, 1], keypoints.dtype)

@@ -8,21 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probmotion.comparison.qualities import first_quality
 from probmotion.interaction.coordinates import align_rigidly
 from probmotion.pictures.pairs import draw_pairs
 from probmotion.pictures.plots import plot_quality_against_cost
 from probmotion.pictures.skeletons import draw_skeletons
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from probmotion.comparison import Comparison
     from probmotion.problems import Problem
     from probmotion.skeleton import Skeleton
 
 __all__ = ["draw_comparison", "draw_problem"]
 
-_QUALITIES = ("swd", "coverage_interaction", "fid")
 _SHOWN = 4
 _POSES = 6
 
@@ -32,9 +30,8 @@ def draw_comparison(
 ) -> list[Path]:
     """Write the plot and one picture of skeletons per problem; return their paths.
 
-    The plot is of the distance from exact draws, of the coverage of poses that were held out or
-    of the Fréchet distance from real 2D motion: the first that was measured. Where none was,
-    there is no plot.
+    The plot is of the first of :data:`~probmotion.comparison.qualities.QUALITIES` that was
+    measured. Where none was, there is no plot.
 
     Parameters
     ----------
@@ -48,7 +45,7 @@ def draw_comparison(
     folder = Path(folder)
     written = []
     table = comparison.table()
-    if quality := _measured(table):
+    if quality := first_quality(table):
         written.append(folder / "quality_against_cost.png")
         plot_quality_against_cost(table, written[0], quality=quality)
     for problem in problems:
@@ -56,14 +53,6 @@ def draw_comparison(
         draw_problem(comparison, problem, path)
         written.append(path)
     return written
-
-
-def _measured(table: pd.DataFrame) -> str | None:
-    """Return the first quality that has a place on a logarithmic axis."""
-    values = table["value"].to_numpy(float)
-    plain = np.isfinite(values) & (values > 0)
-    found = set(table["metric"][plain])
-    return next((name for name in _QUALITIES if name in found), None)
 
 
 def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probmotion.comparison.qualities import QUALITIES, first_quality
 from probmotion.pictures.colours import GREY, INK, save_figure, style_of
 
 if TYPE_CHECKING:
@@ -17,12 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_quality_against_cost"]
 
-_QUALITIES = ("swd", "coverage_interaction")
-_WORDS = {
-    "coverage_interaction": "mean distance of a held-out pose\nto its nearest draw (D_IC, m)",
-    "swd": "sliced Wasserstein distance to exact draws\n(1 = as far as other exact draws)",
-    "seconds": "seconds",
-}
+_LINE = 46
 
 
 def plot_quality_against_cost(
@@ -44,8 +41,8 @@ def plot_quality_against_cost(
     path : str or Path, optional
         Where to write, ``.png``; nowhere by default.
     quality : str, optional
-        Metric of the table; by default the distance from exact draws or, in a table that has
-        none, how well draws cover poses that were held out.
+        Metric of the table; by default the first of
+        :data:`~probmotion.comparison.qualities.QUALITIES` that it has.
     cost : str
         Metric of the table.
 
@@ -57,7 +54,7 @@ def plot_quality_against_cost(
     from matplotlib.figure import Figure
 
     if quality is None:
-        quality = next((name for name in _QUALITIES if (table["metric"] == name).any()), "swd")
+        quality = first_quality(table) or "swd"
     problems = [str(name) for name in dict.fromkeys(table["problem"])]
     points = {problem: _points(table, problem, quality, cost) for problem in problems}
     if not any(points.values()):
@@ -76,11 +73,11 @@ def plot_quality_against_cost(
         )
         if quality == "swd" and points[problem]:
             panel.axhline(1.0, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
-        panel.set_xlabel(_WORDS.get(cost, cost), color=INK)
+        panel.set_xlabel(cost, color=INK)
     for panel in panels[len(problems) :]:
         panel.set_visible(False)
     for panel in panels[::columns]:
-        panel.set_ylabel(_WORDS.get(quality, quality), color=INK)
+        panel.set_ylabel(fill(QUALITIES.get(quality, quality), _LINE), color=INK)
     # Labels go where the points leave room, which is known once everything has its place.
     figure.draw_without_rendering()
     for panel, problem in zip(panels, problems, strict=False):

@@ -9,18 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probmotion.bone_lengths import bone_lengths
 from probmotion.data.cmu_clips import cmu_clip
-from probmotion.data.joint_filters import kalman_smooth
 from probmotion.likelihoods import Joints3D
-from probmotion.models.motion_denoiser import MotionDenoiser
-from probmotion.models.motion_dvae import MotionDVAE
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
 from probmotion.problems.problem import Problem
+
+if TYPE_CHECKING:
+    from probmotion.models import MotionDVAE
 
 __all__ = [
     "DENOISING_PROBLEMS",
@@ -43,6 +44,9 @@ def body_prior(name: str = "body-dvae") -> MotionDVAE:
     FileNotFoundError
         If the package has no such prior.
     """
+    from probmotion.models import MotionDVAE
+    from probmotion.models.motion_denoiser import MotionDenoiser
+
     prior = MotionDVAE.load(name)
     return prior.of(inference_network=MotionDenoiser.load(f"{name}-denoiser", prior))
 
@@ -92,6 +96,8 @@ def body_of(evidence: Joints3D, prior: MotionDVAE) -> np.ndarray:
     several children, such as hips, their directions are those of smoothed joints (Kalman's), which
     say how wide a body is; where a joint is never seen, all are those of the usual body.
     """
+    from probmotion.data.joint_filters import kalman_smooth
+
     seen = evidence.entries.visible
     usual = np.linalg.norm(prior.body, axis=-1)
     lengths = bone_lengths(

@@ -6,30 +6,30 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probmotion import models, seeds
 from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics.generation import GenerationReference
-from probmotion.models.evaluator import TrackEvaluator
-from probmotion.models.motion_diffusion import MotionDiffusion
-from probmotion.models.motion_vae import MotionVAE
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
 from probmotion.problems.evidence import observe
 from probmotion.problems.problem import Problem, simulated
+
+if TYPE_CHECKING:
+    from probmotion.models import MotionDiffusion, MotionVAE
 
 __all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
 
 _NOISE = 0.02
 
 
-def learnt_problem(
-    name: str, description: str, prior: type[MotionDiffusion] | type[MotionVAE] = MotionDiffusion
-) -> Problem:
+def learnt_problem(name: str, description: str, kind: str) -> Problem:
     """Return the generation problem of a prior that comes with the package.
 
+    Its kind is named, so that a process loads no networks but those of the problems it works on.
     Beside the prior's weights lie those of the evaluator, ``<name>-evaluator``, and the features
     of real 2D motion, held out and learnt from, ``<name>-features.npz``; the motion itself is not.
 
@@ -38,6 +38,8 @@ def learnt_problem(
     FileNotFoundError
         If the package has no such prior.
     """
+    from probmotion.models.evaluator import TrackEvaluator
+
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
     with np.load(weights / f"{name}-features.npz") as kept:
@@ -48,10 +50,13 @@ def learnt_problem(
             float(kept["elevation"]),
             float(kept["distance"]),
         )
+    prior: type[MotionDiffusion] | type[MotionVAE] = getattr(models, kind)
     return Problem(name, description, MotionPosterior(prior.load(name)), generation=reference)
 
 
-def seen_draw_problem(name: str, description: str, prior: str, how: str, seed: int = 0) -> Problem:
+def seen_draw_problem(
+    name: str, description: str, prior: str, how: str, *, seed: int = 0
+) -> Problem:
     """Return the problem of a motion VAE's draw that one camera sees; the draw is the truth.
 
     Parameters
@@ -65,7 +70,7 @@ def seen_draw_problem(name: str, description: str, prior: str, how: str, seed: i
     seed : int
         Of the draw and its noise.
     """
-    vae = MotionVAE.load(prior)
+    vae = models.MotionVAE.load(prior)
     truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
     seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
     assert isinstance(seen, Keypoints2D)
@@ -79,18 +84,19 @@ LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
             "walk2d",
             "people who walk, a prior learnt from 2D tracks alone: generation",
             learnt_problem,
+            "MotionDiffusion",
         ),
         (
             "walk-vae",
             "people who walk, a motion VAE learnt from 2D tracks alone: generation",
             learnt_problem,
-            MotionVAE,
+            "MotionVAE",
         ),
         (
             "animal-vae",
             "four-legged animals, a motion VAE learnt from 2D tracks alone: generation",
             learnt_problem,
-            MotionVAE,
+            "MotionVAE",
         ),
         (
             "walk-vae-monocular",

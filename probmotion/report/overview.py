@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
-import numpy as np
+import pandas as pd
 
+from probmotion.comparison.qualities import QUALITIES, best_of, first_quality
 from probmotion.comparison.table import ComparisonTable
-from probmotion.report.marks import best_of
-from probmotion.report.plots import QUALITIES, marker
+from probmotion.report.plots import marker
 from probmotion.report.tables import Outcome, value_cell
 
 if TYPE_CHECKING:
@@ -57,10 +57,8 @@ def overview(
 
 
 def _quality(table: ComparisonTable, problem: str) -> str:
-    """Return the first measure that is there; a dash where none is."""
-    rows = table[(table["problem"] == problem) & np.isfinite(table["value"])]
-    measured = set(rows["metric"])
-    return next((name for name in QUALITIES if name in measured), "–")
+    """Return the measure that says most; a dash where none is there."""
+    return first_quality(pd.DataFrame(table[table["problem"] == problem])) or "–"
 
 
 def _row(table: ComparisonTable, problem: str, place: int, outcomes: Mapping[str, Outcome]) -> str:
@@ -70,7 +68,7 @@ def _row(table: ComparisonTable, problem: str, place: int, outcomes: Mapping[str
         str(name): cells.set_index("seed")["value"]
         for name, cells in rows.groupby("sampler", sort=False)
     }
-    best = best_of(quality, values, max(outcome.seeds for outcome in outcomes.values()))
+    best = best_of(quality, values, range(max(outcome.seeds for outcome in outcomes.values())))
     cells = "".join(
         f'<td class="failed">{outcome.link()}</td>'
         if outcome.failed == outcome.seeds

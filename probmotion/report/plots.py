@@ -9,21 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probmotion.comparison.qualities import QUALITIES, first_quality
 from probmotion.pictures.colours import style_of
 from probmotion.report.label_places import Box, place_labels
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["QUALITIES", "marker", "quality_against_cost"]
-
-QUALITIES = {
-    "swd": "sliced Wasserstein distance to exact draws (1: as far as other exact draws)",
-    "coverage_interaction": "mean distance of a held-out pose to its nearest draw (D_IC, m)",
-    "fid": "Fréchet distance to held-out real views (FID)",
-    "g_mpjpe_mm": "mean distance of a joint from the truth (G-MPJPE, mm)",
-}
-"""What says most of a sampler, in a sentence: the first that was measured above zero counts."""
+__all__ = ["marker", "quality_against_cost"]
 
 _WIDTH, _HEIGHT = 480, 340
 _LEFT, _TOP, _RIGHT, _BOTTOM = 48, 30, 12, 42
@@ -72,13 +65,12 @@ def quality_against_cost(
         The problem's number in the page, for its ids.
     """
     rows = table[table["problem"] == problem]
-    for quality, words in QUALITIES.items():
-        points = _points(rows, quality, list(samplers))
-        if points:
-            drawing = _drawn(points, list(samplers), problem, words, quality == "swd", place)
-            absent = _absent(points, samplers)
-            return f'<figure class="plot">{drawing}{absent}</figure>'
-    return ""
+    quality = first_quality(rows)
+    points = _points(rows, quality, list(samplers)) if quality else {}
+    if quality is None or not points:
+        return ""
+    drawing = _drawn(points, list(samplers), problem, QUALITIES[quality], quality == "swd", place)
+    return f'<figure class="plot">{drawing}{_absent(points, samplers)}</figure>'
 
 
 Point = tuple[np.ndarray, np.ndarray]

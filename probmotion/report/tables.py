@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
+from probmotion.comparison.qualities import best_of
 from probmotion.comparison.table import _BLOCKS, _mean_and_sd
-from probmotion.report.marks import best_of
 from probmotion.report.plots import marker
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _table(
     values: Mapping[tuple[str, str], pd.Series],
     outcomes: Mapping[str, Outcome],
 ) -> str:
-    seeds = max(outcome.seeds for outcome in outcomes.values())
+    seeds = range(max(outcome.seeds for outcome in outcomes.values()))
     best = {}
     for metric in heads:
         found = {name: values[name, metric] for name in samplers if (name, metric) in values}

@@ -12,6 +12,7 @@ from toy_samplers import PriorDraws, generation, monocular
 
 from probmotion.citations import CITATIONS, citations_of
 from probmotion.comparison import QUICK, Comparison, compare, quick_samplers
+from probmotion.comparison.qualities import best_of, first_quality
 from probmotion.comparison.table import ComparisonTable, _mean_and_sd
 from probmotion.samplers import ExactSampler, ScoreDistillation
 from probmotion.sampling import sampler_names
@@ -63,6 +64,52 @@ def test_it_prints_means_and_deviations_with_cost_beside_quality(folder):
     assert world.split()[4:] == ["seconds", "of", "mean", "acceleration"]
     assert "(0.5 to 2 is plausible)" in text
     assert max(map(len, text.splitlines())) < 160
+
+
+def test_marks_are_of_what_can_be_right_or_wrong():
+    values = {"a": pd.Series([1.0, 1.1, 0.9, 1.0]), "b": pd.Series([2.0, 2.1, 1.9, 2.0])}
+    assert best_of("tr", values, range(4)) == ("a", {"a"})
+    assert best_of("precision", values, range(4)) == ("b", {"b"})
+    assert best_of("seconds", values, range(4)) == (None, set())
+    assert best_of("tr", {"a": values["a"]}, range(4)) == (None, set())
+    assert best_of("swd", {"a": values["a"], "b": values["b"] * np.inf}, range(4)) == (None, set())
+
+
+def made_table(**swd):
+    """Columns of three seeds, with seconds for all."""
+    rows = [
+        {"problem": "p", "sampler": name, "seed": seed, "metric": metric, "value": value}
+        for name, values in swd.items()
+        for seed, each in enumerate(values)
+        for metric, value in (("swd", each), ("seconds", 1.0 + seed))
+    ]
+    return ComparisonTable(rows)
+
+
+def test_the_best_and_those_that_are_not_told_from_it_are_marked():
+    text = str(made_table(near=[1.0, 1.1, 0.95], far=[3.0, 3.2, 3.1], alike=[1.1, 1.0, 1.2]))
+    rows = {line.split()[0]: line for line in text.splitlines() if " ± " in line}
+    assert rows["near"].endswith("1.017 ± 0.076*")
+    assert rows["alike"].endswith("1.10 ± 0.10°")
+    assert rows["far"].endswith("3.10 ± 0.10")
+    # Seconds are neither right nor wrong, and numbers stay one below the other.
+    assert [line.count("*") + line.count("°") for line in rows.values()] == [1, 0, 1]
+    assert len(rows["near"]) == len(rows["alike"]) == len(rows["far"]) + 1
+    assert "*: best of its column; °: not to be told from the best" in text
+
+
+def test_what_says_most_is_the_first_that_was_measured():
+    table = made_table(a=[1.0, 2.0])
+    truth = pd.DataFrame({"metric": ["g_mpjpe_mm", "fid", "swd"], "value": [3.0, 2.0, math.nan]})
+    assert first_quality(table) == "swd"
+    assert first_quality(truth) == "fid"
+    assert first_quality(truth[:1]) == "g_mpjpe_mm"
+    assert first_quality(table.query("metric == 'seconds'")) is None
+
+
+def test_with_one_seed_nothing_is_marked():
+    text = str(made_table(near=[1.0], far=[3.0]))
+    assert not {"*", "°"} & set(text)
 
 
 def test_what_is_cut_from_it_is_a_plain_frame(folder):

@@ -94,7 +94,7 @@ def test_the_first_phase_learns_which_view_is_right(poses, first, body) -> None:
 
 def test_a_view_is_chosen_with_the_body_at_rest(first) -> None:
     """Bones that bend into the picture of a wrong view do not make it the one that learns."""
-    drawn = first._drawn(first.batches, np.random.default_rng(0), 16, CPU)
+    drawn = first._shown(first.batches.draw(np.random.default_rng(0), 16), CPU)
     keypoints, seen, rest = drawn
     with torch.no_grad():
         guesses = first.network.eval()(keypoints, seen, rest)
@@ -120,7 +120,7 @@ def test_who_learns_is_first_who_fits_at_rest_and_a_little_of_the_others(first, 
     asked = copy.copy(first)
     asked.anneal(step)
     loss = asked.training_loss(network, np.random.default_rng(0), 16, CPU)
-    keypoints, seen, rest = first._drawn(first.batches, np.random.default_rng(0), 16, CPU)
+    keypoints, seen, rest = first._shown(first.batches.draw(np.random.default_rng(0), 16), CPU)
     guesses = network(keypoints, seen, rest)
     terms = guess_terms(first.body, guesses, keypoints, seen, 7.0)
     losses = weighted_sum(terms, TINY)
@@ -250,7 +250,7 @@ def test_the_second_phase_begins_with_what_the_first_has_learnt(
 
 
 def test_codes_hear_more_of_the_frames_through_small_tokens(first, monkeypatch) -> None:
-    given = first._drawn(first.batches, np.random.default_rng(0), 32, CPU)
+    given = first._shown(first.batches.draw(np.random.default_rng(0), 32), CPU)
     apart = []
     for size in (motion_vae_network._FIRST_ASKED, 1.0):
         monkeypatch.setattr(motion_vae_network, "_FIRST_ASKED", size)

@@ -291,3 +291,19 @@ def test_no_window_is_drawn_in_which_nothing_is_seen():
     batches = TrackBatches([paused, never], 12, 0.3, Augmentation())
     drawn = batches.draw(np.random.default_rng(0), 300)
     assert drawn.valid.any(axis=1).all()
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3])
+def test_a_window_says_which_frames_it_shows_and_how_large(scale):
+    given = [track(frames, seed=frames, name=f"clip/{frames}") for frames in (5, 12, 30)]
+    batches = TrackBatches(given, 8, 0.3, Augmentation(0.5, scale, 0.0, True))
+    keypoints, seen = batches.all_frames()
+    assert len(keypoints) == len(seen) == 2 * 47
+    batch = draw(batches, 60)
+    there = batch.frames >= 0
+    np.testing.assert_array_equal(there, batch.valid)
+    shown = batch.scale[:, None, None, None] * keypoints[batch.frames]
+    np.testing.assert_allclose(batch.keypoints[there], shown[there], rtol=1e-6)
+    # Frames of all tracks, and of their mirror images.
+    assert len(np.unique(batch.frames[there])) > 80
+    assert np.ptp(batch.scale) == pytest.approx(2 * scale, rel=0.1)

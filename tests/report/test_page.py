@@ -22,7 +22,6 @@ from probmotion.likelihoods import Joints3D, Keypoints2D
 from probmotion.models import GaussianMixtureMotion
 from probmotion.problems import Problem
 from probmotion.report.label_places import place_labels
-from probmotion.report.marks import best_of
 from probmotion.report.motions import Shown, motion_numbers
 from probmotion.report.page import write_report
 from probmotion.report.players import shown_problems
@@ -280,17 +279,6 @@ def test_kept_problems_come_back(kind, tmp_path):
     (tmp_path / "there" / "problem.npz").write_bytes(b"half")
     with pytest.raises(ValueError, match="is damaged"):
         read_kept(tmp_path / "there")
-
-
-def test_marks_are_of_what_can_be_right_or_wrong():
-    import pandas as pd
-
-    values = {"a": pd.Series([1.0, 1.1, 0.9, 1.0]), "b": pd.Series([2.0, 2.1, 1.9, 2.0])}
-    assert best_of("tr", values, 4) == ("a", {"a"})
-    assert best_of("precision", values, 4) == ("b", {"b"})
-    assert best_of("seconds", values, 4) == (None, set())
-    assert best_of("tr", {"a": values["a"]}, 4) == (None, set())
-    assert best_of("swd", {"a": values["a"], "b": values["b"] * np.inf}, 4) == (None, set())
 
 
 def test_labels_do_not_cover_each_other():

@@ -1,8 +1,8 @@
-"""Which numbers of a table are the best, and which cannot be told from the best."""
+"""What says most of a sampler, which numbers are the best, and which cannot be told from them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,15 @@ from probmotion.metrics.intervals import best_and_tied
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["best_of"]
+__all__ = ["QUALITIES", "best_of", "first_quality"]
+
+QUALITIES: Mapping[str, str] = {
+    "swd": "sliced Wasserstein distance to exact draws (1: as far as other exact draws)",
+    "coverage_interaction": "mean distance of a held-out pose to its nearest draw (D_IC, m)",
+    "fid": "Fréchet distance to held-out real views (FID)",
+    "g_mpjpe_mm": "mean distance of a joint from the truth (G-MPJPE, mm)",
+}
+"""Measures by what they are, in a sentence: the first that was measured says most."""
 
 _RATIO: Mapping[str, Any] = {"target": 1.0, "ratio": True}
 _LESS: Mapping[str, Any] = {"target": None}
@@ -41,8 +49,15 @@ _LESS_BEGIN = ("coverage_", "fid")
 _LESS_END = ("_mm",)
 
 
+def first_quality(table: pd.DataFrame) -> str | None:
+    """Return the first of :data:`QUALITIES` that a table has, above zero; None where none is."""
+    values = table["value"].to_numpy(float)
+    measured = set(table["metric"][np.isfinite(values) & (values > 0)])
+    return next((name for name in QUALITIES if name in measured), None)
+
+
 def best_of(
-    metric: str, values: Mapping[str, pd.Series], seeds: int
+    metric: str, values: Mapping[str, pd.Series], seeds: Iterable[int]
 ) -> tuple[str | None, set[str]]:
     """Return the best sampler and all that are not distinguishable from it, itself among them.
 
@@ -55,15 +70,15 @@ def best_of(
         As in the table's frame.
     values : mapping of Series
         By sampler, its values by seed.
-    seeds : int
-        Seeds that were asked for.
+    seeds : iterable of int
+        Those that were asked for.
     """
     rule = _RIGHT.get(metric)
     if rule is None and (metric.startswith(_LESS_BEGIN) or metric.endswith(_LESS_END)):
         rule = _LESS
     if rule is None:
         return None, set()
-    rows = {name: row.reindex(range(seeds)).to_numpy(float) for name, row in values.items()}
+    rows = {name: row.reindex(list(seeds)).to_numpy(float) for name, row in values.items()}
     # A ratio of 0 is infinitely wrong, and an infinite value as well.
     errors = {
         name: row

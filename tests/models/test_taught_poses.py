@@ -1,0 +1,104 @@
+"""What a teacher says of frames it has been asked about once is what it says when asked again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion.data.gaits import make_gaits
+from probmotion.data.learning import film_clips
+from probmotion.data.projections import DetectorNoise
+from probmotion.models.articulated_body import ArticulatedBody
+from probmotion.models.motion_vae_losses import pictured
+from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.motion_vae_training import MotionVAETrainee
+from probmotion.models.pose_network import PoseNetwork
+from probmotion.models.taught_poses import TaughtPoses
+from probmotion.models.track_batches import Augmentation, TrackBatches
+from probmotion.rest_poses import estimate_rest_pose
+from probmotion.skeleton import Skeleton
+
+PERSON = Skeleton.preset("person14")
+SIZE = replace(MotionVAESettings.tiny(), frames=8)
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    """Walks of which detections are missing."""
+    clips = make_gaits(3, styles={"walk": 1.0}, frames=90, seed=1)
+    return film_clips(clips, PERSON, 10.0, views=1, noise=DetectorNoise(share=0.1)).tracks
+
+
+@pytest.fixture(scope="module")
+def body(tracks) -> ArticulatedBody:
+    return ArticulatedBody(PERSON, estimate_rest_pose(tracks))
+
+
+@pytest.fixture(scope="module")
+def rest(body) -> torch.Tensor:
+    return torch.as_tensor(body.rest_positions, dtype=torch.float32)
+
+
+@pytest.fixture(scope="module")
+def network(body) -> PoseNetwork:
+    found = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
+    with torch.no_grad():
+        # Poses that differ from frame to frame and view to view.
+        found.bone_decoder.leave.weight.mul_(20)
+        found.rigid[-1].weight.mul_(20)
+        found.log_lengths.weight.mul_(10)
+    return found
+
+
+def batches_of(tracks, **augmentation) -> TrackBatches:
+    return TrackBatches(tracks, SIZE.frames, 0.3, replace(Augmentation.none(), **augmentation))
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest, mirror):
+    batches = batches_of(tracks, mirror=mirror)
+    drawn = batches.draw(np.random.default_rng(0), 12)
+    found = TaughtPoses(network, batches, rest).of(drawn)
+    seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
+    with torch.no_grad():
+        asked = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
+    for name in ("rotation", "translation", "turns", "log_lengths"):
+        torch.testing.assert_close(
+            getattr(found, name), getattr(asked, name), rtol=1e-4, atol=1e-5, msg=name
+        )
+    assert asked.log_lengths.std() > 0.01
+
+
+def test_of_a_scaled_window_the_picture_is_scaled(tracks, network, rest, body):
+    batches = batches_of(tracks, scale=0.4)
+    taught = TaughtPoses(network, batches, rest)
+    drawn = batches.draw(np.random.default_rng(0), 12)
+    pictures = []
+    for given in (drawn, drawn._replace(scale=np.ones_like(drawn.scale))):
+        said = taught.of(given)
+        moved = torch.nn.functional.pad(said.translation, (0, 1))
+        positions = body.positions(said.turns, said.rotation, moved, said.log_lengths)
+        pictures.append(pictured(positions, None))
+    scale = torch.as_tensor(drawn.scale)
+    assert scale.std() > 0.1
+    torch.testing.assert_close(pictures[0], scale[:, None, None, None, None] * pictures[1])
+
+
+def test_a_teacher_is_asked_once_of_what_is_learnt_and_of_what_is_watched(tracks, network, body):
+    trainee = MotionVAETrainee(tracks, tracks, SIZE, body, network, distance=7.0)
+    asked = []
+    network.register_forward_hook(lambda *_: asked.append(1))
+    for step in range(3):
+        rng = np.random.default_rng(step)
+        trainee.training_loss(trainee.network, rng, 4, torch.device("cpu"))
+        with torch.no_grad():
+            trainee.validation_loss(trainee.network, torch.device("cpu"))
+    assert len(asked) == 2
+
+
+def test_windows_that_are_moved_are_refused(tracks, network, rest):
+    with pytest.raises(ValueError, match=r"batches has shift=0\.1, expected 0"):
+        TaughtPoses(network, batches_of(tracks, shift=0.1), rest)
