@@ -1,22 +1,24 @@
 """Every sampler on every problem: the table that ``probmotion which`` and the README advise from.
 
-    python notebooks/which_sampler.py --out grid            # resumes; 15 minutes on two cores a seed
+    python notebooks/which_sampler.py --out grid      # resumes; 15 minutes on two cores a seed
 
 Every sampler may spend as many seconds on a cell, by :data:`~probmotion.comparison.QUICK_BUDGET`;
 one that cannot is a row that says so. Problems whose data is not at hand are left out, and said.
 Beside the comparison's own files and its page, ``measured.csv`` and ``measured.json`` are written
-to ``probmotion/advice`` and the README's block is replaced.
+to ``probmotion/advice`` and the README's table is replaced.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from readme_figures import replace_block
 
-from probmotion.advice import advise, keep_measured
+from probmotion.advice import Advice, Standing, advise, keep_measured
 from probmotion.comparison import QUICK_BUDGET, QUICK_LIMIT, compare, quick_samplers
 from probmotion.problems import load_problem, problem_names
 
@@ -51,9 +53,33 @@ def main() -> None:
     keep_measured(found, "python notebooks/which_sampler.py")
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    block = "\n\n".join(str(advise(name)) for name in problems)
-    readme.write_text(
-        replace_block(text, "which", f"```text\n{block}\n```"), encoding="utf-8"
+    text = replace_block(text, "which", "\n".join(table_of(map(advise, problems))))
+    readme.write_text(text, encoding="utf-8")
+
+
+def table_of(advices: Iterable[Advice]) -> Iterator[str]:
+    """Yield the lines of the README's table."""
+    yield "| problem | by | take | not to be told from the best | worse | without draws |"
+    yield "|---|---|---|---|---|---|"
+    for each in advices:
+        without = ", ".join(f"`{name}`: {word}" for name, word in each.without.items())
+        cells = [
+            f"`{each.problem}`",
+            each.measure.partition(",")[0],
+            in_brief([each.take]) + f", {each.take.seconds:.2g} s",
+            in_brief(each.alike),
+            in_brief(each.worse),
+            without,
+        ]
+        yield f"| {' | '.join(cells)} |"
+
+
+def in_brief(standings: Sequence[Standing]) -> str:
+    """Return samplers with their means and deviations."""
+    return ", ".join(
+        f"`{each.sampler}` {each.value:.3g}"
+        + (f" ± {each.spread:.1g}" if math.isfinite(each.spread) else "")
+        for each in standings
     )
 
 

@@ -272,7 +272,7 @@ def one_frame(folder: Path) -> str:
         ("compare --clips no/such.bvh", ("no/such.bvh",)),
         ("show no/such.bvh", ("no/such.bvh",)),
         ("convert no/such.bvh out.npz", ("no/such.bvh",)),
-        ("draw", ("'draw'", "compare, list, show, convert")),
+        ("draw", ("'draw'", "compare, which, list, show, convert")),
     ],
 )
 def test_wrong_words_get_one_sentence(words, expected, tmp_path, capsys, monkeypatch):

@@ -19,6 +19,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.comparison.budgets import Budget
 from probmotion.comparison.failures import CellNotKept, Failure, NotFinite
+from probmotion.comparison.memory import watched_memory
 from probmotion.comparison.time_limits import time_limit
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
@@ -147,9 +148,13 @@ class Cell:
         from probmotion.metrics import measure
 
         seed = seeds.integer(self.seed, "cell", self.problem, self.sampler)
-        draws = self._drawn(problem.posterior, seed, progress)
+        with watched_memory() as peak:
+            draws = self._drawn(problem.posterior, seed, progress)
         # All samplers of a problem and seed are judged by the same exact draws.
-        return draws, measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
+        metrics = measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
+        if peak.mebibytes is not None:
+            metrics["peak_memory_mib"] = peak.mebibytes
+        return draws, metrics
 
     def _drawn(self, posterior: MotionPosterior, seed: int, progress: bool) -> MotionDraws:
         """Return what the sampler draws: as many as were asked for, all finite."""

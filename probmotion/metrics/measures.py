@@ -11,7 +11,8 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.draws import MotionDraws
-from probmotion.metrics import accuracy, distribution
+from probmotion.likelihoods import Keypoints2D
+from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.cost import costs
 from probmotion.metrics.generation import GenerationReference, diversity
@@ -63,7 +64,10 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     ``near_floor``, shares of draws; of annotated evidence ``degenerate``, the share of a draw's
     pictures (of 100 draws) that have no triangulation of their own.
 
-    Against the truth, where it is known, millimetres: see :func:`accuracy_of`. Of chains: see
+    Against the truth, where it is known, millimetres: see :func:`accuracy_of`. In the pictures of
+    2D evidence, against the truth's, all joints: ``pck``, percent nearer than a tenth of the
+    picture, and ``velocity_error``, relative, each as in :mod:`probmotion.metrics.keypoints`; no
+    numbers where a draw is behind a camera. Of chains: see
     :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost: ``seconds`` and evaluations.
 
     Parameters
@@ -83,6 +87,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     found |= _against_density(problem, draws)
     if problem.truth is not None:
         found |= accuracy_of(positions, problem.truth, problem.posterior)
+        found |= _in_pictures(positions, problem.truth, problem.posterior)
     if problem.held_out is not None:
         found |= _coverage_of(positions, problem.held_out)
     if problem.generation is not None:
@@ -270,6 +275,25 @@ def accuracy_of(
             found["acceleration_ratio"] = float(
                 accuracy.acceleration_ratio(positions, truth).mean()
             )
+    return found
+
+
+def _in_pictures(
+    positions: np.ndarray, truth: np.ndarray, posterior: MotionPosterior
+) -> dict[str, float]:
+    if not isinstance(posterior.likelihood, Keypoints2D):
+        return {}
+    cameras = posterior.likelihood.cameras
+    true = cameras.project(truth)
+    try:
+        shown = cameras.project(positions)
+    except ValueError:
+        return {"pck": math.nan, "velocity_error": math.nan}
+    true = np.broadcast_to(true, shown.shape)
+    size = keypoints.picture_size(true)
+    found = {"pck": keypoints.percentage_of_correct_keypoints(shown, true, size)}
+    if np.diff(true, axis=-3).any():
+        found["velocity_error"] = keypoints.velocity_error(shown, true)
     return found
 
 

@@ -33,7 +33,7 @@ if __name__ == "__main__":
 
 def numbers(folder):
     table = pd.read_csv(Path(folder) / "table.csv")
-    return table[table["metric"] != "seconds"].to_csv(index=False)
+    return table[~table["metric"].isin(["seconds", "peak_memory_mib"])].to_csv(index=False)
 
 
 def runs(diary):

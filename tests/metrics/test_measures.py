@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from probmotion import Keypoints2D, Motion, MotionDraws, MotionPosterior, Skeleton
+from probmotion import Cameras, Keypoints2D, Motion, MotionDraws, MotionPosterior, Skeleton
 from probmotion.metrics import accuracy_of, measure
 from probmotion.metrics.measures import _exact_draws
 from probmotion.metrics.stein import kernel_stein_discrepancy, score_of
@@ -129,6 +129,37 @@ def test_draws_are_judged_by_the_density_where_they_keep_theta(occluded, prior):
     assert found == pytest.approx(kernel_stein_discrepancy(theta[0], score))
     assert math.isnan(measure(occluded, run(occluded, exact, theta=0 * theta), 0)["ksd"])
     assert "ksd" not in measure(occluded, run(occluded, exact), 0)
+
+
+def test_draws_are_compared_with_the_truth_in_the_pictures_that_were_seen(occluded):
+    truth = occluded.truth
+    root = np.repeat(truth[:1], len(truth), axis=0)
+    far = truth.copy()
+    far[:, ::2] += 10.0  # every other joint, further than any picture is wide
+    n_far = len(range(0, truth.shape[1], 2)) / truth.shape[1]
+    draws = {"right": truth, "still": root, "far": far}
+    found = {
+        name: measure(occluded, run(occluded, np.stack([motion] * 9)), 0)
+        for name, motion in draws.items()
+    }
+    assert (found["right"]["pck"], found["right"]["velocity_error"]) == (100, 0)
+    assert found["far"]["pck"] == pytest.approx(100 * (1 - n_far))
+    # What stands still misses all of every displacement.
+    assert found["still"]["velocity_error"] == pytest.approx(1)
+    assert found["far"]["velocity_error"] == pytest.approx(0, abs=1e-9)
+
+
+def test_behind_a_camera_there_is_no_picture(occluded):
+    truth = occluded.truth
+    camera = Cameras.ring(1, distance=5.0, perspective=True)
+    motion = Motion(truth, occluded.posterior.skeleton, occluded.posterior.fps)
+    seen = Keypoints2D.observe(motion, camera, noise=0.05, seed=0)
+    problem = Problem("near", "near", MotionPosterior(occluded.posterior.prior, seen), truth)
+    behind = np.stack([truth, truth + 20.0, truth - 20.0] * 3)
+    found = measure(problem, run(problem, behind), 0)
+    assert math.isnan(found["pck"])
+    assert math.isnan(found["velocity_error"])
+    assert found["g_mpjpe_mm"] > 1000
 
 
 def test_samplers_of_one_seed_share_their_exact_draws(generation):

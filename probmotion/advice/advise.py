@@ -1,0 +1,192 @@
+"""Advice for one problem: which sampler, how wrong it is, and what is wrong with the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+from probmotion.advice.measured import Measured, measured
+from probmotion.comparison.qualities import QUALITIES, best_of, first_quality
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Advice", "Standing", "advise"]
+
+_WIDTH = 100
+# What is as good for less than this share of the best's time is what to take.
+_CHEAPER = 0.5
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How a sampler fared.
+
+    Parameters
+    ----------
+    sampler : str
+        Its name.
+    value, spread : float
+        Mean and standard deviation over seeds of the measure that says most; the latter NaN of one.
+    seconds : float
+        Mean time of a cell.
+    warnings : tuple of str
+        What its other measures say against it, with their figures.
+    """
+
+    sampler: str
+    value: float
+    spread: float
+    seconds: float
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        spread = f" ± {self.spread:.2g}" if math.isfinite(self.spread) else ""
+        told = f"{self.sampler} {self.value:.3g}{spread} in {self.seconds:.2g} s"
+        return f"{told} ({'; '.join(self.warnings)})" if self.warnings else told
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Which sampler to take for a problem; ``print`` says it in sentences, each with its figure.
+
+    Parameters
+    ----------
+    problem, description : str
+        What it is.
+    how : str
+        What was measured, and how.
+    measure : str
+        The measure that the samplers are ranked by, in words.
+    take : Standing
+        The best; or one that cannot be told from it and takes less than half as long.
+    alike : tuple of Standing
+        The others that cannot be told from the best.
+    worse : tuple of Standing
+        Those that can, the nearest first.
+    without : dict of str
+        By sampler, why it has no draws, in a word.
+    """
+
+    problem: str
+    description: str
+    how: str
+    measure: str
+    take: Standing
+    alike: tuple[Standing, ...]
+    worse: tuple[Standing, ...]
+    without: dict[str, str]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.problem}: {self.description}",
+            f"measured: {self.how}",
+            f"ranked by: {self.measure}",
+            f"take: {self.take}",
+            f"not to be told from the best: {_listed(self.alike)}",
+            f"worse: {_listed(self.worse)}",
+        ]
+        if self.without:
+            words = ", ".join(f"{name} ({word})" for name, word in self.without.items())
+            lines.append(f"without draws: {words}")
+        return "\n".join(fill(line, _WIDTH, subsequent_indent="  ") for line in lines)
+
+
+def advise(problem: str, found: Measured | None = None) -> Advice:
+    """Return which sampler to take for a problem.
+
+    Parameters
+    ----------
+    problem : str
+        The name of one that was measured.
+    found : Measured, optional
+        Measurements; by default those that come with the package.
+
+    Raises
+    ------
+    ValueError
+        If the problem was not measured; the message lists those that were. Of a problem of one's
+        own, :func:`~probmotion.comparison.compare` finds out.
+    """
+    found = measured() if found is None else found
+    if problem not in found.problems:
+        raise ValueError(
+            f"problem is {problem!r}, expected one that was measured: {', '.join(found.problems)}; "
+            "of others, probmotion compare finds out"
+        )
+    rows = found.rows[found.rows["problem"] == problem]
+    quality = first_quality(rows)
+    if quality is None:
+        raise ValueError(f"problem is {problem!r}, of which no sampler has a quality")
+    values = {
+        str(name): cells.set_index("seed")["value"]
+        for name, cells in rows[rows["metric"] == quality].groupby("sampler", sort=False)
+    }
+    best, tied = best_of(quality, values, range(found.seeds))
+    if best is None:
+        best, tied = min(values, key=lambda name: values[name].mean()), set(values)
+    standings = {name: _standing(rows, name, quality) for name in values}
+    take = _taken(standings, best, tied)
+    ranked = sorted(standings.values(), key=lambda each: _wrong(quality, each.value))
+    return Advice(
+        problem,
+        found.problems[problem],
+        f"{found.draws} draws, {found.seeds} seeds, {'; '.join(found.notes)} ({found.command})",
+        f"{quality}, {QUALITIES[quality]}",
+        take,
+        tuple(each for each in ranked if each.sampler in tied and each != take),
+        tuple(each for each in ranked if each.sampler not in tied),
+        {
+            name: found.words[f"{problem}/{name}"]
+            for name in found.samplers
+            if name not in values and f"{problem}/{name}" in found.words
+        },
+    )
+
+
+def _taken(standings: dict[str, Standing], best: str, tied: set[str]) -> Standing:
+    cheapest = min((standings[name] for name in tied), key=lambda each: each.seconds)
+    dear = standings[best].seconds
+    return cheapest if cheapest.seconds < _CHEAPER * dear else standings[best]
+
+
+def _wrong(quality: str, value: float) -> float:
+    """Return how far a value is from the right one, in the order that :func:`best_of` has."""
+    if quality != "swd":
+        return value
+    return abs(math.log(value)) if value > 0 else math.inf
+
+
+def _standing(rows: pd.DataFrame, sampler: str, quality: str) -> Standing:
+    own = rows[rows["sampler"] == sampler].groupby("metric")["value"]
+    means = own.mean()
+    said = [
+        words.format(float(means[metric]))
+        for metric, against, words in _WARNINGS
+        if metric in means.index and against(float(means[metric]))
+    ]
+    return Standing(
+        sampler,
+        float(means[quality]),
+        float(own.std()[quality]),
+        float(means["seconds"]),
+        tuple(said),
+    )
+
+
+_WARNINGS: Sequence[tuple[str, Callable[[float], bool], str]] = (
+    ("tr", lambda value: value < 0.8, "too narrow: trace of covariance {:.2g} of the exact"),
+    ("tr", lambda value: value > 1.25, "too wide: trace of covariance {:.2g} of the exact"),
+    ("off", lambda value: value > 1.5, "variance off the prior's manifold {:.2g} of the exact"),
+    ("off", lambda value: value < 0.67, "variance off the prior's manifold {:.2g} of the exact"),
+    ("share_error", lambda value: value > 0.2, "styles' shares wrong by {:.2g}"),
+    ("rhat", lambda value: value > 1.05, "chains do not agree: R-hat {:.3g}"),
+)
+"""What tells against a sampler: a measure, where it does, and the words."""
+
+
+def _listed(standings: Sequence[Standing]) -> str:
+    return "; ".join(map(str, standings)) or "none"

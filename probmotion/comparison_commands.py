@@ -1,0 +1,241 @@
+"""The command ``probmotion compare``: samplers on problems, of the library or of one's own.
+
+It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from probmotion.file_commands import file_called
+
+if TYPE_CHECKING:
+    from probmotion.problems import Problem
+
+__all__ = ["Clips", "Compare"]
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Clips of your own to compare on, and what is seen of the one that is held out."""
+
+    clips: tuple[str, ...] = ()
+    """Motion files, .npz or .bvh, or quoted patterns of them: the prior is fitted to all but one,
+    and the evidence is of that one."""
+
+    observe: str = "monocular"
+    """What is seen of the held-out clip: monocular, occluded, sparse or none."""
+
+    fps: float | None = None
+    """Resample every clip to this frame rate; needed where their own rates differ."""
+
+    frames: int = 30
+    """Frames per motion."""
+
+    rank: int = 10
+    """Latent dimensions of each style."""
+
+    styles: int = 3
+    """Number of styles, found by clustering."""
+
+    noise: float = 0.02
+    """Standard deviation of the keypoints, metres."""
+
+    held_out: str | None = None
+    """Name of the clip to hold out (its file's name without the ending); the last by default."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Draw with several samplers from the same posteriors; print how far each of them is off.
+
+    The folder --out keeps every finished cell (problem, sampler, seed): the same command run again
+    goes on where it was stopped.
+    """
+
+    problems: Positional[tuple[str, ...]] = ()
+    """Names of problems (see probmotion list)."""
+
+    samplers: tuple[str, ...] = ()
+    """Names of samplers or their presets (see probmotion list); all samplers by default."""
+
+    draws: int = 200
+    """Draws of each sampler in all."""
+
+    chains: int | None = None
+    """Chains that they are spread over; by default the most, up to 4, that divide the draws."""
+
+    seeds: int = 1
+    """Independent repeats, with seeds 0, 1, …"""
+
+    workers: int = 1
+    """Processes; they never change the draws."""
+
+    out: Path = Path("comparison")
+    """Folder for table.csv and all draws; made where it is missing."""
+
+    quick: bool = False
+    """Begin from settings that cost less, as a demonstration wants; the table names them."""
+
+    evaluations: int | None = None
+    """What every sampler may spend on a cell: evaluations of a density or a denoiser, a gradient
+    counting as two. Pilot runs find the settings that do. By default samplers run as they are."""
+
+    seconds: float | None = None
+    """The same in seconds of this machine."""
+
+    time_limit: float | None = None
+    """Seconds after which a cell is ended, and a row that says so."""
+
+    calibrate: int = 0
+    """Also simulate every problem that can be so many times, and rank the truth among each
+    sampler's draws."""
+
+    report: bool = False
+    """Also write report.html: the table, the plots, and draws that play in a browser."""
+
+    pictures: bool = False
+    """Also write one picture of skeletons per problem and, where quality can be measured,
+    quality_against_cost.png."""
+
+    prior: str | None = None
+    """Also draw from a prior of your own: the folder of a run of probmotion train diffusion or
+    dvae. There is no evidence, and nothing to measure draws by but what they cost; they are in
+    --out."""
+
+    own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
+
+    settings: ClassVar[Any] = None
+    """The samplers' settings: a field of the class that the command line makes of this one."""
+
+    def run(self) -> None:
+        """Run the comparison, write ``table.csv``, print the table."""
+        from probmotion.comparison import compare
+
+        samplers = self._samplers()
+        problems = self._problems()
+        fitting = max(n for n in (1, 2, 3, 4) if self.draws % n == 0)
+        chains = fitting if self.chains is None else self.chains
+        comparison = compare(
+            problems,
+            samplers,
+            draws=self.draws,
+            chains=chains,
+            seeds=self.seeds,
+            workers=self.workers,
+            out=self.out,
+            budget=self._budget(),
+            time_limit=self.time_limit,
+        )
+        comparison.write(self.out)
+        print(comparison.table())
+        print(f"\ntable and draws are in {self.out}")
+        calibration = self._calibration(problems, samplers, chains) if self.calibrate else None
+        if self.report:
+            print(f"wrote {comparison.report(self.out / 'report.html', calibration)}")
+        if self.pictures:
+            from probmotion.pictures.comparisons import draw_comparison
+
+            draw_comparison(comparison, problems, self.out)
+
+    def _budget(self) -> Any:
+        from probmotion.comparison import Budget
+
+        if self.evaluations is None and self.seconds is None:
+            return None
+        return Budget(evaluations=self.evaluations, seconds=self.seconds)
+
+    def _calibration(self, problems: list[Problem], samplers: dict[str, Any], chains: int) -> Any:
+        from probmotion.calibration import calibrate
+
+        simulated = [problem for problem in problems if problem.simulate is not None]
+        if not simulated:
+            raise ValueError("calibrate is given, but none of the problems can be simulated")
+        found = calibrate(
+            simulated,
+            samplers,
+            simulations=self.calibrate,
+            draws=self.draws,
+            chains=chains,
+            workers=self.workers,
+            out=self.out,
+            time_limit=self.time_limit,
+        )
+        for problem in simulated:
+            for sampler in samplers:
+                print(found.verdict(problem.name, sampler))
+        return found
+
+    def _samplers(self) -> dict[str, Any]:
+        from probmotion.sampling import sampler_names
+        from probmotion.settings_options import sampler_called
+
+        names = self.samplers or sampler_names()
+        return {name: sampler_called(name, self.settings) for name in names}
+
+    def _problems(self) -> list[Problem]:
+        from probmotion.problems import load_problem
+
+        if not self.problems and not self.own.clips and self.prior is None:
+            raise ValueError(
+                "no problem is given, expected names of problems (probmotion list shows them), "
+                "clips of your own (--clips FILE…) or a prior of your own (--prior FOLDER)"
+            )
+        if not self.own.clips and self.own != Clips():
+            changed = [entry.name for entry in fields(Clips) if self._differs(entry.name)]
+            raise ValueError(
+                f"{', '.join(changed)} is given without clips, expected --clips FILE… beside it"
+            )
+        problems = [load_problem(name) for name in self.problems]
+        if self.own.clips:
+            problems.append(_problem_of_clips(self.own))
+        if self.prior is not None:
+            problems.append(_problem_of_prior(self.prior))
+        return problems
+
+    def _differs(self, option: str) -> bool:
+        return getattr(self.own, option) != getattr(Clips(), option)
+
+
+def _problem_of_clips(own: Clips) -> Problem:
+    """Return the problem that a user's clips make."""
+    from probmotion.motion import load_motions
+    from probmotion.problems import clips_problem
+
+    return clips_problem(
+        load_motions(own.clips),
+        observe=own.observe,
+        fps=own.fps,
+        frames=own.frames,
+        rank=own.rank,
+        styles=own.styles,
+        noise=own.noise,
+        held_out=-1 if own.held_out is None else own.held_out,
+    )
+
+
+def _problem_of_prior(source: str) -> Problem:
+    """Return the problem to draw from a prior that a user trained, called as its folder."""
+    from probmotion.models import motion_diffusion, motion_dvae
+    from probmotion.posterior import MotionPosterior
+    from probmotion.problems import Problem
+    from probmotion.summaries import kind_of_network
+
+    known: dict[str, Any] = {
+        motion_diffusion.KIND: motion_diffusion.MotionDiffusion,
+        motion_dvae.KIND: motion_dvae.MotionDVAE,
+    }
+    kind = kind_of_network(file_called(Path(source)))
+    if kind not in known:
+        raise ValueError(
+            f"prior is {source}, which holds a {kind}, expected a {' or a '.join(known)}"
+        )
+    posterior = MotionPosterior(known[kind].load(source))
+    path = Path(source).resolve()
+    name = path.parent.name if path.name == "model.safetensors" else path.name
+    name = name.removesuffix(".safetensors")
+    return Problem(name, "a prior that was trained on data of one's own: generation", posterior)
