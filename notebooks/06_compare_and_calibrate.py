@@ -24,6 +24,7 @@ import pandas as pd
 from IPython.display import Image
 
 import probmotion as pm
+from probmotion.advice import advise
 from probmotion.bias import bias_budget
 from probmotion.calibration import Overconfident, calibrate
 from probmotion.comparison import Budget
@@ -118,7 +119,16 @@ budget.plot("bias.png")
 Image("bias.png")
 
 # %% [markdown]
-# ## 5. Your own
+# ## 5. Which sampler, then?
+#
+# Every sampler was measured on every problem of the library, with a small budget; `probmotion
+# which` says the same on the command line.
+
+# %%
+print(advise("gait-monocular"))
+
+# %% [markdown]
+# ## 6. Your own
 #
 # Any posterior and any object with `name`, `requires` and `sample` take part; a package registers a
 # sampler by an entry point of the group `probmotion.samplers`.

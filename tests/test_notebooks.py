@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from probmotion import Comparison
+from probmotion.advice import advise
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
@@ -158,6 +159,7 @@ def test_compare_and_calibrate(tmp_path, monkeypatch):
     used = table[table["metric"] == "budget_used"].groupby("sampler")["value"].max()
     assert (used[["mh", "mas"]] <= 20_000).all()
     assert 1e4 < (tmp_path / "report.html").stat().st_size < 15e6
+    assert str(advise("gait-monocular")) in printed
     right, wrong = (line for line in printed.splitlines() if " on gait-monocular(" in line)
     assert "no deviation found" in right
     assert "too sure: 90 % intervals hold" in wrong

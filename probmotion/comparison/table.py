@@ -102,9 +102,9 @@ exact (1; below: over-confident); mean: error of the mean / √tr (0); off: vari
 manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
 styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
 The frame and table.csv hold more measures."""
-_MARKS_LEGEND = """\
-*: best of its column; °: not to be told from the best (intervals of 95 % of paired differences over
-seeds, Student's at Holm's levels, hold 0)."""
+_SEEDS_LEGEND = """\
+±: standard deviation over seeds; *: best of its column; °: not to be told from the best (intervals
+of 95 % of paired differences over seeds, Student's at Holm's levels, hold 0)."""
 _TESTS_LEGEND = """\
 C2ST: how often a classifier tells a draw from an exact one (0.5: it guesses); MMD²: squared maximum
 mean discrepancy from exact draws (0); KSD²: squared kernel Stein discrepancy from density (0)."""
@@ -148,7 +148,7 @@ class ComparisonTable(pd.DataFrame):
         problems = list(dict.fromkeys(self["problem"]))
         parts = [self._problem(problem) for problem in problems]
         if self.groupby("problem")["seed"].nunique().gt(1).any():
-            parts.append(_MARKS_LEGEND)
+            parts.append(_SEEDS_LEGEND)
         if any(self["metric"] == "swd"):
             parts.append(_LEGEND)
         if self["metric"].isin(["c2st", "ksd"]).any():

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -104,7 +104,7 @@ class OutlierGibbs:
         )
 
     def _chain(
-        self, posterior: MotionPosterior, draws: int, rng: np.random.Generator, bar: object
+        self, posterior: MotionPosterior, draws: int, rng: np.random.Generator, bar: Any
     ) -> np.ndarray:
         prior, evidence = posterior.prior, posterior.likelihood
         assert isinstance(prior, HasExactPosterior)
@@ -122,7 +122,7 @@ class OutlierGibbs:
             draw, left = divmod(step - self.warmup + 1, self.thin)
             if left == 0 and draw > 0:
                 found[draw - 1] = motion
-                bar.update(1)  # type: ignore[attr-defined]
+                bar.update(1)
         return found
 
 

@@ -95,7 +95,7 @@ def test_the_best_and_those_that_are_not_told_from_it_are_marked():
     # Seconds are neither right nor wrong, and numbers stay one below the other.
     assert [line.count("*") + line.count("°") for line in rows.values()] == [1, 0, 1]
     assert len(rows["near"]) == len(rows["alike"]) == len(rows["far"]) + 1
-    assert "*: best of its column; °: not to be told from the best" in text
+    assert "±: standard deviation over seeds; *: best of its column; °: not to be told from" in text
 
 
 def test_what_says_most_is_the_first_that_was_measured():
@@ -109,7 +109,7 @@ def test_what_says_most_is_the_first_that_was_measured():
 
 def test_with_one_seed_nothing_is_marked():
     text = str(made_table(near=[1.0], far=[3.0]))
-    assert not {"*", "°"} & set(text)
+    assert not {"*", "°", "±"} & set(text)
 
 
 def test_what_is_cut_from_it_is_a_plain_frame(folder):
