@@ -1,7 +1,8 @@
 """How fast the motion VAE generates and learns, at the published size on the CPU: ``name: value``.
 
 Weights are fresh: what is computed does not depend on them. A training step is one of the second
-phase, in mixed precision as the settings say, with what the pose network answers.
+phase, in mixed precision as the settings say. Its teacher is asked once of every frame, before the
+first step: ``teacher_seconds_per_1000_frames``.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def generate(network: MotionVAENetwork, body: ArticulatedBody) -> torch.Tensor:
 
 
 def training(body: ArticulatedBody, settings: MotionVAESettings) -> Callable[[], None]:
-    """Return a step of the second phase, all of it: batch, teacher, loss, gradient, optimiser."""
+    """Return a step of the second phase, all of it: batch, loss, gradient, optimiser."""
     skeleton, rng = body.skeleton, np.random.default_rng(0)
     shape = (4 * settings.frames, skeleton.n_joints)
     tracks = [

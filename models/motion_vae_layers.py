@@ -238,7 +238,7 @@ def _looked_up(
     asked: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
     """Return what attention finds, ``(N, heads, K, d)``."""
-    if asked.dtype != torch.bfloat16:
+    if asked.dtype != torch.bfloat16 or asked.device.type != "cpu":
         return functional.scaled_dot_product_attention(asked, keys, values, attn_mask=mask)
     # Torch's own takes 4 times as long in bfloat16 on the CPU, among so few tokens.
     scores = (asked @ keys.mT).float() * asked.shape[-1] ** -0.5

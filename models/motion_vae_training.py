@@ -31,7 +31,7 @@ from probmotion.models.motion_vae_model import KIND, MotionVAEModel, description
 from probmotion.models.motion_vae_network import MotionVAENetwork
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.pose_network import PoseGuesses, PoseNetwork
-from probmotion.models.taught_poses import TaughtPoses
+from probmotion.models.taught_poses import TaughtPoses, scaled
 from probmotion.models.track_batches import (
     Augmentation,
     Batch,
@@ -116,8 +116,13 @@ class _LearnsFromTracks:
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
-        """Return the loss of fresh sequences, a mean over them."""
-        return self._loss(network, self.batches, rng, batch, device)
+        """Return the loss of fresh sequences, a mean over them.
+
+        Networks multiply as their settings say; where bodies are posed, and what is lost, stays in
+        single precision whatever the trainer asks for.
+        """
+        with torch.autocast(device.type, enabled=False):
+            return self._loss(network, self.batches, rng, batch, device)
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
         """Return the loss on held-out sequences that never change."""
@@ -347,8 +352,11 @@ class MotionVAETrainee(_LearnsFromTracks):
         if batches not in self._poses:
             self._poses[batches] = TaughtPoses(self._teacher, batches, rest)
         guesses = self._poses[batches].of(drawn)
-        terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
-        return best_guess(guesses, weighted_sum(terms, self.size))
+        scale = torch.as_tensor(drawn.scale, device=keypoints.device)
+        # Which view is best does not depend on how a window is scaled.
+        shown = keypoints / scale[:, None, None, None]
+        terms = guess_terms(self.body, guesses, shown, seen, self.distance)
+        return scaled(best_guess(guesses, weighted_sum(terms, self.size)), scale)
 
 
 def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSettings]:

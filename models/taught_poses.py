@@ -8,15 +8,15 @@ from probmotion.models.motion_vae_layers import FRAMES_AT_ONCE
 from probmotion.models.pose_network import PoseGuesses, PoseNetwork
 from probmotion.models.track_batches import Batch, TrackBatches
 
-__all__ = ["TaughtPoses"]
+__all__ = ["TaughtPoses", "scaled"]
 
 
 class TaughtPoses:
     """The poses of all frames of tracks, and of their mirror images, under every view.
 
     Frames do not look at each other and a teacher does not learn: what it says of a frame is the
-    same in every window that shows it. Of a window that is scaled it says that the body is larger,
-    and as much farther from the picture's centre. It takes some 3 kB for a frame of a person.
+    same in every window that shows it. A window that is scaled shows the same poses of a larger
+    body, see :func:`scaled`. It takes some 3 kB for a frame of a person, and its mirror image's.
 
     Parameters
     ----------
@@ -58,15 +58,43 @@ class TaughtPoses:
         self._log_lengths = torch.cat([guesses.log_lengths for guesses in found])
 
     def of(self, drawn: Batch) -> PoseGuesses:
-        """Return what the teacher says of windows that the batches have drawn."""
-        device = self._turns.device
-        frames = torch.as_tensor(drawn.frames, device=device)
-        scale = torch.as_tensor(drawn.scale, device=device)[:, None, None]
-        # Lengths are read from the mean of what frames say, linearly.
-        lengths = self._log_lengths[frames].mean(dim=1) + scale.log()
+        """Return what the teacher says of windows that the batches have drawn, before scaling.
+
+        Raises
+        ------
+        ValueError
+            If a window is longer than its track.
+        """
+        if (drawn.frames < 0).any():
+            raise ValueError("drawn has windows that are padded, expected frames of tracks only")
+        frames = torch.as_tensor(drawn.frames, device=self._turns.device)
         return PoseGuesses(
             self._rotation[frames].transpose(1, 2),
-            scale[..., None] * self._translation[frames].transpose(1, 2),
+            self._translation[frames].transpose(1, 2),
             self._turns[frames].transpose(1, 2),
-            lengths,
+            # Lengths are read from the mean of what frames say, linearly.
+            self._log_lengths[frames].mean(dim=1),
         )
+
+
+def scaled(guesses: PoseGuesses, scale: torch.Tensor) -> PoseGuesses:
+    """Return poses whose pictures are larger: of a larger body, farther from the centre.
+
+    Exactly so where rays are parallel. A camera at 7 m sees a joint that is half a metre nearer
+    than the root, of a body a twentieth larger, 3 mm away from there.
+
+    Parameters
+    ----------
+    guesses : PoseGuesses
+        Of B windows.
+    scale : Tensor, (B,)
+        By which their pictures are scaled.
+    """
+    factor = scale.reshape(-1, *[1] * (guesses.translation.ndim - 1))
+    longer = scale.log().reshape(-1, *[1] * (guesses.log_lengths.ndim - 1))
+    return PoseGuesses(
+        guesses.rotation,
+        factor * guesses.translation,
+        guesses.turns,
+        guesses.log_lengths + longer,
+    )

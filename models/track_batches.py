@@ -176,11 +176,13 @@ class TrackBatches:
         return Standards(mean, np.sqrt(squares + self.augmentation.shift**2 / 3))
 
     def all_frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the keypoints, (2F, J, 2), and what is seen, (2F, J), of all tracks' F frames.
+        """Return the keypoints, (F, J, 2), and what is seen, (F, J), of all frames of all tracks.
 
-        Those that are mirrored come after those that are not.
+        Where windows are mirrored, the mirror images of all frames come after them.
         """
         points, seen = np.concatenate(self._keypoints), np.concatenate(self._seen)
+        if not self.augmentation.mirror:
+            return points, seen
         return (
             np.concatenate([points, self._mirrored(points)]),
             np.concatenate([seen, seen[:, self._order]]),

@@ -66,7 +66,9 @@ def table_of(advices: Iterable[Advice]) -> Iterator[str]:
         cells = [
             f"`{each.problem}`",
             each.measure.partition(",")[0],
-            in_brief([each.take]) + f", {each.take.seconds:.2g} s",
+            in_brief([each.take])
+            + f", {each.take.seconds:.2g} s"
+            + (" – not right yet" if each.take.warnings else ""),
             in_brief(each.alike),
             in_brief(each.worse),
             without,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ class Standing:
     seconds : float
         Mean time of a cell.
     warnings : tuple of str
-        What its other measures say against it, with their figures.
+        What tells against it, with the figures.
     """
 
     sampler: str
@@ -62,9 +62,10 @@ class Advice:
     measure : str
         The measure that the samplers are ranked by, in words.
     take : Standing
-        The best; or one that cannot be told from it and takes less than half as long.
+        Of the best and those that cannot be told from it: one that nothing tells against, if there
+        is one; the nearest, or one that takes less than half as long.
     alike : tuple of Standing
-        The others that cannot be told from the best.
+        The others that cannot be told from the best, the nearest first.
     worse : tuple of Standing
         Those that can, the nearest first.
     without : dict of str
@@ -81,11 +82,12 @@ class Advice:
     without: dict[str, str]
 
     def __str__(self) -> str:
+        verdict = "none is right at this cost; nearest" if self.take.warnings else "take"
         lines = [
             f"{self.problem}: {self.description}",
             f"measured: {self.how}",
             f"ranked by: {self.measure}",
-            f"take: {self.take}",
+            f"{verdict}: {self.take}",
             f"not to be told from the best: {_listed(self.alike)}",
             f"worse: {_listed(self.worse)}",
         ]
@@ -125,20 +127,20 @@ def advise(problem: str, found: Measured | None = None) -> Advice:
         str(name): cells.set_index("seed")["value"]
         for name, cells in rows[rows["metric"] == quality].groupby("sampler", sort=False)
     }
-    best, tied = best_of(quality, values, range(found.seeds))
-    if best is None:
-        best, tied = min(values, key=lambda name: values[name].mean()), set(values)
-    standings = {name: _standing(rows, name, quality) for name in values}
-    take = _taken(standings, best, tied)
-    ranked = sorted(standings.values(), key=lambda each: _wrong(quality, each.value))
+    # A single sampler has nobody to be compared with.
+    tied = best_of(quality, values, range(found.seeds))[1] or set(values)
+    standings = [_standing(rows, name, quality, found.rhat_at_most) for name in values]
+    standings.sort(key=lambda each: _wrong(quality, each.value))
+    alike = [each for each in standings if each.sampler in tied]
+    take = _taken(alike)
     return Advice(
         problem,
         found.problems[problem],
         f"{found.draws} draws, {found.seeds} seeds, {'; '.join(found.notes)} ({found.command})",
         f"{quality}, {QUALITIES[quality]}",
         take,
-        tuple(each for each in ranked if each.sampler in tied and each != take),
-        tuple(each for each in ranked if each.sampler not in tied),
+        tuple(each for each in alike if each != take),
+        tuple(each for each in standings if each.sampler not in tied),
         {
             name: found.words[f"{problem}/{name}"]
             for name in found.samplers
@@ -147,10 +149,11 @@ def advise(problem: str, found: Measured | None = None) -> Advice:
     )
 
 
-def _taken(standings: dict[str, Standing], best: str, tied: set[str]) -> Standing:
-    cheapest = min((standings[name] for name in tied), key=lambda each: each.seconds)
-    dear = standings[best].seconds
-    return cheapest if cheapest.seconds < _CHEAPER * dear else standings[best]
+def _taken(alike: Sequence[Standing]) -> Standing:
+    """Return which of those that cannot be told apart to take, the nearest first."""
+    sound = [each for each in alike if not each.warnings] or list(alike)
+    cheapest = min(sound, key=lambda each: each.seconds)
+    return cheapest if cheapest.seconds < _CHEAPER * sound[0].seconds else sound[0]
 
 
 def _wrong(quality: str, value: float) -> float:
@@ -160,13 +163,16 @@ def _wrong(quality: str, value: float) -> float:
     return abs(math.log(value)) if value > 0 else math.inf
 
 
-def _standing(rows: pd.DataFrame, sampler: str, quality: str) -> Standing:
+def _standing(rows: pd.DataFrame, sampler: str, quality: str, rhat_at_most: float) -> Standing:
     own = rows[rows["sampler"] == sampler].groupby("metric")["value"]
     means = own.mean()
     said = [
         words.format(float(means[metric]))
-        for metric, against, words in _WARNINGS
-        if metric in means.index and against(float(means[metric]))
+        for metric, low, high, words in (
+            *_WARNINGS,
+            ("rhat", 0.0, rhat_at_most, "chains do not agree: R-hat {:.3g}"),
+        )
+        if metric in means.index and not low <= float(means[metric]) <= high
     ]
     return Standing(
         sampler,
@@ -177,15 +183,13 @@ def _standing(rows: pd.DataFrame, sampler: str, quality: str) -> Standing:
     )
 
 
-_WARNINGS: Sequence[tuple[str, Callable[[float], bool], str]] = (
-    ("tr", lambda value: value < 0.8, "too narrow: trace of covariance {:.2g} of the exact"),
-    ("tr", lambda value: value > 1.25, "too wide: trace of covariance {:.2g} of the exact"),
-    ("off", lambda value: value > 1.5, "variance off the prior's manifold {:.2g} of the exact"),
-    ("off", lambda value: value < 0.67, "variance off the prior's manifold {:.2g} of the exact"),
-    ("share_error", lambda value: value > 0.2, "styles' shares wrong by {:.2g}"),
-    ("rhat", lambda value: value > 1.05, "chains do not agree: R-hat {:.3g}"),
+_WARNINGS: Sequence[tuple[str, float, float, str]] = (
+    ("swd", 1 / 1.5, 1.5, "far from exact draws: swd {:.3g}"),
+    ("tr", 1 / 1.5, 1.5, "spread wrong: trace of covariance {:.2g} of the exact"),
+    ("off", 1 / 1.5, 1.5, "variance off the prior's manifold {:.2g} of the exact"),
+    ("share_error", 0.0, 0.3, "styles' shares wrong by {:.2g}"),
 )
-"""What tells against a sampler: a measure, where it does, and the words."""
+"""What tells against a sampler: a measure, within what it is right enough, and the words."""
 
 
 def _listed(standings: Sequence[Standing]) -> str:

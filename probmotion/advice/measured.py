@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from probmotion.comparison.qualities import QUALITIES
 from probmotion.files import written_whole
+from probmotion.metrics.chains import rhat_of_independent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,6 +41,8 @@ class Measured:
         What measured it.
     draws, seeds : int
         Draws of a cell, and independent repeats.
+    rhat_at_most : float
+        What the R-hat of so many draws is for chains that have mixed, 95 times in 100.
     notes : list of str
         What every sampler could spend.
     problems : dict of str
@@ -54,6 +57,7 @@ class Measured:
     command: str
     draws: int
     seeds: int
+    rhat_at_most: float
     notes: list[str]
     problems: dict[str, str]
     samplers: list[str]
@@ -81,6 +85,7 @@ def keep_measured(comparison: Comparison, command: str, folder: str | Path = _FO
         command,
         plan.draws,
         plan.seeds,
+        rhat_of_independent(plan.chains, plan.draws // plan.chains),
         list(plan.notes),
         dict(plan.problems),
         list(plan.samplers),

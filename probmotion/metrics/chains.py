@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from probmotion import seeds
 from probmotion.draws import MotionDraws
 
-__all__ = ["chain_diagnostics", "watched_coordinates"]
+__all__ = ["chain_diagnostics", "rhat_of_independent", "watched_coordinates"]
 
 _FEW = 32
 _PRINCIPAL = 10
@@ -46,6 +47,29 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     if "divergent" in data:
         found["divergent"] = float(data["divergent"].sum())
     return found
+
+
+def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
+    """Return what the R-hat of a run exceeds with probability ``1 − level`` though it has mixed.
+
+    The quantile of the greatest R-hat of as many coordinates as diagnostics ever look at, of
+    independent draws: of short chains it is far from 1. Found from 100 such runs.
+
+    Parameters
+    ----------
+    chains, draws : int
+        Chains, and draws of each: 4 or more.
+    level : float
+        Between 0 and 1.
+    seed : int
+        Of the runs.
+    """
+    from arviz_stats.base import array_stats
+
+    runs, coordinates = 100, _FEW + 1
+    values = seeds.generator(seed, "rhat").standard_normal((chains, draws, runs * coordinates))
+    found = array_stats.rhat(values, chain_axis=0, draw_axis=1)
+    return float(np.quantile(found.reshape(runs, coordinates).max(axis=1), level))
 
 
 def watched_coordinates(draws: MotionDraws) -> np.ndarray:

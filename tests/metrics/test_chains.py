@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from probmotion import MotionDraws, Skeleton
-from probmotion.metrics.chains import chain_diagnostics, watched_coordinates
+from probmotion.metrics.chains import (
+    chain_diagnostics,
+    rhat_of_independent,
+    watched_coordinates,
+)
 from probmotion.metrics.cost import costs
 
 CHAINS, DRAWS = 4, 500
@@ -119,3 +123,14 @@ def test_acceptance_is_averaged_and_divergences_are_counted(rng):
 def test_costs_are_the_runs(rng):
     found = costs(run(rng.normal(size=(1, 10, 1))))
     assert found == {"seconds": 2.5, "density_evaluations": 7}
+
+
+def test_of_short_chains_even_independent_draws_have_an_r_hat_far_from_1(rng):
+    assert rhat_of_independent(4, 2000) < 1.02
+    limit = rhat_of_independent(4, 10)
+    found = [chain_diagnostics(run(rng.normal(size=(4, 10, 32))))["rhat"] for _ in range(40)]
+    assert limit > 1.25
+    assert np.median(found) > 1.15
+    # One in 20, by its name; of 40 more than 8 are one in 3000.
+    assert sum(value > 0.97 * limit for value in found) > 0
+    assert sum(value > limit for value in found) <= 8
