@@ -1,6 +1,6 @@
 """Every sampler on every problem: the table that ``probmotion which`` and the README advise from.
 
-    python notebooks/which_sampler.py --out grid      # resumes; 15 minutes on two cores a seed
+    python notebooks/which_sampler.py --out grid    # resumes; two cores: 6 minutes and 4 a seed
 
 Every sampler may spend as many seconds on a cell, by :data:`~probmotion.comparison.QUICK_BUDGET`;
 one that cannot is a row that says so. Problems whose data is not at hand are left out, and said.
@@ -59,8 +59,8 @@ def main() -> None:
 
 def table_of(advices: Iterable[Advice]) -> Iterator[str]:
     """Yield the lines of the README's table."""
-    yield "| problem | by | take | not to be told from the best | worse | without draws |"
-    yield "|---|---|---|---|---|---|"
+    yield "| problem | by | take | as good | not told from it, doubtful | worse | without draws |"
+    yield "|---|---|---|---|---|---|---|"
     for each in advices:
         without = ", ".join(f"`{name}`: {word}" for name, word in each.without.items())
         cells = [
@@ -70,6 +70,7 @@ def table_of(advices: Iterable[Advice]) -> Iterator[str]:
             + f", {each.take.seconds:.2g} s"
             + (" – not right yet" if each.take.warnings else ""),
             in_brief(each.alike),
+            in_brief(each.doubtful),
             in_brief(each.worse),
             without,
         ]

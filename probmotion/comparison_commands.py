@@ -118,6 +118,7 @@ class Compare:
 
         samplers = self._samplers()
         problems = self._problems()
+        self._check_calibrate(problems)
         fitting = max(n for n in (1, 2, 3, 4) if self.draws % n == 0)
         chains = fitting if self.chains is None else self.chains
         comparison = compare(
@@ -153,8 +154,6 @@ class Compare:
         from probmotion.calibration import calibrate
 
         simulated = [problem for problem in problems if problem.simulate is not None]
-        if not simulated:
-            raise ValueError("calibrate is given, but none of the problems can be simulated")
         found = calibrate(
             simulated,
             samplers,
@@ -169,6 +168,24 @@ class Compare:
             for sampler in samplers:
                 print(found.verdict(problem.name, sampler))
         return found
+
+    def _check_calibrate(self, problems: list[Problem]) -> None:
+        """Refuse what would fail after the comparison has run."""
+        from probmotion.calibration import FEWEST_SIMULATIONS
+
+        if not self.calibrate:
+            return
+        if self.calibrate < FEWEST_SIMULATIONS:
+            raise ValueError(
+                f"calibrate is {self.calibrate}, expected {FEWEST_SIMULATIONS} simulations or more"
+            )
+        if self._budget() is not None:
+            raise ValueError(
+                "calibrate is given with a budget, expected one of them: simulations run samplers "
+                "with the settings that are given"
+            )
+        if all(problem.simulate is None for problem in problems):
+            raise ValueError("calibrate is given, but none of the problems can be simulated")
 
     def _samplers(self) -> dict[str, Any]:
         from probmotion.sampling import sampler_names

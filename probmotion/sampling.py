@@ -132,16 +132,25 @@ def suited(posterior: MotionPosterior) -> list[str]:
     """Return the names of the registered samplers that can draw from a posterior.
 
     The prior has what they require, a gradient where they need one (``needs_gradient``), and no
-    more dimensions than they take by default (``largest_dim``).
+    more dimensions than they take by default (``largest_dim``). One that cannot be imported, as of
+    a package that is half removed, is none.
     """
-    kinds = {name: load_sampler(name) for name in sampler_names()}
     return [
         name
-        for name, kind in kinds.items()
+        for name, kind in _importable()
         if not missing(kind, posterior)
         and (posterior.differentiable or not getattr(kind, "needs_gradient", False))
         and posterior.dim <= getattr(kind, "largest_dim", posterior.dim)
     ]
+
+
+def _importable() -> Iterator[tuple[str, type[Any]]]:
+    for name in sampler_names():
+        try:
+            kind = load_sampler(name)
+        except ValueError:
+            continue
+        yield name, kind
 
 
 @cache
@@ -164,12 +173,23 @@ def load_sampler(name: str) -> type[Any]:
     Raises
     ------
     ValueError
-        If no sampler has that name; the message lists the known ones.
+        If no sampler has that name; the message lists the known ones. Or it cannot be imported;
+        the message says from where, whose it is and why.
     """
     known = _registered()
     if name not in known:
         raise ValueError(f"sampler is {name!r}, expected one of {', '.join(sorted(known))}")
-    return known[name].load()
+    point = known[name]
+    try:
+        return point.load()
+    # A package of somebody else's may fail in any way as it is imported.
+    except Exception as error:
+        package = f"the package {point.dist.name}" if point.dist else "a package without a name"
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(
+            f"sampler is {name!r}, which {package} registers as {point.value!r}, expected one "
+            f"that can be imported ({reason})"
+        ) from error
 
 
 class _Silent:

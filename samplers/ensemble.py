@@ -256,11 +256,11 @@ class _Run:
     def statistics(self) -> dict[str, np.ndarray]:
         """Return per ensemble the share of moves accepted and the autocorrelation time.
 
-        The latter is the slowest coordinate's, in draws: 1 where kept iterations are independent.
-        A run of too few iterations to tell stores neither.
+        The latter is the slowest coordinate's, in draws: 1 where kept iterations are independent,
+        NaN after too few iterations to tell, which have no share of moves either.
         """
         if len(self.trace) < 4:
-            return {}
+            return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
         # A stretch is never by a factor of exactly 1: a walker that moved has changed.
         moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
         traces = zip(*self.trace, strict=True)

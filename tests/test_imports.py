@@ -49,6 +49,13 @@ def test_the_language_imports_no_library_of_networks_or_pictures(module: str) ->
     assert run.stdout.strip() == "[]"
 
 
+def test_problems_load_no_network_that_they_are_not_about() -> None:
+    """A worker of a comparison begins with this."""
+    probe = "import sys, probmotion.problems; print(sorted({'torch', 'jax'} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
 def test_every_public_name_is_there() -> None:
     import probmotion
 

@@ -34,7 +34,7 @@ class Standing:
     seconds : float
         Mean time of a cell.
     warnings : tuple of str
-        What tells against it, with the figures.
+        What tells against it, with the figures; that some seeds have no draws is one.
     """
 
     sampler: str
@@ -65,7 +65,9 @@ class Advice:
         Of the best and those that cannot be told from it: one that nothing tells against, if there
         is one; the nearest, or one that takes less than half as long.
     alike : tuple of Standing
-        The others that cannot be told from the best, the nearest first.
+        Others that cannot be told from the best and that nothing tells against, the nearest first.
+    doubtful : tuple of Standing
+        Those that this measure cannot tell from the best, but something tells against.
     worse : tuple of Standing
         Those that can, the nearest first.
     without : dict of str
@@ -78,6 +80,7 @@ class Advice:
     measure: str
     take: Standing
     alike: tuple[Standing, ...]
+    doubtful: tuple[Standing, ...]
     worse: tuple[Standing, ...]
     without: dict[str, str]
 
@@ -88,7 +91,8 @@ class Advice:
             f"measured: {self.how}",
             f"ranked by: {self.measure}",
             f"{verdict}: {self.take}",
-            f"not to be told from the best: {_listed(self.alike)}",
+            f"as good, as far as can be told: {_listed(self.alike)}",
+            f"not told from the best by this measure, but: {_listed(self.doubtful)}",
             f"worse: {_listed(self.worse)}",
         ]
         if self.without:
@@ -126,10 +130,11 @@ def advise(problem: str, found: Measured | None = None) -> Advice:
     values = {
         str(name): cells.set_index("seed")["value"]
         for name, cells in rows[rows["metric"] == quality].groupby("sampler", sort=False)
+        if cells["value"].notna().any()
     }
     # A single sampler has nobody to be compared with.
     tied = best_of(quality, values, range(found.seeds))[1] or set(values)
-    standings = [_standing(rows, name, quality, found.rhat_at_most) for name in values]
+    standings = [_standing(rows, name, quality, found) for name in values]
     standings.sort(key=lambda each: _wrong(quality, each.value))
     alike = [each for each in standings if each.sampler in tied]
     take = _taken(alike)
@@ -139,7 +144,8 @@ def advise(problem: str, found: Measured | None = None) -> Advice:
         f"{found.draws} draws, {found.seeds} seeds, {'; '.join(found.notes)} ({found.command})",
         f"{quality}, {QUALITIES[quality]}",
         take,
-        tuple(each for each in alike if each != take),
+        tuple(each for each in alike if each != take and not each.warnings),
+        tuple(each for each in alike if each != take and each.warnings),
         tuple(each for each in standings if each.sampler not in tied),
         {
             name: found.words[f"{problem}/{name}"]
@@ -163,17 +169,19 @@ def _wrong(quality: str, value: float) -> float:
     return abs(math.log(value)) if value > 0 else math.inf
 
 
-def _standing(rows: pd.DataFrame, sampler: str, quality: str, rhat_at_most: float) -> Standing:
+def _standing(rows: pd.DataFrame, sampler: str, quality: str, found: Measured) -> Standing:
     own = rows[rows["sampler"] == sampler].groupby("metric")["value"]
     means = own.mean()
     said = [
         words.format(float(means[metric]))
         for metric, low, high, words in (
             *_WARNINGS,
-            ("rhat", 0.0, rhat_at_most, "chains do not agree: R-hat {:.3g}"),
+            ("rhat", 0.0, found.rhat_at_most, "chains do not agree: R-hat {:.3g}"),
         )
         if metric in means.index and not low <= float(means[metric]) <= high
     ]
+    if (there := int(own.count()[quality])) < found.seeds:
+        said.append(f"draws at {there} of {found.seeds} seeds")
     return Standing(
         sampler,
         float(means[quality]),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from probmotion.calibration.grid import calibrate
+from probmotion.calibration.grid import FEWEST_SIMULATIONS, calibrate
 from probmotion.calibration.negative_control import Overconfident
 from probmotion.calibration.result import Calibration
 
-__all__ = ["Calibration", "Overconfident", "calibrate"]
+__all__ = ["FEWEST_SIMULATIONS", "Calibration", "Overconfident", "calibrate"]

@@ -29,7 +29,7 @@ from probmotion.problems import Problem, load_problem
 
 __all__ = ["calibrate"]
 
-_FEWEST_SIMULATIONS, _FEWEST_DRAWS = 10, 10
+FEWEST_SIMULATIONS, _FEWEST_DRAWS = 10, 10
 # Far from the simulations' own numbers: motions that have nothing to do with them.
 _ELSEWHERE = 2**32
 
@@ -82,7 +82,7 @@ def calibrate(
     KeyboardInterrupt
         At Ctrl-C; the message says how many simulations are finished and where.
     """
-    check_count("simulations", simulations, least=_FEWEST_SIMULATIONS)
+    check_count("simulations", simulations, least=FEWEST_SIMULATIONS)
     check_count("draws", draws, least=_FEWEST_DRAWS)
     check_count("chains", chains)
     check_count("workers", workers)

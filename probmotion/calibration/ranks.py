@@ -59,7 +59,8 @@ def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
 
     As many as the quantity's own effective sample size (bulk, Vehtari et al. 2021; an ensemble's
     is draws / autocorrelation time), all if the draws are independent anyway; at least one. What
-    never moves, is not finite everywhere, or has chains of fewer than 4 draws is one draw.
+    never moves, is not finite everywhere, has chains of fewer than 4 draws, or is of an ensemble
+    whose autocorrelation time is not known (NaN) is one draw.
 
     Parameters
     ----------

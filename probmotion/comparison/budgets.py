@@ -3,7 +3,8 @@
 A sampler's class names in ``effort`` the settings that its cost grows with, the first one counted
 in its own units and the others kept in proportion to it, and in ``least_effort`` the smallest
 value that makes sense. Pilot runs, each of twice the effort of the one before, show what a unit of
-it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt.
+it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of seconds
+the first pilot is run twice: libraries compile at the first.
 """
 
 from __future__ import annotations
@@ -117,6 +118,9 @@ def affordable(
         return {}
     given = getattr(sampler, effort_of(sampler)[0])
     effort = _least(sampler)
+    if budget.seconds is not None:
+        # What is compiled at the first run is there for all that follow.
+        pilot(_with(sampler, effort))
     costs = [(effort, pilot(_with(sampler, effort)))]
     if costs[0][1] > budget.amount:
         raise UnsupportedPosterior(

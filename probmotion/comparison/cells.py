@@ -179,7 +179,9 @@ class Cell:
         if self.budget is not None:
             used = None if draws is None else self.budget.spent(draws)
             spent = {"asked": str(self.budget), "settings": self.settings, "used": used}
-            metrics = metrics if used is None else {**metrics, "budget_used": used}
+            if used is not None:
+                bought = {f"set_{name}": float(n) for name, n in (self.settings or {}).items()}
+                metrics = {**metrics, "budget_used": used, **bought}
         address = (self.problem, self.sampler, self.seed)
         result = CellResult(*address, self.fingerprint, metrics, failure, spent)
         _forget(self.folder.parent, self.folder.name)
@@ -196,6 +198,12 @@ class Cell:
         except OSError as error:
             shutil.rmtree(unfinished, ignore_errors=True)
             raise CellNotKept(error.strerror or str(error)) from error
+        except Exception as error:
+            # Draws that no file can hold are the sampler's fault.
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if draws is None:
+                raise
+            self.fail(error)
 
 
 def read_result(folder: Path) -> CellResult | None:

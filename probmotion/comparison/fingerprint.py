@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cached_property, partial
 from pathlib import PurePath
+from types import CellType, CodeType, EllipsisType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,28 @@ from probmotion.arrays import to_numpy
 
 __all__ = ["fingerprint"]
 
+_SIMPLE = bool | int | float | complex | str | bytes | EllipsisType | np.generic
+
+_NUMPYS_OWN_RANDOMNESS = getattr(np.random.random, "__self__", None)
+
+_CODE = (
+    *("code", "consts", "names", "varnames", "freevars", "cellvars", "exceptiontable"),
+    *("argcount", "posonlyargcount", "kwonlyargcount", "flags"),
+)
+"""What code does, of its attributes: not the file and the lines that it stands in."""
+
 
 def fingerprint(value: Any) -> str:
     """Return a hexadecimal digest of what ``value`` holds.
 
     Numbers, strings, arrays, lists, mappings, dataclasses (by the fields they are made with, so
-    that caches do not count), classes and functions (by name), networks (by layers and weights),
-    and other objects by their attributes.
+    that caches do not count), classes, modules and functions written in C (by name), functions of
+    Python (by name, compiled code, defaults and what they close over), bound methods (by what
+    they are bound to as well), networks (by layers and weights), and other objects by their
+    attributes.
+
+    Globals that a function reads, and methods of an object's class, count by their names alone.
+    Another version of Python compiles other code, so that it has other fingerprints of functions.
 
     Raises
     ------
@@ -40,7 +56,7 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     parts: list[Any] = []
     if id(value) in above:
         digest.update(f"the object {above.index(id(value))} levels down".encode())
-    elif value is None or isinstance(value, bool | int | float | str | bytes | np.generic):
+    elif value is None or isinstance(value, _SIMPLE):
         digest.update(repr(value).encode())
     elif isinstance(value, Mapping):
         for key in sorted(value, key=repr):
@@ -49,6 +65,16 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         parts += value
     elif isinstance(value, set | frozenset):
         parts += sorted(value, key=repr)
+    elif _has_a_name(value):
+        name = getattr(value, "__qualname__", "")
+        digest.update(f"{getattr(value, '__module__', '')}.{name}".encode())
+        parts += _behind_the_name(value)
+    elif isinstance(value, CodeType):
+        parts += [getattr(value, f"co_{name}") for name in _CODE]
+    elif value is _NUMPYS_OWN_RANDOMNESS:
+        pass  # There is one; SciPy's distributions hold it, whose density does not ask it.
+    elif isinstance(value, slice):
+        parts += [value.start, value.stop, value.step]
     elif is_array_api_obj(value):
         array = np.ascontiguousarray(to_numpy(value))
         digest.update(f"{array.dtype.str}{array.shape}".encode())
@@ -60,8 +86,6 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         digest.update(str(value).encode())
     elif isinstance(value, partial):
         parts += [value.func, value.args, value.keywords]
-    elif isinstance(value, type) or hasattr(value, "__qualname__"):
-        digest.update(f"{value.__module__}.{value.__qualname__}".encode())
     elif is_dataclass(value):
         for field in fields(value):
             if field.init:
@@ -78,6 +102,46 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     for part in parts:
         _add(digest, part, (*above, id(value)))
     digest.update(b"</>")
+
+
+def _has_a_name(value: Any) -> bool:
+    if isinstance(value, type | ModuleType | FunctionType | MethodType):
+        return True
+    # An object of a class of Python may be called, and have taken over a function's name, but its
+    # attributes say what it does.
+    if not callable(value) or isinstance(type(value).__call__, FunctionType):
+        return False
+    return hasattr(value, "__qualname__")
+
+
+def _behind_the_name(value: Any) -> list[Any]:
+    """Return what tells a function or method from another of the same name."""
+    if isinstance(value, type):
+        return []
+    if isinstance(value, ModuleType):
+        return [value.__name__]
+    if isinstance(value, MethodType):
+        return [value.__func__, value.__self__]
+    if isinstance(value, FunctionType):
+        defaults = [_or_marker(each) for each in value.__defaults__ or ()]
+        named = {name: _or_marker(each) for name, each in (value.__kwdefaults__ or {}).items()}
+        cells = [_held(cell) for cell in value.__closure__ or ()]
+        return [value.__code__, defaults, named, cells, vars(value)]
+    # Written in C: a method of an object, or the compiled or caching form of a function.
+    return [getattr(value, "__self__", None), getattr(value, "__wrapped__", None)]
+
+
+def _held(cell: CellType) -> list[Any]:
+    """Return what a function closes over; nothing where that is not assigned yet."""
+    try:
+        return [_or_marker(cell.cell_contents)]
+    except ValueError:
+        return []
+
+
+def _or_marker(value: Any) -> Any:
+    """Return the value, or for a bare object, which libraries use for "not given", its class."""
+    return object if type(value) is object else value
 
 
 def _computed(kind: type, name: str) -> bool:

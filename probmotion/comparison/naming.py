@@ -41,8 +41,13 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
 def _registered_name(problem: Problem) -> str | None:
     """A registered problem travels by its name: a process then makes it once for all cells."""
     name = problem.name
-    known = name.partition("(")[0] in problem_names()
-    return name if known and load_problem(name) is problem else None
+    if name.partition("(")[0] not in problem_names():
+        return None
+    try:
+        return name if load_problem(name) is problem else None
+    except (ValueError, FileNotFoundError):
+        # What cannot be made by that name is the caller's own, such as "gait(mine)".
+        return None
 
 
 def named_samplers(samplers: Any) -> dict[str, Sampler]:

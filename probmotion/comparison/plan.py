@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from probmotion.comparison.budgets import Budget, effort_of
+from probmotion.comparison.fingerprint import fingerprint
 from probmotion.files import written_whole
 from probmotion.problems import Problem, load_problem
 from probmotion.sampling import Sampler
@@ -147,5 +148,13 @@ def _changed_settings(sampler: Any) -> dict[str, str]:
     return {
         field.name: repr(getattr(sampler, field.name))
         for field in fields(sampler)
-        if usual is None or getattr(sampler, field.name) != getattr(usual, field.name)
+        if usual is None or not _same(getattr(sampler, field.name), getattr(usual, field.name))
     }
+
+
+def _same(value: Any, usual: Any) -> bool:
+    """Whether two settings are equal; those with arrays, which say it by element, by contents."""
+    try:
+        return bool(value == usual)
+    except (ValueError, RuntimeError):
+        return fingerprint(value) == fingerprint(usual)

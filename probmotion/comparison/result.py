@@ -65,8 +65,17 @@ class Comparison:
     @property
     def notes(self) -> list[str]:
         """Sentences to read with the table: budget, settings other than defaults, failures."""
-        notes = list(self.plan.notes)
-        for sampler, settings in self.plan.samplers.items():
+        notes = [*self.plan.notes, *self._used()]
+        bought = {
+            (result.sampler, name)
+            for result in self.results
+            for name in (result.budget or {}).get("settings") or {}
+        }
+        for sampler, given in self.plan.samplers.items():
+            # What a budget has bought stands in the table.
+            settings = {
+                name: value for name, value in given.items() if (sampler, name) not in bought
+            }
             if settings:
                 listed = ", ".join(f"{name}={value}" for name, value in settings.items())
                 notes.append(f"{sampler} ran with {listed}; its other settings are its defaults")
@@ -80,6 +89,21 @@ class Comparison:
             some = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
             notes.append(sentence + (some if len(failed) < self.plan.seeds else ""))
         return notes
+
+    def _used(self) -> list[str]:
+        """What samplers used of a budget, from the least to the most of a cell."""
+        used: dict[str, list[float]] = {}
+        for result in self.results:
+            if result.budget is not None and result.budget["used"] is not None:
+                used.setdefault(result.sampler, []).append(result.budget["used"])
+        if not used:
+            return []
+        each = [
+            f"{sampler} {min(amounts):.3g} to {max(amounts):.3g}"
+            for sampler, amounts in used.items()
+        ]
+        listed = ", ".join(each)
+        return [f"used per cell (budget_used; set_…: settings that it bought): {listed}"]
 
     def table(self) -> ComparisonTable:
         """Return the tidy data frame: columns problem, sampler, seed, metric, value.

@@ -21,8 +21,9 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     divergent transitions.
 
     Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
-    run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from that. It cannot see that
-    ensembles sit in different modes; their R-hat, each ensemble being one chain, can.
+    run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from that, and none where that
+    is NaN, not known. It cannot see that ensembles sit in different modes; their R-hat, each
+    ensemble being one chain, can.
     """
     if draws.independent:
         return {}
@@ -35,7 +36,8 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     found: dict[str, float] = {}
     if "autocorrelation_time" in data:
         slowest = float(np.max(data["autocorrelation_time"].values))
-        found["ess_bulk"] = n_chains * n_draws / slowest
+        if not np.isnan(slowest):
+            found["ess_bulk"] = n_chains * n_draws / slowest
     else:
         found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
@@ -66,10 +68,13 @@ def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: i
     """
     from arviz_stats.base import array_stats
 
-    runs, coordinates = 100, _FEW + 1
-    values = seeds.generator(seed, "rhat").standard_normal((chains, draws, runs * coordinates))
-    found = array_stats.rhat(values, chain_axis=0, draw_axis=1)
-    return float(np.quantile(found.reshape(runs, coordinates).max(axis=1), level))
+    greatest = []
+    for run in range(100):
+        # One at a time, each with its own stream: all at once would take gigabytes.
+        rng = seeds.generator(seed, "rhat", run)
+        values = rng.standard_normal((chains, draws, _FEW + 1))
+        greatest.append(array_stats.rhat(values, chain_axis=0, draw_axis=1).max())
+    return float(np.quantile(greatest, level))
 
 
 def watched_coordinates(draws: MotionDraws) -> np.ndarray:

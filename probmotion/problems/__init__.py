@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from probmotion.problems.clips import clips_problem
+from probmotion.problems.clips import CLIP_PROBLEMS, clips_problem
 from probmotion.problems.denoising import DENOISING_PROBLEMS
 from probmotion.problems.gait import GAIT_OUTLIER_PROBLEMS, GAIT_PROBLEMS
 from probmotion.problems.kept_references import KeptReference, find_reference
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
-_OTHERS = {**PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
+_OTHERS = {**CLIP_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
 _SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")
 
 

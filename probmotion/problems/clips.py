@@ -1,20 +1,25 @@
-"""A problem made from a user's own clips: one is held out, the prior is fitted to the others."""
+"""Problems made from clips, one's own or CMU's: one is held out, a prior fitted to the others."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 
 from probmotion.checks import check_count, check_positive
+from probmotion.data.cmu_clips import cmu_clip
 from probmotion.models import GaussianMixtureMotion
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
 from probmotion.problems.evidence import OBSERVATIONS, observe
-from probmotion.problems.problem import Problem
+from probmotion.problems.problem import Problem, simulated
 from probmotion.threads import one_thread
 
-__all__ = ["clips_problem"]
+__all__ = ["CLIP_PROBLEMS", "clips_problem"]
 
 _WINDOWS = 1000
+_TRIALS = 10
+_HELD_OUT = "cmu_02_02"
 
 
 def clips_problem(
@@ -102,12 +107,13 @@ def clips_problem(
         )
         truth = hidden.window((hidden.frames - frames) // 2, frames).centred()
         evidence = _observe(truth, observe, noise, seed)
-    return Problem(
+    problem = Problem(
         name,
         _description(long, len(clips) - len(long), hidden, frames, observe, noise),
         MotionPosterior(prior, evidence),
         None if evidence is None else truth.positions,
     )
+    return simulated(problem)
 
 
 _observe = observe  # the function, which the argument of the same name hides
@@ -169,3 +175,20 @@ def _description(
         f"{prior}; {how} keypoints (σ {100 * noise:g} cm) of {hidden.name or 'the one held out'}, "
         "which was held out"
     )
+
+
+def _of_cmu(name: str, description: str, observe: str) -> Problem:
+    """Return the problem on the clips of subject 02: walks, runs, jumps, blows and others."""
+    clips = [cmu_clip(f"cmu_02_{trial:02}") for trial in range(1, _TRIALS + 1)]
+    problem = clips_problem(clips, observe=observe, held_out=_HELD_OUT, name=name)
+    return replace(problem, description=description)
+
+
+CLIP_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
+    name: (description, partial(_of_cmu, name, description, observe))
+    for name, description, observe in (
+        ("cmu", f"a second of CMU's subject 02, {_HELD_OUT} held out: generation", "none"),
+        ("cmu-monocular", f"{_HELD_OUT}, 2D keypoints of one camera (σ 2 cm)", "monocular"),
+    )
+}
+"""What each problem is, and the function that makes it, by name."""

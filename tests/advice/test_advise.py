@@ -89,7 +89,10 @@ def test_what_tells_against_a_sampler_is_said_with_its_figure(metric, value, sai
 def test_what_something_tells_against_is_taken_only_if_there_is_nothing_else():
     doubtful = [("near", "rhat", 2.0)]
     found = advise("p", made(near=NEAR, alike=ALIKE, more=doubtful))
-    assert (found.take.sampler, found.alike[0].sampler) == ("alike", "near")
+    assert (found.take.sampler, found.alike, found.doubtful[0].sampler) == ("alike", (), "near")
+    assert "but: near 0.997 ± 0.025 in 6 s (chains do not agree: R-hat 2)" in " ".join(
+        str(found).split()
+    )
     alone = advise("p", made(near=NEAR, far=FAR, more=doubtful))
     assert alone.take.sampler == "near"
     assert "none is right at this cost; nearest: near 0.997" in str(alone)
@@ -99,7 +102,15 @@ def test_what_something_tells_against_is_taken_only_if_there_is_nothing_else():
 def test_with_one_sampler_there_is_no_more_to_say():
     found = advise("p", made("fid", only=NEAR))
     assert (found.take.sampler, found.alike, found.worse) == ("only", (), ())
-    assert "not to be told from the best: none" in str(found)
+    assert "as good, as far as can be told: none" in str(found)
+
+
+def test_seeds_without_draws_are_told_and_a_sampler_without_numbers_is_none():
+    nan = float("nan")
+    found = advise("p", made(near=NEAR, some=[1.0, nan, nan], none=[nan, nan, nan]))
+    assert found.take.sampler == "near"
+    assert [each.warnings for each in found.doubtful] == [("draws at 1 of 3 seeds",)]
+    assert "nan" not in str(found)
 
 
 def test_a_problem_that_was_not_measured_is_refused():
@@ -129,7 +140,7 @@ def test_what_ships_was_measured_of_every_sampler_on_every_problem():
     assert found.samplers == sampler_names()
     for problem in found.problems:
         advice = advise(problem)
-        named = [advice.take, *advice.alike, *advice.worse]
+        named = [advice.take, *advice.alike, *advice.doubtful, *advice.worse]
         told = {each.sampler for each in named} | set(advice.without)
         assert told == set(found.samplers)
         # Nothing is nearer to exact draws than they are, but by chance.

@@ -194,6 +194,8 @@ def test_chains_are_thinned_to_about_independent_draws():
     walkers = Run()
     walkers.dataset = {"autocorrelation_time": pd.Series([10.0, 20.0])}
     assert len(independent_draws(chains, walkers)) == 100
+    walkers.dataset = {"autocorrelation_time": pd.Series([10.0, np.nan])}
+    assert len(independent_draws(chains, walkers)) == 1
 
 
 def test_a_right_chain_passes_thinned_and_would_not_unthinned():

@@ -180,6 +180,33 @@ def test_seconds_are_measured_once_and_kept(tmp_path):
     assert "every sampler had 0.4 seconds per cell" in more.notes
 
 
+def test_what_is_compiled_at_the_first_run_is_no_cost_of_a_cell():
+    """Of 3 seconds, 10 of which the first run of all takes more."""
+    asked = []
+
+    def pilot(sampler):
+        asked.append(sampler.stride)
+        return 0.01 * sampler.stride + (10 if len(asked) == 1 else 0)
+
+    found = affordable(Budget(seconds=3.0), Walking(), pilot)
+    assert found["stride"] == 300
+    assert asked[0] == asked[1]
+
+
+def test_notes_say_what_was_used_and_not_what_the_budget_has_replaced():
+    samplers = {"walking": Walking(stride=7, start=3), "free": PriorDraws(2.0)}
+    found = compare(generation(), samplers, seeds=2, budget=Budget(evaluations=2000), **SMALL)
+    table = found.table()
+    used = table[table["metric"] == "budget_used"].groupby("sampler")["value"].mean()
+    words = f"walking {used['walking']:.3g} to {used['walking']:.3g}, free 100 to 100"
+    assert any(note.startswith("used per cell") and note.endswith(words) for note in found.notes)
+    assert not any(note.startswith("walking ran with") for note in found.notes)
+    assert "free ran with spread=2.0; its other settings are its defaults" in found.notes
+    for result in found.results:
+        if result.sampler == "walking":
+            assert result.metrics["set_stride"] == result.budget["settings"]["stride"] > 7
+
+
 def test_what_a_sampler_cannot_do_and_cannot_afford_are_rows(tmp_path):
     samplers = {"rich": Walking(start=10**6), "poor": Walking(), "prior": PriorDraws()}
     budget = Budget(evaluations=2000)

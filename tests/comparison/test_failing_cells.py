@@ -21,6 +21,7 @@ from toy_samplers import (
     PriorDraws,
     Quitting,
     Unchecked,
+    Unwritable,
     generation,
 )
 
@@ -150,6 +151,15 @@ def test_on_another_thread_a_limit_is_told_at_the_end():
     thread.start()
     thread.join()
     assert found == ["ended", "told"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_draws_that_no_file_can_hold_are_a_row(tmp_path, workers):
+    samplers = {"odd": Unwritable(), "right": PriorDraws()}
+    found = compare(generation(), samplers, out=tmp_path, workers=workers, **SMALL)
+    words = {result.sampler: result.failure and result.failure.word for result in found.results}
+    assert words == {"odd": "TypeError", "right": None}
+    assert not list(tmp_path.glob("cells/*/*/.unfinished*"))
 
 
 @pytest.mark.parametrize(("workers", "how"), [(1, ()), (2, ()), (2, ("slow",))])

@@ -6,18 +6,112 @@ import copy
 import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial, update_wrapper, wraps
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import expon, norm
 from threadpoolctl import threadpool_info, threadpool_limits
 from toy_samplers import Holder, Plain, PriorDraws, generation, monocular
 
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.threads import one_thread
+
+
+def scaled(noise):
+    """Return a function within a function, as many are written."""
+
+    def log_density(x, *, power=2):
+        return sum(-((each / noise) ** power) for each in x[..., 0])
+
+    return log_density
+
+
+def counting(n):
+    """Return a function that calls itself."""
+
+    def count(k):
+        return 0 if k == n else 1 + count(k + 1)
+
+    return count
+
+
+def unfinished():
+    """Return a function of what is not assigned yet."""
+
+    def read():
+        return later
+
+    if Slotted is None:
+        later = 1
+    return read
+
+
+def told(function, **attributes):
+    """Return the function with attributes."""
+    vars(function).update(attributes)
+    return function
+
+
+class Prior:
+    """An object that a method is bound to."""
+
+    def __init__(self, noise):
+        self.noise = noise
+
+    def log_density(self, x):
+        return -((x / self.noise) ** 2)
+
+    @lru_cache  # noqa: B019
+    def known(self):
+        return self.noise
+
+    @classmethod
+    def named(cls):
+        return cls.__name__
+
+
+class Wrapper:
+    """A decorator with a number of its own and its function's name."""
+
+    def __init__(self, function, noise):
+        update_wrapper(self, function)
+        self.noise = noise
+
+    def __call__(self, x):
+        return self.__wrapped__(x) / self.noise
+
+
+MARKER = object()
+
+
+def functions():
+    """Return functions that differ though most have the same names."""
+    return [
+        *(scaled(0.1), scaled(0.2), scaled(np.array(0.2)), counting(1), counting(2), unfinished()),
+        *(lambda x: x, lambda x: 2 * x, lambda x: 3 * x, lambda x: abs(x), lambda x: all(x)),
+        *(lambda *x: x, lambda x, y: x - y, lambda y, x: x - y, lambda x, y: y - x),
+        *(lambda x=1: x, lambda x=2: x, lambda *, x=1: x, lambda *, x=2: x, lambda *, y=2: y),
+        *(lambda x: x[..., :1], lambda x: x * 1j, lambda x: x in {"a", "b", "c", "d"}),
+        *((lambda: lambda: 1), (lambda: lambda: 2)),
+        *(Prior(1).log_density, Prior(2).log_density, Prior(1).known, Prior(2).known),
+        *(Prior.log_density, Prior.named, Prior, [].append, [1].append, "a".upper, str.upper),
+        *(partial(scaled(1), 1), partial(scaled(2), 1), partial(scaled(2), 2)),
+        *(lru_cache(scaled(1)), lru_cache(scaled(2)), wraps(scaled(1))(scaled(2))),
+        *(told(scaled(1), noise=1), told(scaled(1), noise=2)),
+        *(Wrapper(scaled(1), 1), Wrapper(scaled(1), 2), Wrapper(scaled(2), 2)),
+        *(np.sin, np.cos, np.mean, torch.sin, torch.cos, np.add.reduce, np.maximum.reduce),
+        *(norm.logpdf, norm.cdf, expon.logpdf, partial(norm.logpdf, scale=2), np.random.normal),
+        *(lambda x, y=MARKER: x if y else y, lambda x, *, y=MARKER: x if y else y),
+        *(np, torch, slice(1), slice(2), 1j, Network),
+    ]
+
+
+def functions_found():
+    return [fingerprint(function) for function in functions()]
 
 
 class Slotted:
@@ -80,6 +174,48 @@ def test_a_worker_finds_the_same_fingerprints():
     assert found == [fingerprint(value) for value in DIFFERENT]
 
 
+def test_functions_are_told_apart_by_what_they_do():
+    found = functions_found()
+    doubles = [k for k, each in enumerate(found) if each in found[:k]]
+    assert doubles == []
+    assert found == functions_found()
+
+
+def test_a_worker_finds_the_same_fingerprints_of_functions():
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert pool.submit(functions_found).result() == functions_found()
+
+
+def test_where_a_function_stands_and_how_often_it_ran_do_not_count():
+    source = "def f(x):\n    return [each + 0.5 for each in x]\n"
+    found = set()
+    for file, above in (("one", ""), ("another", "\n\n")):
+        space = {"__name__": "somewhere"}
+        exec(compile(above + source, file, "exec"), space)
+        found.add(fingerprint(space["f"]))
+        for _ in range(1000):  # until Python has made its code faster
+            space["f"]([1.0, 2.0])
+        found.add(fingerprint(space["f"]))
+    assert len(found) == 1
+
+
+def test_an_own_posterior_of_another_noise_is_another_question():
+    found = [
+        fingerprint([Plain(function)])
+        for noise in (0.1, 0.2)
+        for function in (scaled(noise), Prior(noise).log_density, partial(scaled(noise), 0))
+    ]
+    assert len(set(found)) == 6
+
+
+def test_an_object_that_holds_its_own_method_ends():
+    knots = [Prior(1), Prior(1), Prior(2)]
+    for knot in knots:
+        knot.step = knot.log_density
+    one, again, other = map(fingerprint, knots)
+    assert one == again != other
+
+
 def test_caches_and_order_do_not_count():
     holder = Holder(1)
     before = fingerprint(holder)
@@ -132,7 +268,12 @@ def test_an_object_that_holds_itself_ends():
 
 
 @pytest.mark.parametrize(
-    "value", [Slotted(), np.random.default_rng(0), object()], ids=["slots", "generator", "object"]
+    "value",
+    [
+        *(Slotted(), np.random.default_rng(0), object(), (x for x in "a")),
+        *(scaled(np.random.default_rng(0)), np.random.default_rng(0).normal),
+    ],
+    ids=["slots", "generator", "object", "iteration", "closed over", "bound"],
 )
 def test_what_cannot_be_told_apart_is_refused(value):
     with pytest.raises(ValueError, match="which cannot be told from another"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 import threading
 
@@ -26,6 +27,29 @@ def test_what_a_block_takes_is_known_though_it_gave_it_back():
     assert taken(200) == pytest.approx(200, abs=20)
     # A greater one before does not count.
     assert taken(50) == pytest.approx(50, abs=20)
+
+
+def small_blocks(mebibytes: int) -> list[bytearray]:
+    return [bytearray(2**16) for _ in range(mebibytes * 16)]
+
+
+@LINUX
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's heap is given back")
+def test_what_a_block_reuses_of_a_freed_heap_is_its_own():
+    blocks = small_blocks(200)
+    # A few that stay keep the C library from shrinking its heap by itself.
+    kept = blocks[::100]
+    del blocks
+    with watched_memory() as peak:
+        small_blocks(100)
+    assert kept
+    assert peak.mebibytes is not None
+    assert 80 <= peak.mebibytes <= 130
+
+
+def test_without_glibc_nothing_is_given_back_and_nothing_fails(monkeypatch):
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
+    memory._give_back()
 
 
 @LINUX

@@ -83,6 +83,45 @@ if __name__ == "__main__":
     }))
 """
 
+BROKEN = """
+import json
+import numpy as np
+import probmotion as pm
+from probmotion.comparison import compare
+from probmotion.models import GaussianMixtureMotion
+from probmotion.samplers import ExactSampler
+from probmotion.sampling import load_sampler, sampler_names, suited
+
+class Bare:
+    skeleton, frames, fps, dim = pm.Skeleton(["a"], [-1]), 1, 30.0, 3
+
+    def motion(self, theta):
+        return theta.reshape(*theta.shape[:-1], 1, 1, 3)
+
+rng = np.random.default_rng(0)
+prior = GaussianMixtureMotion(
+    skeleton=pm.Skeleton(["root", "a", "b"], [-1, 0, 1]), fps=30.0,
+    means=rng.normal(size=(1, 4, 3, 3)), factors=0.4 * rng.normal(size=(1, 2, 4, 3, 3)),
+    noise=0.1, weights=np.ones(1), azimuths=1,
+)
+
+def said(call):
+    try:
+        call()
+    except Exception as error:
+        return [type(error).__name__, str(error)]
+
+exact = ExactSampler()
+print(json.dumps({
+    "listed": sampler_names(),
+    "suited": suited(pm.MotionPosterior(prior)),
+    "unsupported": said(lambda: exact.sample(pm.MotionPosterior(Bare()), draws=1)),
+    "loaded": {name: said(lambda: load_sampler(name)) for name in ("gone", "bare", "wild")},
+    "all": said(lambda: compare("gait", draws=10, chains=1, progress=False)),
+    "other": said(lambda: compare("gait", "exact", draws=10, chains=1, progress=False)),
+}))
+"""
+
 
 @pytest.fixture
 def package(tmp_path):
@@ -121,3 +160,44 @@ def test_its_sampler_runs_beside_ours_on_a_posterior_of_one_s_own(package, tmp_p
     # Its effort is spent like that of our own samplers.
     assert found["settings"] == {"importance": {"candidates": 1500}, "exact": {}}
     assert "importance" in found["suited"]
+
+
+def test_those_that_cannot_be_imported_are_named_and_stop_no_others(package, tmp_path):
+    (package / "wild.py").write_text("raise RuntimeError('two\\nlines')")
+    (package / "walkers_of_ours-0.3.dist-info" / "entry_points.txt").write_text(
+        "[probmotion.samplers]\n"
+        "gone = gone_for_good:Sampler\nbare = walkers_of_ours:Nobody\nwild = wild:Sampler\n"
+    )
+    (tmp_path / "run.py").write_text(BROKEN)
+    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.run(
+        [sys.executable, "-W", "error", str(tmp_path / "run.py")],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert run.returncode == 0, run.stderr
+    found = json.loads(run.stdout)
+    assert {"gone", "bare", "wild", "exact"} <= set(found["listed"])
+    assert "exact" in found["suited"]
+    assert not {"gone", "bare", "wild"} & set(found["suited"])
+    kind, sentence = found["unsupported"]
+    assert kind == "UnsupportedPosterior"
+    assert sentence.startswith("exact needs a prior with ")
+    for name, value, reason in [
+        ("gone", "gone_for_good:Sampler", "ModuleNotFoundError: No module named 'gone_for_good'"),
+        (
+            "bare",
+            "walkers_of_ours:Nobody",
+            "AttributeError: module 'walkers_of_ours' has no attribute 'Nobody'",
+        ),
+        ("wild", "wild:Sampler", "RuntimeError: two lines"),
+    ]:
+        assert found["loaded"][name] == [
+            "ValueError",
+            f"sampler is {name!r}, which the package walkers-of-ours registers as {value!r}, "
+            f"expected one that can be imported ({reason})",
+        ]
+    assert found["all"] in found["loaded"].values()
+    assert found["other"] is None

@@ -93,6 +93,18 @@ class PriorDraws:
 
 
 @dataclass(frozen=True)
+class Unwritable(PriorDraws):
+    """Its draws hold what no file can."""
+
+    name: ClassVar[str] = "unwritable"
+
+    def sample(self, posterior, **settings):
+        found = super().sample(posterior, **settings)
+        found.dataset.attrs["odd"] = {"a": 1}
+        return found
+
+
+@dataclass(frozen=True)
 class Crashing(PriorDraws):
     name: ClassVar[str] = "crashing"
 

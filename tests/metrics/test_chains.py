@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from probmotion import MotionDraws, Skeleton
+from probmotion import MotionDraws, Skeleton, seeds
 from probmotion.metrics.chains import (
     chain_diagnostics,
     rhat_of_independent,
@@ -110,6 +111,16 @@ def test_ensembles_in_different_modes_are_seen(rng):
     assert found["rhat"] > 1.5
 
 
+def test_an_ensemble_of_unknown_autocorrelation_time_has_no_ess(rng):
+    """Never a chain's, and none though it is known of the other ensembles."""
+    theta = rng.normal(size=(CHAINS, 10, 2))
+    for known in (0, CHAINS - 1):
+        times = np.r_[np.ones(known), np.full(CHAINS - known, np.nan)]
+        assert set(chain_diagnostics(run(theta, {"autocorrelation_time": times}))) == {"rhat"}
+        alone = chain_diagnostics(run(theta[-1:], {"autocorrelation_time": times[-1:]}))
+        assert alone == {}
+
+
 def test_acceptance_is_averaged_and_divergences_are_counted(rng):
     theta = rng.normal(size=(CHAINS, DRAWS, 1))
     divergent = np.zeros((CHAINS, DRAWS), dtype=bool)
@@ -123,6 +134,30 @@ def test_acceptance_is_averaged_and_divergences_are_counted(rng):
 def test_costs_are_the_runs(rng):
     found = costs(run(rng.normal(size=(1, 10, 1))))
     assert found == {"seconds": 2.5, "density_evaluations": 7}
+
+
+def test_the_limit_of_r_hat_holds_one_run_at_a_time(monkeypatch):
+    from arviz_stats.base import array_stats
+
+    monkeypatch.setattr(array_stats, "rhat", lambda values, **axes: np.ones(values.shape[2]))
+    tracemalloc.start()
+    try:
+        assert rhat_of_independent(4, 500) == 1
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 3 * 4 * 500 * 33 * 8
+
+
+def test_the_limit_of_r_hat_is_of_the_runs_and_the_level():
+    """The same from all runs at once; and half of all runs exceed the median."""
+    from arviz_stats.base import array_stats
+
+    runs = [seeds.generator(7, "rhat", k).standard_normal((2, 12, 33)) for k in range(100)]
+    together = array_stats.rhat(np.concatenate(runs, axis=2), chain_axis=0, draw_axis=1)
+    greatest = np.sort(together.reshape(100, 33).max(axis=1))
+    found = rhat_of_independent(2, 12, level=0.5, seed=7)
+    assert found == pytest.approx((greatest[49] + greatest[50]) / 2, rel=1e-12)
 
 
 def test_of_short_chains_even_independent_draws_have_an_r_hat_far_from_1(rng):

@@ -128,6 +128,11 @@ def test_draws_are_judged_by_the_density_where_they_keep_theta(occluded, prior):
     score = score_of(occluded.posterior, theta[0])
     assert found == pytest.approx(kernel_stein_discrepancy(theta[0], score))
     assert math.isnan(measure(occluded, run(occluded, exact, theta=0 * theta), 0)["ksd"])
+    # A chain that moved once in a while is judged by all else.
+    theta[0, : 9 * N // 10] = 0
+    found = measure(occluded, run(occluded, exact, theta=theta), 0)
+    assert math.isnan(found["ksd"])
+    assert math.isfinite(found["swd"])
     assert "ksd" not in measure(occluded, run(occluded, exact), 0)
 
 

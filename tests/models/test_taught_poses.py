@@ -16,13 +16,13 @@ from probmotion.models.motion_vae_losses import pictured
 from probmotion.models.motion_vae_settings import MotionVAESettings
 from probmotion.models.motion_vae_training import MotionVAETrainee
 from probmotion.models.pose_network import PoseNetwork
-from probmotion.models.taught_poses import TaughtPoses
+from probmotion.models.taught_poses import TaughtPoses, scaled
 from probmotion.models.track_batches import Augmentation, TrackBatches
 from probmotion.rest_poses import estimate_rest_pose
 from probmotion.skeleton import Skeleton
 
 PERSON = Skeleton.preset("person14")
-SIZE = replace(MotionVAESettings.tiny(), frames=8)
+SIZE = replace(MotionVAESettings.tiny(), frames=8, mixed_precision=True)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,8 @@ def batches_of(tracks, **augmentation) -> TrackBatches:
 def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest, mirror):
     batches = batches_of(tracks, mirror=mirror)
     drawn = batches.draw(np.random.default_rng(0), 12)
-    found = TaughtPoses(network, batches, rest).of(drawn)
+    # A trainer has set it to train; what it says is not of the half precision it would train in.
+    found = TaughtPoses(network.train(), batches, rest).of(drawn)
     seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
     with torch.no_grad():
         asked = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
@@ -72,19 +73,51 @@ def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest,
     assert asked.log_lengths.std() > 0.01
 
 
-def test_of_a_scaled_window_the_picture_is_scaled(tracks, network, rest, body):
+@pytest.mark.parametrize(("distance", "off"), [(None, 1e-6), (7.0, 0.02)])
+def test_of_a_scaled_window_the_picture_is_scaled(tracks, network, rest, body, distance, off):
     batches = batches_of(tracks, scale=0.4)
-    taught = TaughtPoses(network, batches, rest)
     drawn = batches.draw(np.random.default_rng(0), 12)
-    pictures = []
-    for given in (drawn, drawn._replace(scale=np.ones_like(drawn.scale))):
-        said = taught.of(given)
-        moved = torch.nn.functional.pad(said.translation, (0, 1))
-        positions = body.positions(said.turns, said.rotation, moved, said.log_lengths)
-        pictures.append(pictured(positions, None))
+    every = TaughtPoses(network, batches, rest).of(drawn)
     scale = torch.as_tensor(drawn.scale)
     assert scale.std() > 0.1
-    torch.testing.assert_close(pictures[0], scale[:, None, None, None, None] * pictures[1])
+    pictures = []
+    for said in (scaled(every, scale), every):
+        moved = torch.nn.functional.pad(said.translation, (0, 1))
+        positions = body.positions(said.turns, said.rotation, moved, said.log_lengths)
+        pictures.append(pictured(positions, distance))
+    wanted = scale[:, None, None, None, None] * pictures[1]
+    size = wanted.abs().mean()
+    assert (pictures[0] - wanted).abs().mean() < off * size
+
+
+@pytest.mark.parametrize("lengths", [0.0, 100.0])
+def test_the_view_that_teaches_does_not_depend_on_how_a_window_is_scaled(
+    tracks, network, body, lengths
+):
+    size = replace(SIZE, lengths=lengths, smoothness=0.0, ranges=0.0)
+    trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
+    batches = batches_of(tracks)
+    drawn = batches.draw(np.random.default_rng(0), 40)
+    keypoints, seen, rest = trainee._shown(drawn, torch.device("cpu"))
+    plain = trainee._taught(batches, drawn, keypoints, seen, rest)
+    larger = np.geomspace(0.05, 20, 40, dtype=np.float32)
+    shown = keypoints * torch.as_tensor(larger)[:, None, None, None]
+    found = trainee._taught(batches, drawn._replace(scale=larger), shown, seen, rest)
+    torch.testing.assert_close(found.turns, plain.turns)
+    torch.testing.assert_close(found.rotation, plain.rotation)
+    torch.testing.assert_close(
+        found.log_lengths, plain.log_lengths + torch.as_tensor(larger).log()[:, None]
+    )
+
+
+def test_what_is_lost_is_in_single_precision_whatever_the_trainer_asks_for(tracks, network, body):
+    size = replace(SIZE, mixed_precision=False)
+    trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
+    learner, n, device = trainee.network, 8, torch.device("cpu")
+    plain = trainee._loss(learner, trainee.batches, np.random.default_rng(0), n, device)
+    with torch.autocast("cpu", torch.bfloat16):
+        asked = trainee.training_loss(learner, np.random.default_rng(0), n, device)
+    torch.testing.assert_close(asked, plain, rtol=0, atol=0)
 
 
 def test_a_teacher_is_asked_once_of_what_is_learnt_and_of_what_is_watched(tracks, network, body):
@@ -99,6 +132,15 @@ def test_a_teacher_is_asked_once_of_what_is_learnt_and_of_what_is_watched(tracks
     assert len(asked) == 2
 
 
-def test_windows_that_are_moved_are_refused(tracks, network, rest):
+def test_frames_are_mirrored_only_where_windows_are(tracks):
+    plain, _ = batches_of(tracks).all_frames()
+    both, _ = batches_of(tracks, mirror=True).all_frames()
+    assert len(both) == 2 * len(plain)
+
+
+def test_windows_that_are_moved_or_padded_are_refused(tracks, network, rest):
+    long = TrackBatches(tracks, 99, 0.3, Augmentation.none())
+    with pytest.raises(ValueError, match="drawn has windows that are padded"):
+        TaughtPoses(network, long, rest).of(long.draw(np.random.default_rng(0), 2))
     with pytest.raises(ValueError, match=r"batches has shift=0\.1, expected 0"):
         TaughtPoses(network, batches_of(tracks, shift=0.1), rest)

@@ -10,7 +10,8 @@ import pytest
 
 from probmotion import Motion, load_motions
 from probmotion.data.gaits import make_gait
-from probmotion.problems import clips_problem
+from probmotion.problems import clips_problem, load_problem
+from probmotion.problems.clips import CLIP_PROBLEMS
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 SMALL = {"frames": 10, "rank": 3, "styles": 2}
@@ -128,3 +129,42 @@ def test_clips_that_do_not_move_are_refused_in_one_sentence():
     still = replace(clip, positions=np.repeat(clip.positions[:1], 200, axis=0))
     with pytest.raises(ValueError, match="windows that are all alike, expected clips that differ"):
         clips_problem([still, clip])
+
+
+def test_it_can_be_simulated_and_so_calibrated():
+    problem = clips_problem(gaits(), **SMALL)
+    again = problem.simulate(3)
+    assert again.truth.shape == problem.truth.shape
+    assert not np.allclose(again.truth, problem.truth)
+    np.testing.assert_array_equal(again.truth, problem.simulate(3).truth)
+    # Its evidence is of its own truth, through the same camera.
+    off = again.posterior.likelihood.keypoints - again.posterior.likelihood.cameras.project(
+        again.truth
+    )
+    assert np.sqrt((off**2).mean()) == pytest.approx(0.02, rel=0.2)
+
+
+@pytest.mark.parametrize(("name", "sees"), [("cmu", False), ("cmu-monocular", True)])
+def test_cmu_s_clips_make_an_exact_problem(real_data, name, sees):
+    problem = load_problem(name)
+    assert problem.exact is not None
+    assert (problem.truth is not None) == sees
+    assert problem.simulate is not None
+    walks = problem.posterior.prior
+    assert walks.frames == 30
+    if sees:
+        # What one camera saw says a good part, of a walk that nothing was learnt from.
+        known = problem.reference(0, 50)
+        believed = problem.posterior.prior.sample(np.random.default_rng(0), 50)
+        far, near = (
+            np.linalg.norm(drawn - drawn[:, :, :1] - problem.truth + problem.truth[:, :1], axis=-1)
+            for drawn in (believed, known)
+        )
+        assert near.mean() < 0.6 * far.mean()
+
+
+def test_without_cmu_s_clips_the_way_to_get_them_is_said(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="the clip cmu_02_01 is not in"):
+        CLIP_PROBLEMS["cmu"][1]()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion import MotionDraws, MotionPosterior, seeds
+from probmotion.metrics.chains import chain_diagnostics
 from probmotion.samplers import Ensemble
 from probmotion.samplers.autocorrelation import autocorrelation_time
 from probmotion.sampling import Interrupted, UnsupportedPosterior
@@ -157,6 +158,21 @@ def test_a_walker_that_never_moves_has_no_autocorrelation_time():
     still, moving = autocorrelation_time(trace)
     assert np.isnan(still)
     assert np.isfinite(moving)
+
+
+@pytest.mark.parametrize("thin", [1, 3])
+def test_a_short_run_gets_no_ess_of_a_chain(posterior, tmp_path, thin):
+    """Of 10 draws of 8 walkers: two kept iterations, too few for an autocorrelation time."""
+    sampler = Ensemble(walkers=8, warmup=0, thin=thin, candidates=1)
+    for draws in (10, 4):
+        run(posterior, draws, chains=4, sampler=sampler).save(tmp_path / "short.nc")
+        found = MotionDraws.load(tmp_path / "short.nc")
+        told = chain_diagnostics(found)
+        known = np.isfinite(found.dataset["autocorrelation_time"].values)
+        assert known.shape == (4,)
+        assert known.any() == ("acceptance" in told) == (thin == 3 and draws == 10)
+        assert "ess_tail" not in told
+        assert ("ess_bulk" in told) == known.all()
 
 
 @pytest.mark.parametrize("name", ["walkers", "warmup", "thin", "largest_dim"])
