@@ -149,19 +149,24 @@ class ComparisonTable(pd.DataFrame):
         parts = [self._problem(problem) for problem in problems]
         if self.groupby("problem")["seed"].nunique().gt(1).any():
             parts.append(_SEEDS_LEGEND)
-        if any(self["metric"] == "swd"):
-            parts.append(_LEGEND)
-        if self["metric"].isin(["c2st", "ksd"]).any():
-            parts.append(_TESTS_LEGEND)
-        if any(self["metric"] == "g_mpjpe_mean_mm"):
-            parts.append(_WORLD_LEGEND)
-        if any(self["metric"] == "coverage_cartesian"):
-            parts.append(_COVERAGE_LEGEND)
-        if any(self["metric"] == "fid"):
-            parts.append(_GENERATION_LEGEND)
+        parts += self.legends()
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
         return "\n\n".join(parts) if parts else "no cell is finished"
+
+    def legends(self) -> list[str]:
+        """Return how to read the measures that it has, a paragraph per kind."""
+        return [
+            legend
+            for metric, legend in (
+                ("swd", _LEGEND),
+                ("c2st|ksd", _TESTS_LEGEND),
+                ("g_mpjpe_mean_mm", _WORLD_LEGEND),
+                ("coverage_cartesian", _COVERAGE_LEGEND),
+                ("fid", _GENERATION_LEGEND),
+            )
+            if self["metric"].isin(metric.split("|")).any()
+        ]
 
     def _problem(self, problem: str) -> str:
         """The blocks of one problem, each a measure per column and a sampler per row."""

@@ -57,7 +57,7 @@ def contents(comparison: Comparison, with_calibration: bool) -> str:
 
 def reading(comparison: Comparison, table: ComparisonTable) -> str:
     """Return how the measures and the skeletons are to be read, as HTML."""
-    legends = "".join(f"<p>{escape(legend)}</p>" for legend in _legends(comparison, table))
+    legends = "".join(f"<p>{escape(legend)}</p>" for legend in table.legends())
     alone = " With one seed nothing can be told." if comparison.plan.seeds == 1 else ""
     return f"""\
 <details open><summary>How to read this page</summary>
@@ -71,14 +71,6 @@ the keys: <kbd>space</kbd> plays and stops, the arrow keys turn, <kbd>,</kbd> an
 one frame back and forth, <kbd>Home</kbd> and <kbd>End</kbd> to the first and the last,
 <kbd>c</kbd> to the camera's view and back.</p>
 </details>"""
-
-
-def _legends(comparison: Comparison, table: ComparisonTable) -> list[str]:
-    """The legends that the table prints: what stands between its problems and its notes."""
-    if table.empty:
-        return []
-    parts = table.summary().split("\n\n")[table["problem"].nunique() :]
-    return parts[:-1] if comparison.notes else parts
 
 
 def note_ids(comparison: Comparison) -> dict[tuple[str, str], str]:
