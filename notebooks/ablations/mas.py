@@ -3,7 +3,7 @@
     python notebooks/ablations/mas.py --out mas
     python notebooks/ablations/mas.py --quick --out quick     (made walks, tiny networks, a minute)
 
-Parts: table, exact; ``--parts`` chooses. The networks of walk2d come with the package; the
+Parts: table, strided, exact; ``--parts`` chooses. The networks of walk2d come with the package; the
 lifter is trained here, on the same tracks. Motions that are left in ``--out/motions`` are not made
 again, so that what is interrupted goes on. Clips are looked for in ``--data``, by default
 ../shared/data beside the repository.
@@ -357,6 +357,23 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
     return found
 
 
+def strided(study: Study) -> pd.DataFrame:
+    """MAS and mvpc with fewer levels than the network has learnt."""
+    posterior = MotionPosterior(study.prior)
+    real = study.motions("test")
+    rows = []
+    for steps in (10, 20, 50, 100):
+        for name, sampler in (
+            ("MAS", MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)),
+            ("mvpc", MultiViewPredictorCorrector(steps=steps, trained_steps=100)),
+        ):
+            motions, seconds = study.draw(f"{name}, {steps} steps", sampler, posterior)
+            row = score(study, name, motions, None, real, seconds / study.draws)
+            rows.append({"steps": steps, **row})
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
 def exact(study: Study) -> pd.DataFrame:
     """How wrong the network makes a sampler: it learns from pictures of the prior of ``gait``.
 
@@ -399,7 +416,7 @@ def exact(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-PARTS = {"table": table, "exact": exact}
+PARTS = {"table": table, "strided": strided, "exact": exact}
 
 
 def main() -> None:

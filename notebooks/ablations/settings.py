@@ -35,18 +35,6 @@ class Study:
 
 
 STUDIES = {
-    "strides": Study(
-        "fewer levels than a network has learnt (100)",
-        ("walk2d",),
-        {
-            f"{name}, {steps} levels": kind
-            for steps in (10, 20, 50, 100)
-            for name, kind in (
-                ("mas", MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)),
-                ("mvpc", MultiViewPredictorCorrector(steps=steps, trained_steps=100)),
-            )
-        },
-    ),
     "views": Study(
         "how many views, and whether they share their noise",
         ("gait", "gait-monocular"),
