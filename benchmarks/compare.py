@@ -3,8 +3,8 @@
 ``efficiency_two_workers``: seconds with one worker over twice those with two, both from the call of
 ``compare`` to its table, so that the start of processes and what they import is in it.
 ``worker_import_seconds``, ``worker_problem_seconds``: what a worker does first;
-``worker_start_seconds``: what two workers take longer than half of one's time, all in all. Run it on
-a machine with two idle cores.
+``worker_start_seconds``: what two workers take longer than half of one's time, all in all. Run it
+on a machine with two idle cores.
 """
 
 from __future__ import annotations
