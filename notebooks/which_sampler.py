@@ -1,6 +1,6 @@
 """Every sampler on every problem: the table that ``probmotion which`` and the README advise from.
 
-    python notebooks/which_sampler.py --out grid    # resumes; two cores: 6 minutes and 4 a seed
+    python notebooks/which_sampler.py --out grid    # resumes; two cores: 8 minutes and 4 a seed
 
 Every sampler may spend as many seconds on a cell, by :data:`~probmotion.comparison.QUICK_BUDGET`;
 one that cannot is a row that says so. Problems whose data is not at hand are left out, and said.
