@@ -63,8 +63,9 @@ def test_what_is_as_good_in_less_than_half_the_time_is_taken():
 
 
 def test_a_ratio_of_half_is_as_wrong_as_of_double():
-    found = advise("p", made(near=NEAR, half=[0.5, 0.51, 0.49], thrice=[3.0, 3.1, 2.9]))
-    assert [each.sampler for each in found.worse] == ["half", "thrice"]
+    far = {"quarter": [0.25, 0.26, 0.24], "half": [0.5, 0.51, 0.49], "thrice": [3.0, 3.1, 2.9]}
+    found = advise("p", made(near=NEAR, **far))
+    assert [each.sampler for each in found.worse] == ["half", "thrice", "quarter"]
 
 
 @pytest.mark.parametrize(
