@@ -46,8 +46,8 @@ def main() -> None:
 
 
 def made_body() -> ArticulatedBody:
-    """Return a body of 20 bones that turn, one after the other."""
-    n_joints = BONES + 2
+    """Return a body of 20 bones, one after the other: the first is the rigid pose's, 19 turn."""
+    n_joints = BONES + 1
     names = ["root", *(f"joint {number}" for number in range(1, n_joints))]
     rest = np.tile([0.0, 0.1, 0.0], (n_joints, 1))
     return ArticulatedBody(Skeleton(names, range(-1, n_joints - 1)), rest)
@@ -78,7 +78,7 @@ def training(
         KeypointTrack(rng.normal(size=(*shape, 2)), np.ones(shape), skeleton, 10.0, f"made-{n}")
         for n in range(8)
     ]
-    teacher = PoseNetwork(settings, skeleton.n_joints, BONES, body.n_groups)
+    teacher = PoseNetwork(settings, skeleton.n_joints, len(body.bones), body.n_groups)
     with warnings.catch_warnings():
         # The bones of a chain have no mirror images.
         warnings.simplefilter("ignore")
