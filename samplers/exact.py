@@ -1,4 +1,4 @@
-"""`ExactSampler`: independent draws from a posterior in closed form."""
+"""`ExactSampler`: independent draws from a posterior that is known exactly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from probmotion import seeds
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
-from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate
+from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate, Samplable
 from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
 
 __all__ = ["ExactSampler"]
@@ -21,6 +21,8 @@ __all__ = ["ExactSampler"]
 @dataclass(frozen=True)
 class ExactSampler:
     """Independent draws from the posterior that the prior knows in closed form.
+
+    Without evidence the posterior is the prior, and any that can be drawn from will do.
 
     Draw i of chain k comes from its own random numbers, so that it is the same however many draws
     and chains there are.
@@ -44,11 +46,11 @@ class ExactSampler:
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no closed form.
+            If the posterior has no closed form, and is not the prior.
         Interrupted
             On Ctrl-C; it carries the draws that were finished.
         """
-        exact = self._closed_form(posterior)
+        exact = self._source(posterior)
         check_count("draws", draws)
         check_count("chains", chains)
         if initial is not None:
@@ -80,11 +82,15 @@ class ExactSampler:
             raise Interrupted(result()) from stop
         return result()
 
-    def _closed_form(self, posterior: MotionPosterior) -> ExactPosterior:
-        require(self, posterior)
-        assert isinstance(posterior.prior, HasExactPosterior)
+    def _source(self, posterior: MotionPosterior) -> ExactPosterior | Samplable:
+        prior = posterior.prior
+        if not isinstance(prior, HasExactPosterior):
+            if posterior.likelihood is None and isinstance(prior, Samplable):
+                return prior
+            require(self, posterior)
+        assert isinstance(prior, HasExactPosterior)
         try:
-            return posterior.prior.exact_posterior(posterior.likelihood)
+            return prior.exact_posterior(posterior.likelihood)
         except NotConjugate as error:
             raise UnsupportedPosterior(
                 self.name,

@@ -52,7 +52,7 @@ def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys,
     [
         (["gate"], "problem is 'gate', expected one of"),
         ([SMALL, "--draws", "81"], "draws is 81, expected a multiple of 8"),
-        (["walk2d"], "has no density of positions"),
+        (["walk2d"], "MotionDiffusion has no density, expected one of positions"),
     ],
 )
 def test_wrong_words_get_one_sentence(words, sentence, tmp_path, capsys):

@@ -49,7 +49,7 @@ _RIGHT: Mapping[str, Mapping[str, Any]] = {
     "view_recall_learnt": _MORE,
 }
 _LESS_BEGIN = ("coverage_", "fid")
-_LESS_END = ("_mm",)
+_LESS_END = ("_mm", "_cm2")
 
 
 def first_quality(table: pd.DataFrame) -> str | None:

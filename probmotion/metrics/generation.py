@@ -16,6 +16,7 @@ from probmotion import seeds
 from probmotion.checks import check_count, check_finite, check_shape
 from probmotion.metrics.distribution import precision_recall
 from probmotion.metrics.filming import Angles, film_motions
+from probmotion.metrics.motion_chamfer import MotionChamfer, motion_chamfer_distance
 from probmotion.skeleton import Skeleton
 
 __all__ = [
@@ -31,6 +32,8 @@ __all__ = [
 
 COLLAPSED_BELOW = 0.1
 """Recall below which a generator has collapsed (MAS, table 2)."""
+
+_CHAMFER_FRAMES = 10  # as published
 
 Scores = dict[str, tuple[float, float]]
 """Mean and standard deviation over repeats, by the names of :class:`GenerationScores`."""
@@ -218,11 +221,14 @@ class GenerationReference:
         Of the cameras that film generated 3D motions, radians.
     distance : float
         From them to the root, metres.
+    held_out_views : ndarray, (M', L', J, 2), optional
+        Some of the held-out motions themselves, metres, centred on the root: their distance from
+        generated ones needs no features.
 
     Raises
     ------
     ValueError
-        If the features are not (M, D) or not finite.
+        If the features are not (M, D), the views not (M', L', J, 2), or one is not finite.
     """
 
     evaluator: EncodesViews
@@ -230,8 +236,13 @@ class GenerationReference:
     learnt_features: np.ndarray | None = None
     elevation: float = math.pi / 16
     distance: float = 7.0
+    held_out_views: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        if self.held_out_views is not None:
+            joints = self.evaluator.skeleton.n_joints
+            check_shape("held_out_views", self.held_out_views, ("M", "L", joints, 2))
+            check_finite("held_out_views", self.held_out_views)
         check_shape("held_out_features", self.held_out_features, ("M", "D"))
         check_finite("held_out_features", self.held_out_features)
         if self.learnt_features is not None:
@@ -270,19 +281,40 @@ class GenerationReference:
         no side of the body's own: motions lifted from views at random azimuths, or that face any
         way. Motions that all face +Z have another distribution there, however real they are.
         """
-        root = self.evaluator.skeleton.roots[0]
 
         def film(rng: np.random.Generator, n: int) -> np.ndarray:
-            return film_motions(
-                positions[_subset(rng, len(positions), n)],
-                rng,
-                elevation=self.elevation,
-                distance=self.distance,
-                angles=angles,
-                root=root,
-            )
+            return self._film(positions[_subset(rng, len(positions), n)], rng, angles)
 
         return self._score(film, seed, samples, repeats)
+
+    def chamfer(self, positions: np.ndarray, *, seed: int) -> MotionChamfer:
+        """Return the Motion Chamfer Distance of 3D motions, (N, L, J, 3) metres, each seen once.
+
+        Whole windows of 10 frames are compared, or of as many as there are if there are fewer.
+
+        Raises
+        ------
+        ValueError
+            If no motions were held out, but features alone.
+        """
+        if self.held_out_views is None:
+            raise ValueError("held_out_views is missing, expected 2D motions to compare with")
+        views = self._film(positions, seeds.generator(seed, "chamfer"), "all")
+        frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
+        shown, real = (
+            some[:, : some.shape[1] // frames * frames] for some in (views, self.held_out_views)
+        )
+        return motion_chamfer_distance(shown, real, frames=frames)
+
+    def _film(self, positions: np.ndarray, rng: np.random.Generator, angles: Angles) -> np.ndarray:
+        return film_motions(
+            positions,
+            rng,
+            elevation=self.elevation,
+            distance=self.distance,
+            angles=angles,
+            root=self.evaluator.skeleton.roots[0],
+        )
 
     def score_views(
         self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10

@@ -30,6 +30,7 @@ _DIRECTIONS = 256
 # Exact draws to compare with: sets as large as the run's, as many as make about 4000.
 _ENOUGH, _MOST_SETS = 4000, 8
 _MILLIMETRES = 1000.0
+_SQUARE_CENTIMETRES = 1e4
 _LOOKED_AT = 100
 _OF_DENSITY = 500
 _REAL_PAIRS = 5000
@@ -57,6 +58,8 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     ``diversity_ratio`` (over the real motion's), ``view_precision``, ``view_recall``, and from the
     side ``fid_side`` and ``view_recall_side``; ``fid_learnt`` and ``view_recall_learnt`` are
     against the clips that were learnt from: few clips are far from few others, even real ones.
+    ``mcd_cm2``: Motion Chamfer Distance, square centimetres, where real 2D motion itself is at hand
+    and not its features alone.
 
     Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
     ``coverage_shape-context``, the mean distance of each to its nearest draw; see
@@ -197,6 +200,8 @@ def _against_real_views(
         again = reference.of_learnt().score_motions(positions, seed=seed, samples=samples)
         found["fid_learnt"] = again["fid"][0]
         found["view_recall_learnt"] = again["recall"][0]
+    if reference.held_out_views is not None:
+        found["mcd_cm2"] = _SQUARE_CENTIMETRES * reference.chamfer(positions, seed=seed).mean
     return found
 
 

@@ -2,7 +2,8 @@
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
 ``certificate.json``. It is known to be of a posterior by that posterior's density at some of the
-draws, which is the same on every machine to many digits, as the bits of a fitted prior are not.
+draws, which is the same on every machine to many digits, as the bits of a fitted prior are not; or,
+where only θ has a density, by that of points to start from, and where their motions are.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from probmotion import seeds
 from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_finite, check_shape
 from probmotion.posterior import MotionPosterior
+from probmotion.priors import HasLogDensity
 
 __all__ = [
     "HasPositionDensity",
@@ -182,16 +185,26 @@ def find_reference(name: str) -> KeptReference | None:
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:
-    """Return the posterior's log density at the first draws, what a reference is known by.
+    """Return the numbers that a reference is known by.
+
+    The posterior's log density at the first draws; where positions have none, that of four θ to
+    start from, and the mean distance of their joints from the origin, metres.
 
     Raises
     ------
     ValueError
-        As in :func:`log_density_at`.
+        If the prior has a density neither of positions nor of θ.
     """
-    # Whoever wrote them and whoever reads them must ask at the same points: as they are kept.
-    some = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
-    return [round(float(value), 6) for value in log_density_at(posterior, some)]
+    prior = posterior.prior
+    if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):
+        # Whoever wrote them and whoever reads them must ask at the same points: as they are kept.
+        some = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
+        known = [log_density_at(posterior, some)]
+    else:
+        theta = prior.initial(seeds.generator(0, "fingerprint"), _PROBES)
+        distances = np.linalg.norm(to_numpy(prior.motion(theta)), axis=-1)
+        known = [to_numpy(posterior.log_density(theta)), distances.mean(axis=(1, 2))]
+    return [round(float(value), 6) for value in np.concatenate(known)]
 
 
 def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndarray:
@@ -205,8 +218,8 @@ def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndar
     prior, likelihood = posterior.prior, posterior.likelihood
     if not isinstance(prior, HasPositionDensity):
         raise ValueError(
-            f"prior {type(prior).__name__} has no density of positions, expected one with "
-            "log_prior(positions)"
+            f"prior {type(prior).__name__} has no density, expected one of positions, "
+            "log_prior(positions), or of θ, log_density(theta)"
         )
     value = to_numpy(prior.log_prior(positions))
     if likelihood is not None:

@@ -86,20 +86,28 @@ class Problem:
             return None
 
     @property
+    def known(self) -> ExactPosterior | Samplable | None:
+        """What independent draws come from: the closed form; without evidence, the prior."""
+        prior = self.posterior.prior
+        if self.exact is None and self.posterior.likelihood is None:
+            return prior if isinstance(prior, Samplable) else None
+        return self.exact
+
+    @property
     def has_reference(self) -> bool:
         """Whether reference draws can be had, exact or kept."""
-        return self.kept is not None or self.exact is not None
+        return self.kept is not None or self.known is not None
 
     @property
     def most_reference(self) -> int | None:
         """The most reference draws there are; None where any number can be had."""
-        return None if self.kept is None or self.exact is not None else self.kept.n
+        return None if self.kept is None or self.known is not None else self.kept.n
 
     def reference(self, seed: int, n: int) -> np.ndarray:
         """Return n independent reference draws, (n, L, J, 3), metres.
 
-        Exact ones where the posterior has a closed form; else kept ones, chosen without
-        replacement.
+        Exact ones where the posterior has a closed form or is a prior that can be drawn from; else
+        kept ones, chosen without replacement.
 
         Raises
         ------
@@ -107,9 +115,9 @@ class Problem:
             If there are none, or fewer than n are kept.
         """
         check_count("n", n)
-        exact = self.exact
-        if exact is not None:
-            return exact.sample(seeds.generator(seed, "reference"), n)
+        known = self.known
+        if known is not None:
+            return known.sample(seeds.generator(seed, "reference"), n)
         if self.kept is not None:
             return self.kept.choose(seeds.generator(seed, "reference"), n)
         raise ValueError(

@@ -1,8 +1,8 @@
 """`make_reference`: reference draws from two independent runs that agree.
 
 Both runs are the sampler's own, four chains each, started apart; their draws are kept only if each
-has mixed and they cannot be told apart. Of an exact posterior they are two sets of exact draws,
-which are measured the same way.
+has mixed and they cannot be told apart. Of a posterior that is known exactly they are two sets of
+exact draws, which are measured the same way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from probmotion.checks import check_count
 from probmotion.draws import MotionDraws, library_versions
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.distribution import random_directions
-from probmotion.problems.kept_references import KeptReference, fingerprint_of, log_density_at
+from probmotion.problems.kept_references import KeptReference, fingerprint_of
 from probmotion.problems.outlier_gibbs import OutlierGibbs
 from probmotion.problems.problem import Problem
 from probmotion.sampling import Sampler, load_sampler
@@ -63,12 +63,12 @@ def make_reference(
     sampler : Sampler, optional
         What draws where the posterior is not exact. By default
         :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` where that can, else NUTS with a
-        longer warm-up.
+        longer warm-up; a random walk where there is no gradient.
 
     Raises
     ------
     ValueError
-        If ``draws`` is not such a number, or the prior has no density of positions.
+        If ``draws`` is not such a number, or the prior has no density.
     ReferenceRefused
         If R-hat is above 1.01, or the runs disagree.
     """
@@ -79,8 +79,8 @@ def make_reference(
     if draws % (2 * _CHAINS):
         raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
     shape = (asked.posterior.frames, asked.posterior.skeleton.n_joints, 3)
-    log_density_at(asked.posterior, np.zeros((1, *shape)))  # says so before hours are spent
-    with_sampler = None if asked.exact is not None else sampler or _long_run(asked)
+    fingerprint_of(asked.posterior, np.zeros((1, *shape)))  # says so before hours are spent
+    with_sampler = None if asked.known is not None else sampler or _long_run(asked)
     made = max(draws, _LEAST) // 2
     runs = [_run(asked, with_sampler, made, seed, half, progress) for half in range(2)]
     return certify(asked, runs, seed, draws)
@@ -90,7 +90,9 @@ def _long_run(problem: Problem) -> Sampler:
     gibbs = OutlierGibbs()
     if gibbs.draws_from(problem.posterior):
         return gibbs
-    return load_sampler("nuts")(warmup=1000, candidates=10_000)
+    if problem.posterior.differentiable:
+        return load_sampler("nuts")(warmup=1000, candidates=10_000)
+    return load_sampler("mh")(warmup=20_000, thin=50)
 
 
 def _run(
@@ -138,7 +140,7 @@ def certify(
     certificate: dict[str, Any] = {
         "problem": problem.name,
         "draws": len(positions),
-        "exact": problem.exact is not None,
+        "exact": problem.known is not None,
         "sampler": first["sampler"],
         "settings": json.loads(first["settings"]),
         "draws_made": sum(len(run.flat()) for run in runs),

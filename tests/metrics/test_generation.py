@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -222,6 +223,23 @@ def test_views_are_judged_as_they_are(rng, reference):
     expected = frechet_distance(Plain().features(views), reference.held_out_features)
     assert scores["fid"] == (pytest.approx(expected), pytest.approx(0, abs=1e-12))
     assert reference.score_views(views, seed=0, samples=40, repeats=3)["fid"][1] > 0
+
+
+@pytest.mark.parametrize(("frames", "whole"), [(23, 20), (10, 10), (4, 4)])
+def test_the_chamfer_distance_is_of_whole_windows_of_pictures(rng, reference, frames, whole):
+    motions = 0.5 * rng.normal(size=(1, frames, 3, 3))
+    filmed = film_motions(
+        motions, seeds.generator(3, "chamfer"), elevation=0.2, distance=9.0, root=2
+    )
+    real = filmed + np.array([0.1, 0.0])
+    real[:, whole:] = 50.0
+    found = replace(reference, held_out_views=real).chamfer(motions, seed=3)
+    # The nearest of its windows is the same one, 10 cm beside.
+    assert found.of_generated == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="held_out_views is missing"):
+        reference.chamfer(motions, seed=0)
+    with pytest.raises(ValueError, match=r"held_out_views has shape \(5, 4, 2, 2\)"):
+        replace(reference, held_out_views=np.zeros((5, 4, 2, 2)))
 
 
 def test_bad_input(rng):

@@ -12,10 +12,12 @@ from probmotion.data.animals import animal_clips, made_animals
 from probmotion.data.gaits import make_gaits
 from probmotion.data.projections import centre_motion
 from probmotion.data.walks import walk_clips
+from probmotion.metrics import measure
 from probmotion.metrics.motion_distances import nearest_distances, windows
 from probmotion.models import MotionVAE
 from probmotion.models.view_hypotheses import judge_hypotheses
 from probmotion.problems import load_problem
+from probmotion.problems.learnt import LEARNT_PROBLEMS
 from probmotion.samplers import MultiViewAncestral
 from probmotion.sampling import UnsupportedPosterior, load_sampler
 
@@ -74,6 +76,26 @@ def test_draws_are_nearer_to_held_out_motion_than_a_still_body_is(name: str, rea
     assert 0.3 < pace[0] / pace[1] < 2
     # Of real motions, how far the nearest draw is: a mean pose is far from most of them.
     assert ours[1] < 0.8 * theirs[1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_of_held_out_clips_are_compared_with_where_they_are(
+    name: str, real_data, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    made = LEARNT_PROBLEMS[name][1]
+    without = made()
+    assert without.generation.held_out_views is None
+    monkeypatch.setenv("PROBMOTION_DATA", str(real_data))
+    problem = made()
+    draws = load_sampler("exact")().sample(problem.posterior, draws=40, progress=False)
+    found, blind = measure(problem, draws, 0), measure(without, draws, 0)
+    assert blind == {measured: n for measured, n in found.items() if measured != "mcd_cm2"}
+    still = draws.flat().mean(axis=(0, 1), keepdims=True).repeat(problem.posterior.frames, axis=1)
+    assert found["mcd_cm2"] < 1e4 * problem.generation.chamfer(still, seed=0).mean
+    # Draws of the prior are its own reference.
+    assert 0.7 < found["swd"] < 1.4
 
 
 def test_compare_draws_from_it_by_every_kind_of_sampler() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from probmotion import Joints3D, Motion, MotionDraws, MotionPosterior, seeds
 from probmotion.models import GaussianMixtureMotion
+from probmotion.models.standard_normal import StandardNormalPrior
 from probmotion.problems import KeptReference, Problem, kept_references, load_problem
 from probmotion.problems.outlier_gibbs import OutlierGibbs
 from probmotion.problems.references import (
@@ -220,9 +221,53 @@ def test_a_number_of_draws_that_chains_cannot_share_is_refused(exact):
         make_reference(exact, draws=100)
 
 
-def test_a_prior_without_density_of_positions_has_no_reference():
-    with pytest.raises(ValueError, match="prior MotionVAE has no density of positions"):
-        make_reference("walk-vae-monocular")
+class Moved(StandardNormalPrior):
+    """Two frames of one joint, which stands at ``size`` θ: only θ has a density."""
+
+    skeleton, frames, fps, dim = Skeleton(["hip"], [-1]), 2, 30.0, 3
+
+    def __init__(self, size: float = 1.0) -> None:
+        self.size = size
+
+    def motion(self, theta):
+        return self.size * theta[..., None, None, :] * np.ones((2, 1, 1))
+
+
+def seen(size: float = 1.0, at: float = 0.5) -> Problem:
+    """Both frames were seen ``at`` 1, −1 and 2 times, with noise of .5: Gaussian, by hand."""
+    shown = np.broadcast_to(at * np.array([1.0, -1.0, 2.0]), (2, 1, 3))
+    return Problem("moved", "", MotionPosterior(Moved(size), Joints3D(shown, noise=0.5)))
+
+
+def test_of_a_prior_without_density_of_positions_a_long_run_is_right_and_known_again():
+    problem = seen()
+    walk = load_sampler("mh")(warmup=2000, thin=20)
+    kept = make_reference(problem, draws=4000, seed=1, progress=False, sampler=walk)
+    # Of precision 1 + 2 / .5², at 2 y / .5² over it.
+    x = kept.positions[:, 0, 0]
+    np.testing.assert_allclose(x.mean(axis=0), 0.5 * np.array([1, -1, 2]) * 8 / 9, atol=0.03)
+    np.testing.assert_allclose(x.std(axis=0), 1 / 3, rtol=0.06)
+    assert not kept.certificate["exact"]
+    assert kept.certificate["rhat"] <= 1.01
+    assert replace(problem, kept=kept).has_reference
+    for other in (seen(size=1.1), seen(at=0.6)):
+        with pytest.raises(ValueError, match="certificate is of another posterior than moved's"):
+            replace(other, kept=kept)
+
+
+def test_without_evidence_the_priors_own_draws_are_the_reference():
+    problem = Problem("moved", "", MotionPosterior(Moved(2.0)))
+    assert problem.has_reference
+    assert problem.exact is None
+    drawn = problem.reference(0, 4000)
+    np.testing.assert_allclose(drawn.std(axis=0), 2, rtol=0.06)
+    kept = make_reference(problem, draws=800, progress=False)
+    assert (kept.certificate["sampler"], kept.certificate["exact"]) == ("exact", True)
+
+
+def test_a_prior_without_any_density_has_no_reference():
+    with pytest.raises(ValueError, match="prior MotionDiffusion has no density, expected one of"):
+        make_reference("walk2d")
 
 
 def test_the_shipped_reference_is_of_its_problem_and_agrees_with_another_run(monkeypatch, tmp_path):

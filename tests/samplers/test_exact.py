@@ -46,6 +46,28 @@ def test_a_prior_without_a_closed_form_is_refused(two_bumps):
         ExactSampler().sample(MotionPosterior(two_bumps), draws=1, progress=False)
 
 
+class Drawn:
+    """A prior that can be drawn from, and no more."""
+
+    skeleton, frames, fps, dim = Skeleton(["a"], [-1]), 2, 30.0, 6
+
+    def motion(self, theta):
+        return theta.reshape(*theta.shape[:-1], 2, 1, 3)
+
+    def sample(self, rng, n):
+        return rng.normal(7.0, 2.0, (n, 2, 1, 3))
+
+
+def test_without_evidence_a_prior_that_can_be_drawn_from_will_do():
+    draws = ExactSampler().sample(MotionPosterior(Drawn()), draws=500, chains=2, progress=False)
+    assert draws.independent
+    assert draws.flat().mean() == pytest.approx(7, abs=0.2)
+    assert draws.flat().std() == pytest.approx(2, rel=0.1)
+    seen = MotionPosterior(Drawn(), Joints3D(np.zeros((2, 1, 3)), noise=0.5))
+    with pytest.raises(UnsupportedPosterior, match=r"exact needs a prior with HasExactPosterior"):
+        ExactSampler().sample(seen, draws=1, progress=False)
+
+
 def test_evidence_without_a_closed_form_is_refused(posterior):
     outliers = Joints3D(np.zeros((2, 2, 3)), noise=0.5, degrees_of_freedom=4.0)
     with pytest.raises(
