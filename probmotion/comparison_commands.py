@@ -162,6 +162,7 @@ class Compare:
             chains=chains,
             workers=self.workers,
             out=self.out,
+            budget=self._budget(),
             time_limit=self.time_limit,
         )
         for problem in simulated:
@@ -178,11 +179,6 @@ class Compare:
         if self.calibrate < FEWEST_SIMULATIONS:
             raise ValueError(
                 f"calibrate is {self.calibrate}, expected {FEWEST_SIMULATIONS} simulations or more"
-            )
-        if self._budget() is not None:
-            raise ValueError(
-                "calibrate is given with a budget, expected one of them: simulations run samplers "
-                "with the settings that are given"
             )
         if all(problem.simulate is None for problem in problems):
             raise ValueError("calibrate is given, but none of the problems can be simulated")

@@ -266,7 +266,6 @@ def one_frame(folder: Path) -> str:
         ("compare", ("no problem is given", "--clips", "--prior")),
         ("compare gait --draws 3", ("draws is 3",)),
         ("compare gait --calibrate 5", ("calibrate is 5", "10 simulations or more")),
-        ("compare gait --calibrate 20 --seconds 5", ("calibrate is given with a budget",)),
         ("compare dance-pairs --calibrate 20", ("none of the problems can be simulated",)),
         ("compare gait --chains 0", ("chains is 0",)),
         ("compare gait --observe sparse", ("observe is given without clips", "--clips")),

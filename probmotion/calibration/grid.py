@@ -16,6 +16,7 @@ from probmotion import seeds
 from probmotion.calibration.ranks import ranks_of_truth
 from probmotion.calibration.result import Calibration
 from probmotion.checks import check_count, check_positive
+from probmotion.comparison.budgets import Budget, check_budget
 from probmotion.comparison.cells import Cell, forget_unfinished
 from probmotion.comparison.failures import Failure
 from probmotion.comparison.locks import locked
@@ -44,6 +45,7 @@ def calibrate(
     out: str | Path | None = None,
     workers: int = 1,
     executor: Executor | None = None,
+    budget: Budget | None = None,
     time_limit: float | None = None,
     progress: bool = True,
 ) -> Calibration:
@@ -70,6 +72,9 @@ def calibrate(
         it may be a comparison's. A temporary one by default.
     workers, executor, time_limit, progress
         As of :func:`~probmotion.comparison.compare`.
+    budget : Budget, optional
+        What every sampler may spend on a simulation, as of
+        :func:`~probmotion.comparison.compare`; the pilots run on the problem itself.
 
     Raises
     ------
@@ -90,6 +95,7 @@ def calibrate(
         raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
     if time_limit is not None:
         check_positive("time_limit", time_limit)
+    check_budget(budget)
     chosen = named_problems(problems)
     used = named_samplers(samplers)
     for name, source in chosen.items():
@@ -102,15 +108,16 @@ def calibrate(
     given = Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else Path(out)
     folder = writable_folder(given / Calibration.FOLDER)
     Plan.check_folder(folder)
-    plan = Plan.of(chosen, used, draws, chains, simulations)
+    plan = Plan.of(chosen, used, draws, chains, simulations, budget)
     with locked(folder, chosen):
-        grid = CalibrationGrid(folder, plan, chosen, used, limit=time_limit)
-        cells = grid.cells()
-        refuse_taken(folder, cells)
+        grid = CalibrationGrid(folder, plan, chosen, used, budget, time_limit)
+        refuse_taken(folder, [*grid.pilots(), *grid.cells()])
         forget_unfinished(folder / "cells", chosen)
         plan.save(folder)
         with finished_kept(grid):
-            run_tasks(missing(cells), workers, executor, progress, label="simulations")
+            where = (workers, executor, progress)
+            run_tasks(missing(grid.pilots()), *where, label="pilots")
+            run_tasks(missing(grid.cells()), *where, label="simulations")
         # A run of other problems in this folder may have left its own plan.
         plan.save(folder)
         calibration = Calibration(folder, plan, temporary=out is None)

@@ -105,8 +105,8 @@ class Calibration:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences to read with the table: what failed, on how many simulations, and thinning."""
-        notes = []
+        """Sentences to read with the table: budget, failures, simulations, and thinning."""
+        notes = [*self.plan.notes]
         counted: dict[str, int] = {}
         for result in self.failures:
             assert result.failure is not None

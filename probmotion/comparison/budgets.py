@@ -17,7 +17,7 @@ from probmotion.checks import check_count, check_positive
 from probmotion.draws import MotionDraws
 from probmotion.sampling import Sampler, UnsupportedPosterior
 
-__all__ = ["Budget", "affordable", "effort_of"]
+__all__ = ["Budget", "affordable", "check_budget", "effort_of"]
 
 # What an evaluation counts, if not 1; a gradient comes with its value, which costs about as much.
 _WORTH = {"gradient": 2}
@@ -85,6 +85,12 @@ class Budget:
         if self.evaluations is None:
             return self.words(self.amount)
         return f"{self.words(self.amount)} (a gradient counts 2, any other 1)"
+
+
+def check_budget(budget: object) -> None:
+    """Raise ``ValueError`` unless it is a budget or None."""
+    if budget is not None and not isinstance(budget, Budget):
+        raise ValueError(f"budget is {budget!r}, expected a Budget")
 
 
 def effort_of(sampler: Sampler) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from probmotion import seeds as addressed
 from probmotion.checks import check_count, check_positive
-from probmotion.comparison.budgets import Budget
+from probmotion.comparison.budgets import Budget, check_budget
 from probmotion.comparison.cells import forget_unfinished
 from probmotion.comparison.kept_problems import keep_problem
 from probmotion.comparison.locks import locked
@@ -96,8 +96,7 @@ def compare(
         raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    if budget is not None and not isinstance(budget, Budget):
-        raise ValueError(f"budget is {budget!r}, expected a Budget")
+    check_budget(budget)
     chosen = named_problems(problems)
     used = named_samplers(samplers)
     folder = (

@@ -22,6 +22,7 @@ from probmotion.calibration.quantities import DENSITY, DISTANCE, credible_level,
 from probmotion.calibration.ranks import independent_draws, rank
 from probmotion.calibration.result import Calibration
 from probmotion.calibration.table import LEVELS, coverage_curve
+from probmotion.comparison import Budget
 from probmotion.metrics.uniformity import uniformity_p_value
 from probmotion.problems import Problem
 from probmotion.problems.evidence import observe
@@ -50,6 +51,7 @@ class Batch:
     blind: bool = False
     diary: str = ""
     fails_above: float = math.inf
+    thin: int = 1
 
     def sample(self, posterior, *, draws=1000, chains=1, seed=0, initial=None, progress=True):
         if self.diary:
@@ -69,9 +71,20 @@ class Batch:
             theta=np.zeros((chains, draws, posterior.dim)),
             log_density=np.zeros((chains, draws)),
             statistics={"acceptance": np.full((chains, draws), 0.25)},
-            counts={"density": 7},
+            counts={"density": 7 * self.thin},
             independent=True,
         )
+
+
+@dataclass(frozen=True)
+class Paid(Batch):
+    """Notes how it was thinned."""
+
+    effort: ClassVar[tuple[str, ...]] = ("thin",)
+
+    def sample(self, posterior, **asked):
+        Path(self.diary).parent.joinpath(f"thin-{self.thin}").touch()
+        return super().sample(posterior, **asked)
 
 
 @dataclass(frozen=True)
@@ -333,6 +346,25 @@ def test_a_run_goes_on_where_it_was_and_ranks_do_not_depend_on_the_order(tmp_pat
         np.testing.assert_array_equal(ranks[:10], first.ranks("toy", "batch")[name])
     with pytest.raises(ValueError, match="made with other settings"):
         once(simulations=10, out=tmp_path / "kept", draws=20)
+
+
+def test_what_a_budget_buys_is_found_once_and_all_simulations_have_it(tmp_path):
+    paid = Paid(diary=str(tmp_path / "diary"))
+    asked = partial(calibrate, toy(), paid, out=tmp_path / "kept", **SMALL)
+    held = asked(simulations=10, budget=Budget(evaluations=350))
+    assert (tmp_path / "thin-50").exists()
+    pilots = len((tmp_path / "diary").read_text().split()) - 10
+    assert pilots > 0
+    assert held.notes[0].startswith("every sampler had 350 evaluations")
+    asked(simulations=12, budget=Budget(evaluations=350))
+    assert len((tmp_path / "diary").read_text().split()) == pilots + 12
+    plain_ranks = calibrate(toy(), replace(paid, thin=50), simulations=10, **SMALL)
+    for name, ranks in plain_ranks.ranks("toy", "batch").items():
+        np.testing.assert_array_equal(held.ranks("toy", "batch")[name], ranks)
+    with pytest.raises(ValueError, match="made with other settings"):
+        asked(simulations=12, budget=Budget(evaluations=700))
+    with pytest.raises(ValueError, match="budget is 350, expected a Budget"):
+        asked(simulations=12, budget=350)
 
 
 def test_no_draws_are_kept_and_a_temporary_folder_goes(tmp_path):
