@@ -4,8 +4,9 @@
     python notebooks/ablations/mas.py --quick --out quick     (made walks, tiny networks, a minute)
 
 Parts: table, strided, exact; ``--parts`` chooses. The networks of walk2d come with the package; the
-lifter is trained here, on the same tracks. Motions that are left in ``--out/motions`` are not made
-again, so that what is interrupted goes on. Clips are looked for in ``--data``, by default
+lifter is trained here, on the same tracks. Samplers draw through the grid, a comparison per part in
+``--out/comparisons``; what else is made, the 2D model's views and lifted motions, is kept in
+``--out/motions``. What is interrupted goes on. Clips are looked for in ``--data``, by default
 ../shared/data beside the repository.
 """
 
@@ -24,6 +25,8 @@ import pandas as pd
 
 from probmotion import seeds
 from probmotion.cameras import Cameras
+from probmotion.comparison import Comparison, compare
+from probmotion.comparison.cells import CellResult, Failure
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.data.learning import (
     LearningTracks,
@@ -60,7 +63,7 @@ from probmotion.motion import Motion
 from probmotion.pictures import draw_skeletons
 from probmotion.pictures.generation import draw_generation
 from probmotion.posterior import MotionPosterior
-from probmotion.problems import load_problem
+from probmotion.problems import Problem, load_problem
 from probmotion.samplers import (
     MultiViewAncestral,
     MultiViewPredictorCorrector,
@@ -154,6 +157,16 @@ class Study:
         held_out, learnt = (evaluator.features(self.views(part, 200)) for part in ("test", "train"))
         return GenerationReference(evaluator, held_out, learnt)
 
+    @cached_property
+    def problem(self) -> Problem:
+        """What samplers draw from, and what they are to be like."""
+        return Problem(
+            "walks",
+            "people who walk, a prior learnt from 2D tracks alone: generation",
+            MotionPosterior(self.prior),
+            generation=self.reference,
+        )
+
     @property
     def frames(self) -> int:
         """Frames L of a motion."""
@@ -186,13 +199,21 @@ class Study:
                 )
             return archive["made"].astype(np.float64), float(archive["seconds"])
 
-    def draw(self, name: str, sampler: Sampler, posterior: MotionPosterior) -> tuple:
-        """Return a sampler's 3D motions, (n, L, J, 3), and the seconds that they took."""
-
-        def make() -> np.ndarray:
-            return sampler.sample(posterior, draws=self.draws, seed=SEED, progress=False).flat()
-
-        return self.once(name, [sampler, posterior.prior, self.draws], make)
+    def compared(
+        self,
+        part: str,
+        problems: Mapping[str, Problem | MotionPosterior],
+        samplers: Mapping[str, Sampler],
+    ) -> Comparison:
+        """Return the grid of a part; cells that are finished are not drawn again."""
+        return compare(
+            problems,
+            samplers,
+            draws=self.draws,
+            chains=1,
+            out=self.out / "comparisons" / part,
+            progress=not self.quick,
+        )
 
 
 def samplers(iterations: int) -> dict[str, Sampler]:
@@ -211,9 +232,9 @@ def samplers(iterations: int) -> dict[str, Sampler]:
 
 def table(study: Study) -> pd.DataFrame:
     """Tables 2 and 3: 2D against held-out 2D, all around and from the side, and 3D against 3D."""
-    posterior = MotionPosterior(study.prior)
+    posterior = study.problem.posterior
     real = study.motions("test")
-    rows = []
+    rows: list[dict[str, object]] = []
 
     def add(
         name: str, motions: np.ndarray | None, views: np.ndarray | None, seconds: float
@@ -239,10 +260,12 @@ def table(study: Study) -> pd.DataFrame:
     )
     add("2D model", None, views, seconds / study.draws)
     drawn = {}
-    for name, sampler in samplers(study.iterations).items():
-        motions, seconds = study.draw(name, sampler, posterior)
-        drawn[name] = motions
-        add(name, motions, None, seconds / study.draws)
+    found = study.compared("table", {"walks": study.problem}, samplers(study.iterations))
+    for cell in found.results:
+        rows.append(score_cell(study, cell.sampler, found, cell, real))
+        print(rows[-1], flush=True)
+        if cell.failure is None:
+            drawn[cell.sampler] = found.draws(cell.problem, cell.sampler).flat()
     lifted = study.views("train", study.draws)
     with written_whole(study.out / "to_lift.npz") as path, open(path, "wb") as file:
         np.savez_compressed(file, keypoints=lifted, fps=FPS, joint_names=PERSON.joint_names)
@@ -299,6 +322,21 @@ def score(
             row |= {f"{measured}{where}": mean, f"{measured}{where}_sd": sd}
     row["collapsed"] = row["recall"] < COLLAPSED_BELOW
     return row
+
+
+def score_cell(
+    study: Study, name: str, found: Comparison, cell: CellResult, real: np.ndarray
+) -> dict[str, object]:
+    """Return the row of a sampler that drew in the grid, or failed."""
+    if cell.failure is not None:
+        return {"name": name, "failed": reason(cell.failure)}
+    motions = found.draws(cell.problem, cell.sampler).flat()
+    return score(study, name, motions, None, real, cell.metrics["seconds"] / study.draws)
+
+
+def reason(failure: Failure) -> str:
+    """Return what stands in the table in place of scores."""
+    return f"{failure.word}: {failure.message}"
 
 
 def bone_changes(motions: np.ndarray) -> float:
@@ -359,18 +397,18 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
 
 def strided(study: Study) -> pd.DataFrame:
     """MAS and mvpc with fewer levels than the network has learnt."""
-    posterior = MotionPosterior(study.prior)
     real = study.motions("test")
-    rows = []
+    ways: dict[tuple[int, str], Sampler] = {}
     for steps in (10, 20, 50, 100):
-        for name, sampler in (
-            ("MAS", MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)),
-            ("mvpc", MultiViewPredictorCorrector(steps=steps, trained_steps=100)),
-        ):
-            motions, seconds = study.draw(f"{name}, {steps} steps", sampler, posterior)
-            row = score(study, name, motions, None, real, seconds / study.draws)
-            rows.append({"steps": steps, **row})
-            print(rows[-1], flush=True)
+        fewer = {"steps": steps, "trained_steps": 100}
+        ways[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
+        ways[steps, "mvpc"] = MultiViewPredictorCorrector(**fewer)
+    labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in ways.items()}
+    found = study.compared("strided", {"walks": study.problem}, labelled)
+    rows = []
+    for (steps, name), cell in zip(ways, found.results, strict=True):
+        rows.append({"steps": steps, **score_cell(study, name, found, cell, real)})
+        print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
 
@@ -397,22 +435,28 @@ def exact(study: Study) -> pd.DataFrame:
     trainee = DiffusionTrainee(tracks[held:], tracks[:held], size, augmentation=plain)
     settings = TrainingSettings(steps=study.steps // (10 if study.quick else 1), learning_rate=1e-3)
     learnt = MotionDiffusion.load(study.trained("gait", trainee, settings))
+    found = study.compared(
+        "exact",
+        {"exact": problem, "network": MotionPosterior(learnt)},
+        {
+            "mas": MultiViewAncestral(),
+            "mvpc": MultiViewPredictorCorrector(),
+            "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
+        },
+    )
+    kept = ("swd", "tr", "mean_error", "off", "share_error", "precision", "recall")
     rows = []
-    for name, sampler in (
-        ("mas", MultiViewAncestral()),
-        ("mvpc", MultiViewPredictorCorrector()),
-        ("mvpc, accurate", MultiViewPredictorCorrector.accurate()),
-    ):
-        for denoiser, prior in (("exact", known), ("network", learnt)):
-            draws = sampler.sample(
-                MotionPosterior(prior), draws=study.draws, seed=SEED, progress=False
-            )
-            measured = measure(problem, draws, SEED)
-            kept = ("swd", "tr", "mean_error", "off", "share_error", "precision", "recall")
-            rows.append(
-                {"sampler": name, "denoiser": denoiser, **{key: measured[key] for key in kept}}
-            )
-            print(rows[-1], flush=True)
+    # The two rows of a sampler one below the other.
+    for cell in sorted(found.results, key=lambda cell: cell.sampler):
+        row: dict[str, object] = {"sampler": cell.sampler, "denoiser": cell.problem}
+        if cell.failure is None:
+            # The grid cannot compare the network's draws with exact ones: its posterior knows none.
+            measured = measure(problem, found.draws(cell.problem, cell.sampler), SEED)
+            row |= {key: measured[key] for key in kept}
+        else:
+            row["failed"] = reason(cell.failure)
+        rows.append(row)
+        print(row, flush=True)
     return pd.DataFrame(rows)
 
 

@@ -6,8 +6,10 @@
 Parts: views (how often the right view hypothesis wins), table (the shapes of tables 3, 4, 6, 7 and
 8 of the paper), generation (beside MAS and SDS on the same 2D data); ``--parts`` chooses. All
 variants learn here, from the same tracks, their second phase as long as ``--steps`` says; what is
-left in ``--out/networks`` is not learnt again. Clips are looked for in ``--data``, by default
-../shared/data beside the repository. 3D clips are filmed to be learnt from, and measured against.
+left in ``--out/networks`` is not learnt again. The part generation draws through the grid; its
+comparisons are in ``--out/comparisons``, where what is finished is not drawn again. Clips are
+looked for in ``--data``, by default ../shared/data beside the repository. 3D clips are filmed to be
+learnt from, and measured against.
 """
 
 from __future__ import annotations
@@ -25,9 +27,11 @@ import pandas as pd
 import torch
 
 from probmotion import seeds
+from probmotion.comparison import compare
 from probmotion.data.learning import film_clips
 from probmotion.data.projections import Filming, centre_motion
 from probmotion.data.walks import made_walks, walk_clips
+from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
 from probmotion.metrics.filming import film_motions
 from probmotion.metrics.keypoints import (
@@ -38,7 +42,6 @@ from probmotion.metrics.keypoints import (
 from probmotion.metrics.motion_chamfer import motion_chamfer_distance
 from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
 from probmotion.models.articulated_body import ArticulatedBody
-from probmotion.models.motion_diffusion import MotionDiffusion
 from probmotion.models.motion_vae import MotionVAE
 from probmotion.models.motion_vae_losses import best_guess, guess_terms, pictured, weighted_sum
 from probmotion.models.motion_vae_settings import MotionVAESettings
@@ -52,8 +55,10 @@ from probmotion.models.training import train
 from probmotion.models.view_hypotheses import judge_hypotheses
 from probmotion.motion import KeypointTrack, Motion
 from probmotion.posterior import MotionPosterior
+from probmotion.problems import Problem, load_problem
 from probmotion.rest_poses import estimate_rest_pose
-from probmotion.samplers import MultiViewAncestral, ScoreDistillation
+from probmotion.samplers import ExactSampler, MultiViewAncestral, ScoreDistillation
+from probmotion.sampling import Sampler
 from probmotion.skeleton import Skeleton
 
 FPS = 10.0
@@ -261,41 +266,66 @@ def table(study: Study) -> pd.DataFrame:
 
 def generation(study: Study) -> pd.DataFrame:
     """Return generation beside MAS and SDS, which draw from a diffusion model of the same clips."""
-    other = MotionDiffusion.load("walk2d")
-    step, per_motion = round(other.fps / FPS), other.frames // round(other.fps / FPS) // FRAMES
-    n = max(2, study.draws // 10)
-    posterior = MotionPosterior(other)
-    ours = study.variant("final") if study.quick else MotionVAE.load("walk-vae")
-    ways: dict[str, np.ndarray] = {
-        "motion VAE": ours.sample(seeds.generator(0, "draws"), n * per_motion)
-    }
-    samplers = {
-        "MAS": MultiViewAncestral(),
-        "SDS": ScoreDistillation(iterations=50 if study.quick else 1000),
-    }
-    seconds = {}
-    for name, sampler in samplers.items():
-        begun = time.perf_counter()
-        drawn = sampler.sample(posterior, draws=n, seed=0, progress=False).flat()
-        seconds[name] = time.perf_counter() - begun
-        thinned = drawn[:, ::step][:, : per_motion * FRAMES]
-        ways[name] = thinned.reshape(n * per_motion, FRAMES, *drawn.shape[2:])
+    other = load_problem("walk2d")
+    longer = other.posterior
+    per_motion = longer.frames // round(longer.fps / FPS) // FRAMES
+    # A cell of the grid has ten draws at least.
+    n = max(10, study.draws // 10)
+    ours = MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
+    iterations = 50 if study.quick else 1000
+    grids: tuple[tuple[str, Problem | MotionPosterior, dict[str, Sampler], int], ...] = (
+        ("motion-vae", ours, {"motion VAE": ExactSampler()}, n * per_motion),
+        (
+            "walk2d",
+            other,
+            {"MAS": MultiViewAncestral(), "SDS": ScoreDistillation(iterations=iterations)},
+            n,
+        ),
+    )
+    rows = []
+    for name, source, samplers, draws in grids:
+        found = compare(
+            {name: source},
+            samplers,
+            draws=draws,
+            chains=1,
+            out=study.out / "comparisons" / name,
+            progress=not study.quick,
+        )
+        for cell in found.results:
+            row: dict[str, Any] = {"way": cell.sampler}
+            if cell.failure is None:
+                motions = sequences(found.draws(cell.problem, cell.sampler))
+                row |= {"sequences": len(motions), "seconds": cell.metrics["seconds"]}
+                row |= beside_real(study, motions)
+            else:
+                row["failed"] = f"{cell.failure.word}: {cell.failure.message}"
+            rows.append(row)
+            print(row, flush=True)
     rng = seeds.generator(study.seed, "real draws")
     every = study.real_windows("train", FRAMES)
-    ways["real motion that was learnt from"] = every[rng.integers(0, len(every), n * per_motion)]
-    truth = {part: study.real_windows(part, FRAMES)[::3] for part in ("test", "train")}
-    rows = []
-    for name, motions in ways.items():
-        centred = motions - motions[:, :, :1]
-        row = {"way": name, "sequences": len(motions), "seconds": seconds.get(name)}
-        row |= generated(study, centred, 0)
-        for part, real in truth.items():
-            near = nearest_distances(centred, real)
-            row |= {f"to_{part}_mm": 1000 * near[0], f"of_{part}_mm": 1000 * near[1]}
-        row["mirrored"] = mirror_share(centred, truth["test"])
-        rows.append(row)
-        print(row, flush=True)
+    motions = every[rng.integers(0, len(every), n * per_motion)]
+    row = {"way": "real motion that was learnt from", "sequences": len(motions)}
+    rows.append(row | beside_real(study, motions))
+    print(rows[-1], flush=True)
     return pd.DataFrame(rows)
+
+
+def sequences(draws: MotionDraws) -> np.ndarray:
+    """Return draws as sequences of the study's frames and rate, (n, FRAMES, J, 3)."""
+    thinned = draws.flat()[:, :: round(draws.fps / FPS)]
+    return np.concatenate([pieces(motion, FRAMES) for motion in thinned])
+
+
+def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
+    """Return how near motions and their pictures are to real ones, all about the root."""
+    centred = motions - motions[:, :, :1]
+    row = generated(study, centred, 0)
+    truth = {part: study.real_windows(part, FRAMES)[::3] for part in ("test", "train")}
+    for part, real in truth.items():
+        near = nearest_distances(centred, real)
+        row |= {f"to_{part}_mm": 1000 * near.of_draws, f"of_{part}_mm": 1000 * near.of_real}
+    return row | {"mirrored": mirror_share(centred, truth["test"])}
 
 
 PARTS = {"views": views, "table": table, "generation": generation}
