@@ -6,7 +6,8 @@
 Parts: table, speed, recording, posterior; ``--parts`` chooses. Recordings are made of clips that
 were held out whole: noise, outliers, limbs that hide. The prior and its denoiser come with the
 package; the networks of the ablations "no prior" and "no noisy training" are trained here, as long
-as the shipped one was. Clips are looked for in ``--data``, by default ../shared/data beside the
+as the shipped one was. What the part posterior draws is drawn through the grid, comparisons in
+``--out/comparisons``. Clips are looked for in ``--data``, by default ../shared/data beside the
 repository.
 """
 
@@ -19,6 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -26,9 +28,11 @@ import pandas as pd
 from matplotlib.ticker import NullFormatter
 
 from probmotion import seeds
+from probmotion.comparison import compare
 from probmotion.data.denoising_clips import denoising_clips, made_denoising_clips
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
 from probmotion.data.recordings import read_recording
+from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
 from probmotion.likelihoods import Joints3D
 from probmotion.metrics import accuracy
@@ -45,8 +49,10 @@ from probmotion.models.noisy_windows import Stitching
 from probmotion.models.training import train
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
+from probmotion.problems import Problem
 from probmotion.problems.denoising import body_of, body_prior, gaussian_noise, limbs_hidden
 from probmotion.samplers import NUTS, DVAEInference
+from probmotion.sampling import Sampler
 
 FRAMES = 60
 BALANCING = "S00_P00_T01_BalancingTrial_multiview.npz"
@@ -394,6 +400,25 @@ def recording(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+@dataclass(frozen=True)
+class StartedNUTS:
+    """NUTS from draws of Motion-DVAE; the seconds are those of NUTS alone."""
+
+    name: ClassVar[str] = "nuts"
+    requires: ClassVar[tuple[type, ...]] = NUTS.requires
+
+    start: DVAEInference
+    nuts: NUTS
+
+    def sample(
+        self, posterior: MotionPosterior, *, chains: int, seed: int, progress: bool, **how: Any
+    ) -> MotionDraws:
+        """Return the draws of NUTS; its chains start at one draw each."""
+        begun = self.start.sample(posterior, draws=1, chains=chains, seed=seed, progress=progress)
+        how["initial"] = begun.dataset["theta"].values[:, 0]
+        return self.nuts.sample(posterior, chains=chains, seed=seed, progress=progress, **how)
+
+
 def posterior(study: Study) -> pd.DataFrame:
     """Return how honest draws are: spread against error, share of the truth inside 90 %.
 
@@ -404,23 +429,40 @@ def posterior(study: Study) -> pd.DataFrame:
     truth = recording.truth.window(0, frames)
     hidden = limbs_hidden(truth)
     evidence = Joints3D.observe(truth, KINDS["occluded"][0], study.seed, hidden=hidden)
-    asked = study.posterior(Recording(truth, evidence, hidden))
+    problem = Problem(
+        "occluded",
+        "a window of a held-out clip in which limbs hide",
+        study.posterior(Recording(truth, evidence, hidden)),
+        truth=truth.positions,
+    )
     fit = DVAEInference(mode="optimization", iterations=50 if study.quick else 200)
-    runs = {
-        "dvae, regression": DVAEInference().sample(asked, draws=200, progress=False),
-        "dvae, optimization": fit.sample(asked, draws=200, progress=False),
-    }
-    begun = runs["dvae, optimization"].dataset["theta"].values[0, :1]
     nuts = NUTS(warmup=10 if study.quick else 150, max_tree_depth=3 if study.quick else 6)
-    runs["nuts"] = nuts.sample(
-        asked, draws=10 if study.quick else 100, initial=begun, progress=not study.quick
+    # A chain is not asked for as many draws as networks, whose draws cost nothing.
+    grids: tuple[tuple[str, dict[str, Sampler], int], ...] = (
+        ("dvae", {"dvae, regression": DVAEInference(), "dvae, optimization": fit}, 200),
+        ("nuts", {"nuts": StartedNUTS(fit, nuts)}, 10 if study.quick else 100),
     )
     rows = []
-    for name, draws in runs.items():
-        row = {"sampler": name, **honesty(draws.flat(), truth, hidden)}
-        row["log_density"] = float(draws.dataset["log_density"].mean())
-        rows.append(row | {"seconds": float(draws.dataset.attrs["seconds"])})
-        print(rows[-1], flush=True)
+    for name, samplers, draws in grids:
+        found = compare(
+            problem,
+            samplers,
+            draws=draws,
+            chains=1,
+            out=study.out / "comparisons" / name,
+            progress=not study.quick,
+        )
+        for cell in found.results:
+            row: dict[str, object] = {"sampler": cell.sampler}
+            if cell.failure is None:
+                drawn = found.draws(cell.problem, cell.sampler)
+                row |= honesty(drawn.flat(), truth, hidden)
+                row["log_density"] = float(drawn.dataset["log_density"].mean())
+                row["seconds"] = cell.metrics["seconds"]
+            else:
+                row["failed"] = f"{cell.failure.word}: {cell.failure.message}"
+            rows.append(row)
+            print(row, flush=True)
     return pd.DataFrame(rows)
 
 

@@ -4,26 +4,28 @@
     python notebooks/ablations/pose_pairs.py --quick --out quick     (made dances, minutes)
 
 Parts: noise, calibration, paired, truncation, velocity, coverage, embedding, completion;
-``--parts`` chooses. Each leaves a CSV file and pictures in ``--out``. A run that has left its file
-in ``--out/runs`` is not made again, so that what is interrupted goes on.
+``--parts`` chooses. Each leaves a CSV file and pictures in ``--out``. What they look at is drawn
+through the grid, a comparison per part in ``--out/comparisons`` (3 GB in all), so that what is
+interrupted goes on. The parts embedding and completion look at the draws of the part coverage.
 Real data are looked for as in :func:`probmotion.data.downloads.salsa_pairs`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
-from importlib.metadata import version
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from probmotion import seeds
+from probmotion.comparison import Comparison, compare
+from probmotion.comparison.cells import CellResult
 from probmotion.data.dances import make_dances
 from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import (
@@ -46,15 +48,16 @@ from probmotion.interaction.coordinates import align_rigidly
 from probmotion.interaction.pose_distances import MEASURES, pose_distances
 from probmotion.interaction.retrieval import views_around
 from probmotion.interaction.views import project_to_views
-from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.coverage import coverage
 from probmotion.models.pair_posterior import PairSettings, pair_posterior
 from probmotion.models.single_pose_lifting import lift_people
 from probmotion.pictures.calibration import draw_calibration
 from probmotion.pictures.coverage import classical_scaling, draw_coverage, draw_embedding
 from probmotion.pictures.pairs import draw_pairs
+from probmotion.problems import Problem
 from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.proposals import Isotropic, Proposal, VelocityBiased
+from probmotion.skeleton import Skeleton
 from probmotion.truncation import TruncatedPosterior, limit_for_dimension
 
 SEED = 0
@@ -62,6 +65,19 @@ SEED = 0
 # they cover best, for interaction coordinates the middle one of their three best.
 VALIDATION = ("cmu_60_61_02", "cmu_60_61_10")
 NOISE = {"interaction": 0.005, "cartesian": 0.01, "shape-context": 0.005}
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """What was changed for each problem, by its name, and the grid that was drawn of them."""
+
+    asked: Mapping[str, Mapping[str, Any]]
+    found: Comparison
+
+    def draws(self, problem: str, sampler: str = "isotropic") -> MotionDraws | None:
+        """Return the draws of a cell; None where it failed."""
+        failed = {(cell.problem, cell.sampler) for cell in self.found.failures}
+        return None if (problem, sampler) in failed else self.found.draws(problem, sampler)
 
 
 @dataclass(frozen=True)
@@ -113,7 +129,9 @@ class Study:
         n = min(self.n_annotations, sum(int(some.sum()) for some in frames))
         return draw_annotations(self.clips[0], n, repeat, frames=frames)
 
-    def posterior(self, density: str, repeat: int = 0, **changes: object) -> TruncatedPosterior:
+    def posterior(
+        self, density: str = "interaction", repeat: int = 0, **changes: object
+    ) -> TruncatedPosterior:
         """Return the posterior over a density: a measure's name, or ``"prior"``."""
         if density == "prior":
             return pair_posterior(self.seed_pose, None, replace(PairSettings(), **changes))
@@ -123,67 +141,128 @@ class Study:
 
     def run(
         self,
-        posterior: TruncatedPosterior,
-        repeat: int = 0,
-        proposal: Proposal | None = None,
-        draws: int = 0,
-    ) -> MotionDraws:
-        """Return every state after the warm-up of chains that start at the seed, side by side."""
-        sampler = MetropolisHastings(proposal or Isotropic(0.02), warmup=self.warmup, thin=1)
-        return sampler.sample(
-            posterior,
-            draws=(draws or self.draws) // self.chains,
+        part: str,
+        asked: Mapping[str, Mapping[str, Any]],
+        proposals: Mapping[str, Proposal] | None = None,
+        draws: int | None = None,
+    ) -> Runs:
+        """Return every state after the warm-up of chains that start at the seed, side by side.
+
+        A repeat has annotations and views of its own: in the grid it is another problem.
+        """
+        problems = {
+            name: Problem(
+                name,
+                "pose-pairs of clips that were held out: coverage",
+                self.posterior(**changes),
+                held_out=self.held_out[:, None],
+            )
+            for name, changes in asked.items()
+        }
+        samplers = {
+            name: MetropolisHastings(proposal, warmup=self.warmup, thin=1)
+            for name, proposal in (proposals or {"isotropic": Isotropic(0.02)}).items()
+        }
+        found = compare(
+            problems,
+            samplers,
+            draws=draws or self.draws // 10,
             chains=self.chains,
-            seed=repeat,
-            progress=False,
+            out=self.out / "comparisons" / part,
+            progress=not self.quick,
         )
+        for cell in found.failures:
+            print(f"{part}: {cell.sampler} on {cell.problem} failed, {reason(cell)}")
+        return Runs(asked, found)
 
-    def keep(self, name: str, poses: np.ndarray) -> None:
-        """Write some draws of every chain, (chains, n, J, 3), for what comes after."""
-        with (
-            written_whole(self.out / f"poses-{name}.npz") as path,
-            open(path, "wb") as file,
-        ):
-            np.savez_compressed(file, poses=poses.astype(np.float32))
+    @cached_property
+    def by_density(self) -> Runs:
+        """All draws of four densities: the part "coverage", which others look at, too."""
+        asked = {
+            f"{density}, repeat {repeat}": {"density": density, "repeat": repeat}
+            for density in ("interaction", "cartesian", "prior", "shape-context")
+            # Shape contexts cost several times as much, and are drawn once.
+            for repeat in range(1 if density == "shape-context" else self.repeats)
+        }
+        return self.run("coverage", asked, draws=self.draws)
 
-    def kept(self, name: str) -> np.ndarray:
-        """Read what :meth:`keep` wrote."""
-        path = self.out / f"poses-{name}.npz"
-        if not path.exists():
-            raise SystemExit(f"{path} is missing: run the part that makes it, coverage, first")
-        with np.load(path) as archive:
-            return archive["poses"].astype(np.float64)
+    def table(
+        self, runs: Runs, fewer: Sequence[int] = (), also: Sequence[str] = ()
+    ) -> pd.DataFrame:
+        """Return coverage by all draws of every cell, and by the first so many, step by step.
 
-    def once(self, name: str, make: Callable[[], pd.DataFrame]) -> pd.DataFrame:
-        """Return the table of one run; it is made where its file is missing."""
-        path = self.out / "runs" / f"{name}.csv"
-        if not path.exists():
-            start = time.perf_counter()
-            table = make()
-            path.parent.mkdir(exist_ok=True)
-            with written_whole(path) as unfinished:
-                table.to_csv(unfinished, index=False)
-            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
-        return pd.read_csv(path)
+        ``also`` names what else is taken from what the grid measured.
+        """
+        rows = []
+        for cell in runs.found.results:
+            about = dict(runs.asked[cell.problem])
+            if len(runs.found.plan.samplers) > 1:
+                about["proposal"] = cell.sampler
+            covered = {
+                (measure, runs.found.plan.draws): cell.metrics.get(f"coverage_{measure}", np.nan)
+                for measure in MEASURES
+            }
+            draws = runs.draws(cell.problem, cell.sampler)
+            if draws is None:
+                about["failed"] = reason(cell)
+            else:
+                about |= {name: cell.metrics[name] for name in ("acceptance", *also)}
+                about["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
+                about |= {"ess": cell.metrics["ess_bulk"], "seconds": cell.metrics["seconds"]}
+                covered = self.covered(step_by_step(draws), fewer) | covered
+            rows += [
+                {"measure": measure, "draws": count, "coverage": value, **about}
+                for (measure, count), value in covered.items()
+            ]
+        return pd.DataFrame(rows)
 
-    def covered(self, draws: MotionDraws, counts: list[int] | None = None) -> pd.DataFrame:
-        """Return coverage by the first so many draws of all chains, step by step."""
-        poses = step_by_step(draws)
-        counts = counts or [len(poses)]
-        rows = [
-            {"measure": measure, "draws": count, "coverage": value}
+    def covered(self, poses: np.ndarray, counts: Sequence[int]) -> dict[tuple[str, int], float]:
+        """Return coverage by the first so many poses, by measure and number."""
+        if not counts:
+            return {}
+        return {
+            (measure, count): float(value)
             for measure in MEASURES
             for count, value in zip(
                 counts, coverage(self.held_out, poses, measure, counts), strict=True
             )
-        ]
-        return pd.DataFrame(rows)
+        }
+
+    def draw_states(
+        self, runs: Mapping[str, MotionDraws | None], path: Path, compared: str
+    ) -> None:
+        """Draw the states that the paper shows of the first chain, turned to the seed."""
+        rows = {}
+        for label, draws in runs.items():
+            if draws is not None:
+                last = draws.positions.sizes["draw"] - 1
+                chosen = [min(number, last) for number in (200, 400, 600, 800)]
+                poses = draws.positions.values[0, chosen, 0]
+                rows[label] = align_rigidly(poses, np.broadcast_to(self.seed_pose, poses.shape))
+        if rows:
+            draw_pairs(
+                rows,
+                Skeleton.preset("pair17"),
+                path,
+                columns=4,
+                title=f"states 200, 400, 600 and 800 of a chain, by {compared}",
+            )
+
+
+def reason(cell: CellResult) -> str:
+    """Return why a cell has no draws."""
+    return f"{cell.failure.word}: {cell.failure.message}"
 
 
 def step_by_step(draws: MotionDraws) -> np.ndarray:
     """Return the poses of all chains, first step first: (chains × draws, J, 3)."""
     poses = np.swapaxes(draws.positions.values[:, :, 0], 0, 1)
     return poses.reshape(-1, *poses.shape[2:])
+
+
+def evenly(poses: np.ndarray, n: int) -> np.ndarray:
+    """Return about n of the poses, evenly apart."""
+    return poses[:: max(1, len(poses) // n)]
 
 
 def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.ndarray]:
@@ -198,15 +277,16 @@ def calibration(study: Study) -> pd.DataFrame:
     """What the density says of real pairs, of the seed and of draws, at several σ_l."""
     rng = seeds.generator(SEED, "calibration")
     real = study.held_in[rng.choice(len(study.held_in), min(400, len(study.held_in)), False)]
+    sizes = {f"noise {size}": size for size in (0.005, PairSettings().noise, 0.02)}
+    runs = study.run("calibration", {name: {"noise": size} for name, size in sizes.items()})
     rows = []
-    for size in (0.005, PairSettings().noise, 0.02):
-        posterior = study.posterior("interaction", noise=size)
-        drawn = step_by_step(study.run(posterior, draws=study.draws // 10))
-        found = {
-            "real pairs": levels(posterior, real),
-            "draws": levels(posterior, drawn[:: max(1, len(drawn) // 400)]),
-            "seed": levels(posterior, study.seed_pose[None]),
-        }
+    for name, size in sizes.items():
+        posterior = study.posterior(noise=size)
+        poses = {"real pairs": real}
+        if (draws := runs.draws(name)) is not None:
+            poses["draws"] = evenly(step_by_step(draws), 400)
+        poses["seed"] = study.seed_pose[None]
+        found = {kind: levels(posterior, some) for kind, some in poses.items()}
         if size == PairSettings().noise:
             draw_calibration(found, study.out / "calibration.png")
         rows += [
@@ -225,51 +305,34 @@ def noise(study: Study) -> pd.DataFrame:
         "cartesian": (0.0025, 0.005, 0.01, 0.02),
         "shape-context": (0.005, 0.01, 0.02),
     }
-
-    def run(density: str, size: float, repeat: int) -> pd.DataFrame:
-        posterior = study.posterior(density, repeat, noise=size)
-        draws = study.run(posterior, repeat, draws=study.draws // 10)
-        return study.covered(draws).assign(density=density, noise=size, **summary(draws))
-
-    return pd.concat(
-        study.once(f"noise-{density}-{size}-{repeat}", partial(run, density, size, repeat))
+    asked = {
+        f"{density} {size}, repeat {repeat}": {"density": density, "noise": size, "repeat": repeat}
         for repeat in range(study.repeats)
         for density, sizes in scales.items()
         for size in sizes
-    )
+    }
+    return study.table(study.run("noise", asked))
 
 
 def paired(study: Study) -> pd.DataFrame:
-    """Interaction against Cartesian coordinates at the same σ_l, annotations, views and seeds."""
-
-    def run(density: str, size: float, repeat: int) -> pd.DataFrame:
-        posterior = study.posterior(density, repeat, noise=size)
-        draws = study.run(posterior, repeat, draws=study.draws // 10)
-        found = study.covered(draws).assign(density=density, noise=size, repeat=repeat)
-        return found.assign(**summary(draws))
-
-    return pd.concat(
-        study.once(f"paired-{density}-{size}-{repeat}", partial(run, density, size, repeat))
+    """Interaction against Cartesian coordinates at the same σ_l, annotations and views."""
+    asked = {
+        f"{density} {size}, repeat {repeat}": {"density": density, "noise": size, "repeat": repeat}
         for repeat in range(study.repeats)
         for size in (0.005, 0.01)
         for density in ("interaction", "cartesian")
-    )
+    }
+    return study.table(study.run("paired", asked))
 
 
 def truncation(study: Study) -> pd.DataFrame:
     """c of eq. 11: shares of draws where the density is cut, and coverage."""
-
-    def run(limit: float, repeat: int) -> pd.DataFrame:
-        posterior = study.posterior("interaction", repeat, limit=limit)
-        draws = study.run(posterior, repeat, draws=study.draws // 10)
-        shares = {name: float(draws.dataset[name].mean()) for name in ("at_cap", "near_floor")}
-        return study.covered(draws).assign(limit=limit, **shares, **summary(draws))
-
-    return pd.concat(
-        study.once(f"truncation-{limit:.3g}-{repeat}", partial(run, limit, repeat))
+    asked = {
+        f"limit {limit:.3g}, repeat {repeat}": {"limit": limit, "repeat": repeat}
         for repeat in range(study.repeats)
         for limit in (100.0, limit_for_dimension(108), np.inf)
-    )
+    }
+    return study.table(study.run("truncation", asked), also=("at_cap", "near_floor"))
 
 
 def velocity(study: Study) -> pd.DataFrame:
@@ -280,55 +343,31 @@ def velocity(study: Study) -> pd.DataFrame:
         "biased-10": VelocityBiased(base=0.02, bias=10.0),
         "velocity-alone": VelocityBiased(base=0.001, bias=1.0),
     }
-
-    def run(name: str, repeat: int) -> pd.DataFrame:
-        posterior = study.posterior("interaction", repeat)
-        draws = study.run(posterior, repeat, proposals[name], draws=study.draws // 10)
-        study.keep(f"{name}-{repeat}", early(study, draws))
-        return study.covered(draws).assign(proposal=name, **summary(draws))
-
-    table = pd.concat(
-        study.once(f"velocity-{name}-{repeat}", partial(run, name, repeat))
-        for repeat in range(study.repeats)
-        for name in proposals
-    )
-    draw_pairs(
-        {"unbiased": study.kept("isotropic-0"), "velocity-\nbiased": study.kept("biased-1-0")},
-        study.posterior("prior").skeleton,
+    asked = {f"repeat {repeat}": {"repeat": repeat} for repeat in range(study.repeats)}
+    runs = study.run("velocity", asked, proposals)
+    study.draw_states(
+        {
+            "unbiased": runs.draws("repeat 0"),
+            "velocity-\nbiased": runs.draws("repeat 0", "biased-1"),
+        },
         study.out / "figure7.png",
-        columns=4,
-        title="states 200, 400, 600 and 800 of a chain, by proposal",
+        "proposal",
     )
-    return table
+    return study.table(runs)
 
 
 def densities(study: Study) -> pd.DataFrame:
     """Coverage against the number of draws, four densities, three dissimilarities (figure 9)."""
-    counts = [study.draws // 100, study.draws // 10, study.draws]
-
-    def run(density: str, repeat: int) -> pd.DataFrame:
-        draws = study.run(study.posterior(density, repeat), repeat)
-        poses = step_by_step(draws)
-        study.keep(f"{density}-{repeat}", poses[:: max(1, len(poses) // 10_000)])
-        study.keep(f"{density}-early-{repeat}", early(study, draws))
-        return study.covered(draws, counts).assign(density=density, **summary(draws))
-
-    table = pd.concat(
-        study.once(f"coverage-{density}-{repeat}", partial(run, density, repeat))
-        for density in ("interaction", "cartesian", "prior", "shape-context")
-        # Shape contexts cost several times as much, and are drawn once.
-        for repeat in range(1 if density == "shape-context" else study.repeats)
-    )
+    runs = study.by_density
+    table = study.table(runs, fewer=(study.draws // 100, study.draws // 10))
     draw_coverage(table, study.out / "figure9.png")
-    draw_pairs(
+    study.draw_states(
         {
-            "prior alone": study.kept("prior-early-0"),
-            "prior and\nlikelihood": study.kept("interaction-early-0"),
+            "prior alone": runs.draws("prior, repeat 0"),
+            "prior and\nlikelihood": runs.draws("interaction, repeat 0"),
         },
-        study.posterior("prior").skeleton,
         study.out / "figure6.png",
-        columns=4,
-        title="states 200, 400, 600 and 800 of a chain, by density",
+        "density",
     )
     rows = [
         {
@@ -348,18 +387,18 @@ def densities(study: Study) -> pd.DataFrame:
 
 def embedding(study: Study) -> pd.DataFrame:
     """Draws over the space of the real pairs, by multidimensional scaling (figure 8)."""
-    sets = {"real": study.held_out[:: max(1, len(study.held_out) // 150)]}
+    sets = {"real": evenly(study.held_out, 150)}
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
-        # Of two thousand draws evenly apart some of the first 20, of the first 200 and of all.
-        states = study.kept(f"{density}-0")
-        states = states[:: max(1, len(states) // 2000)]
-        sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
+        if (draws := study.by_density.draws(f"{density}, repeat 0")) is not None:
+            # Of two thousand draws evenly apart some of the first 20, of the first 200 and of all.
+            states = evenly(step_by_step(draws), 2000)
+            sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
     poses = np.concatenate(list(sets.values()))
     kinds = [kind for kind, some in sets.items() for _ in some]
     points = classical_scaling(pose_distances(poses, poses, "interaction"))
-    parts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
-    counts = parts | {f"{study.draws} draws": len(sets["prior"])}
+    counts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
+    counts[f"{study.draws} draws"] = len(poses)
     draw_embedding(points, kinds, study.out / "figure8.png", counts=counts)
     return pd.DataFrame({"kind": kinds, "x": points[:, 0], "y": points[:, 1]})
 
@@ -376,7 +415,8 @@ def completion(study: Study) -> pd.DataFrame:
     annotated = study.pictures(0).annotations
     skeleton = annotated.skeleton
     views = annotation_views(asked.annotations, study.seed_pose)
-    states = study.kept("interaction-0")
+    draws = study.by_density.draws("interaction, repeat 0")
+    states = None if draws is None else evenly(step_by_step(draws), 10_000)
     rows = []
     for index in range(n):
         keypoints, visible = asked.annotations.keypoints[index], asked.annotations.visible[index]
@@ -386,39 +426,21 @@ def completion(study: Study) -> pd.DataFrame:
             continue
         lifted = lift_people(keypoints, visible, study.seed_pose, skeleton, view)
         seed = project_to_views(study.seed_pose[None], view[None], skeleton)[0, 0]
-        for name, positions in {
-            "draws": complete_keypoints(
-                keypoints, visible, states, skeleton, views=views_around(view)
-            ).positions,
+        completed = {
             "nearest annotation": nearest_annotation_completion(
                 keypoints, visible, annotated.keypoints, skeleton
             ).positions,
             "single-pose lifting": lifted[:, :2],
             "the seed": np.asarray(align_rigidly(seed, keypoints, visible)),
-        }.items():
+        }
+        if states is not None:
+            completed["draws"] = complete_keypoints(
+                keypoints, visible, states, skeleton, views=views_around(view)
+            ).positions
+        for name, positions in completed.items():
             error = hidden_joint_error(truth, positions, ~visible)
             rows.append({"method": name, "pair": index, "error": error})
     return pd.DataFrame(rows)
-
-
-def summary(draws: MotionDraws) -> dict[str, float]:
-    """Return acceptance, the steps' scale, and the seconds of a run."""
-    scale = draws.state.get("proposal_log_scale", np.array([np.nan]))
-    found = chain_diagnostics(draws)
-    return {
-        "acceptance": found["acceptance"],
-        "scale": float(np.exp(scale).mean()),
-        "ess": found["ess_bulk"],
-        "seconds": draws.seconds,
-    }
-
-
-def early(study: Study, draws: MotionDraws) -> np.ndarray:
-    """Return the states that the paper shows of the first chain, turned to the seed, (4, J, 3)."""
-    last = draws.positions.sizes["draw"] - 1
-    chosen = [min(number, last) for number in (200, 400, 600, 800)]
-    poses = draws.positions.values[0, chosen, 0]
-    return align_rigidly(poses, np.broadcast_to(study.seed_pose, poses.shape))
 
 
 PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
@@ -443,25 +465,15 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     others = [
         c for c in ("acceptance", "scale", "ess", "seconds", "at_cap", "near_floor") if c in table
     ]
-    wide = table.pivot_table(index=keys, columns="measure", values="coverage", sort=False)
+    means = table.groupby([*keys, "measure"], sort=False)["coverage"].mean()
+    wide = means.unstack("measure", sort=False)
     if others:
         wide = wide.join(table.groupby(keys)[others].mean())
     return wide.round(4)
 
 
-def same_study(study: Study) -> None:
-    """Stop where the folder holds runs of another study, which would be taken for this one's."""
-    about = {k: v for k, v in asdict(study).items() if k not in ("out", "repeats", "validating")}
-    about |= {"noise": NOISE, "version": version("probmotion")}
-    path = study.out / "study.json"
-    if path.exists() and json.loads(path.read_text()) != about:
-        raise SystemExit(f"{path} is of another study, expected {about}: choose another --out")
-    with written_whole(path) as unfinished:
-        unfinished.write_text(json.dumps(about))
-
-
 def main() -> None:
-    """Run the parts that are not there yet; print every table."""
+    """Run the parts that are asked for; print every table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose-pairs"))
     parser.add_argument("--parts", nargs="*", choices=list(PARTS), default=list(PARTS))
@@ -469,8 +481,10 @@ def main() -> None:
     parser.add_argument("--draws", type=int, help="of all chains; 100000 by default")
     parser.add_argument("--repeats", type=int, default=3, help="with other annotations each")
     options = parser.parse_args()
-    if options.repeats < 1 or (options.draws is not None and options.draws < 400):
-        parser.error("expected --repeats of at least 1 and --draws of at least 400")
+    # A tenth of them is shared among four chains.
+    given = 400 if options.draws is None else options.draws
+    if options.repeats < 1 or given < 400 or given % 40:
+        parser.error("expected --repeats of at least 1, --draws of at least 400, a multiple of 40")
     options.out.mkdir(parents=True, exist_ok=True)
     study = Study(
         options.out,
@@ -482,15 +496,11 @@ def main() -> None:
         n_annotations=300 if options.quick else 6000,
         n_held_out=40 if options.quick else 300,
     )
-    same_study(study)
     for name in options.parts:
-        path = options.out / f"{name}.csv"
         start = time.perf_counter()
-        if not path.exists():
-            table = PARTS[name](study)
-            with written_whole(path) as unfinished:
-                table.to_csv(unfinished, index=False)
-        table = pd.read_csv(path)
+        table = PARTS[name](study)
+        with written_whole(options.out / f"{name}.csv") as unfinished:
+            table.to_csv(unfinished, index=False)
         print(f"\n{name} ({time.perf_counter() - start:.0f} s)\n{shown(name, table).to_string()}")
 
 
