@@ -20,7 +20,8 @@ PICTURES = ROOT / "notebooks" / "pictures"
 SHOWN = ("exact", "mas", "mvpc", "nuts")
 
 ADVICE = {
-    "exact": "prior and evidence have a closed form: nothing else is needed",
+    "exact": "prior and evidence have a closed form, or there is no evidence and a prior that can "
+    "be drawn from: nothing else is needed",
     "ensemble": "there is a log density of at most about 20 dimensions",
     "nuts": "there is a log density with a gradient; start many chains, and look at R-hat: chains "
     "that began in different modes stay there",

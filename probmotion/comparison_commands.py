@@ -104,8 +104,8 @@ class Compare:
 
     prior: str | None = None
     """Also draw from a prior of your own: the folder of a run of probmotion train diffusion or
-    dvae. There is no evidence, and nothing to measure draws by but what they cost; they are in
-    --out."""
+    dvae. There is no evidence. Draws are compared with the prior's own where it can be drawn from;
+    else there is nothing to measure them by but what they cost."""
 
     own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 

@@ -102,6 +102,11 @@ class MotionPosterior:
         parts = (self.prior, self.likelihood)
         return all(getattr(part, "differentiable", True) for part in parts)
 
+    @property
+    def reshaped(self) -> bool:
+        """Whether the density is another than that of prior and evidence."""
+        return False
+
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ) + log p(y | θ), the posterior's up to a constant: ``(…, dim) → (…)``.
 

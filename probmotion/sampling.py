@@ -131,8 +131,9 @@ def require(sampler: Sampler, posterior: MotionPosterior) -> None:
 def suited(posterior: MotionPosterior) -> list[str]:
     """Return the names of the registered samplers that can draw from a posterior.
 
-    The prior has what they require, a gradient where they need one (``needs_gradient``), and no
-    more dimensions than they take by default (``largest_dim``). One that cannot be imported, as of
+    The prior has what they require, a gradient where they need one (``needs_gradient``), no more
+    dimensions than they take by default (``largest_dim``), and what a static method ``draws_from``
+    asks of the posterior. One that cannot be imported, as of
     a package that is half removed, is none.
     """
     return [
@@ -141,6 +142,7 @@ def suited(posterior: MotionPosterior) -> list[str]:
         if not missing(kind, posterior)
         and (posterior.differentiable or not getattr(kind, "needs_gradient", False))
         and posterior.dim <= getattr(kind, "largest_dim", posterior.dim)
+        and (not hasattr(kind, "draws_from") or kind.draws_from(posterior))
     ]
 
 

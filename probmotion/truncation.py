@@ -61,6 +61,11 @@ class TruncatedPosterior(MotionPosterior):
         object.__setattr__(self, "log_seed", log_seed)
 
     @property
+    def reshaped(self) -> bool:
+        """Whether the density is cut."""
+        return math.isfinite(self.limit)
+
+    @property
     def log_floor(self) -> float:
         """log f₀/c."""
         return self.log_seed - math.log(self.limit)

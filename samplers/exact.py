@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +13,13 @@ from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate, Samplable
-from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
+from probmotion.sampling import (
+    Interrupted,
+    UnsupportedPosterior,
+    progress_bar,
+    require,
+    suited,
+)
 
 __all__ = ["ExactSampler"]
 
@@ -29,7 +35,7 @@ class ExactSampler:
     """
 
     name: ClassVar[str] = "exact"
-    requires: ClassVar[tuple[type, ...]] = (HasExactPosterior,)
+    requires: ClassVar[tuple[Any, ...]] = (HasExactPosterior | Samplable,)
 
     def sample(
         self,
@@ -82,13 +88,35 @@ class ExactSampler:
             raise Interrupted(result()) from stop
         return result()
 
+    @staticmethod
+    def draws_from(posterior: MotionPosterior) -> bool:
+        """Return whether it can, as far as can be told before the evidence is looked at."""
+        if posterior.reshaped:
+            return False
+        if isinstance(posterior.prior, HasExactPosterior):
+            return True
+        return posterior.likelihood is None and isinstance(posterior.prior, Samplable)
+
     def _source(self, posterior: MotionPosterior) -> ExactPosterior | Samplable:
+        require(self, posterior)
         prior = posterior.prior
+        if posterior.reshaped:
+            raise UnsupportedPosterior(
+                self.name,
+                "draws from prior and evidence, and the posterior's density is cut",
+                word="truncated",
+                others=suited(posterior),
+            )
         if not isinstance(prior, HasExactPosterior):
             if posterior.likelihood is None and isinstance(prior, Samplable):
                 return prior
-            require(self, posterior)
-        assert isinstance(prior, HasExactPosterior)
+            raise UnsupportedPosterior(
+                self.name,
+                "needs a prior with HasExactPosterior where there is evidence, which "
+                f"{type(prior).__name__} is not",
+                word="HasExactPosterior",
+                others=suited(posterior),
+            )
         try:
             return prior.exact_posterior(posterior.likelihood)
         except NotConjugate as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
@@ -255,6 +256,20 @@ def one_frame(folder: Path) -> str:
     path = folder / "still.npz"
     Motion(np.zeros((1, 17, 3)) + np.arange(17)[:, None], skeleton, 30).save(path)
     return str(path)
+
+
+def test_calibration_within_a_budget_goes_on(tmp_path, capsys):
+    words = ["compare", "gait-sparse(frames=4, components=6)", "--samplers", "mh"]
+    words += ["--draws", "20", "--evaluations", "9000", "--calibrate", "10", "--out", str(tmp_path)]
+    for _ in range(2):
+        assert main(words) == 0
+        told = capsys.readouterr().out
+    assert "in 10 simulations" in told
+    cells = list((tmp_path / "calibration/cells").rglob("cell.json"))
+    assert len(cells) == 10
+    held = json.loads(cells[0].read_text())
+    assert held["budget"]["used"] <= 9000
+    assert held["budget"]["settings"]["thin"] >= 1
 
 
 @pytest.mark.parametrize(

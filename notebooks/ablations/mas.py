@@ -164,7 +164,7 @@ class Study:
             "walks",
             "people who walk, a prior learnt from 2D tracks alone: generation",
             MotionPosterior(self.prior),
-            generation=self.reference,
+            generation=replace(self.reference, held_out_views=self.views("test", 400)),
         )
 
     @property

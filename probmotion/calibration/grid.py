@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import ClassVar
 
 from probmotion import seeds
 from probmotion.calibration.ranks import ranks_of_truth
@@ -18,7 +19,6 @@ from probmotion.calibration.result import Calibration
 from probmotion.checks import check_count, check_positive
 from probmotion.comparison.budgets import Budget, check_budget
 from probmotion.comparison.cells import Cell, forget_unfinished
-from probmotion.comparison.failures import Failure
 from probmotion.comparison.locks import locked
 from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
 from probmotion.comparison.plan import Plan
@@ -108,7 +108,7 @@ def calibrate(
     given = Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else Path(out)
     folder = writable_folder(given / Calibration.FOLDER)
     Plan.check_folder(folder)
-    plan = Plan.of(chosen, used, draws, chains, simulations, budget)
+    plan = Plan.of(chosen, used, draws, chains, simulations, budget, per="simulation")
     with locked(folder, chosen):
         grid = CalibrationGrid(folder, plan, chosen, used, budget, time_limit)
         refuse_taken(folder, [*grid.pilots(), *grid.cells()])
@@ -137,6 +137,9 @@ class CalibrationGrid(Grid):
 class CalibrationCell(Cell):
     """One sampler on one simulation, whose number is ``seed``; its ranks are its metrics."""
 
+    # Draws of hundreds of simulations fill a disk, and nothing more is asked of them.
+    keeps_draws: ClassVar[bool] = False
+
     def _measured(self, problem: Problem, progress: bool) -> tuple[MotionDraws, dict[str, float]]:
         assert problem.simulate is not None
         simulation = problem.simulate(self.seed)
@@ -156,9 +159,3 @@ class CalibrationCell(Cell):
         for name, rank in ranks.items():
             kept |= {f"rank {name}": rank.value, f"draws {name}": float(rank.draws)}
         return draws, kept
-
-    def _keep(
-        self, metrics: dict[str, float], draws: MotionDraws | None, failure: Failure | None
-    ) -> None:
-        # Draws of hundreds of simulations fill a disk, and nothing more is asked of them.
-        super()._keep(metrics, None, failure)

@@ -7,12 +7,13 @@ import math
 import shutil
 import weakref
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.cells import CellResult, read_result
+from probmotion.comparison.cells import CellResult, read_result, used_of_budget
 from probmotion.comparison.plan import Plan
 from probmotion.files import written_whole
 
@@ -107,6 +108,9 @@ class Calibration:
     def notes(self) -> list[str]:
         """Sentences to read with the table: budget, failures, simulations, and thinning."""
         notes = [*self.plan.notes]
+        places = product(self.plan.problems, self.plan.samplers)
+        if used := used_of_budget(result for place in places for result in self.cells(*place)):
+            notes.append(f"used per simulation: {', '.join(used)}")
         counted: dict[str, int] = {}
         for result in self.failures:
             assert result.failure is not None

@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,7 +27,15 @@ from probmotion.problems import Problem, load_problem
 from probmotion.sampling import Sampler
 from probmotion.threads import one_thread
 
-__all__ = ["Cell", "CellResult", "Failure", "forget_unfinished", "read_draws", "read_result"]
+__all__ = [
+    "Cell",
+    "CellResult",
+    "Failure",
+    "forget_unfinished",
+    "read_draws",
+    "read_result",
+    "used_of_budget",
+]
 
 _DRAWS, _RESULT = "draws.nc", "cell.json"
 _UNFINISHED = ".unfinished-"
@@ -79,6 +87,8 @@ class Cell:
     beforehand : Failure, optional
         Why it cannot run within it; the cell then has this failure.
     """
+
+    keeps_draws: ClassVar[bool] = True
 
     folder: Path
     problem: str
@@ -188,7 +198,7 @@ class Cell:
         unfinished = self.folder.parent / f"{_UNFINISHED}{self.folder.name}-{os.getpid()}"
         try:
             unfinished.mkdir(parents=True, exist_ok=True)
-            if draws is not None:
+            if draws is not None and self.keeps_draws:
                 draws.save(unfinished / _DRAWS)
             with open(unfinished / _RESULT, "w", encoding="utf-8") as file:
                 json.dump(_without_nan(asdict(result)), file, indent=1)
@@ -226,6 +236,17 @@ def read_result(folder: Path) -> CellResult | None:
 def read_draws(folder: Path) -> MotionDraws:
     """Return the draws kept in a cell's folder."""
     return MotionDraws.load(folder / _DRAWS)
+
+
+def used_of_budget(results: Iterable[CellResult]) -> list[str]:
+    """Return what each sampler used of a budget, from the least to the most of a cell, in words."""
+    used: dict[str, list[float]] = {}
+    for result in results:
+        if result.budget is not None and result.budget["used"] is not None:
+            used.setdefault(result.sampler, []).append(result.budget["used"])
+    return [
+        f"{sampler} {min(amounts):.3g} to {max(amounts):.3g}" for sampler, amounts in used.items()
+    ]
 
 
 def forget_unfinished(cells: Path, problems: Iterable[str]) -> None:

@@ -53,8 +53,9 @@ class Plan:
         chains: int,
         seeds: int,
         budget: Budget | None = None,
+        per: str = "cell",
     ) -> Plan:
-        """Return the plan of a grid of these objects."""
+        """Return the plan of a grid of these objects; ``per`` says what a budget is for."""
         loaded = {
             name: load_problem(source) if isinstance(source, str) else source
             for name, source in problems.items()
@@ -65,7 +66,7 @@ class Plan:
             draws=draws,
             chains=chains,
             seeds=seeds,
-            notes=() if budget is None else _budget_notes(budget, samplers),
+            notes=() if budget is None else _budget_notes(budget, samplers, per),
         )
 
     def cells(self) -> Iterator[tuple[str, str, int]]:
@@ -128,8 +129,8 @@ def _check_format(folder: Path, held: Any) -> None:
         )
 
 
-def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler]) -> tuple[str, ...]:
-    notes = [f"every sampler had {budget} per cell"]
+def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler], per: str) -> tuple[str, ...]:
+    notes = [f"every sampler had {budget} per {per}"]
     if free := [name for name, sampler in samplers.items() if not effort_of(sampler)]:
         verb = "has" if len(free) == 1 else "have"
         notes.append(f"{', '.join(free)} {verb} no setting of effort and ran as given")

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probmotion.comparison.cells import CellResult, read_draws, read_result
+from probmotion.comparison.cells import CellResult, read_draws, read_result, used_of_budget
 from probmotion.comparison.plan import Plan
 from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
@@ -65,7 +65,11 @@ class Comparison:
     @property
     def notes(self) -> list[str]:
         """Sentences to read with the table: budget, settings other than defaults, failures."""
-        notes = [*self.plan.notes, *self._used()]
+        notes = [*self.plan.notes]
+        if used := used_of_budget(self.results):
+            notes.append(
+                f"used per cell (budget_used; set_…: settings that it bought): {', '.join(used)}"
+            )
         bought = {
             (result.sampler, name)
             for result in self.results
@@ -89,21 +93,6 @@ class Comparison:
             some = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
             notes.append(sentence + (some if len(failed) < self.plan.seeds else ""))
         return notes
-
-    def _used(self) -> list[str]:
-        """What samplers used of a budget, from the least to the most of a cell."""
-        used: dict[str, list[float]] = {}
-        for result in self.results:
-            if result.budget is not None and result.budget["used"] is not None:
-                used.setdefault(result.sampler, []).append(result.budget["used"])
-        if not used:
-            return []
-        each = [
-            f"{sampler} {min(amounts):.3g} to {max(amounts):.3g}"
-            for sampler, amounts in used.items()
-        ]
-        listed = ", ".join(each)
-        return [f"used per cell (budget_used; set_…: settings that it bought): {listed}"]
 
     def table(self) -> ComparisonTable:
         """Return the tidy data frame: columns problem, sampler, seed, metric, value.

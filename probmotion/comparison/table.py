@@ -121,8 +121,9 @@ _GENERATION_LEGEND = """\
 FID: Fréchet distance of the features of random views and of held-out real ones; it falls with the
 number of draws; diversity: mean distance of two motions / real motions' (1 is right); P, R:
 precision and recall; side: from π/4 to 3π/4 beside the first view; learnt: against the clips that
-were learnt from, which few held-out clips need not be like; MCD: Motion Chamfer Distance to clips
-that were held out (cm²), where they are at hand."""
+were learnt from, which few held-out clips need not be like; MCD: Motion Chamfer Distance to
+held-out views, of windows of 10 frames (cm²), where a problem has them; it falls with the number of
+draws as well."""
 
 
 class ComparisonTable(pd.DataFrame):

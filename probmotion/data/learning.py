@@ -81,20 +81,13 @@ def film_clips(
 
 
 def film_windows(
-    motions: Sequence[Motion],
-    skeleton: Skeleton,
-    fps: float,
-    frames: int,
-    n: int,
-    *,
-    seed: int,
-    views: int = 64,
+    motions: Sequence[Motion], skeleton: Skeleton, fps: float, frames: int, n: int, *, seed: int
 ) -> np.ndarray:
     """Return n random windows of filmed clips, whole: ``(n, frames, J, 2)``, metres.
 
     The detector errs but loses no joint, and windows with a hole are left out; all else is as in
-    :func:`film_clips`. Every window of every clip is as likely, from ``views`` sides, and as likely
-    in a mirror: what is compared with them has learnt from mirror images, too.
+    :func:`film_clips`. Every window of every clip is as likely, from 64 sides, and as likely in a
+    mirror: what is compared with them has learnt from mirror images, too.
 
     Raises
     ------
@@ -102,7 +95,7 @@ def film_windows(
         If no clip is as long as a window.
     """
     noise = DetectorNoise(share=0.0)
-    filmed = film_clips(motions, skeleton, fps, views=views, seed=seed, noise=noise).tracks
+    filmed = film_clips(motions, skeleton, fps, views=64, seed=seed, noise=noise).tracks
     every = [
         sliding_window_view(track.keypoints, frames, axis=0).transpose(0, 3, 1, 2)
         for track in filmed

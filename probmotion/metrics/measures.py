@@ -58,8 +58,8 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     ``diversity_ratio`` (over the real motion's), ``view_precision``, ``view_recall``, and from the
     side ``fid_side`` and ``view_recall_side``; ``fid_learnt`` and ``view_recall_learnt`` are
     against the clips that were learnt from: few clips are far from few others, even real ones.
-    ``mcd_cm2``: Motion Chamfer Distance, square centimetres, where real 2D motion itself is at hand
-    and not its features alone.
+    ``mcd_cm2``: Motion Chamfer Distance, square centimetres, of windows of 10 frames, where the
+    reference holds views and not their features alone; it falls with the number of draws.
 
     Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
     ``coverage_shape-context``, the mean distance of each to its nearest draw; see

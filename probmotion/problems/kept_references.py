@@ -25,6 +25,7 @@ from probmotion.arrays import Array, to_numpy
 from probmotion.checks import check_finite, check_shape
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
+from probmotion.truncation import TruncatedPosterior
 
 __all__ = [
     "HasPositionDensity",
@@ -188,12 +189,13 @@ def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[fl
     """Return the numbers that a reference is known by.
 
     The posterior's log density at the first draws; where positions have none, that of four θ to
-    start from, and the mean distance of their joints from the origin, metres.
+    start from, and the mean distance of their joints from the origin, metres. Of a density that is
+    cut, the levels of the cuts as well.
 
     Raises
     ------
     ValueError
-        If the prior has a density neither of positions nor of θ.
+        If the prior has a density neither of positions nor of θ, or draws of it have none.
     """
     prior = posterior.prior
     if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):
@@ -204,6 +206,13 @@ def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[fl
         theta = prior.initial(seeds.generator(0, "fingerprint"), _PROBES)
         distances = np.linalg.norm(to_numpy(prior.motion(theta)), axis=-1)
         known = [to_numpy(posterior.log_density(theta)), distances.mean(axis=(1, 2))]
+        if not np.isfinite(known).all():
+            raise ValueError(
+                f"posterior has log densities of {known[0].tolist()} at draws of its prior, "
+                "expected finite ones, which a reference is known by"
+            )
+    if isinstance(posterior, TruncatedPosterior) and posterior.reshaped:
+        known.append(np.array([posterior.log_floor, posterior.log_cap]))
     return [round(float(value), 6) for value in np.concatenate(known)]
 
 

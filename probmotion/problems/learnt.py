@@ -11,10 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion import models, seeds
-from probmotion.data.animals import animal_clips
-from probmotion.data.downloads import data_places
-from probmotion.data.learning import film_windows
-from probmotion.data.walks import walk_clips
 from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics.generation import GenerationReference
 from probmotion.motion import Motion
@@ -28,12 +24,6 @@ if TYPE_CHECKING:
 __all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
 
 _NOISE = 0.02
-_WINDOWS, _SIDES = 400, 16
-_CLIPS: Mapping[str, Callable[[Path], Mapping[str, list[Motion]]]] = {
-    "walk2d": walk_clips,
-    "walk-vae": walk_clips,
-    "animal-vae": animal_clips,
-}
 
 
 def learnt_problem(name: str, description: str, kind: str) -> Problem:
@@ -41,8 +31,7 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
 
     Its kind is named, so that a process loads no networks but those of the problems it works on.
     Beside the prior's weights lie those of the evaluator, ``<name>-evaluator``, and the features
-    of real 2D motion, held out and learnt from, ``<name>-features.npz``. The motion itself is not:
-    where the clips are found (:func:`~probmotion.data.downloads.data_places`), they are filmed.
+    of real 2D motion, held out and learnt from, ``<name>-features.npz``; the motion itself is not.
 
     Raises
     ------
@@ -53,8 +42,6 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
 
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
-    kinds: type[MotionDiffusion] | type[MotionVAE] = getattr(models, kind)
-    prior = kinds.load(name)
     with np.load(weights / f"{name}-features.npz") as kept:
         reference = GenerationReference(
             evaluator,
@@ -62,22 +49,9 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
             kept["learnt"].astype(np.float64),
             float(kept["elevation"]),
             float(kept["distance"]),
-            _held_out_views(name, prior),
         )
-    return Problem(name, description, MotionPosterior(prior), generation=reference)
-
-
-def _held_out_views(name: str, prior: MotionDiffusion | MotionVAE) -> np.ndarray | None:
-    """Return windows of filmed clips that were held out, (M, L, J, 2); None without the clips."""
-    for place in data_places():
-        try:
-            held_out = _CLIPS[name](place)["test"]
-        except FileNotFoundError:
-            continue
-        return film_windows(
-            held_out, prior.skeleton, prior.fps, prior.frames, _WINDOWS, seed=1, views=_SIDES
-        )
-    return None
+    prior: type[MotionDiffusion] | type[MotionVAE] = getattr(models, kind)
+    return Problem(name, description, MotionPosterior(prior.load(name)), generation=reference)
 
 
 def seen_draw_problem(

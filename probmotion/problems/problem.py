@@ -78,7 +78,7 @@ class Problem:
     def exact(self) -> ExactPosterior | None:
         """The posterior in closed form, where it has one."""
         prior = self.posterior.prior
-        if not isinstance(prior, HasExactPosterior):
+        if self.posterior.reshaped or not isinstance(prior, HasExactPosterior):
             return None
         try:
             return prior.exact_posterior(self.posterior.likelihood)
@@ -88,10 +88,10 @@ class Problem:
     @property
     def known(self) -> ExactPosterior | Samplable | None:
         """What independent draws come from: the closed form; without evidence, the prior."""
-        prior = self.posterior.prior
-        if self.exact is None and self.posterior.likelihood is None:
-            return prior if isinstance(prior, Samplable) else None
-        return self.exact
+        posterior, exact = self.posterior, self.exact
+        if exact is not None or posterior.reshaped or posterior.likelihood is not None:
+            return exact
+        return posterior.prior if isinstance(posterior.prior, Samplable) else None
 
     @property
     def has_reference(self) -> bool:
@@ -117,7 +117,11 @@ class Problem:
         check_count("n", n)
         known = self.known
         if known is not None:
-            return known.sample(seeds.generator(seed, "reference"), n)
+            drawn = known.sample(seeds.generator(seed, "reference"), n)
+            shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
+            check_shape(f"sample(rng, {n}) of {type(known).__name__}", drawn, (n, *shape))
+            check_finite(f"sample(rng, {n}) of {type(known).__name__}", drawn)
+            return drawn
         if self.kept is not None:
             return self.kept.choose(seeds.generator(seed, "reference"), n)
         raise ValueError(

@@ -1,7 +1,9 @@
 """`make_reference`: reference draws from two independent runs that agree.
 
-Both runs are the sampler's own, four chains each, started apart; their draws are kept only if each
-has mixed and they cannot be told apart. Of a posterior that is known exactly they are two sets of
+Both runs are the sampler's own, four chains each; their draws are kept only if each has mixed and
+they cannot be told apart. Chains start where the prior says: where that is a few seeds, they start
+together and say nothing of modes that none of them reached, and the certificate tells from how many
+points. Of a posterior that is known exactly they are two sets of
 exact draws, which are measured the same way.
 """
 
@@ -19,6 +21,7 @@ from probmotion.checks import check_count
 from probmotion.draws import MotionDraws, library_versions
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.distribution import random_directions
+from probmotion.priors import HasSeeds
 from probmotion.problems.kept_references import KeptReference, fingerprint_of
 from probmotion.problems.outlier_gibbs import OutlierGibbs
 from probmotion.problems.problem import Problem
@@ -145,6 +148,7 @@ def certify(
         "settings": json.loads(first["settings"]),
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
+        "seeds": _n_seeds(problem),
         "rhat": worst,
         "ess_bulk": _least(measured, "ess_bulk"),
         "ess_tail": _least(measured, "ess_tail"),
@@ -154,6 +158,12 @@ def certify(
         "fingerprint": fingerprint_of(problem.posterior, positions),
     }
     return KeptReference(positions, certificate)
+
+
+def _n_seeds(problem: Problem) -> int | None:
+    """Return from how many points chains start; None where each starts at a draw of its own."""
+    prior = problem.posterior.prior
+    return len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None
 
 
 def _evenly(run: MotionDraws, draws: int | None) -> np.ndarray:

@@ -356,6 +356,9 @@ def test_what_a_budget_buys_is_found_once_and_all_simulations_have_it(tmp_path):
     pilots = len((tmp_path / "diary").read_text().split()) - 10
     assert pilots > 0
     assert held.notes[0].startswith("every sampler had 350 evaluations")
+    assert held.notes[0].endswith("per simulation")
+    assert held.notes[1] == "used per simulation: batch 350 to 350"
+    assert not list((tmp_path / "kept").rglob("draws.nc"))
     asked(simulations=12, budget=Budget(evaluations=350))
     assert len((tmp_path / "diary").read_text().split()) == pilots + 12
     plain_ranks = calibrate(toy(), replace(paid, thin=50), simulations=10, **SMALL)

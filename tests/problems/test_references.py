@@ -22,6 +22,7 @@ from probmotion.problems.references import (
 )
 from probmotion.sampling import load_sampler
 from probmotion.skeleton import Skeleton
+from probmotion.truncation import TruncatedPosterior
 
 
 def toy(
@@ -263,6 +264,48 @@ def test_without_evidence_the_priors_own_draws_are_the_reference():
     np.testing.assert_allclose(drawn.std(axis=0), 2, rtol=0.06)
     kept = make_reference(problem, draws=800, progress=False)
     assert (kept.certificate["sampler"], kept.certificate["exact"]) == ("exact", True)
+    assert kept.certificate["seeds"] is None
+
+
+@pytest.mark.parametrize(
+    ("drawn", "sentence"),
+    [
+        (np.zeros((5, 2, 3)), r"sample\(rng, 5\) of Odd has shape \(5, 2, 3\), expected"),
+        (np.full((5, 2, 1, 3), np.nan), r"sample\(rng, 5\) of Odd has 30 values that are NaN"),
+    ],
+)
+def test_draws_of_a_prior_that_are_no_motions_are_no_reference(drawn, sentence):
+    class Odd(Moved):
+        def sample(self, rng, n):
+            return drawn
+
+    with pytest.raises(ValueError, match=sentence):
+        Problem("odd", "", MotionPosterior(Odd())).reference(0, 5)
+
+
+def test_a_cut_density_is_another_posterior():
+    def known(limit: float) -> list[float]:
+        cut = TruncatedPosterior(Moved(0.1), seen(0.1, at=0.0).posterior.likelihood, limit=limit)
+        return kept_references.fingerprint_of(cut, np.zeros((1, 2, 1, 3)))
+
+    assert known(1e9) != known(2e9)
+    assert len(known(1e9)) == len(known(np.inf)) + 2
+    with pytest.raises(
+        ValueError, match=r"posterior has log densities of .*-inf.* at draws of its"
+    ):
+        known(1.001)
+
+
+def test_chains_that_start_at_one_seed_are_told():
+    class Seeded(Moved):
+        def seed_coordinates(self):
+            return np.zeros((1, 3))
+
+    evidence = seen().posterior.likelihood
+    problem = Problem("seeded", "", MotionPosterior(Seeded(), evidence))
+    walk = load_sampler("mh")(warmup=2000, thin=20)
+    kept = make_reference(problem, draws=4000, seed=1, progress=False, sampler=walk)
+    assert kept.certificate["seeds"] == 1
 
 
 def test_a_prior_without_any_density_has_no_reference():

@@ -7,9 +7,11 @@ import pytest
 
 from probmotion import Joints3D, MotionPosterior
 from probmotion.models import GaussianMixtureMotion
+from probmotion.problems import Problem
 from probmotion.samplers import ExactSampler
-from probmotion.sampling import UnsupportedPosterior
+from probmotion.sampling import UnsupportedPosterior, suited
 from probmotion.skeleton import Skeleton
+from probmotion.truncation import TruncatedPosterior
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,7 @@ def test_a_prior_without_a_closed_form_is_refused(two_bumps):
 
 
 class Drawn:
-    """A prior that can be drawn from, and no more."""
+    """A prior that can be drawn from, and has a density."""
 
     skeleton, frames, fps, dim = Skeleton(["a"], [-1]), 2, 30.0, 6
 
@@ -56,6 +58,12 @@ class Drawn:
 
     def sample(self, rng, n):
         return rng.normal(7.0, 2.0, (n, 2, 1, 3))
+
+    def log_density(self, theta):
+        return -0.5 * ((theta - 7.0) ** 2).sum(axis=-1) / 4.0
+
+    def initial(self, rng, n):
+        return rng.normal(7.0, 2.0, (n, 6))
 
 
 def test_without_evidence_a_prior_that_can_be_drawn_from_will_do():
@@ -66,6 +74,22 @@ def test_without_evidence_a_prior_that_can_be_drawn_from_will_do():
     seen = MotionPosterior(Drawn(), Joints3D(np.zeros((2, 1, 3)), noise=0.5))
     with pytest.raises(UnsupportedPosterior, match=r"exact needs a prior with HasExactPosterior"):
         ExactSampler().sample(seen, draws=1, progress=False)
+    assert "exact" in suited(MotionPosterior(Drawn()))
+    assert "exact" not in suited(seen)
+
+
+def test_a_density_that_is_cut_is_refused(posterior):
+    whole = TruncatedPosterior(Drawn(), seed=np.full(6, 7.0))
+    assert ExactSampler().sample(whole, draws=3, progress=False).independent
+    for cut in (
+        TruncatedPosterior(Drawn(), seed=np.full(6, 7.0), limit=2.0),
+        TruncatedPosterior(posterior.prior, posterior.likelihood, limit=2.0),
+    ):
+        with pytest.raises(UnsupportedPosterior, match="exact draws from prior and evidence") as no:
+            ExactSampler().sample(cut, draws=3, progress=False)
+        assert no.value.word == "truncated"
+        assert "exact" not in suited(cut)
+        assert not Problem("cut", "", cut).has_reference
 
 
 def test_evidence_without_a_closed_form_is_refused(posterior):
