@@ -16,6 +16,7 @@ from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.sampling import Interrupted, Sampler, batches, progress_bar
 from probmotion.seeds import NormalStreams
+from probmotion.threads import one_thread
 
 __all__ = ["DrawBatch", "draw_independently", "refuse_initial", "with_coordinates"]
 
@@ -116,8 +117,11 @@ def with_coordinates(
     # Draw by draw, as the batches were made.
     shape = (sizes["draw"], sizes["chain"])
     theta = np.concatenate(batches_of_theta)[: math.prod(shape)]
+    # One by one: the bits of a product depend on its shape and on the place of a row in it.
+    with one_thread():
+        log_density = np.concatenate([to_numpy(posterior.log_density(row[None])) for row in theta])
+    log_density = log_density.reshape(shape).T
     theta = theta.reshape(*shape, -1).swapaxes(0, 1)
-    log_density = to_numpy(posterior.log_density(theta))
     return MotionDraws(
         found.dataset.assign(
             theta=(("chain", "draw", "coordinate"), theta),

@@ -214,7 +214,7 @@ def test_a_constant_is_learnt_exactly(tmp_path):
     still = replace(track(), keypoints=keypoints)
     trainee = DiffusionTrainee([still], [still], SIZE, augmentation=NONE)
     settings = TrainingSettings(
-        steps=150, batch=8, learning_rate=5e-3, warmup=10, ema=0.9, checkpoint_every=75
+        steps=300, batch=8, learning_rate=5e-3, warmup=10, ema=0.9, checkpoint_every=150
     )
     result = train(trainee, settings, tmp_path, progress=False)
     prior = MotionDiffusion.load(result.model)
