@@ -7,6 +7,7 @@ DATA holds CMU's clips of one person in ``cmu_single`` and its salsa pairs in ``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -229,7 +230,8 @@ def _mean_directions(poses: np.ndarray, bin_rings: int, cell_rings: int) -> np.n
         for part in range(len(PARTS)):
             # Rounded, so that the last bits of a sum do not reach the table.
             mean = np.round(_samples(local, part)[1].mean(axis=0), 4)
-            rest[part] = mean / np.linalg.norm(mean)
+            # Three squares, summed exactly: NumPy's norm ends in other bits on other processors.
+            rest[part] = mean / math.sqrt(math.fsum(value * value for value in mean.tolist()))
     return rest
 
 

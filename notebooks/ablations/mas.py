@@ -26,7 +26,7 @@ import pandas as pd
 from probmotion import seeds
 from probmotion.cameras import Cameras
 from probmotion.comparison import Comparison, compare
-from probmotion.comparison.cells import CellResult, Failure
+from probmotion.comparison.cells import CellResult
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.data.learning import (
     LearningTracks,
@@ -329,14 +329,9 @@ def score_cell(
 ) -> dict[str, object]:
     """Return the row of a sampler that drew in the grid, or failed."""
     if cell.failure is not None:
-        return {"name": name, "failed": reason(cell.failure)}
+        return {"name": name, "failed": str(cell.failure)}
     motions = found.draws(cell.problem, cell.sampler).flat()
     return score(study, name, motions, None, real, cell.metrics["seconds"] / study.draws)
-
-
-def reason(failure: Failure) -> str:
-    """Return what stands in the table in place of scores."""
-    return f"{failure.word}: {failure.message}"
 
 
 def bone_changes(motions: np.ndarray) -> float:
@@ -454,7 +449,7 @@ def exact(study: Study) -> pd.DataFrame:
             measured = measure(problem, found.draws(cell.problem, cell.sampler), SEED)
             row |= {key: measured[key] for key in kept}
         else:
-            row["failed"] = reason(cell.failure)
+            row["failed"] = str(cell.failure)
         rows.append(row)
         print(row, flush=True)
     return pd.DataFrame(rows)

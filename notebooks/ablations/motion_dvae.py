@@ -460,7 +460,7 @@ def posterior(study: Study) -> pd.DataFrame:
                 row["log_density"] = float(drawn.dataset["log_density"].mean())
                 row["seconds"] = cell.metrics["seconds"]
             else:
-                row["failed"] = f"{cell.failure.word}: {cell.failure.message}"
+                row["failed"] = str(cell.failure)
             rows.append(row)
             print(row, flush=True)
     return pd.DataFrame(rows)

@@ -299,7 +299,7 @@ def generation(study: Study) -> pd.DataFrame:
                 row |= {"sequences": len(motions), "seconds": cell.metrics["seconds"]}
                 row |= beside_real(study, motions)
             else:
-                row["failed"] = f"{cell.failure.word}: {cell.failure.message}"
+                row["failed"] = str(cell.failure)
             rows.append(row)
             print(row, flush=True)
     rng = seeds.generator(study.seed, "real draws")

@@ -25,7 +25,6 @@ import pandas as pd
 
 from probmotion import seeds
 from probmotion.comparison import Comparison, compare
-from probmotion.comparison.cells import CellResult
 from probmotion.data.dances import make_dances
 from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import (
@@ -172,7 +171,7 @@ class Study:
             progress=not self.quick,
         )
         for cell in found.failures:
-            print(f"{part}: {cell.sampler} on {cell.problem} failed, {reason(cell)}")
+            print(f"{part}: {cell.sampler} on {cell.problem} failed, {cell.failure}")
         return Runs(asked, found)
 
     @cached_property
@@ -204,7 +203,7 @@ class Study:
             }
             draws = runs.draws(cell.problem, cell.sampler)
             if draws is None:
-                about["failed"] = reason(cell)
+                about["failed"] = str(cell.failure)
             else:
                 about |= {name: cell.metrics[name] for name in ("acceptance", *also)}
                 about["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
@@ -247,11 +246,6 @@ class Study:
                 columns=4,
                 title=f"states 200, 400, 600 and 800 of a chain, by {compared}",
             )
-
-
-def reason(cell: CellResult) -> str:
-    """Return why a cell has no draws."""
-    return f"{cell.failure.word}: {cell.failure.message}"
 
 
 def step_by_step(draws: MotionDraws) -> np.ndarray:

@@ -80,6 +80,9 @@ class Failure:
     unsupported: bool
     traceback: str = ""
 
+    def __str__(self) -> str:
+        return f"{self.word}: {self.message}"
+
     @classmethod
     def of(cls, error: BaseException) -> Failure:
         """Return what an error amounts to."""
