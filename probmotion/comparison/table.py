@@ -209,9 +209,9 @@ def _marks(
     samplers: Sequence[str],
     seeds: Sequence[int],
 ) -> dict[str, str]:
-    """Return what stands behind each sampler's number; with one seed nothing can be told apart."""
+    """Return what stands behind each sampler's number; nothing where none is the best."""
     found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-    best, tied = best_of(metric, found, seeds) if len(seeds) > 1 else (None, set())
+    best, tied = best_of(metric, found, seeds)
     if best is None:
         return {}
     return {name: "*" if name == best else "°" if name in tied else " " for name in found}

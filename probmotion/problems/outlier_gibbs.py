@@ -14,7 +14,7 @@ that it started in.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -157,5 +157,8 @@ class _Weighted:
         return norm - 0.5 * (self.precision * residual**2).sum(axis=(-3, -2, -1))
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> _Weighted:
-        """Nobody draws evidence whose precisions are given."""
-        raise NotImplementedError
+        """Return the likelihood of evidence drawn from p(y | X, λ); entries unseen stay."""
+        seen = self.precision > 0
+        noise = rng.standard_normal(seen.shape) / np.sqrt(np.where(seen, self.precision, 1.0))
+        joints = np.where(seen, positions + noise, self.evidence.joints)
+        return _Weighted(replace(self.evidence, joints=joints), self.precision)

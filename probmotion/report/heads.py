@@ -58,12 +58,16 @@ def contents(comparison: Comparison, with_calibration: bool) -> str:
 def reading(comparison: Comparison, table: ComparisonTable) -> str:
     """Return how the measures and the skeletons are to be read, as HTML."""
     legends = "".join(f"<p>{escape(legend)}</p>" for legend in table.legends())
-    alone = " With one seed nothing can be told." if comparison.plan.seeds == 1 else ""
+    marks = (
+        "With one seed no sampler can be told from another, and none is marked."
+        if comparison.plan.seeds == 1
+        else "★ is the best of its column, ☆ cannot be told from it: 95 % intervals of the "
+        "differences seed by seed, at Holm's levels, hold zero."
+    )
     return f"""\
 <details open><summary>How to read this page</summary>
 {legends}
-<p>★ is the best of its column, ☆ cannot be told from it: 95 % intervals of the differences seed by
-seed, at Holm's levels, hold zero.{alone}</p>
+<p>{marks}</p>
 <p>A press on a table's head sorts by it, least first, then greatest first. –: does not apply, or
 was not measured. A word in place of numbers says why there are none; it leads to the notes.</p>
 <p id="keys">Skeletons of one problem play and turn together. Drag them, or click on them and use

@@ -13,7 +13,7 @@ from probmotion import Joints3D, Motion, MotionDraws, MotionPosterior, seeds
 from probmotion.models import GaussianMixtureMotion
 from probmotion.models.standard_normal import StandardNormalPrior
 from probmotion.problems import KeptReference, Problem, kept_references, load_problem
-from probmotion.problems.outlier_gibbs import OutlierGibbs
+from probmotion.problems.outlier_gibbs import OutlierGibbs, _Weighted
 from probmotion.problems.references import (
     ReferenceRefused,
     agreement,
@@ -152,6 +152,22 @@ def test_gibbs_draws_what_the_density_says(heavy):
         spread = (drawn**power).std(axis=0)
         error = spread * np.sqrt(1 / 1000 + (weight**2).sum())
         assert (np.abs((drawn**power).mean(axis=0) - wanted) < 5 * error).all()
+
+
+def test_evidence_of_given_precisions_is_drawn_with_them():
+    """Residuals times √precision are N(0, 1), the density falls by half their square."""
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(200, 30, 3))
+    precision = rng.gamma(2.0, 50.0, truth.shape)
+    precision[:, 0] = 0
+    blank = _Weighted(Joints3D(np.full_like(truth, 7.0), 0.1), precision)
+    drawn = blank.simulate(rng, truth)
+    seen = ((drawn.evidence.joints - truth) * np.sqrt(precision))[:, 1:]
+    assert (drawn.evidence.joints[:, 0] == 7.0).all()
+    assert abs(seen.mean()) < 5 / np.sqrt(seen.size)
+    assert abs(seen.var() - 1) < 5 * np.sqrt(2 / seen.size)
+    fall = drawn.log_density(drawn.evidence.joints) - drawn.log_density(truth)
+    assert fall == pytest.approx(0.5 * (seen**2).sum())
 
 
 def test_gibbs_draws_from_nothing_else(exact):
