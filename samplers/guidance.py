@@ -109,9 +109,9 @@ class MomentMatched:
     Parameters
     ----------
     steps : int
-        Conjugate-gradient steps, one product with C each. The method supposes that C is symmetric,
-        which a learnt denoiser's is not quite: with more steps than the default its draws are
-        caught far from the evidence, or the run diverges, which is said.
+        Conjugate-gradient steps, one product with C each. The method supposes that C is a
+        covariance, which a learnt denoiser's Jacobian is not quite: a draw's system is left as it
+        is where that shows, so that more steps than the default may bring nothing.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -279,7 +279,10 @@ def conjugate_gradients(
 ) -> np.ndarray:
     """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``.
 
-    One system per row of the first axis, solved side by side; a row that has converged stays.
+    One system per row of the first axis, solved side by side; a row that has converged stays. So
+    does one that meets a direction along which the system is smaller than the identity, as none is
+    with a covariance: steps along it would be too long (as Steihaug 1983 stops at negative
+    curvature).
 
     Parameters
     ----------
@@ -294,12 +297,14 @@ def conjugate_gradients(
     direction = residual
     size = (residual**2).sum(axis=axes)
     enough = 1e-28 * size
+    active = np.ones(len(residual), dtype=bool)
     answer: np.ndarray | None = None
     for _ in range(steps):
         moved = spread(direction)
         image = direction + whiten(moved)
         curvature = (direction * image).sum(axis=axes)
-        active = size > enough
+        least = (1 - _ROUNDING) * (direction**2).sum(axis=axes)
+        active &= (size > enough) & (curvature >= least)
         length = np.where(active, size / np.where(active, curvature, 1.0), 0.0)
         part = moved * _rows(length, moved)
         answer = part if answer is None else answer + part
@@ -310,6 +315,9 @@ def conjugate_gradients(
         size = after
     assert answer is not None
     return answer
+
+
+_ROUNDING = 1e-9
 
 
 def _rows(values: np.ndarray, like: np.ndarray) -> np.ndarray:

@@ -230,6 +230,26 @@ def test_conjugate_gradients_solve_every_row_and_stop_where_done():
     np.testing.assert_allclose(alone[0], found[1], atol=1e-14)
 
 
+def test_conjugate_gradients_stop_where_the_system_is_of_no_covariance():
+    """One eigenvalue of four is −0.999: along it the system is a thousandth of the identity."""
+    values = np.array([[3.0, 2.0, 1.0, 0.5], [3.0, 2.0, 1.0, -0.999]])
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    systems = np.einsum("ij,bj,kj->bik", turn, values, turn)
+    right = np.random.default_rng(1).normal(size=(2, 4))
+
+    def found(steps):
+        return conjugate_gradients(
+            lambda u: np.einsum("bij,bj->bi", systems, u), lambda m: m, right, steps
+        )
+
+    wanted = systems[0] @ np.linalg.solve(np.eye(4) + systems[0], right[0])
+    np.testing.assert_allclose(found(4)[0], wanted, atol=1e-12)
+    left = [np.linalg.norm(found(steps)[1]) for steps in range(1, 9)]
+    # Solved to its end it is hundreds of times the right-hand side.
+    whole = systems[1] @ np.linalg.solve(np.eye(4) + systems[1], right[1])
+    assert 0 < left[0] <= max(left) < 0.01 * np.linalg.norm(whole)
+
+
 @pytest.mark.parametrize(
     "guidance",
     [MomentMatched(), DPS(), Replacement(), WeightedTriangulation()],
