@@ -5,6 +5,7 @@ It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,8 @@ class Reference:
     """Make reference draws of a problem by two long runs that must agree, or exactly.
 
     Writes NAME/draws.npz and NAME/certificate.json, both or neither; what has not mixed or does
-    not agree is not kept.
+    not agree is not kept. A run that has ended is kept until both have, so that the same command
+    goes on after an interrupt.
     """
 
     problem: Positional[str]
@@ -39,14 +41,24 @@ class Reference:
         """Draw, certify, write, and say what is known of the draws."""
         from probmotion.problems import problem_without_reference
         from probmotion.problems.kept_references import references_folder
-        from probmotion.problems.references import make_reference
+        from probmotion.problems.references import ReferenceRefused, make_reference
         from probmotion.threads import one_thread
 
         # Called as it calls itself, whatever order its numbers were given in.
         name = problem_without_reference(self.problem).name
-        with one_thread():
-            reference = make_reference(name, draws=self.draws, seed=self.seed)
-        folder = reference.save((references_folder() if self.out is None else self.out) / name)
+        folder = (references_folder() if self.out is None else self.out) / name
+        unfinished = folder.with_name(f".unfinished-{name}")
+        try:
+            with one_thread():
+                reference = make_reference(
+                    name, draws=self.draws, seed=self.seed, unfinished=unfinished
+                )
+            reference.save(folder)
+        except ReferenceRefused:
+            # The same runs would be refused again.
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+        shutil.rmtree(unfinished, ignore_errors=True)
         told = reference.certificate
         agreed = told["agreement"]
         print(f"{name}: {reference.n} draws by {told['sampler']}, kept in {folder}")

@@ -47,6 +47,23 @@ def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys,
     assert not list(tmp_path.iterdir())
 
 
+def test_stopped_in_its_second_run_it_goes_on_there(tmp_path, monkeypatch):
+    made, asked = references._run, []
+
+    def stopped(problem, sampler, n, seed, half, progress):
+        asked.append(half)
+        if asked == [0, 1]:
+            raise KeyboardInterrupt
+        return made(problem, sampler, n, seed, half, progress)
+
+    monkeypatch.setattr(references, "_run", stopped)
+    words = ["reference", SMALL, "--draws", "80", "--out", str(tmp_path)]
+    assert main(words) == 130
+    assert main(words) == 0
+    assert asked == [0, 1, 1]
+    assert [path.name for path in tmp_path.iterdir()] == [SMALL]
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -9,9 +9,12 @@ exact draws, which are measured the same way.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+from dataclasses import asdict
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,8 +51,9 @@ def make_reference(
     seed: int = 0,
     progress: bool = True,
     sampler: Sampler | None = None,
+    unfinished: str | Path | None = None,
 ) -> KeptReference:
-    """Return reference draws of a problem with their certificate; nothing is written.
+    """Return reference draws of a problem with their certificate.
 
     Parameters
     ----------
@@ -67,6 +71,9 @@ def make_reference(
         What draws where the posterior is not exact. By default
         :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` where that can, else NUTS with a
         longer warm-up; a random walk where there is no gradient.
+    unfinished : str or Path, optional
+        Folder in which a run is kept once it has ended: the same call, stopped in the other run,
+        goes on there. By default nothing is written.
 
     Raises
     ------
@@ -82,10 +89,21 @@ def make_reference(
     if draws % (2 * _CHAINS):
         raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
     shape = (asked.posterior.frames, asked.posterior.skeleton.n_joints, 3)
-    fingerprint_of(asked.posterior, np.zeros((1, *shape)))  # says so before hours are spent
-    with_sampler = None if asked.known is not None else sampler or _long_run(asked)
+    # It says so before hours are spent.
+    known = fingerprint_of(asked.posterior, np.zeros((1, *shape)))
+    used = load_sampler("exact")() if asked.known is not None else sampler or _long_run(asked)
     made = max(draws, _LEAST) // 2
-    runs = [_run(asked, with_sampler, made, seed, half, progress) for half in range(2)]
+    runs = []
+    for half in range(2):
+        name = _name_of_run(used, known, made, seed, half)
+        path = None if unfinished is None else Path(unfinished) / name
+        if path is not None and path.is_file():
+            runs.append(MotionDraws.load(path))
+            continue
+        runs.append(_run(asked, used, made, seed, half, progress))
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            runs[-1].save(path)
     return certify(asked, runs, seed, draws)
 
 
@@ -99,16 +117,23 @@ def _long_run(problem: Problem) -> Sampler:
 
 
 def _run(
-    problem: Problem, sampler: Sampler | None, n: int, seed: int, half: int, progress: bool
+    problem: Problem, sampler: Sampler, n: int, seed: int, half: int, progress: bool
 ) -> MotionDraws:
-    used = load_sampler("exact")() if sampler is None else sampler
-    return used.sample(
+    return sampler.sample(
         problem.posterior,
         draws=n // _CHAINS,
         chains=_CHAINS,
         seed=seeds.integer(seed, "reference run", half),
         progress=progress,
     )
+
+
+def _name_of_run(sampler: Sampler, known: list[float], n: int, seed: int, half: int) -> str:
+    """Return the name of a run's file, which tells by what it was made, and of what."""
+    settings = asdict(sampler)  # type: ignore[call-overload]
+    made_by = [sampler.name, settings, known, n, seed, library_versions()]
+    digest = hashlib.sha256(json.dumps(made_by, default=repr).encode()).hexdigest()
+    return f"run-{half}-{digest[:16]}.nc"
 
 
 def certify(

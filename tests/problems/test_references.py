@@ -12,7 +12,13 @@ import pytest
 from probmotion import Joints3D, Motion, MotionDraws, MotionPosterior, seeds
 from probmotion.models import GaussianMixtureMotion
 from probmotion.models.standard_normal import StandardNormalPrior
-from probmotion.problems import KeptReference, Problem, kept_references, load_problem
+from probmotion.problems import (
+    KeptReference,
+    Problem,
+    kept_references,
+    load_problem,
+    references,
+)
 from probmotion.problems.outlier_gibbs import OutlierGibbs, _Weighted
 from probmotion.problems.references import (
     ReferenceRefused,
@@ -231,6 +237,37 @@ def test_broken_files_are_told(tmp_path, exact, name, content, sentence):
     (folder / name).write_bytes(content)
     with pytest.raises(ValueError, match=sentence):
         KeptReference.load(folder)
+
+
+def test_a_run_that_has_ended_is_not_made_again(tmp_path, heavy, made, monkeypatch):
+    ended = []
+
+    def stopped(*asked):
+        if len(ended) == 1:
+            raise KeyboardInterrupt
+        ended.append(asked)
+        return run(*asked)
+
+    def again(draws=480, seed=1, thin=1):
+        gibbs = OutlierGibbs(thin=thin)
+        return make_reference(
+            heavy, draws=draws, seed=seed, progress=False, sampler=gibbs, unfinished=tmp_path
+        )
+
+    run = references._run
+    monkeypatch.setattr(references, "_run", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        again()
+    monkeypatch.setattr(references, "_run", lambda *asked: ended.append(asked) or run(*asked))
+    kept = again()
+    assert [asked[4] for asked in ended] == [0, 1]  # each half once
+    assert np.array_equal(kept.positions, made.positions)
+    assert kept.certificate == made.certificate
+    # Of another seed, or by other settings, nothing has been made yet.
+    for other in ({"seed": 2}, {"thin": 2}):
+        ended.clear()
+        again(**other)
+        assert len(ended) == 2
 
 
 def test_a_number_of_draws_that_chains_cannot_share_is_refused(exact):
