@@ -71,8 +71,11 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
     data = {"py.typed", "data/registry.csv", "pictures/playing.js"}
     data |= {"report/page.css", "report/players.js", "report/tables.js"}
     data |= {"advice/measured.csv", "advice/measured.json"}
-    kept = "problems/references/gait-noisy3d"
-    data |= {f"{kept}/draws.npz", f"{kept}/certificate.json"}
+    data |= {
+        f"problems/references/{name}/{file}"
+        for name in ("gait-noisy3d", "walk-vae-monocular")
+        for file in ("draws.npz", "certificate.json")
+    }
     learnt = ("joint_limits.npz", "walk2d.md", "walk2d.safetensors", "walk2d-evaluator.safetensors")
     body = ("body-dvae.md", "body-dvae.safetensors", "body-dvae-denoiser.safetensors")
     vae = [
