@@ -21,7 +21,7 @@ from probmotion.skeleton import Skeleton
 if TYPE_CHECKING:
     from probmotion.posterior import MotionPosterior
 
-__all__ = ["MotionDraws", "library_versions"]
+__all__ = ["MotionDraws", "library_versions", "settings_of"]
 
 _VERSION = 1
 
@@ -124,7 +124,7 @@ class MotionDraws:
             "format": "probmotion draws",
             "format_version": _VERSION,
             "sampler": sampler.name,
-            "settings": json.dumps(_settings(sampler), sort_keys=True),
+            "settings": json.dumps(settings_of(sampler), sort_keys=True),
             "seed": int(seed),
             "seconds": float(seconds),
             "independent": int(independent),
@@ -292,7 +292,8 @@ class MotionDraws:
         return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counted]}))
 
 
-def _settings(sampler: Any) -> dict[str, Any]:
+def settings_of(sampler: Any) -> dict[str, Any]:
+    """Return a sampler's settings as JSON holds them; none of one that is no dataclass."""
     if not is_dataclass(sampler) or isinstance(sampler, type):
         return {}
     return json.loads(json.dumps(asdict(sampler), default=repr))

@@ -6,6 +6,7 @@ It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +48,7 @@ class Reference:
         # Called as it calls itself, whatever order its numbers were given in.
         name = problem_without_reference(self.problem).name
         folder = (references_folder() if self.out is None else self.out) / name
-        unfinished = folder.with_name(f".unfinished-{name}")
+        unfinished = folder.with_name(f".unfinished-{name}-{self.draws}-draws-seed-{self.seed}")
         try:
             with one_thread():
                 reference = make_reference(
@@ -56,9 +57,20 @@ class Reference:
             reference.save(folder)
         except ReferenceRefused:
             # The same runs would be refused again.
-            shutil.rmtree(unfinished, ignore_errors=True)
+            shutil.rmtree(unfinished)
             raise
-        shutil.rmtree(unfinished, ignore_errors=True)
+        except KeyboardInterrupt as stop:
+            if unfinished.is_dir() and any(unfinished.iterdir()):
+                raise KeyboardInterrupt(
+                    "interrupted; a run that has ended is kept, and the same command goes on"
+                ) from stop
+            raise
+        else:
+            shutil.rmtree(unfinished)
+        finally:
+            # Where no run has ended nothing is left.
+            with suppress(OSError):
+                unfinished.rmdir()
         told = reference.certificate
         agreed = told["agreement"]
         print(f"{name}: {reference.n} draws by {told['sampler']}, kept in {folder}")

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 
 import numpy as np
 
 from probmotion import seeds
 from probmotion.checks import check_count, check_finite, check_shape
-from probmotion.draws import MotionDraws
+from probmotion.draws import MotionDraws, settings_of
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasSeeds, NotConjugate
 from probmotion.sampling import Sampler, UnsupportedPosterior, batches, require
@@ -203,7 +202,7 @@ def continued(
     if not isinstance(initial, MotionDraws):
         return None
     attributes = initial.dataset.attrs
-    settings = json.loads(json.dumps(asdict(sampler), default=repr))  # type: ignore[call-overload]
+    settings = settings_of(sampler)
     for name, came, expected in (
         ("sampler", sampler.name, attributes["sampler"]),
         ("settings", settings, json.loads(attributes["settings"])),

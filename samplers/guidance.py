@@ -111,7 +111,7 @@ class MomentMatched:
     steps : int
         Conjugate-gradient steps, one product with C each. The method supposes that C is a
         covariance, which a learnt denoiser's Jacobian is not quite: a draw's system is left as it
-        is where that shows, so that more steps than the default may bring nothing.
+        is where that shows, so that more steps than the default bring such draws nothing.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -280,9 +280,8 @@ def conjugate_gradients(
     """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``.
 
     One system per row of the first axis, solved side by side; a row that has converged stays. So
-    does one that meets a direction along which the system is smaller than the identity, as none is
-    with a covariance: steps along it would be too long (as Steihaug 1983 stops at negative
-    curvature).
+    does one whose system shows that it comes of no covariance: it is smaller than the identity
+    along a direction, or directions are not conjugate (:func:`_of_covariance`).
 
     Parameters
     ----------
@@ -293,24 +292,23 @@ def conjugate_gradients(
     steps : int
         Steps, one ``spread`` each.
     """
-    axes = tuple(range(1, residual.ndim))
-    direction = residual
-    size = (residual**2).sum(axis=axes)
+    size = _products(residual, residual)
     enough = 1e-28 * size
     active = np.ones(len(residual), dtype=bool)
+    direction, before = residual, (np.zeros_like(residual), np.zeros(len(residual)))
     answer: np.ndarray | None = None
     for _ in range(steps):
         moved = spread(direction)
         image = direction + whiten(moved)
-        curvature = (direction * image).sum(axis=axes)
-        least = (1 - _ROUNDING) * (direction**2).sum(axis=axes)
-        active &= (size > enough) & (curvature >= least)
+        curvature = _products(direction, image)
+        active &= (size > enough) & _of_covariance(direction, image, curvature, *before)
         length = np.where(active, size / np.where(active, curvature, 1.0), 0.0)
         part = moved * _rows(length, moved)
         answer = part if answer is None else answer + part
         residual = residual - image * _rows(length, image)
-        after = (residual**2).sum(axis=axes)
+        after = _products(residual, residual)
         ratio = np.where(active, after / np.where(active, size, 1.0), 0.0)
+        before = direction, curvature
         direction = residual + direction * _rows(ratio, direction)
         size = after
     assert answer is not None
@@ -318,6 +316,32 @@ def conjugate_gradients(
 
 
 _ROUNDING = 1e-9
+_CONJUGATE = 0.3
+
+
+def _of_covariance(
+    direction: np.ndarray,
+    image: np.ndarray,
+    curvature: np.ndarray,
+    before: np.ndarray,
+    curvature_before: np.ndarray,
+) -> np.ndarray:
+    """Return of which rows the system A = I + K may be one with a covariance K, (B,).
+
+    d · A d is |d|² at least where K is not negative, and the direction before is conjugate,
+    d′ · A d = 0, where K is symmetric. With a learnt denoiser's Jacobian neither holds for sure,
+    and steps of conjugate gradients may grow without end.
+    """
+    square = _products(direction, direction)
+    rounding = _ROUNDING * np.sqrt(square * _products(image, image))
+    crossed = np.abs(_products(before, image))
+    beside = _CONJUGATE * np.sqrt(np.maximum(curvature_before * curvature, 0.0))
+    return (curvature >= square - rounding) & (crossed <= beside)
+
+
+def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the inner product of each row, ``(B, …), (B, …) → (B,)``."""
+    return (one * other).sum(axis=tuple(range(1, one.ndim)))
 
 
 def _rows(values: np.ndarray, like: np.ndarray) -> np.ndarray:

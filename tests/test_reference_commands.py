@@ -47,20 +47,25 @@ def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys,
     assert not list(tmp_path.iterdir())
 
 
-def test_stopped_in_its_second_run_it_goes_on_there(tmp_path, monkeypatch):
+def test_stopped_in_its_second_run_it_goes_on_there(tmp_path, capsys, monkeypatch):
     made, asked = references._run, []
 
     def stopped(problem, sampler, n, seed, half, progress):
-        asked.append(half)
-        if asked == [0, 1]:
+        asked.append((seed, half))
+        if len(asked) in (2, 3):
             raise KeyboardInterrupt
         return made(problem, sampler, n, seed, half, progress)
 
     monkeypatch.setattr(references, "_run", stopped)
     words = ["reference", SMALL, "--draws", "80", "--out", str(tmp_path)]
     assert main(words) == 130
+    assert "a run that has ended is kept, and the same command goes on" in capsys.readouterr().err
+    # Others neither find it nor take it away, whether they are stopped or end.
+    assert main([*words, "--seed", "1"]) == 130
+    assert "nothing was written" in capsys.readouterr().err
+    assert main([*words, "--seed", "1"]) == 0
     assert main(words) == 0
-    assert asked == [0, 1, 1]
+    assert asked == [(0, 0), (0, 1), (1, 0), (1, 0), (1, 1), (0, 1)]
     assert [path.name for path in tmp_path.iterdir()] == [SMALL]
 
 

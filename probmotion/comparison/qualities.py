@@ -64,8 +64,9 @@ def best_of(
 ) -> tuple[str | None, set[str]]:
     """Return the best sampler and all that are not distinguishable from it, itself among them.
 
-    Nobody is with one seed, by which nothing can be told apart, where fewer than two samplers have
-    a number, or where no value of the metric is right, as of costs and of what describes a run.
+    Nobody is where fewer than two samplers have a number, none has one at two seeds, without which
+    nothing can be told apart, or no value of the metric is right, as of costs and of what describes
+    a run.
 
     Parameters
     ----------
@@ -79,10 +80,9 @@ def best_of(
     rule = _RIGHT.get(metric)
     if rule is None and (metric.startswith(_LESS_BEGIN) or metric.endswith(_LESS_END)):
         rule = _LESS
-    asked = list(seeds)
-    if rule is None or len(asked) < 2:
+    if rule is None:
         return None, set()
-    rows = {name: row.reindex(asked).to_numpy(float) for name, row in values.items()}
+    rows = {name: row.reindex(list(seeds)).to_numpy(float) for name, row in values.items()}
     # A ratio of 0 is infinitely wrong, and an infinite value as well.
     errors = {
         name: row
@@ -91,6 +91,6 @@ def best_of(
         and not np.isinf(row).any()
         and not (rule.get("ratio") and (row <= 0).any())
     }
-    if len(errors) < 2:
+    if len(errors) < 2 or max(np.isfinite(row).sum() for row in errors.values()) < 2:
         return None, set()
     return best_and_tied(errors, **rule)

@@ -12,7 +12,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict
+import warnings
+from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,8 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.checks import check_count
-from probmotion.draws import MotionDraws, library_versions
+from probmotion.draws import MotionDraws, library_versions, settings_of
+from probmotion.files import writable_folder
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.distribution import random_directions
 from probmotion.priors import HasSeeds
@@ -35,6 +38,7 @@ __all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
 _CHAINS = 4
 _RHAT = 1.01
 _LEAST = 4000
+_PROBES = 4
 _DIRECTIONS = 128
 _SPREADS, _RATIO = 5.0, 1.5
 _LEVEL = 1e-3
@@ -72,8 +76,8 @@ def make_reference(
         :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` where that can, else NUTS with a
         longer warm-up; a random walk where there is no gradient.
     unfinished : str or Path, optional
-        Folder in which a run is kept once it has ended: the same call, stopped in the other run,
-        goes on there. By default nothing is written.
+        Folder in which each run is kept once it has ended: the same call, stopped in the other
+        run, goes on there. Whoever named it deletes it. By default nothing is written.
 
     Raises
     ------
@@ -89,21 +93,17 @@ def make_reference(
     if draws % (2 * _CHAINS):
         raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
     shape = (asked.posterior.frames, asked.posterior.skeleton.n_joints, 3)
-    # It says so before hours are spent.
-    known = fingerprint_of(asked.posterior, np.zeros((1, *shape)))
+    # A posterior that has no fingerprint is refused before hours are spent.
+    probes = 0.1 * seeds.generator(0, "unfinished").standard_normal((_PROBES, *shape))
+    known = fingerprint_of(asked.posterior, probes)
     used = load_sampler("exact")() if asked.known is not None else sampler or _long_run(asked)
     made = max(draws, _LEAST) // 2
+    folder = None if unfinished is None else writable_folder(Path(unfinished))
+    made_by = [asked.name, known, used.name, settings_of(used), made, seed]
     runs = []
     for half in range(2):
-        name = _name_of_run(used, known, made, seed, half)
-        path = None if unfinished is None else Path(unfinished) / name
-        if path is not None and path.is_file():
-            runs.append(MotionDraws.load(path))
-            continue
-        runs.append(_run(asked, used, made, seed, half, progress))
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            runs[-1].save(path)
+        make = partial(_run, asked, used, made, seed, half, progress)
+        runs.append(make() if folder is None else _kept_or_made(folder, half, made_by, make))
     return certify(asked, runs, seed, draws)
 
 
@@ -128,12 +128,27 @@ def _run(
     )
 
 
-def _name_of_run(sampler: Sampler, known: list[float], n: int, seed: int, half: int) -> str:
-    """Return the name of a run's file, which tells by what it was made, and of what."""
-    settings = asdict(sampler)  # type: ignore[call-overload]
-    made_by = [sampler.name, settings, known, n, seed, library_versions()]
-    digest = hashlib.sha256(json.dumps(made_by, default=repr).encode()).hexdigest()
-    return f"run-{half}-{digest[:16]}.nc"
+def _kept_or_made(
+    folder: Path, half: int, made_by: list[Any], make: Callable[[], MotionDraws]
+) -> MotionDraws:
+    """Return a run that has ended, or make it and keep it; a file that fails stops neither.
+
+    The file's name tells by what it was made, and of what.
+    """
+    told = json.dumps([*made_by, library_versions()])
+    path = folder / f"run-{half}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.nc"
+    if path.is_file():
+        try:
+            return MotionDraws.load(path)
+        except ValueError as error:
+            warnings.warn(f"{error}; the run is made anew", stacklevel=3)
+    run = make()
+    try:
+        run.save(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        warnings.warn(f"cannot keep the run in {path}: {reason}", stacklevel=3)
+    return run
 
 
 def certify(

@@ -74,7 +74,9 @@ def test_marks_are_of_what_can_be_right_or_wrong():
     assert best_of("tr", {"a": values["a"]}, range(4)) == (None, set())
     assert best_of("swd", {"a": values["a"], "b": values["b"] * np.inf}, range(4)) == (None, set())
     # However far two numbers are apart, one seed tells nothing.
-    assert best_of("tr", {name: row[:1] for name, row in values.items()}, range(1)) == (None, set())
+    first = {name: row[:1] for name, row in values.items()}
+    assert best_of("tr", first, range(1)) == (None, set())
+    assert best_of("tr", first, range(4)) == (None, set())
 
 
 def made_table(**swd):

@@ -239,35 +239,85 @@ def test_broken_files_are_told(tmp_path, exact, name, content, sentence):
         KeptReference.load(folder)
 
 
-def test_a_run_that_has_ended_is_not_made_again(tmp_path, heavy, made, monkeypatch):
-    ended = []
+def kept_by(problem, folder, draws=480, seed=1, thin=1):
+    """As ``made``, with a folder for runs that have ended."""
+    gibbs = OutlierGibbs(thin=thin)
+    return make_reference(
+        problem, draws=draws, seed=seed, progress=False, sampler=gibbs, unfinished=folder
+    )
 
-    def stopped(*asked):
-        if len(ended) == 1:
-            raise KeyboardInterrupt
-        ended.append(asked)
-        return run(*asked)
 
-    def again(draws=480, seed=1, thin=1):
-        gibbs = OutlierGibbs(thin=thin)
-        return make_reference(
-            heavy, draws=draws, seed=seed, progress=False, sampler=gibbs, unfinished=tmp_path
-        )
+@pytest.fixture
+def halves(monkeypatch):
+    """The halves whose runs are made from now on."""
+    run, found = references._run, []
+    monkeypatch.setattr(references, "_run", lambda *asked: found.append(asked[4]) or run(*asked))
+    return found
 
-    run = references._run
-    monkeypatch.setattr(references, "_run", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        again()
-    monkeypatch.setattr(references, "_run", lambda *asked: ended.append(asked) or run(*asked))
-    kept = again()
-    assert [asked[4] for asked in ended] == [0, 1]  # each half once
+
+def test_a_run_that_has_ended_is_not_made_again(tmp_path, heavy, made, halves, monkeypatch):
+    save = MotionDraws.save
+
+    def stopped(run, path):
+        save(run, path)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopping:
+        stopping.setattr(MotionDraws, "save", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            kept_by(heavy, tmp_path)
+    kept = kept_by(heavy, tmp_path)
+    assert halves == [0, 1]
     assert np.array_equal(kept.positions, made.positions)
     assert kept.certificate == made.certificate
-    # Of another seed, or by other settings, nothing has been made yet.
-    for other in ({"seed": 2}, {"thin": 2}):
-        ended.clear()
-        again(**other)
-        assert len(ended) == 2
+
+
+def test_runs_of_anything_else_are_made(tmp_path, heavy, halves, monkeypatch):
+    """Other evidence has the same density where all joints are at the origin."""
+    kept_by(heavy, tmp_path)
+    seen = heavy.posterior.likelihood
+    other = replace(heavy.posterior, likelihood=replace(seen, joints=-seen.joints))
+    named = replace(heavy, name="another toy")
+    for problem, how in (
+        (heavy, {"seed": 2}),
+        (heavy, {"thin": 2}),
+        (heavy, {"draws": 4800}),
+        (replace(heavy, posterior=other, truth=None), {}),
+        (named, {}),
+    ):
+        halves.clear()
+        kept_by(problem, tmp_path, **how)
+        assert halves == [0, 1]
+    halves.clear()
+    monkeypatch.setattr(references, "library_versions", lambda: {"numpy": "1"})
+    kept_by(heavy, tmp_path)
+    assert halves == [0, 1]
+
+
+def test_a_file_that_fails_stops_no_run(tmp_path, heavy, made, halves, monkeypatch):
+    kept_by(heavy, tmp_path)
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    halves.clear()
+    with pytest.warns(UserWarning, match="no netCDF file.*; the run is made anew"):
+        kept = kept_by(heavy, tmp_path)
+    assert halves == [0, 1]
+    assert np.array_equal(kept.positions, made.positions)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(MotionDraws, "save", full)
+    with pytest.warns(UserWarning, match="cannot keep the run in .*: No space left on device"):
+        kept = kept_by(heavy, tmp_path / "other")
+    assert np.array_equal(kept.positions, made.positions)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_first_run(tmp_path, heavy, halves):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="expected a writable folder"):
+        kept_by(heavy, tmp_path / "file" / "runs")
+    assert not halves
 
 
 def test_a_number_of_draws_that_chains_cannot_share_is_refused(exact):

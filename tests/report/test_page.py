@@ -217,6 +217,18 @@ def page_of_nothing(comparison: Made, folder: Path) -> str:
     return write_report(comparison, folder / "nothing.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("numbers", [1, 2])
+def test_only_what_several_seeds_tell_is_marked(tmp_path, numbers):
+    told = Made(tmp_path, [problem("joints")], numbers)
+    page = write_report(told, tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ("With one seed no sampler can be told from another" in page) == (numbers == 1)
+    assert ('title="best">★' in page) == (numbers > 1)
+    # Of those asked for only one has ended.
+    told.results = [result for result in told.results if result.seed == 0]
+    page = write_report(told, tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'title="best">★' not in page
+
+
 def test_motions_are_whole_millimetres_where_they_were_drawn(made):
     shown = shown_problems(made)["joints"]
     data = motion_numbers(shown)

@@ -230,24 +230,49 @@ def test_conjugate_gradients_solve_every_row_and_stop_where_done():
     np.testing.assert_allclose(alone[0], found[1], atol=1e-14)
 
 
-def test_conjugate_gradients_stop_where_the_system_is_of_no_covariance():
+def solved(system: np.ndarray, right: np.ndarray, steps: int) -> np.ndarray:
+    """K u where (I + K) u = right, by as many steps of conjugate gradients; both with a row."""
+    return conjugate_gradients(
+        lambda u: np.einsum("bij,bj->bi", system, u), lambda moved: moved, right, steps
+    )
+
+
+def test_conjugate_gradients_stop_where_the_system_is_negative():
     """One eigenvalue of four is −0.999: along it the system is a thousandth of the identity."""
     values = np.array([[3.0, 2.0, 1.0, 0.5], [3.0, 2.0, 1.0, -0.999]])
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
     systems = np.einsum("ij,bj,kj->bik", turn, values, turn)
     right = np.random.default_rng(1).normal(size=(2, 4))
-
-    def found(steps):
-        return conjugate_gradients(
-            lambda u: np.einsum("bij,bj->bi", systems, u), lambda m: m, right, steps
-        )
-
-    wanted = systems[0] @ np.linalg.solve(np.eye(4) + systems[0], right[0])
-    np.testing.assert_allclose(found(4)[0], wanted, atol=1e-12)
-    left = [np.linalg.norm(found(steps)[1]) for steps in range(1, 9)]
+    wanted = np.linalg.solve(np.eye(4) + systems, right[..., None])[..., 0]
+    wanted = np.einsum("bij,bj->bi", systems, wanted)
+    np.testing.assert_allclose(solved(systems, right, 4)[0], wanted[0], atol=1e-12)
     # Solved to its end it is hundreds of times the right-hand side.
-    whole = systems[1] @ np.linalg.solve(np.eye(4) + systems[1], right[1])
-    assert 0 < left[0] <= max(left) < 0.01 * np.linalg.norm(whole)
+    left = [np.linalg.norm(solved(systems, right, steps)[1]) for steps in range(1, 30)]
+    assert 0 < left[0] <= max(left) < 0.01 * np.linalg.norm(wanted[1])
+    assert left[-1] == left[10]
+
+
+def test_conjugate_gradients_stop_where_the_system_is_not_symmetric():
+    """All its curvatures are 1.5: nothing but that directions are not conjugate tells."""
+    system = np.array([[[0.5, 30.0], [-30.0, 0.5]]])
+    right = np.array([[1.0, 1.0]])
+    first = solved(system, right, 1)
+    for steps in (2, 6, 100):
+        assert np.array_equal(solved(system, right, steps), first)
+
+
+@pytest.mark.parametrize("size", [1e2, 1e6, 1e10])
+def test_conjugate_gradients_go_on_where_a_covariance_is_singular(size):
+    """Of rank 2, seen four times over: three steps solve it, whatever is lost to rounding."""
+    rng = np.random.default_rng(0)
+    root = np.tile(rng.normal(size=(50, 5, 2)), (1, 4, 1))
+    system = size * root @ root.swapaxes(1, 2)
+    right = (system @ rng.normal(size=(50, 20, 1)))[..., 0]
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    # K u is nearly the right-hand side, which is in K's range: off by u, at most 1/size of it.
+    found = solved(system, right, 6)
+    smallest = np.linalg.eigvalsh(system)[:, -2]
+    assert (np.linalg.norm(found - right, axis=1) < 2 / smallest + 1e-4).all()
 
 
 @pytest.mark.parametrize(
