@@ -35,6 +35,8 @@ class Plan:
         As given to :func:`~probmotion.comparison.compare`.
     notes : tuple of str
         Sentences to read with the table: the budget, if there was one.
+    references : tuple of str
+        Sentences on problems whose exact draws are those of long runs.
     """
 
     problems: dict[str, str]
@@ -43,6 +45,7 @@ class Plan:
     chains: int
     seeds: int
     notes: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -67,6 +70,7 @@ class Plan:
             chains=chains,
             seeds=seeds,
             notes=() if budget is None else _budget_notes(budget, samplers, per),
+            references=tuple(_reference_notes(loaded)),
         )
 
     def cells(self) -> Iterator[tuple[str, str, int]]:
@@ -94,7 +98,8 @@ class Plan:
         try:
             held = json.loads(path.read_text(encoding="utf-8"))
             _check_format(folder, held)
-            return cls(**held | {"notes": tuple(held.get("notes", ()))})
+            sentences = {name: tuple(held.get(name, ())) for name in ("notes", "references")}
+            return cls(**held | sentences)
         except OSError as error:
             raise ValueError(
                 f"folder is {str(folder)!r}, which holds no {_PLAN}, expected one that compare() "
@@ -127,6 +132,18 @@ def _check_format(folder: Path, held: Any) -> None:
             f"out is {folder}, which another version of probmotion wrote (format {found}, expected "
             f"{_FORMAT}); expected a folder of its own for this one"
         )
+
+
+def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:
+    """Yield what stands for exact draws where there are none."""
+    for name, problem in problems.items():
+        if problem.kept is not None and problem.most_reference is not None:
+            told = problem.kept.certificate
+            mixed = "" if told.get("rhat") is None else f", R-hat {told['rhat']:.3f}"
+            yield (
+                f"what stands for exact draws of {name} are {problem.kept.n} draws of long runs of "
+                f"{told['sampler']}{mixed}"
+            )
 
 
 def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler], per: str) -> tuple[str, ...]:

@@ -64,8 +64,8 @@ class Comparison:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences to read with the table: budget, settings other than defaults, failures."""
-        notes = [*self.plan.notes]
+        """Sentences to read with the table: budget, long runs, settings not defaults, failures."""
+        notes = [*self.plan.notes, *self.plan.references]
         if used := used_of_budget(self.results):
             notes.append(
                 f"used per cell (budget_used; set_…: settings that it bought): {', '.join(used)}"

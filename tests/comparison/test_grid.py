@@ -22,6 +22,7 @@ from toy_samplers import (
 
 from probmotion import MotionPosterior
 from probmotion.comparison import Comparison, compare
+from probmotion.comparison.plan import Plan
 from probmotion.problems import Problem
 from probmotion.samplers import ExactSampler
 
@@ -128,6 +129,20 @@ def test_registered_problems_are_the_same_in_every_process():
         compare("quadruped", ExactSampler(), workers=workers, **SMALL) for workers in (1, 2)
     )
     assert numbers(here) == numbers(there)
+
+
+def test_what_stands_for_exact_draws_is_said(tmp_path):
+    names = ("gait", "gait-noisy3d", "walk-vae-monocular")
+    plan = Plan.of({name: name for name in names}, {}, draws=8, chains=2, seeds=1)
+    assert [sentence[:-5] for sentence in plan.references] == [
+        "what stands for exact draws of gait-noisy3d are 960 draws of long runs of outlier-gibbs, "
+        "R-hat ",
+        "what stands for exact draws of walk-vae-monocular are 960 draws of long runs of nuts, "
+        "R-hat ",
+    ]
+    plan.save(tmp_path)
+    assert Plan.load(tmp_path) == plan
+    assert Comparison(tmp_path, plan).notes == list(plan.references)
 
 
 def test_failures_are_recorded_and_stop_nothing(tmp_path):
