@@ -85,6 +85,8 @@ def make_reference(
         If ``draws`` is not such a number, or the prior has no density.
     ReferenceRefused
         If R-hat is above 1.01, or the runs disagree.
+    OSError
+        If ``unfinished`` cannot be written to; once runs have begun that is a warning.
     """
     from probmotion.problems import problem_without_reference
 
@@ -93,7 +95,8 @@ def make_reference(
     if draws % (2 * _CHAINS):
         raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
     shape = (asked.posterior.frames, asked.posterior.skeleton.n_joints, 3)
-    # A posterior that has no fingerprint is refused before hours are spent.
+    # A posterior that has no fingerprint is refused before hours are spent. Near the origin, where
+    # cameras look: density is asked at any points that tell one evidence from another.
     probes = 0.1 * seeds.generator(0, "unfinished").standard_normal((_PROBES, *shape))
     known = fingerprint_of(asked.posterior, probes)
     used = load_sampler("exact")() if asked.known is not None else sampler or _long_run(asked)

@@ -261,6 +261,22 @@ def test_conjugate_gradients_stop_where_the_system_is_not_symmetric():
         assert np.array_equal(solved(system, right, steps), first)
 
 
+def test_what_has_stopped_does_not_start_again():
+    """Systems of any kind: after two answers that are the same, all are."""
+    rng = np.random.default_rng(0)
+    systems, right = 3 * rng.normal(size=(300, 6, 6)), rng.normal(size=(300, 6))
+    answers = np.stack([solved(systems, right, steps) for steps in range(1, 10)])
+    still = (answers[1:] == answers[:-1]).all(axis=-1)
+    assert still[-1].all()
+    assert (still[1:] >= still[:-1]).all()
+
+
+def test_conjugate_gradients_go_on_where_evidence_hardly_meets_the_covariance():
+    """K = diag(3, 0), and the right-hand side is nearly all outside its range."""
+    found = solved(np.diag([3.0, 0.0])[None], np.array([[0.01, 1.0]]), 2)
+    np.testing.assert_allclose(found, [[0.0075, 0.0]], rtol=1e-9)
+
+
 @pytest.mark.parametrize("size", [1e2, 1e6, 1e10])
 def test_conjugate_gradients_go_on_where_a_covariance_is_singular(size):
     """Of rank 2, seen four times over: three steps solve it, whatever is lost to rounding."""
