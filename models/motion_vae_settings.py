@@ -28,8 +28,8 @@ class MotionVAESettings:
     heads : int
         Of each layer.
     feedforward : int
-        Width of each layer's hidden layer. It is not published; ours is small because a training
-        step of 64 sequences should take half a second on two cores.
+        Width of each layer's hidden layer. It is not published; ours is half the tokens' because a
+        training step of 64 sequences should take half a second on two cores.
     latent : int
         Numbers of z.
     spatial : bool
@@ -67,7 +67,7 @@ class MotionVAESettings:
     width: int = 256
     layers: int = 4
     heads: int = 4
-    feedforward: int = 256
+    feedforward: int = 128
     latent: int = 256
     spatial: bool = True
     hypotheses: int = 4

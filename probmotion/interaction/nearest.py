@@ -88,8 +88,8 @@ class PairComparer:
         check_finite("keypoints", keypoints)
         self.measure, self.graph, self.epsilon = measure, graph, float(epsilon)
         self.n_annotations, self.n_joints = keypoints.shape[:2]
-        self._options = (MEASURES.index(measure), GRAPHS.index(graph), self.epsilon)
-        self._prepared = _prepare(keypoints, visible, *self._options)
+        self.options = (MEASURES.index(measure), GRAPHS.index(graph), self.epsilon)
+        self.prepared = _prepare(keypoints, visible, *self.options)
 
     def nearest(
         self, projections: np.ndarray, candidates: np.ndarray
@@ -125,7 +125,7 @@ class PairComparer:
         alone = only_one_thread() or numba.get_num_threads() == 1
         several = projections.shape[0] * projections.shape[1] > 1
         kernel = nearest_in_batch_on_threads if several and not alone else nearest_in_batch
-        return kernel(projections, candidates, self._prepared, *self._options)
+        return kernel(projections, candidates, self.prepared, *self.options)
 
     def distances(self, projections: np.ndarray) -> np.ndarray:
         """Return the distances to all annotations, (B, n), as for retrieval.
@@ -141,7 +141,7 @@ class PairComparer:
             If the shape does not fit or a projection is not finite.
         """
         projections = self._checked(projections, ("B", self.n_joints, 2))
-        return all_distances(projections, self._prepared, *self._options)
+        return all_distances(projections, self.prepared, *self.options)
 
     def degenerate(self, projections: np.ndarray) -> int:
         """Return how many projections had to be moved by tiny offsets to be triangulated.
@@ -158,7 +158,7 @@ class PairComparer:
         """
         projections = self._checked(projections, ("…", self.n_joints, 2))
         flat = projections.reshape(math.prod(projections.shape[:-2]), self.n_joints, 2)
-        return int(count_degenerate(flat, self._options[1], self._prepared.offsets))
+        return int(count_degenerate(flat, self.options[1], self.prepared.offsets))
 
     def _checked(self, projections: np.ndarray, expected: tuple[int | str, ...]) -> np.ndarray:
         projections = np.ascontiguousarray(projections, dtype=np.float64)

@@ -22,6 +22,7 @@ __all__ = [
     "all_distances",
     "nearest_in_batch",
     "nearest_in_batch_on_threads",
+    "nearest_of",
 ]
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
@@ -67,8 +68,8 @@ def _nearest(
     indices = np.empty((n_items, n_views), dtype=np.int64)
     for flat in numba.prange(n_items * n_views):
         item, view = flat // n_views, flat % n_views
-        best, index = _nearest_of(
-            projections[item, view], candidates[view], prepared, measure, graph, epsilon
+        best, index = nearest_of(
+            projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
         )
         distances[item, view] = best
         indices[item, view] = index
@@ -100,15 +101,19 @@ def all_distances(
 
 
 @numba.njit(cache=True)
-def _nearest_of(
+def nearest_of(
     points: np.ndarray,
     candidates: np.ndarray,
     prepared: Prepared,
     measure: int,
     graph: int,
     epsilon: float,
+    within: float,
 ) -> tuple[float, int]:
-    """Return the least distance of one projection to its candidates, and which it is."""
+    """Return the least distance of one projection to its candidates, and which it is.
+
+    Where none is within ``within`` that is what is returned, and −1.
+    """
     n_candidates = candidates.shape[0]
     joints, edges, weights, n_edges, bins = _look(points, prepared, measure, graph, epsilon)
     turns, left = np.empty((2, n_candidates)), np.empty(n_candidates)
@@ -123,7 +128,7 @@ def _nearest_of(
             of_visible = _square_of_visible(joints, prepared.seen[k], n_visible)
         left[position] = (of_visible + prepared.square[k] - 2.0 * product) / max(n_visible, 1)
     apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
-    best, where = np.inf, n_candidates
+    best, where = within, n_candidates
     # What aligns best is likely nearest: visited first, it lets others be abandoned soon.
     for position in np.argsort(left):
         found = _distance(
@@ -132,7 +137,7 @@ def _nearest_of(
         )  # fmt: skip
         if found < best or (found == best and position < where):
             best, where = found, position
-    return best, int(candidates[where])
+    return best, int(candidates[where]) if where < n_candidates else -1
 
 
 @numba.njit(cache=True)

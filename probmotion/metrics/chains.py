@@ -7,10 +7,17 @@ import numpy as np
 from probmotion import seeds
 from probmotion.draws import MotionDraws
 
-__all__ = ["chain_diagnostics", "rhat_of_independent", "watched_coordinates"]
+__all__ = [
+    "chain_diagnostics",
+    "effective_draws",
+    "principal_coordinates",
+    "rhat_of_independent",
+    "watched_coordinates",
+]
 
 _FEW = 32
 _PRINCIPAL = 10
+_NOTHING = 1e-9
 
 
 def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
@@ -39,9 +46,7 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
         if not np.isnan(slowest):
             found["ess_bulk"] = n_chains * n_draws / slowest
     else:
-        found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
-        tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
-        found["ess_tail"] = float(np.min(tails))
+        found |= effective_draws(values)
     if n_chains > 1 or "autocorrelation_time" not in data:
         found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance" in data:
@@ -49,6 +54,29 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     if "divergent" in data:
         found["divergent"] = float(data["divergent"].sum())
     return found
+
+
+def effective_draws(values: np.ndarray) -> dict[str, float]:
+    """Return the smallest ``ess_bulk`` and ``ess_tail`` of coordinates, (chain, draw, n)."""
+    from arviz_stats.base import array_stats
+
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
+    return {
+        "ess_bulk": float(np.min(array_stats.ess(values, method="bulk", **axes))),
+        "ess_tail": float(np.min(tails)),
+    }
+
+
+def principal_coordinates(values: np.ndarray) -> np.ndarray:
+    """Return the leading 10 principal coordinates over all chains, fewer where fewer vary.
+
+    ``(chain, draw, n) → (chain, draw, at most 10)``, widest first.
+    """
+    flat = values.reshape(-1, values.shape[-1])
+    left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    vary = size[:_PRINCIPAL] > _NOTHING * size[0]
+    return (left * size)[:, :_PRINCIPAL][:, vary].reshape(*values.shape[:2], -1)
 
 
 def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
@@ -89,9 +117,7 @@ def watched_coordinates(draws: MotionDraws) -> np.ndarray:
     values = (data["theta"] if "theta" in data else data["positions"]).values
     values = values.reshape(*shape, -1)
     if values.shape[-1] > _FEW:
-        flat = values.reshape(-1, values.shape[-1])
-        left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-        values = (left * size)[:, :_PRINCIPAL].reshape(*shape, -1)
+        values = principal_coordinates(values)
     if "log_density" in data:
         values = np.concatenate([values, data["log_density"].values[..., None]], axis=-1)
     return values

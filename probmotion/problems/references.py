@@ -1,9 +1,10 @@
 """`make_reference`: reference draws from two independent runs that agree.
 
 Both runs are the sampler's own, four chains each; their draws are kept only if each has mixed and
-they cannot be told apart. Chains start where the prior says: where that is a few seeds, they start
-together and say nothing of modes that none of them reached, and the certificate tells from how many
-points. Of a posterior that is known exactly they are two sets of
+they cannot be told apart, in where motions are as in what they are like wherever they stand: places
+that differ by metres would hide poses that do not mix. Chains start where the prior says: where
+that is a few seeds, they start together and say nothing of modes that none of them reached, and the
+certificate tells from how many points. Of a posterior that is known exactly they are two sets of
 exact draws, which are measured the same way.
 """
 
@@ -25,12 +26,18 @@ from probmotion import seeds
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws, library_versions, settings_of
 from probmotion.files import writable_folder
-from probmotion.metrics.chains import chain_diagnostics
+from probmotion.interaction.coordinates import align_rigidly
+from probmotion.metrics.chains import (
+    chain_diagnostics,
+    effective_draws,
+    principal_coordinates,
+)
 from probmotion.metrics.distribution import random_directions
 from probmotion.priors import HasSeeds
 from probmotion.problems.kept_references import KeptReference, fingerprint_of
 from probmotion.problems.outlier_gibbs import OutlierGibbs
 from probmotion.problems.problem import Problem
+from probmotion.problems.tempered_pairs import TemperedPairs
 from probmotion.sampling import Sampler, load_sampler
 
 __all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
@@ -42,6 +49,7 @@ _PROBES = 4
 _DIRECTIONS = 128
 _SPREADS, _RATIO = 5.0, 1.5
 _LEVEL = 1e-3
+_STILL = 1e-9
 
 
 class ReferenceRefused(ValueError):  # noqa: N818 (a verdict, not a fault)
@@ -73,7 +81,8 @@ def make_reference(
         Show bars.
     sampler : Sampler, optional
         What draws where the posterior is not exact. By default
-        :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` where that can, else NUTS with a
+        :class:`~probmotion.problems.outlier_gibbs.OutlierGibbs` or
+        :class:`~probmotion.problems.tempered_pairs.TemperedPairs` where that can, else NUTS with a
         longer warm-up; a random walk where there is no gradient.
     unfinished : str or Path, optional
         Folder in which each run is kept once it has ended: the same call, stopped in the other
@@ -111,9 +120,11 @@ def make_reference(
 
 
 def _long_run(problem: Problem) -> Sampler:
-    gibbs = OutlierGibbs()
+    gibbs, tempered = OutlierGibbs(), TemperedPairs()
     if gibbs.draws_from(problem.posterior):
         return gibbs
+    if tempered.draws_from(problem.posterior):
+        return tempered
     if problem.posterior.differentiable:
         return load_sampler("nuts")(warmup=1000, candidates=10_000)
     return load_sampler("mh")(warmup=20_000, thin=50)
@@ -166,7 +177,13 @@ def certify(
     ReferenceRefused
         If they have not or do not; the message says how far.
     """
+    moved = [_moved_onto(run, runs[0]) for run in runs]
     measured = [chain_diagnostics(run) for run in runs]
+    measured += [
+        _mixing(positions)
+        for run, positions in zip(runs, moved, strict=True)
+        if not run.independent
+    ]
     worst = max((found["rhat"] for found in measured if "rhat" in found), default=None)
     # Not-a-number is no R-hat that is small.
     if worst is not None and not worst <= _RHAT:
@@ -174,13 +191,11 @@ def certify(
             f"the runs on {problem.name} have an R-hat of {worst:.3f}, expected at most {_RHAT}; "
             "more draws may help, nothing was kept"
         )
-    agreed = agreement(*(run.dataset["positions"].values for run in runs), seed=seed)
-    for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
-        if not agreed[measure] <= agreed[limit]:
-            raise ReferenceRefused(
-                f"two runs on {problem.name} disagree, {measure} is {agreed[measure]:.3g}, "
-                f"expected at most {agreed[limit]:.3g}; nothing was kept"
-            )
+    there = [run.dataset["positions"].values for run in runs]
+    agreed, agreed_moved = (
+        _agreement_or_refused(problem.name, *pair, seed=seed) if _vary(pair) else None
+        for pair in (there, moved)
+    )
     positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
     first = runs[0].dataset.attrs
     certificate: dict[str, Any] = {
@@ -196,11 +211,49 @@ def certify(
         "ess_bulk": _least(measured, "ess_bulk"),
         "ess_tail": _least(measured, "ess_tail"),
         "agreement": agreed,
+        "agreement_wherever_they_stand": agreed_moved,
         "seed": seed,
         "versions": library_versions(),
         "fingerprint": fingerprint_of(problem.posterior, positions),
     }
     return KeptReference(positions, certificate)
+
+
+def _agreement_or_refused(
+    name: str, first: np.ndarray, second: np.ndarray, *, seed: int
+) -> dict[str, float]:
+    agreed = agreement(first, second, seed=seed)
+    for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
+        if not agreed[measure] <= agreed[limit]:
+            raise ReferenceRefused(
+                f"two runs on {name} disagree, {measure} is {agreed[measure]:.3g}, "
+                f"expected at most {agreed[limit]:.3g}; nothing was kept"
+            )
+    return agreed
+
+
+def _vary(runs: list[np.ndarray]) -> bool:
+    """Whether motions differ at all: those of one joint are alike wherever they stand."""
+    return max(float(np.ptp(run, axis=(0, 1)).max()) for run in runs) > _STILL
+
+
+def _moved_onto(run: MotionDraws, other: MotionDraws) -> np.ndarray:
+    """Return motions (chain, draw, L, J, 3) moved and turned, each whole, onto another's first."""
+    positions = run.dataset["positions"].values
+    target = other.dataset["positions"].values[0, 0].reshape(-1, 3)
+    points = positions.reshape(*positions.shape[:2], -1, 3)
+    return np.asarray(align_rigidly(points, target)).reshape(positions.shape)
+
+
+def _mixing(moved: np.ndarray) -> dict[str, float]:
+    """Return R-hat and ESS of what motions are like, nothing where all are alike."""
+    from arviz_stats.base import array_stats
+
+    if not _vary([moved]):
+        return {}
+    values = principal_coordinates(moved.reshape(*moved.shape[:2], -1))
+    rhat = float(np.max(array_stats.rhat(values, chain_axis=0, draw_axis=1)))
+    return {"rhat": rhat, **effective_draws(values)}
 
 
 def _n_seeds(problem: Problem) -> int | None:
@@ -244,7 +297,7 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     halves = [_apart(seen, chosen) for chosen in _mixed_halves(chains)]
     floor = float(np.mean(halves))
     # A root whose center nothing moves has neither deviation nor difference.
-    spread = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > 1e-9
+    spread = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _STILL
     z = _standard_errors_apart(*(run[..., spread] for run in runs))
     return {
         "swd_ratio": _apart(seen, tuple(range(chains))) / floor,

@@ -127,8 +127,8 @@ def test_the_kernel_for_threads_gives_the_same_bits() -> None:
     arguments = (
         0.6 * rng(6).standard_normal((5, 4, J, 2)),
         rng(7).integers(0, 40, (4, 16)),
-        comparer._prepared,
-        *comparer._options,
+        comparer.prepared,
+        *comparer.options,
     )
     serial = nearest_kernels.nearest_in_batch(*arguments)
     parallel = nearest_kernels.nearest_in_batch_on_threads(*arguments)

@@ -132,6 +132,25 @@ def test_chains_that_have_not_mixed_are_refused(exact):
         certify(exact, runs_of(stuck, exact), 0)
 
 
+@pytest.mark.parametrize("stuck", [0.0, 0.5])
+def test_poses_that_have_not_mixed_do_not_hide_behind_where_they_stand(exact, stuck):
+    """Two chains of each run have longer bones; every draw stands somewhere, metres apart."""
+    rng = np.random.default_rng(0)
+    shapes = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 1, 0], [1.2, 1, 0]]]) * np.ones((4000, 1, 1, 1))
+    longer = np.repeat([0.0, stuck, 0.0, stuck] * 2, 500)[:, None] + 0.1 * rng.normal(
+        size=(4000, 1)
+    )
+    shapes[:, :, 1, 0] += longer
+    anywhere = shapes + 10 * rng.normal(size=(4000, 1, 1, 3))
+    if stuck:
+        with pytest.raises(ReferenceRefused, match="R-hat of 1"):
+            certify(exact, runs_of(anywhere, exact), 0)
+    else:
+        kept = certify(exact, runs_of(anywhere, exact), 0)
+        apart = kept.certificate["agreement_wherever_they_stand"]
+        assert apart["swd_ratio"] <= apart["swd_ratio_at_most"]
+
+
 def test_agreeing_runs_are_seldom_refused():
     """Both bounds hold for 20 pairs of sets that are alike."""
     rng = np.random.default_rng(3)

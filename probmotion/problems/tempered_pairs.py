@@ -1,0 +1,360 @@
+"""`TemperedPairs`: what draws reference pose-pairs, by parallel tempering over single views.
+
+The posterior over pose-pairs is a mean over views, and in each view the nearest annotation alone
+counts: pairs that are like one annotation are far from those that are like another, and a random
+walk stays where it began. Here the view is a part of the state,
+
+    π(Θ, v) ∝ f(Θ) L(Θ_v; v),
+
+whose sum over v is the posterior. A step that keeps the view asks one view of the likelihood in
+place of all; the view is drawn anew, given the pair, after every few steps. Levels with L to a
+power between 0 and 1 stand below it, and neighbours exchange their states (Swendsen and Wang 1986):
+at power 0 pairs move through the prior, and come back in other views and near other annotations.
+Exchanges take even and odd neighbours in turn, and powers are set so that all exchanges are
+rejected alike (Syed et al. 2022).
+
+Where the density is cut (eq. 11), f* ≤ f: one more state, of f*, exchanges with that of power 1.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Event
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.checks import check_count
+from probmotion.draws import MotionDraws
+from probmotion.posterior import MotionPosterior
+from probmotion.priors import HasLogDensity
+from probmotion.sampling import progress_bar
+from probmotion.truncation import TruncatedPosterior
+
+if TYPE_CHECKING:
+    from probmotion.problems.pair_walk_kernels import Body, Physics, Sight
+
+__all__ = ["TemperedPairs"]
+
+_ACCEPTED = 0.3
+_FIRST_SIZE = 0.1
+_LARGEST_SIZE = math.e
+_FIRST_ROUND = 16
+_SMALLEST_POWER = 1e-5
+
+
+@dataclass(frozen=True)
+class TemperedPairs:
+    """Parallel tempering of pose-pairs and views; each chain has levels of its own.
+
+    Parameters
+    ----------
+    levels : int
+        Powers of the likelihood, from 0 to 1.
+    steps : int
+        Steps that a level takes between exchanges.
+    warmup : int
+        Exchanges before the first draw, in which powers and step sizes are set.
+    thin : int
+        Exchanges per draw.
+    """
+
+    name: ClassVar[str] = "tempered-pairs"
+    requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+
+    levels: int = 24
+    steps: int = 60
+    warmup: int = 2000
+    thin: int = 20
+
+    def __post_init__(self) -> None:
+        check_count("levels", self.levels, least=3)
+        check_count("steps", self.steps)
+        check_count("warmup", self.warmup, least=_FIRST_ROUND)
+        check_count("thin", self.thin)
+
+    def draws_from(self, posterior: MotionPosterior) -> bool:
+        """Whether the prior is that of pose-pairs, with annotations of all of its joints."""
+        # Compiled code is imported by those who use it.
+        from probmotion.interaction.annotated_pairs import AnnotatedPairs
+        from probmotion.models.pose_pairs import PosePairPrior
+
+        evidence = posterior.likelihood
+        return (
+            isinstance(posterior.prior, PosePairPrior)
+            and isinstance(evidence, AnnotatedPairs)
+            and bool(evidence.annotations.visible.all())
+        )
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``draws`` states of each of ``chains`` chains; see the sampler's protocol.
+
+        Chains run side by side on threads, one a processor; each has random numbers of its own.
+
+        Raises
+        ------
+        ValueError
+            If the posterior is not :meth:`draws_from`'s, or ``initial`` is given.
+        """
+        if not self.draws_from(posterior):
+            raise ValueError(
+                f"posterior has {type(posterior.likelihood).__name__} evidence and a "
+                f"{type(posterior.prior).__name__} prior, expected a PosePairPrior with "
+                "AnnotatedPairs all of whose joints are visible"
+            )
+        if initial is not None:
+            raise ValueError(
+                f"initial is {type(initial).__name__}, expected None: chains start at the seeds"
+            )
+        check_count("draws", draws)
+        check_count("chains", chains)
+        start, stop = time.perf_counter(), Event()
+        arrays = pair_arrays(posterior)
+        with (
+            progress_bar(chains * draws, self.name, progress) as bar,
+            ThreadPoolExecutor(min(chains, os.cpu_count() or 1)) as threads,
+        ):
+            ladders = [
+                _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
+                for chain in range(chains)
+            ]
+            waiting = [threads.submit(ladder.draw, draws, bar, stop) for ladder in ladders]
+            try:
+                found = [each.result() for each in waiting]
+            finally:
+                stop.set()
+        return MotionDraws.of(
+            posterior,
+            self,
+            np.stack(found)[:, :, None],
+            seed=seed,
+            seconds=time.perf_counter() - start,
+            statistics={
+                "round_trips": np.array([ladder.round_trips for ladder in ladders]),
+                "rejected_exchanges": np.array([ladder.barrier for ladder in ladders]),
+            },
+            counts={"density": sum(ladder.evaluations for ladder in ladders)},
+        )
+
+
+class _Ladder:
+    """The levels of one chain."""
+
+    def __init__(
+        self,
+        sampler: TemperedPairs,
+        posterior: MotionPosterior,
+        arrays: tuple[Body, Physics, Sight],
+        rng: np.random.Generator,
+        chain: int,
+    ) -> None:
+        from probmotion.models.pose_pairs import PosePairPrior
+        from probmotion.problems.pair_walk_kernels import choose_view, moves_of, weigh
+
+        prior = posterior.prior
+        assert isinstance(prior, PosePairPrior)
+        self.sampler, self.arrays, self.rng = sampler, arrays, rng
+        body, physics, sight = arrays
+        levels = sampler.levels
+        self.powers = np.concatenate([[0.0], np.geomspace(_SMALLEST_POWER, 1.0, levels - 1)])
+        self.moves = moves_of(body)
+        self.log_sizes = np.full((levels, len(self.moves)), math.log(_FIRST_SIZE))
+        self.tried, self.taken = np.zeros_like(self.log_sizes), np.zeros_like(self.log_sizes)
+        pose = prior.seed[chain % len(prior.seed)]
+        self.poses = np.repeat(pose[None], levels, axis=0)
+        self.parts = np.zeros((levels, 2 + 2 * len(body.roots)))
+        self.seen, self.views = np.zeros((levels, 2)), np.zeros(levels, dtype=np.int64)
+        for level in range(levels):
+            weigh(self.poses[level], body, physics, self.parts[level])
+            self.views[level], *self.seen[level] = choose_view(
+                self.poses[level], self.powers[level], body, sight, rng
+            )
+        self.cut = _Cut(self, posterior) if _is_cut(posterior) else None
+        self.rejected, self.asked = np.zeros(levels - 1), 0
+        self.odd = False
+        # Whether a state has been at power 0 since it was last at power 1.
+        self.been_down = np.zeros(levels, dtype=bool)
+        self.round_trips = self.evaluations = 0
+
+    @property
+    def barrier(self) -> float:
+        """Sum over neighbours of how often an exchange is rejected: Λ of Syed et al."""
+        return float(self.rejected.sum() / max(self.asked, 1))
+
+    def draw(self, draws: int, bar: Any, stop: Event) -> np.ndarray:
+        """Return the states at the top after a warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
+        self._warm_up(stop)
+        found = np.empty((draws, *self.poses.shape[1:]))
+        for draw in range(draws):
+            for _ in range(self.sampler.thin):
+                self._exchange_after_walking(stop)
+            found[draw] = self.poses[-1] if self.cut is None else self.cut.pose
+            bar.update(1)
+        return found
+
+    def _warm_up(self, stop: Event) -> None:
+        """Set step sizes after every exchange, and powers after rounds of growing length."""
+        end_of_round, length = _FIRST_ROUND, _FIRST_ROUND
+        for number in range(1, self.sampler.warmup + 1):
+            self._exchange_after_walking(stop)
+            tried = self.tried > 0
+            surplus = self.taken / np.where(tried, self.tried, 1) - _ACCEPTED
+            change = np.where(tried, 2 * surplus, 0.0) / math.sqrt(number)
+            self.log_sizes = np.minimum(self.log_sizes + change, math.log(_LARGEST_SIZE))
+            self.tried[:], self.taken[:] = 0, 0
+            if number == end_of_round:
+                self._set_powers()
+                # The last round is not cut short: what it says is what powers are set by.
+                length = (
+                    2 * length
+                    if end_of_round + 6 * length <= self.sampler.warmup
+                    else (self.sampler.warmup - end_of_round)
+                )
+                end_of_round += length
+        self.round_trips = 0
+
+    def _set_powers(self) -> None:
+        """Move the powers to where the rejected exchanges so far say that all reject alike."""
+        rejected = np.maximum(self.rejected / self.asked, 1e-3)
+        so_far = np.concatenate([[0.0], np.cumsum(rejected)])
+        powers = np.interp(np.linspace(0.0, so_far[-1], len(so_far)), so_far, self.powers)
+        for sizes in self.log_sizes.T:
+            sizes[:] = np.interp(powers, self.powers, sizes)
+        self.powers = powers
+        self.rejected[:], self.asked = 0, 0
+
+    def _exchange_after_walking(self, stop: Event) -> None:
+        from probmotion.problems.pair_walk_kernels import scan
+
+        if stop.is_set():
+            raise KeyboardInterrupt
+        scan(
+            self.poses,
+            self.parts,
+            self.seen,
+            self.views,
+            self.powers,
+            self.sampler.steps,
+            self.moves,
+            np.exp(self.log_sizes),
+            self.tried,
+            self.taken,
+            *self.arrays,
+            self.rng,
+        )
+        self.evaluations += self.sampler.steps * len(self.poses)
+        if self.cut is not None:
+            self.cut.exchange(self)
+        log_ratio = np.diff(self.powers) * (self.seen[:-1, 0] - self.seen[1:, 0])
+        probability = np.exp(np.minimum(log_ratio, 0.0))
+        self.rejected += 1 - probability
+        self.asked += 1
+        for level in range(int(self.odd), len(probability), 2):
+            if self.rng.random() < probability[level]:
+                pair = [level, level + 1]
+                for held in (self.poses, self.parts, self.seen, self.views, self.been_down):
+                    held[pair] = held[pair[::-1]]
+        self.odd = not self.odd
+        self.been_down[0] = True
+        self.round_trips += int(self.been_down[-1])
+        self.been_down[-1] = False
+
+
+class _Cut:
+    """One more state, of the density that is cut; it exchanges with that of power 1.
+
+    f*/f is 0 below the floor, cap/f above the cap, else 1.
+    """
+
+    def __init__(self, ladder: _Ladder, posterior: MotionPosterior) -> None:
+        assert isinstance(posterior, TruncatedPosterior)
+        self.floor, self.cap = posterior.log_floor, posterior.log_cap
+        self.pose, self.parts = ladder.poses[-1].copy(), ladder.parts[-1].copy()
+        self.seen, self.view = ladder.seen[-1].copy(), ladder.views[-1]
+
+    def exchange(self, ladder: _Ladder) -> None:
+        """Exchange states with the top level, or not."""
+        ratio = self._log_share(ladder.parts[-1], ladder.seen[-1], ladder)
+        ratio -= self._log_share(self.parts, self.seen, ladder)
+        if -ladder.rng.standard_exponential() < ratio:
+            for own, theirs in (
+                (self.pose, ladder.poses),
+                (self.parts, ladder.parts),
+                (self.seen, ladder.seen),
+            ):
+                own[:], theirs[-1] = theirs[-1].copy(), own.copy()
+            self.view, ladder.views[-1] = ladder.views[-1], self.view
+
+    def _log_share(self, parts: np.ndarray, seen: np.ndarray, ladder: _Ladder) -> float:
+        """Return log f*/f; f is relative to the measure, which is the first part."""
+        from probmotion.problems.pair_walk_kernels import log_prior
+
+        log_f = log_prior(parts, ladder.arrays[1]) - parts[0] + seen[1]
+        return -math.inf if log_f < self.floor else min(0.0, self.cap - log_f)
+
+
+def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
+    """Return what compiled code reads of a posterior over pose-pairs."""
+    from probmotion.interaction.annotated_pairs import AnnotatedPairs
+    from probmotion.interaction.local_frames import chests, trees
+    from probmotion.interaction.views import view_vectors
+    from probmotion.models.penetration import capsules_of
+    from probmotion.models.pose_pairs import PosePairPrior
+    from probmotion.problems.pair_walk_kernels import Body, Physics, Sight
+
+    prior, evidence = posterior.prior, posterior.likelihood
+    assert isinstance(prior, PosePairPrior)
+    assert isinstance(evidence, AnnotatedPairs)
+    skeleton, limits, comparer = prior.skeleton, prior.joint_limits, evidence.comparer
+    parents = np.array(skeleton.parents, dtype=np.int64)
+    below = np.eye(skeleton.n_joints, dtype=bool)
+    for joint in range(skeleton.n_joints):
+        below[list(skeleton.ancestors(joint)), joint] = True
+    children = [np.flatnonzero(parents == joint) for joint in range(skeleton.n_joints)]
+    roots = np.array(skeleton.roots)
+    return (
+        Body(
+            parents=parents,
+            below=below,
+            only_child=np.array([each[0] if len(each) == 1 else -1 for each in children]),
+            roots=roots,
+            chests=np.array(chests(skeleton)),
+            person=np.searchsorted(roots, trees(skeleton)),
+            seed=prior.seed[0],
+            bone_noise=prior.bone_noise,
+            root_noise=prior.root_noise,
+        ),
+        Physics(
+            limits.trees,
+            limits.arrays,
+            *capsules_of(skeleton),
+            prior.penetration_weight,
+            prior.position_noise,
+            prior.max_invalid,
+        ),
+        Sight(
+            view_vectors(evidence.views),
+            evidence.near,
+            comparer.prepared,
+            *comparer.options,
+            evidence.noise,
+        ),
+    )
+
+
+def _is_cut(posterior: MotionPosterior) -> bool:
+    return isinstance(posterior, TruncatedPosterior) and posterior.reshaped
