@@ -62,7 +62,9 @@ class _ShortAttention(Function):
         asked, keys, values, weights = ctx.saved_tensors
         of_weights = (gradient @ values.mT).float()
         weighted = of_weights.mul_(weights)
+        # Rounded weights do not add up to 1: what all values have in common would pull at scores.
+        mean = weighted.sum(dim=-1, keepdim=True) / weights.float().sum(dim=-1, keepdim=True)
         # Of what is not seen the weight is 0, and so is all that comes of it.
-        of_scores = weighted.sub_(weights * weighted.sum(dim=-1, keepdim=True))
+        of_scores = weighted.sub_(weights * mean)
         of_scores = of_scores.mul_(ctx.scale).to(weights.dtype)
         return of_scores @ keys, of_scores.mT @ asked, weights.mT @ gradient, None

@@ -6,6 +6,7 @@ It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,8 +77,14 @@ class Reference:
         print(f"{name}: {reference.n} draws by {told['sampler']}, kept in {folder}")
         if told["rhat"] is not None:
             print(f"  R-hat {told['rhat']:.4f}, least ESS {told['ess_bulk']:.0f}")
-        print(
-            f"  two runs apart: sliced Wasserstein ratio {agreed['swd_ratio']:.2f} (at most "
-            f"{agreed['swd_ratio_at_most']:.2f}), means {agreed['mean_z']:.1f} standard errors (at "
-            f"most {agreed['mean_z_at_most']:.1f})"
-        )
+        print(f"  two runs apart: {_apart(agreed)}")
+        if told["agreement_wherever_they_stand"] is not None:
+            print(f"  wherever motions stand: {_apart(told['agreement_wherever_they_stand'])}")
+
+
+def _apart(agreed: Mapping[str, float]) -> str:
+    return (
+        f"sliced Wasserstein ratio {agreed['swd_ratio']:.2f} (at most "
+        f"{agreed['swd_ratio_at_most']:.2f}), means {agreed['mean_z']:.1f} standard errors (at "
+        f"most {agreed['mean_z_at_most']:.1f})"
+    )

@@ -55,6 +55,12 @@ class PairComparer:
     epsilon : float
         ε of eq. 8, metres.
 
+    Attributes
+    ----------
+    prepared, options
+        What compiled code of others reads: the annotations, and measure, graph and ε as its
+        kernels know them.
+
     Raises
     ------
     ValueError

@@ -20,9 +20,13 @@ __all__ = [
     "SHAPE_CONTEXT",
     "Prepared",
     "all_distances",
+    "centred",
+    "distance_to",
+    "look",
     "nearest_in_batch",
     "nearest_in_batch_on_threads",
     "nearest_of",
+    "nearest_to",
 ]
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
@@ -89,7 +93,7 @@ def all_distances(
     out = np.empty((n_items, n_annotations))
     for item in range(n_items):
         points = projections[item]
-        joints, edges, weights, n_edges, bins = _look(points, prepared, measure, graph, epsilon)
+        joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
         apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
         for k in range(n_annotations):
             cosine, sine, _ = _rotation(joints, prepared.joints[k])
@@ -114,8 +118,24 @@ def nearest_of(
 
     Where none is within ``within`` that is what is returned, and −1.
     """
+    joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
+    return nearest_to(joints, edges, weights, n_edges, bins, candidates, prepared, measure, within)
+
+
+@numba.njit(cache=True)
+def nearest_to(
+    joints: np.ndarray,
+    edges: np.ndarray,
+    weights: np.ndarray,
+    n_edges: int,
+    bins: np.ndarray,
+    candidates: np.ndarray,
+    prepared: Prepared,
+    measure: int,
+    within: float,
+) -> tuple[float, int]:
+    """Return what :func:`nearest_of` does, of a projection that was looked at before."""
     n_candidates = candidates.shape[0]
-    joints, edges, weights, n_edges, bins = _look(points, prepared, measure, graph, epsilon)
     turns, left = np.empty((2, n_candidates)), np.empty(n_candidates)
     n_joints, square = joints.shape[1], 0.0
     for joint in range(n_joints):
@@ -141,10 +161,27 @@ def nearest_of(
 
 
 @numba.njit(cache=True)
-def _look(
-    points: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
-    """Return a projection's joints about their mean, its graph and weights, or its polar bins."""
+def distance_to(
+    joints: np.ndarray,
+    edges: np.ndarray,
+    weights: np.ndarray,
+    n_edges: int,
+    bins: np.ndarray,
+    k: int,
+    prepared: Prepared,
+    measure: int,
+) -> float:
+    """Return the distance to annotation k of a projection that was looked at before."""
+    cosine, sine, _ = _rotation(joints, prepared.joints[k])
+    return _distance(
+        joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure, np.inf,
+        np.empty_like(joints), np.empty(edges.shape[1]),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def centred(points: np.ndarray) -> np.ndarray:
+    """Return a projection's joints about their mean, ``(J, 2) → (2, J)``."""
     n_joints = points.shape[0]
     joints = np.empty((2, n_joints))
     for axis in range(2):
@@ -154,6 +191,15 @@ def _look(
         mean /= n_joints
         for joint in range(n_joints):
             joints[axis, joint] = points[joint, axis] - mean
+    return joints
+
+
+@numba.njit(cache=True)
+def look(
+    points: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
+    """Return a projection's joints about their mean, its graph and weights, or its polar bins."""
+    n_joints, joints = points.shape[0], centred(points)
     n_edges = 0
     most = edge_room(n_joints, graph) if measure == INTERACTION else 0
     edges, weights = np.empty((2, most), dtype=np.uint16), np.empty(most)

@@ -9,7 +9,6 @@ from probmotion.draws import MotionDraws
 
 __all__ = [
     "chain_diagnostics",
-    "effective_draws",
     "principal_coordinates",
     "rhat_of_independent",
     "watched_coordinates",
@@ -20,12 +19,12 @@ _PRINCIPAL = 10
 _NOTHING = 1e-9
 
 
-def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
+def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> dict[str, float]:
     """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
 
-    ``ess_bulk``, ``ess_tail``: the smallest over :func:`watched_coordinates`; ``rhat``: the
-    largest (Vehtari et al. 2021, by ArviZ). ``acceptance``: the mean; ``divergent``: the number of
-    divergent transitions.
+    ``ess_bulk``, ``ess_tail``: the smallest over ``values``, (chain, draw, n), by default
+    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ).
+    ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
 
     Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
     run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from that, and none where that
@@ -38,7 +37,7 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
 
     data = draws.dataset
     n_chains, n_draws = data.sizes["chain"], data.sizes["draw"]
-    values = watched_coordinates(draws)
+    values = watched_coordinates(draws) if values is None else values
     axes = {"chain_axis": 0, "draw_axis": 1}
     found: dict[str, float] = {}
     if "autocorrelation_time" in data:
@@ -46,7 +45,9 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
         if not np.isnan(slowest):
             found["ess_bulk"] = n_chains * n_draws / slowest
     else:
-        found |= effective_draws(values)
+        found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
+        tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
+        found["ess_tail"] = float(np.min(tails))
     if n_chains > 1 or "autocorrelation_time" not in data:
         found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance" in data:
@@ -56,26 +57,15 @@ def chain_diagnostics(draws: MotionDraws) -> dict[str, float]:
     return found
 
 
-def effective_draws(values: np.ndarray) -> dict[str, float]:
-    """Return the smallest ``ess_bulk`` and ``ess_tail`` of coordinates, (chain, draw, n)."""
-    from arviz_stats.base import array_stats
-
-    axes = {"chain_axis": 0, "draw_axis": 1}
-    tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
-    return {
-        "ess_bulk": float(np.min(array_stats.ess(values, method="bulk", **axes))),
-        "ess_tail": float(np.min(tails)),
-    }
-
-
 def principal_coordinates(values: np.ndarray) -> np.ndarray:
     """Return the leading 10 principal coordinates over all chains, fewer where fewer vary.
 
-    ``(chain, draw, n) → (chain, draw, at most 10)``, widest first.
+    ``(chain, draw, n) → (chain, draw, 1 to 10)``, widest first; the first is always there.
     """
     flat = values.reshape(-1, values.shape[-1])
     left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    vary = size[:_PRINCIPAL] > _NOTHING * size[0]
+    vary = size[:_PRINCIPAL] >= _NOTHING * size[0]
+    vary[1:] &= size[0] > 0
     return (left * size)[:, :_PRINCIPAL][:, vary].reshape(*values.shape[:2], -1)
 
 

@@ -61,8 +61,8 @@ class KeptReference:
         The draws, nearly independent, metres.
     certificate : mapping
         ``problem``, ``draws``, ``exact``, ``sampler``, ``settings``, ``rhat``, ``ess_bulk``,
-        ``ess_tail``, ``agreement`` of two independent runs, ``seed``, ``versions`` and
-        ``fingerprint``.
+        ``ess_tail``, ``agreement`` of two independent runs (``agreement_wherever_they_stand``:
+        of motions turned and moved onto each other), ``seed``, ``versions`` and ``fingerprint``.
 
     Raises
     ------

@@ -23,17 +23,14 @@ from typing import Any
 import numpy as np
 
 from probmotion import seeds
+from probmotion.arrays import to_numpy
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws, library_versions, settings_of
 from probmotion.files import writable_folder
 from probmotion.interaction.coordinates import align_rigidly
-from probmotion.metrics.chains import (
-    chain_diagnostics,
-    effective_draws,
-    principal_coordinates,
-)
+from probmotion.metrics.chains import chain_diagnostics, principal_coordinates
 from probmotion.metrics.distribution import random_directions
-from probmotion.priors import HasSeeds
+from probmotion.priors import HasSeeds, Samplable
 from probmotion.problems.kept_references import KeptReference, fingerprint_of
 from probmotion.problems.outlier_gibbs import OutlierGibbs
 from probmotion.problems.problem import Problem
@@ -177,25 +174,30 @@ def certify(
     ReferenceRefused
         If they have not or do not; the message says how far.
     """
-    moved = [_moved_onto(run, runs[0]) for run in runs]
-    measured = [chain_diagnostics(run) for run in runs]
-    measured += [
-        _mixing(positions)
-        for run, positions in zip(runs, moved, strict=True)
-        if not run.independent
-    ]
-    worst = max((found["rhat"] for found in measured if "rhat" in found), default=None)
-    # Not-a-number is no R-hat that is small.
-    if worst is not None and not worst <= _RHAT:
-        raise ReferenceRefused(
-            f"the runs on {problem.name} have an R-hat of {worst:.3f}, expected at most {_RHAT}; "
-            "more draws may help, nothing was kept"
-        )
     there = [run.dataset["positions"].values for run in runs]
-    agreed, agreed_moved = (
-        _agreement_or_refused(problem.name, *pair, seed=seed) if _vary(pair) else None
-        for pair in (there, moved)
-    )
+    moved = [_moved_onto(positions, there[0][0, 0]) for positions in there]
+    measured = [chain_diagnostics(run) for run in runs]
+    # A rigid body looks the same wherever it stands; what is left of it is rounding.
+    several = not _alike(moved)
+    if several:
+        measured += [
+            chain_diagnostics(*pair) for pair in zip(runs, map(_principal, moved), strict=True)
+        ]
+    elif not _is_rigid(problem):
+        raise ReferenceRefused(
+            f"the runs on {problem.name} hold one motion wherever it stands, expected several; "
+            "nothing was kept"
+        )
+    found = [each["rhat"] for each in measured if "rhat" in each]
+    # Not-a-number is no R-hat that is small.
+    for number, rhat in enumerate(found):
+        if not rhat <= _RHAT:
+            raise ReferenceRefused(
+                f"the runs on {problem.name} have an R-hat of {rhat:.3f}{_where(number > 1)}, "
+                f"expected at most {_RHAT}; more draws may help, nothing was kept"
+            )
+    agreed = _agreed(problem.name, there, seed, "")
+    agreed_moved = _agreed(problem.name, moved, seed, _where(True)) if several else None
     positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
     first = runs[0].dataset.attrs
     certificate: dict[str, Any] = {
@@ -207,7 +209,7 @@ def certify(
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
         "seeds": _n_seeds(problem),
-        "rhat": worst,
+        "rhat": max(found, default=None),
         "ess_bulk": _least(measured, "ess_bulk"),
         "ess_tail": _least(measured, "ess_tail"),
         "agreement": agreed,
@@ -219,41 +221,45 @@ def certify(
     return KeptReference(positions, certificate)
 
 
-def _agreement_or_refused(
-    name: str, first: np.ndarray, second: np.ndarray, *, seed: int
-) -> dict[str, float]:
-    agreed = agreement(first, second, seed=seed)
+def _agreed(name: str, runs: list[np.ndarray], seed: int, where: str) -> dict[str, float]:
+    """Return :func:`agreement` of two runs, or raise :class:`ReferenceRefused`."""
+    agreed = agreement(*runs, seed=seed)
     for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
         if not agreed[measure] <= agreed[limit]:
             raise ReferenceRefused(
-                f"two runs on {name} disagree, {measure} is {agreed[measure]:.3g}, "
+                f"two runs on {name} disagree, {measure} is {agreed[measure]:.3g}{where}, "
                 f"expected at most {agreed[limit]:.3g}; nothing was kept"
             )
     return agreed
 
 
-def _vary(runs: list[np.ndarray]) -> bool:
-    """Whether motions differ at all: those of one joint are alike wherever they stand."""
-    return max(float(np.ptp(run, axis=(0, 1)).max()) for run in runs) > _STILL
+def _where(moved: bool) -> str:
+    return " wherever motions stand" if moved else ""
 
 
-def _moved_onto(run: MotionDraws, other: MotionDraws) -> np.ndarray:
-    """Return motions (chain, draw, L, J, 3) moved and turned, each whole, onto another's first."""
-    positions = run.dataset["positions"].values
-    target = other.dataset["positions"].values[0, 0].reshape(-1, 3)
-    points = positions.reshape(*positions.shape[:2], -1, 3)
-    return np.asarray(align_rigidly(points, target)).reshape(positions.shape)
+def _moved_onto(positions: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return motions (…, L, J, 3) moved and turned, each as a whole, onto one, (L, J, 3)."""
+    points = positions.reshape(*positions.shape[:-3], -1, 3)
+    return np.asarray(align_rigidly(points, target.reshape(-1, 3))).reshape(positions.shape)
 
 
-def _mixing(moved: np.ndarray) -> dict[str, float]:
-    """Return R-hat and ESS of what motions are like, nothing where all are alike."""
-    from arviz_stats.base import array_stats
+def _alike(moved: list[np.ndarray]) -> bool:
+    flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in moved])
+    return bool(np.ptp(flat, axis=0).max() < _STILL)
 
-    if not _vary([moved]):
-        return {}
-    values = principal_coordinates(moved.reshape(*moved.shape[:2], -1))
-    rhat = float(np.max(array_stats.rhat(values, chain_axis=0, draw_axis=1)))
-    return {"rhat": rhat, **effective_draws(values)}
+
+def _is_rigid(problem: Problem) -> bool:
+    """Whether all motions of the prior are one, wherever it stands."""
+    prior, rng = problem.posterior.prior, seeds.generator(0, "rigid")
+    if isinstance(prior, Samplable):
+        positions = to_numpy(prior.sample(rng, 8))
+    else:
+        positions = to_numpy(prior.motion(rng.standard_normal((8, problem.posterior.dim))))
+    return _alike([_moved_onto(positions, positions[0])])
+
+
+def _principal(moved: np.ndarray) -> np.ndarray:
+    return principal_coordinates(moved.reshape(*moved.shape[:2], -1))
 
 
 def _n_seeds(problem: Problem) -> int | None:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from threading import Event
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -70,7 +70,7 @@ class TemperedPairs:
     levels: int = 24
     steps: int = 60
     warmup: int = 2000
-    thin: int = 20
+    thin: int = 45
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
@@ -84,11 +84,11 @@ class TemperedPairs:
         from probmotion.interaction.annotated_pairs import AnnotatedPairs
         from probmotion.models.pose_pairs import PosePairPrior
 
-        evidence = posterior.likelihood
         return (
-            isinstance(posterior.prior, PosePairPrior)
-            and isinstance(evidence, AnnotatedPairs)
-            and bool(evidence.annotations.visible.all())
+            type(posterior) in (MotionPosterior, TruncatedPosterior)
+            and type(posterior.prior) is PosePairPrior
+            and type(posterior.likelihood) is AnnotatedPairs
+            and _hidden(posterior) == 0
         )
 
     def sample(
@@ -103,7 +103,9 @@ class TemperedPairs:
     ) -> MotionDraws:
         """Return ``draws`` states of each of ``chains`` chains; see the sampler's protocol.
 
-        Chains run side by side on threads, one a processor; each has random numbers of its own.
+        Chains run side by side on threads, one a processor, wherever this is called: each has
+        random numbers of its own and shares nothing, so that bits do not depend on threads.
+        The run counts steps as evaluations of the density, though most ask a part of it.
 
         Raises
         ------
@@ -112,9 +114,9 @@ class TemperedPairs:
         """
         if not self.draws_from(posterior):
             raise ValueError(
-                f"posterior has {type(posterior.likelihood).__name__} evidence and a "
-                f"{type(posterior.prior).__name__} prior, expected a PosePairPrior with "
-                "AnnotatedPairs all of whose joints are visible"
+                f"posterior is a {type(posterior).__name__} of {type(posterior.prior).__name__} "
+                f"and {type(posterior.likelihood).__name__} with {_hidden(posterior)} hidden "
+                "joints, expected PosePairPrior and AnnotatedPairs with none"
             )
         if initial is not None:
             raise ValueError(
@@ -132,11 +134,15 @@ class TemperedPairs:
                 _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
                 for chain in range(chains)
             ]
-            waiting = [threads.submit(ladder.draw, draws, bar, stop) for ladder in ladders]
             try:
-                found = [each.result() for each in waiting]
+                waiting = [threads.submit(ladder.draw, draws, bar, stop) for ladder in ladders]
+                # One that fails stops all, not only those that were waited for before it.
+                ended, _ = wait(waiting, return_when=FIRST_EXCEPTION)
+                for each in ended:
+                    each.result()
             finally:
                 stop.set()
+            found = [each.result() for each in waiting]
         return MotionDraws.of(
             posterior,
             self,
@@ -226,6 +232,8 @@ class _Ladder:
                 )
                 end_of_round += length
         self.round_trips = 0
+        if self.cut is not None:
+            self.cut.check(self)
 
     def _set_powers(self) -> None:
         """Move the powers to where the rejected exchanges so far say that all reject alike."""
@@ -299,6 +307,14 @@ class _Cut:
                 own[:], theirs[-1] = theirs[-1].copy(), own.copy()
             self.view, ladder.views[-1] = ladder.views[-1], self.view
 
+    def check(self, ladder: _Ladder) -> None:
+        """Raise ``ValueError`` if no state was met that the cut leaves."""
+        if self._log_share(self.parts, self.seen, ladder) == -math.inf:
+            raise ValueError(
+                f"posterior is cut at {self.floor:.4g} nats and nothing above that was met in the "
+                "warm-up, expected a greater limit"
+            )
+
     def _log_share(self, parts: np.ndarray, seen: np.ndarray, ladder: _Ladder) -> float:
         """Return log f*/f; f is relative to the measure, which is the first part."""
         from probmotion.problems.pair_walk_kernels import log_prior
@@ -354,6 +370,12 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
             evidence.noise,
         ),
     )
+
+
+def _hidden(posterior: MotionPosterior) -> int:
+    """Return how many annotated joints are hidden; 0 where there are none."""
+    annotations = getattr(posterior.likelihood, "annotations", None)
+    return 0 if annotations is None else int((~annotations.visible).sum())
 
 
 def _is_cut(posterior: MotionPosterior) -> bool:

@@ -136,6 +136,20 @@ def test_the_kernel_for_threads_gives_the_same_bits() -> None:
         np.testing.assert_array_equal(one, other)
 
 
+def test_only_what_is_within_is_found() -> None:
+    """At the distance itself there is one still; nearer there is none."""
+    from probmotion.interaction.nearest_kernels import nearest_of
+
+    keypoints, visible = annotated_pairs(9, 0.1, seed=5)
+    comparer = PairComparer(keypoints, visible)
+    projection, candidates = 0.6 * rng(6).standard_normal((J, 2)), np.arange(9)
+    given = (projection, candidates, comparer.prepared, *comparer.options)
+    distance, index = nearest_of(*given, np.inf)
+    assert index == comparer.distances(projection[None])[0].argmin()
+    assert nearest_of(*given, distance) == (distance, index)
+    assert nearest_of(*given, np.nextafter(distance, 0))[1] == -1
+
+
 def test_of_equal_annotations_the_first_candidate_is_named() -> None:
     keypoints, visible = annotated_pairs(3, 0.0, seed=8)
     keypoints = np.concatenate([keypoints, keypoints])

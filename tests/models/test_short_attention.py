@@ -45,6 +45,18 @@ def test_the_gradient_is_that_of_finite_differences(monkeypatch):
     assert torch.autograd.gradcheck(short_attention, (*some(torch.float64), half_hidden()))
 
 
+def test_what_all_values_have_in_common_pulls_at_no_score():
+    """Scores feel differences of values alone, though rounded weights do not add up to 1."""
+    errors = []
+    for common in (0.0, 8.0):
+        ours, theirs = some(torch.bfloat16), some(torch.float64)
+        pull = torch.randn(3, 2, 5, 4, generator=torch.Generator().manual_seed(1))
+        short_attention(ours[0], ours[1], ours[2] + common).backward(pull.to(torch.bfloat16))
+        scaled_dot_product_attention(*theirs).backward(pull.double())
+        errors.append(float((ours[0].grad.double() - theirs[0].grad).norm()))
+    assert errors[1] < 6 * errors[0]
+
+
 def test_what_is_not_seen_gets_no_gradient():
     asked, keys, values = some(torch.bfloat16)
     short_attention(asked, keys, values, half_hidden()).float().square().sum().backward()

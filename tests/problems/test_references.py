@@ -151,6 +151,17 @@ def test_poses_that_have_not_mixed_do_not_hide_behind_where_they_stand(exact, st
         assert apart["swd_ratio"] <= apart["swd_ratio_at_most"]
 
 
+@pytest.mark.parametrize(("apart", "why"), [(0.0, "hold one motion wherever"), (0.5, "disagree")])
+def test_a_pose_that_never_moves_is_refused_wherever_it_stands(exact, apart, why):
+    """One shape all along, the same in both runs or each its own."""
+    rng = np.random.default_rng(0)
+    shapes = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 1, 0], [1.2, 1, 0]]]) * np.ones((4000, 1, 1, 1))
+    shapes[2000:, :, 1, 0] += apart
+    anywhere = shapes + 10 * rng.normal(size=(4000, 1, 1, 3))
+    with pytest.raises(ReferenceRefused, match=why):
+        certify(exact, runs_of(anywhere, exact), 0)
+
+
 def test_agreeing_runs_are_seldom_refused():
     """Both bounds hold for 20 pairs of sets that are alike."""
     rng = np.random.default_rng(3)
