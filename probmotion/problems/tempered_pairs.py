@@ -70,7 +70,7 @@ class TemperedPairs:
     levels: int = 24
     steps: int = 60
     warmup: int = 2000
-    thin: int = 45
+    thin: int = 60
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
