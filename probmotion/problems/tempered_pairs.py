@@ -37,7 +37,8 @@ from probmotion.sampling import progress_bar
 from probmotion.truncation import TruncatedPosterior
 
 if TYPE_CHECKING:
-    from probmotion.problems.pair_walk_kernels import Body, Physics, Sight
+    from probmotion.problems.pair_densities import Physics, Sight
+    from probmotion.problems.pair_moves import Body
 
 __all__ = ["TemperedPairs"]
 
@@ -169,7 +170,8 @@ class _Ladder:
         chain: int,
     ) -> None:
         from probmotion.models.pose_pairs import PosePairPrior
-        from probmotion.problems.pair_walk_kernels import choose_view, moves_of, weigh
+        from probmotion.problems.pair_densities import choose_view, weigh
+        from probmotion.problems.pair_moves import moves_of
 
         prior = posterior.prior
         assert isinstance(prior, PosePairPrior)
@@ -317,7 +319,7 @@ class _Cut:
 
     def _log_share(self, parts: np.ndarray, seen: np.ndarray, ladder: _Ladder) -> float:
         """Return log f*/f; f is relative to the measure, which is the first part."""
-        from probmotion.problems.pair_walk_kernels import log_prior
+        from probmotion.problems.pair_densities import log_prior
 
         log_f = log_prior(parts, ladder.arrays[1]) - parts[0] + seen[1]
         return -math.inf if log_f < self.floor else min(0.0, self.cap - log_f)
@@ -330,7 +332,8 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
     from probmotion.interaction.views import view_vectors
     from probmotion.models.penetration import capsules_of
     from probmotion.models.pose_pairs import PosePairPrior
-    from probmotion.problems.pair_walk_kernels import Body, Physics, Sight
+    from probmotion.problems.pair_densities import Physics, Sight
+    from probmotion.problems.pair_moves import Body
 
     prior, evidence = posterior.prior, posterior.likelihood
     assert isinstance(prior, PosePairPrior)

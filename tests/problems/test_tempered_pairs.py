@@ -16,7 +16,9 @@ from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotation_sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior
 from probmotion.problems import load_problem, tempered_pairs
-from probmotion.problems.pair_walk_kernels import choose_view, log_prior, moves_of, walk, weigh
+from probmotion.problems.pair_densities import choose_view, log_prior, weigh
+from probmotion.problems.pair_moves import moves_of
+from probmotion.problems.pair_walk_kernels import walk
 from probmotion.problems.tempered_pairs import TemperedPairs, pair_arrays
 from probmotion.truncation import TruncatedPosterior
 

@@ -1,0 +1,201 @@
+"""Compiled: how a pose-pair may move, and what its moves keep as it is.
+
+The measure that densities are relative to is a product: bones point anywhere alike, their log
+lengths and the roots' places are normal, as in ``PoseChart.log_measure`` but for the roots'
+frames, which move nothing. Each move is a rotation of some bones, or a step of a length or a place:
+it keeps areas and volumes as they are, so that densities alone decide.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+__all__ = ["SHIFT", "TURN", "Body", "log_places", "moves_of", "place_anew", "propose"]
+
+SWING, SLIDE, STRETCH, CRANK, TURN, SHIFT = range(6)
+_HALF_TURN = 0.3
+"""How often a crank turns by any angle."""
+
+
+class Body(NamedTuple):
+    """Two people or more, and where their seed stands."""
+
+    parents: np.ndarray
+    """(J,) int64, −1 for roots."""
+    below: np.ndarray
+    """(J, J) bool: whether a joint is another, or hangs from it."""
+    only_child: np.ndarray
+    """(J,) int64: the one joint that hangs from a bone's end, or −1."""
+    roots: np.ndarray
+    """(K,) int64."""
+    chests: np.ndarray
+    """(K,) int64."""
+    person: np.ndarray
+    """(J,) int64: whose each joint is, 0 to K − 1."""
+    seed: np.ndarray
+    """(J, 3) metres."""
+    bone_noise: float
+    root_noise: float
+
+
+def moves_of(body: Body) -> np.ndarray:
+    """Return every move, its kind and the joint or root that it is of: (moves, 2)."""
+    bones = np.flatnonzero(body.parents >= 0)
+    found = [(kind, joint) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
+    found += [(CRANK, joint) for joint in bones if body.only_child[joint] >= 0]
+    found += [(kind, root) for kind in (TURN, SHIFT) for root in body.roots]
+    return np.array(found, dtype=np.int64)
+
+
+@numba.njit(cache=True, nogil=True)
+def propose(
+    pose: np.ndarray,
+    kind: int,
+    joint: int,
+    size: float,
+    body: Body,
+    rng: np.random.Generator,
+    proposed: np.ndarray,
+) -> None:
+    """Write where a move of a joint or root takes a pose; ``size``: radians, metres or a share."""
+    proposed[:] = pose
+    parent = body.parents[joint]
+    turn, vector, centre = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    for i in range(3):
+        vector[i] = size * rng.standard_normal()
+    if kind == SHIFT:
+        for k in range(len(pose)):
+            if body.below[joint, k]:
+                proposed[k] += vector
+    elif kind == STRETCH:
+        factor = np.exp(vector[0]) - 1.0
+        for i in range(3):
+            vector[i] = factor * (pose[joint, i] - pose[parent, i])
+        for k in range(len(pose)):
+            if body.below[joint, k]:
+                proposed[k] += vector
+    elif kind == TURN:
+        people = 0
+        for k in range(len(pose)):
+            if body.below[joint, k]:
+                centre += pose[k]
+                people += 1
+        _rotation(vector, turn)
+        _turn_about(proposed, body.below[joint], centre / people, turn)
+    elif kind == SWING:
+        _rotation(vector, turn)
+        _turn_about(proposed, body.below[joint], pose[parent], turn)
+    elif kind == SLIDE:
+        _rotation(vector, turn)
+        for i in range(3):
+            moved = -(pose[joint, i] - pose[parent, i])
+            for m in range(3):
+                moved += turn[i, m] * (pose[joint, m] - pose[parent, m])
+            vector[i] = moved
+        for k in range(len(pose)):
+            if body.below[joint, k]:
+                proposed[k] += vector
+    else:
+        angle = vector[0]
+        if rng.random() < _HALF_TURN:
+            angle = np.pi * (2.0 * rng.random() - 1.0)
+        axis = pose[body.only_child[joint]] - pose[parent]
+        length = np.sqrt((axis**2).sum())
+        if length > 0:
+            _rotation(axis * (angle / length), turn)
+            alone = np.zeros(len(pose), dtype=np.bool_)
+            alone[joint] = True
+            _turn_about(proposed, alone, pose[parent], turn)
+
+
+@numba.njit(cache=True, nogil=True)
+def place_anew(pose: np.ndarray, parts: np.ndarray, body: Body, rng: np.random.Generator) -> None:
+    """Turn the pair by any rotation and draw where it stands: all else sees the same pair."""
+    n_roots = len(body.roots)
+    middle, start, new = np.zeros(3), np.zeros(3), np.empty(3)
+    for root in body.roots:
+        middle += pose[root] / n_roots
+        start += body.seed[root] / n_roots
+    for i in range(3):
+        new[i] = start[i] + body.root_noise / np.sqrt(n_roots) * rng.standard_normal()
+    turn = np.empty((3, 3))
+    _any_rotation(rng, turn)
+    # The middle is drawn from what the roots' places say of it; what is left is how the roots
+    # stand about it.
+    before, after = 0.0, 0.0
+    for root in body.roots:
+        for i in range(3):
+            turned = 0.0
+            for m in range(3):
+                turned += turn[i, m] * (pose[root, m] - middle[m])
+            wanted = body.seed[root, i] - start[i]
+            before += (pose[root, i] - middle[i] - wanted) ** 2
+            after += (turned - wanted) ** 2
+    log_ratio = 0.5 * (before - after) / body.root_noise**2
+    if -rng.standard_exponential() < log_ratio:
+        parts[0] -= log_places(pose, body)
+        _turn_about(pose, np.ones(len(pose), dtype=np.bool_), middle, turn)
+        pose += new - middle
+        parts[0] += log_places(pose, body)
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn_about(pose: np.ndarray, chosen: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> None:
+    for k in range(len(pose)):
+        if chosen[k]:
+            x, y, z = pose[k, 0] - centre[0], pose[k, 1] - centre[1], pose[k, 2] - centre[2]
+            for i in range(3):
+                pose[k, i] = centre[i] + turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotation(vector: np.ndarray, turn: np.ndarray) -> None:
+    """Write the matrix of a rotation vector."""
+    angle = np.sqrt((vector**2).sum())
+    half = 0.5 * angle
+    scale = np.sin(half) / angle if angle > 1e-12 else 0.5
+    _of_quaternion(np.cos(half), scale * vector[0], scale * vector[1], scale * vector[2], turn)
+
+
+@numba.njit(cache=True, nogil=True)
+def _any_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
+    w, x, y, z = (
+        rng.standard_normal(),
+        rng.standard_normal(),
+        rng.standard_normal(),
+        rng.standard_normal(),
+    )
+    size = np.sqrt(w * w + x * x + y * y + z * z)
+    _of_quaternion(w / size, x / size, y / size, z / size, turn)
+
+
+@numba.njit(cache=True, nogil=True)
+def _of_quaternion(w: float, x: float, y: float, z: float, turn: np.ndarray) -> None:
+    turn[0, 0], turn[0, 1], turn[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    turn[1, 0], turn[1, 1], turn[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    turn[2, 0], turn[2, 1], turn[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def log_places(pose: np.ndarray, body: Body) -> float:
+    """Return the log density of the roots' normal places, 0 at the seed."""
+    total = 0.0
+    for root in body.roots:
+        for i in range(3):
+            total += (pose[root, i] - body.seed[root, i]) ** 2
+    return -0.5 * total / body.root_noise**2
