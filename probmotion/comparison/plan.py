@@ -139,10 +139,11 @@ def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:
     for name, problem in problems.items():
         if problem.kept is not None and problem.most_reference is not None:
             told = problem.kept.certificate
+            anywhere = "" if problem.aligned_to is None else ", wherever motions stand"
             mixed = "" if told.get("rhat") is None else f", R-hat {told['rhat']:.3f}"
             yield (
                 f"what stands for exact draws of {name} are {problem.kept.n} draws of long runs of "
-                f"{told['sampler']}{mixed}"
+                f"{told['sampler']}{mixed}{anywhere}"
             )
 
 

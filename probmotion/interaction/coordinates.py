@@ -16,6 +16,7 @@ from probmotion.checks import check_positive, check_shape
 from probmotion.interaction.graphs import check_graph, graph_edges
 
 __all__ = [
+    "align_motions",
     "align_rigidly",
     "cartesian_distance",
     "dissimilarity",
@@ -65,6 +66,29 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
     least = constant([0.0] * (source.shape[-1] - 1) + [1.0], source)[:, None]
     right = xp.where(mirrored, right * (1 - 2 * least), right)
     return centred @ (left @ right) + target_centre
+
+
+def align_motions(motions: Array, target: Array) -> Array:
+    """Return ``motions`` each moved and turned, as a whole, to where it is nearest to ``target``.
+
+    Parameters
+    ----------
+    motions, target : Array
+        Shapes (…, L, J, 3) and (L, J, 3), metres; see :func:`align_rigidly`.
+
+    Returns
+    -------
+    Array
+        Shape (…, L, J, 3), metres.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    """
+    xp = array_namespace(motions, target)
+    points = xp.reshape(motions, (*motions.shape[:-3], -1, 3))
+    return xp.reshape(align_rigidly(points, xp.reshape(target, (-1, 3))), motions.shape)
 
 
 def interaction_coordinates(points: Array, edges: Array) -> Array:

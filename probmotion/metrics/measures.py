@@ -11,6 +11,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.draws import MotionDraws
+from probmotion.interaction.coordinates import align_motions
 from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
@@ -39,7 +40,8 @@ _REAL_PAIRS = 5000
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
     """Return every measure that applies, by name.
 
-    Against reference draws, exact ones or those that a long run left, where the problem has them:
+    Against reference draws, exact ones or those that a long run left, where the problem has them
+    (aligned to one motion where the problem says so, but for densities, styles and the manifold):
 
     - ``swd``: sliced Wasserstein distance over that of two exact sets; 1 is right
     - ``tr``: trace of covariance over the exact one; < 1 is over-confident
@@ -119,7 +121,7 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
     most = problem.most_reference
     n_sets = min(_MOST_SETS, max(2, _ENOUGH // n), *([] if most is None else [most // n]))
     reference = problem.reference(seed, n_sets * n)
-    flat = reference.reshape(len(reference), -1)
+    flat = _compared(problem, reference)
     rng = seeds.generator(seed, "directions")
     prior = problem.posterior.prior
     return _Exact(
@@ -133,7 +135,7 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
 
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
-    flat = positions.reshape(len(positions), -1)
+    flat = _compared(problem, positions)
     # Of many draws as many are judged, evenly apart, as two sets of reference draws can have.
     most = problem.most_reference
     n = len(flat) if most is None else min(len(flat), most // 2)
@@ -160,6 +162,13 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
     found["mmd"] = maximum_mean_discrepancy(some, exact.sets[0])
     found["c2st"] = classifier_two_sample(some, exact.sets[0], seed)
     return found
+
+
+def _compared(problem: Problem, motions: np.ndarray) -> np.ndarray:
+    """Return what of motions is compared with that of reference draws: (n, L J 3)."""
+    if problem.aligned_to is not None:
+        motions = align_motions(motions, problem.aligned_to)
+    return motions.reshape(len(motions), -1)
 
 
 def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:

@@ -67,12 +67,11 @@ def pairs_problem(
     n = min(n_annotations, int(sum(frames.sum() for frames in chosen)))
     annotations = draw_annotations(shown, n, seed, frames=chosen).annotations
     poses, _, _ = ground_truth(shown)
-    posterior = pair_posterior(
-        poses[choose_seed(poses)], annotations, settings, fps=shown[0].fps, view_seed=seed
-    )
+    first = poses[choose_seed(poses)]
+    posterior = pair_posterior(first, annotations, settings, fps=shown[0].fps, view_seed=seed)
     there = sum(int(dance_frames(motion).sum()) for motion in hidden)
     covered, _, _ = ground_truth(hidden, min(n_held_out, there))
-    return Problem(name, description, posterior, held_out=covered[:, None])
+    return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=first[None])
 
 
 _MADE = "two made people who dance, 300 annotated 2D pairs and one 3D seed: coverage"

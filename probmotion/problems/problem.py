@@ -43,6 +43,9 @@ class Problem:
         Real 2D motion of the kind that draws, filmed, are to be like.
     kept : KeptReference, optional
         Draws of a long run, where nothing is exact.
+    aligned_to : ndarray, (L, J, 3), optional
+        Motion to which draws and reference draws are aligned, each moved and turned as a whole,
+        before they are compared: for a posterior to which it is all the same where motions stand.
     simulate : callable, optional
         ``simulate(k)`` is the same problem with another truth, drawn from the prior, and evidence
         of it, both addressed by the seed k; see :func:`simulated`.
@@ -50,8 +53,8 @@ class Problem:
     Raises
     ------
     ValueError
-        If the truth or a motion that was held out has another shape than the posterior's
-        motions, or is not finite, or what is kept was drawn from another posterior.
+        If the truth, ``aligned_to`` or a motion that was held out has another shape than the
+        posterior's motions, or is not finite, or what is kept was drawn from another posterior.
     """
 
     name: str
@@ -61,13 +64,16 @@ class Problem:
     held_out: np.ndarray | None = None
     generation: GenerationReference | None = None
     kept: KeptReference | None = None
+    aligned_to: np.ndarray | None = None
     simulate: Callable[[int], Problem] | None = None
 
     def __post_init__(self) -> None:
         shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
-        if self.truth is not None:
-            check_shape("truth", self.truth, shape)
-            check_finite("truth", self.truth)
+        for name in ("truth", "aligned_to"):
+            motion = getattr(self, name)
+            if motion is not None:
+                check_shape(name, motion, shape)
+                check_finite(name, motion)
         if self.held_out is not None:
             check_shape("held_out", self.held_out, ("G", *shape))
             check_finite("held_out", self.held_out)

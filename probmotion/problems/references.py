@@ -27,7 +27,7 @@ from probmotion.arrays import to_numpy
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws, library_versions, settings_of
 from probmotion.files import writable_folder
-from probmotion.interaction.coordinates import align_rigidly
+from probmotion.interaction.coordinates import align_motions
 from probmotion.metrics.chains import chain_diagnostics, principal_coordinates
 from probmotion.metrics.distribution import random_directions
 from probmotion.priors import HasSeeds, Samplable
@@ -175,7 +175,7 @@ def certify(
         If they have not or do not; the message says how far.
     """
     there = [run.dataset["positions"].values for run in runs]
-    moved = [_moved_onto(positions, there[0][0, 0]) for positions in there]
+    moved = [align_motions(positions, there[0][0, 0]) for positions in there]
     measured = [chain_diagnostics(run) for run in runs]
     # A rigid body looks the same wherever it stands; what is left of it is rounding.
     several = not _alike(moved)
@@ -237,12 +237,6 @@ def _where(moved: bool) -> str:
     return " wherever motions stand" if moved else ""
 
 
-def _moved_onto(positions: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return motions (…, L, J, 3) moved and turned, each as a whole, onto one, (L, J, 3)."""
-    points = positions.reshape(*positions.shape[:-3], -1, 3)
-    return np.asarray(align_rigidly(points, target.reshape(-1, 3))).reshape(positions.shape)
-
-
 def _alike(moved: list[np.ndarray]) -> bool:
     flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in moved])
     return bool(np.ptp(flat, axis=0).max() < _STILL)
@@ -255,7 +249,7 @@ def _is_rigid(problem: Problem) -> bool:
         positions = to_numpy(prior.sample(rng, 8))
     else:
         positions = to_numpy(prior.motion(rng.standard_normal((8, problem.posterior.dim))))
-    return _alike([_moved_onto(positions, positions[0])])
+    return _alike([align_motions(positions, positions[0])])
 
 
 def _principal(moved: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -172,6 +172,30 @@ def test_samplers_of_one_seed_share_their_exact_draws(generation):
     draws = run(generation, generation.reference(1, 50))
     assert measure(generation, draws, 4) == measure(generation, draws, 4)
     assert measure(generation, draws, 4)["swd"] != measure(generation, draws, 5)["swd"]
+
+
+def test_where_motions_stand_does_not_count_where_the_problem_says_so(generation, prior):
+    """Right motions, each put anywhere, are right; of wrong ones the place hides nothing."""
+    rng = np.random.default_rng(0)
+    anywhere = replace(generation, aligned_to=prior.means[0])
+    right = generation.reference(100, N)
+    wrong = prior.means[0] + 1.5 * (right - prior.means[0])
+    found = {}
+    for name, motions in (("right", right), ("wrong", wrong)):
+        turns, _ = np.linalg.qr(rng.normal(size=(N, 1, 3, 3)))
+        turns *= np.linalg.det(turns)[..., None, None]
+        placed = motions @ turns + 10 * rng.normal(size=(N, 1, 1, 3))
+        for problem in (generation, anywhere):
+            found[name, problem] = measure(problem, run(problem, placed), seed=0)
+    assert found["right", generation]["swd"] > 5
+    assert found["right", generation]["c2st"] > 0.7
+    assert found["right", anywhere]["swd"] == pytest.approx(1, abs=0.4)
+    assert found["right", anywhere]["tr"] == pytest.approx(1, abs=0.2)
+    assert found["right", anywhere]["c2st"] == pytest.approx(0.5, abs=0.1)
+    assert found["wrong", anywhere]["swd"] > 2
+    assert found["wrong", anywhere]["tr"] > 1.5
+    with pytest.raises(ValueError, match="aligned_to has shape"):
+        replace(generation, aligned_to=prior.means)
 
 
 def test_generation_has_no_truth_and_evidence_has_one(generation, occluded):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import probmotion as pm
+from probmotion import MotionDraws
 from probmotion.data.dances import make_dances
 from probmotion.data.pair_sets import SALSA_HELD_OUT
 from probmotion.metrics import measure
@@ -53,7 +54,7 @@ def test_clips_are_held_out_whole(problem):
     assert sources <= {f"dance-{number}" for number in range(6)}
 
 
-def test_runs_are_measured_by_coverage(problem):
+def test_runs_are_measured_by_coverage_and_wherever_pairs_stand(problem):
     sampler = MetropolisHastings(Isotropic(0.02), warmup=300, thin=2)
     draws = sampler.sample(problem.posterior, draws=30, chains=2, progress=False)
     found = measure(problem, draws, seed=0)
@@ -64,7 +65,11 @@ def test_runs_are_measured_by_coverage(problem):
         )
     assert 0 <= found["at_cap"] <= 1
     assert 0 <= found["near_floor"] <= 1
-    assert "swd" not in found
+    moved = draws.dataset["positions"].values + np.array([50.0, 0.0, -50.0])
+    elsewhere = MotionDraws.of(problem.posterior, sampler, moved, seed=0, seconds=1.0)
+    again = measure(problem, elsewhere, seed=0)
+    assert again["swd"] == pytest.approx(found["swd"], rel=1e-6)
+    assert found["swd"] > 1.5
 
 
 def test_draws_cover_better_than_the_seed_and_than_the_prior(problem):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from dataclasses import replace
 from threading import Event
 
@@ -184,6 +186,35 @@ def test_a_chain_that_fails_stops_all(prior, evidence, monkeypatch):
     sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
     with pytest.raises(MemoryError, match="no room"):
         sampler.sample(posterior, draws=10**6, chains=2, progress=False)
+
+
+def test_ctrl_c_stops_every_chain(prior, evidence):
+    sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
+    main, before = threading.main_thread().ident, signal.getsignal(signal.SIGINT)
+    pressed = threading.Timer(0.5, signal.pthread_kill, (main, signal.SIGINT))
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        pressed.start()
+        with pytest.raises(KeyboardInterrupt):
+            sampler.sample(MotionPosterior(prior, evidence), draws=10**6, chains=3, progress=False)
+    finally:
+        pressed.join()
+        signal.signal(signal.SIGINT, before)
+    assert not [thread for thread in threading.enumerate() if "Executor" in thread.name]
+
+
+def test_chains_start_at_the_seeds_in_turn(prior, evidence, dances):
+    """The measure is that of the first seed, wherever a chain begins."""
+    both = np.stack([prior.seed[0], dances[1].positions[40]])
+    posterior = MotionPosterior(replace(prior, seed=both), evidence)
+    arrays, rng = pair_arrays(posterior), np.random.default_rng(0)
+    for chain, seed in enumerate((0, 1, 0)):
+        ladder = tempered_pairs._Ladder(TemperedPairs(), posterior, arrays, rng, chain)
+        assert (ladder.poses == both[seed]).all()
+        theta = posterior.prior.seed_coordinates()[seed]
+        stretches, places = theta[12:].reshape(-1, 3)[:, 2], theta[6:12]
+        normal = -0.5 * ((stretches / prior.bone_noise) ** 2).sum() - 0.5 * (places**2).sum()
+        np.testing.assert_allclose(ladder.parts[:, 0], normal, rtol=1e-9, atol=1e-9)
 
 
 def test_a_cut_above_all_that_was_met_is_said(prior, evidence):
