@@ -56,7 +56,7 @@ def draw_comparison(
 
 
 def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> None:
-    """Write each sampler's draws of a problem below exact draws.
+    """Write each sampler's draws of a problem below exact draws, or those of a long run.
 
     Where there is evidence, motions are seen from the side of the first camera, which is what it
     does not show, and the truth stands behind them in grey. Where there is none, all motions are
@@ -65,20 +65,21 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
     Raises
     ------
     ValueError
-        If there is neither a sampler's draw nor an exact one.
+        If there is neither a sampler's draw nor a reference draw.
     """
     drawn = {}
+    shown = _SHOWN if problem.held_out is None else _POSES
     for result in comparison.results:
         if result.problem == problem.name and result.seed == 0 and result.failure is None:
             motions = comparison.draws(problem.name, result.sampler).flat()
             # Neighbours in a chain look alike: show draws that are far apart.
-            shown = _SHOWN if problem.held_out is None else _POSES
             drawn[result.sampler] = motions[:: max(1, len(motions) // shown)]
     rows = {}
     if "exact" in drawn:
         rows["exact"] = drawn.pop("exact")
     elif problem.has_reference:
-        rows["exact draws"] = problem.reference(0, _SHOWN)
+        label = "reference" if problem.known is None else "exact draws"
+        rows[label] = problem.reference(0, shown)
     rows |= drawn
     if not rows:
         raise ValueError(f"problem is {problem.name!r}, which no sampler drew from")

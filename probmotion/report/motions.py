@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from probmotion.comparison.kept_problems import KeptProblem
-from probmotion.interaction.coordinates import align_rigidly
+from probmotion.interaction.coordinates import align_motions
 from probmotion.pictures.skeletons import _facing, _sides
 
 __all__ = ["Shown", "choose_draws", "motion_numbers"]
@@ -112,7 +112,7 @@ def _unplaced(rows: Mapping[str, np.ndarray], shown: Shown) -> dict[str, np.ndar
     first = next(iter(rows.values()))[0]
     for label, motions in rows.items():
         if motions.shape[1] == 1:
-            motions = align_rigidly(motions, np.broadcast_to(first, motions.shape))
+            motions = align_motions(motions, first)
         elif skeleton.mirrored_pairs:
             motions = _facing(motions, skeleton, _HEADING)
         middle = motions[:, :, roots].mean(axis=2, keepdims=True)
