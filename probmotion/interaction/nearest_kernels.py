@@ -21,7 +21,8 @@ __all__ = [
     "Prepared",
     "all_distances",
     "centred",
-    "distance_to",
+    "distance_by_its_graph",
+    "distances_to",
     "look",
     "nearest_in_batch",
     "nearest_in_batch_on_threads",
@@ -90,17 +91,13 @@ def all_distances(
 ) -> np.ndarray:
     """Return the distances of (B, J, 2) to all n annotations, (B, n)."""
     n_items, n_annotations = projections.shape[0], prepared.joints.shape[0]
-    out = np.empty((n_items, n_annotations))
+    out, every = np.empty((n_items, n_annotations)), np.arange(n_annotations)
     for item in range(n_items):
         points = projections[item]
         joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
-        apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
-        for k in range(n_annotations):
-            cosine, sine, _ = _rotation(joints, prepared.joints[k])
-            out[item, k] = _distance(
-                joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure,
-                np.inf, apart, terms,
-            )  # fmt: skip
+        distances_to(
+            joints, edges, weights, n_edges, bins, every, prepared, measure, out[item]
+        )  # fmt: skip
     return out
 
 
@@ -161,22 +158,36 @@ def nearest_to(
 
 
 @numba.njit(cache=True)
-def distance_to(
+def distances_to(
     joints: np.ndarray,
     edges: np.ndarray,
     weights: np.ndarray,
     n_edges: int,
     bins: np.ndarray,
-    k: int,
+    candidates: np.ndarray,
     prepared: Prepared,
     measure: int,
+    found: np.ndarray,
+) -> None:
+    """Write the distances to all candidates of a projection that was looked at before."""
+    apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
+    for position in range(len(candidates)):
+        k = candidates[position]
+        cosine, sine, _ = _rotation(joints, prepared.joints[k])
+        found[position] = _distance(
+            joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure,
+            np.inf, apart, terms,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def distance_by_its_graph(
+    joints: np.ndarray, k: int, prepared: Prepared, apart: np.ndarray, terms: np.ndarray
 ) -> float:
-    """Return the distance to annotation k of a projection that was looked at before."""
+    """Return eq. 8 with annotation k's graph in place of the projection's too."""
     cosine, sine, _ = _rotation(joints, prepared.joints[k])
-    return _distance(
-        joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure, np.inf,
-        np.empty_like(joints), np.empty(edges.shape[1]),
-    )  # fmt: skip
+    _turned_less(joints, prepared.joints[k], cosine, sine, apart)
+    return 2.0 * _annotated_part(apart, k, prepared, terms)
 
 
 @numba.njit(cache=True)
@@ -265,24 +276,36 @@ def _distance(
     if measure == SHAPE_CONTEXT:
         angle = np.arctan2(sine, cosine)
         return context_cost(bins, angle, seen, prepared.contexts[k], prepared.shared, best)
-    target = prepared.joints[k]
-    for joint in range(joints.shape[1]):
-        x, y = joints[0, joint], joints[1, joint]
-        apart[0, joint] = cosine * x - sine * y - target[0, joint]
-        apart[1, joint] = sine * x + cosine * y - target[1, joint]
+    _turned_less(joints, prepared.joints[k], cosine, sine, apart)
     if measure == CARTESIAN:
         return _root_mean_square(apart, seen, prepared.n_visible[k])
     hidden = prepared.n_visible[k] < joints.shape[1]
     total = _own_part(apart, edges, weights, n_edges, hidden, seen, terms)
-    start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
-    if total > best or start == stop:
+    if total > best or prepared.edge_start[k] == prepared.edge_start[k + 1]:
         return np.inf
-    own_edges, own_weights = prepared.edges, prepared.weights
+    return total + _annotated_part(apart, k, prepared, terms)
+
+
+@numba.njit(cache=True)
+def _turned_less(
+    joints: np.ndarray, target: np.ndarray, cosine: float, sine: float, apart: np.ndarray
+) -> None:
+    """Write a projection's joints, turned onto an annotation's, less those."""
+    for joint in range(joints.shape[1]):
+        x, y = joints[0, joint], joints[1, joint]
+        apart[0, joint] = cosine * x - sine * y - target[0, joint]
+        apart[1, joint] = sine * x + cosine * y - target[1, joint]
+
+
+@numba.njit(cache=True)
+def _annotated_part(apart: np.ndarray, k: int, prepared: Prepared, terms: np.ndarray) -> float:
+    """Return the second sum of eq. 8, over the annotation's graph."""
+    start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
     for edge in range(start, stop):
-        i, j = own_edges[0, edge], own_edges[1, edge]
+        i, j = prepared.edges[0, edge], prepared.edges[1, edge]
         x, y = apart[0, i] - apart[0, j], apart[1, i] - apart[1, j]
-        terms[edge - start] = own_weights[edge] * np.sqrt(x * x + y * y)
-    return total + _sum(terms, stop - start)
+        terms[edge - start] = prepared.weights[edge] * np.sqrt(x * x + y * y)
+    return _sum(terms, stop - start)
 
 
 @numba.njit(cache=True)

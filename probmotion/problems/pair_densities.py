@@ -7,7 +7,15 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from probmotion.interaction.nearest_kernels import Prepared, nearest_of
+from probmotion.interaction.nearest_kernels import (
+    INTERACTION,
+    Prepared,
+    centred,
+    distance_by_its_graph,
+    distances_to,
+    look,
+    nearest_of,
+)
 from probmotion.models.joint_limits_kernels import LimitArrays, project_poses
 from probmotion.models.penetration_kernels import total_depths
 from probmotion.problems.pair_moves import Body, log_places
@@ -15,15 +23,20 @@ from probmotion.problems.pair_moves import Body, log_places
 __all__ = [
     "Physics",
     "Sight",
-    "choose_view",
     "judge",
+    "log_annotations",
     "log_measure",
     "log_penetration",
     "log_prior",
+    "log_sketch",
     "log_view",
+    "log_views",
     "picture_of",
     "weigh",
 ]
+
+
+_Vector = tuple[float, float, float]
 
 
 class Physics(NamedTuple):
@@ -76,33 +89,70 @@ def log_prior(parts: np.ndarray, physics: Physics) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def log_view(pose: np.ndarray, view: int, body: Body, sight: Sight) -> float:
-    """Return log L(Θ_v; v) of one view: −d²/2σ_l² of the nearest annotation (eq. 9)."""
-    distance, _ = nearest_of(
+def log_view(
+    pose: np.ndarray, view: int, body: Body, sight: Sight, least: float = -np.inf
+) -> float:
+    """Return log L(Θ_v; v) of one view: −d²/2σ_l² of the nearest annotation (eq. 9).
+
+    −∞ where it is below ``least``, which is sooner known.
+    """
+    distance, nearest = nearest_of(
         picture_of(pose, view, body, sight),
         sight.near[view],
         sight.prepared,
         sight.measure,
         sight.graph,
         sight.epsilon,
-        np.inf,
+        sight.noise * np.sqrt(-2.0 * least),
     )
-    return -0.5 * (distance / sight.noise) ** 2
+    return -0.5 * (distance / sight.noise) ** 2 if nearest >= 0 else -np.inf
 
 
 @numba.njit(cache=True, nogil=True)
-def choose_view(
-    pose: np.ndarray, power: float, body: Body, sight: Sight, rng: np.random.Generator
-) -> tuple[int, float, float]:
-    """Return a view drawn in proportion to L_v^power, its log L_v, and log L of all views."""
-    n_views = len(sight.vectors)
-    logs = np.empty(n_views)
-    for view in range(n_views):
-        logs[view] = log_view(pose, view, body, sight)
-    most = logs.max()
-    total = np.cumsum(np.exp(power * (logs - most)))
-    view = min(int(np.searchsorted(total, rng.random() * total[-1], side="right")), n_views - 1)
-    return view, logs[view], most + np.log(np.exp(logs - most).mean())
+def log_views(pose: np.ndarray, body: Body, sight: Sight) -> np.ndarray:
+    """Return log L(Θ_v; v) of every view, (V,)."""
+    found = np.empty(len(sight.vectors))
+    for view in range(len(found)):
+        found[view] = log_view(pose, view, body, sight)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def log_annotations(
+    pose: np.ndarray, view: int, body: Body, sight: Sight, found: np.ndarray
+) -> None:
+    """Write −d²/2σ_l² to every annotation near a view: ``found`` (N,); its maximum is log L_v."""
+    picture = picture_of(pose, view, body, sight)
+    seen = look(picture, sight.prepared, sight.measure, sight.graph, sight.epsilon)
+    distances_to(*seen, sight.near[view], sight.prepared, sight.measure, found)
+    for position in range(len(found)):
+        found[position] = -0.5 * (found[position] / sight.noise) ** 2
+
+
+@numba.njit(cache=True, nogil=True)
+def log_sketch(
+    pose: np.ndarray,
+    view: int,
+    annotation: int,
+    body: Body,
+    sight: Sight,
+    apart: np.ndarray,
+    terms: np.ndarray,
+) -> float:
+    """Return −d²/2σ_l² to one annotation, by its own graph alone: near it, for a tenth of the time.
+
+    ``apart`` (2, J) and ``terms`` (edges,) are room to work in.
+    """
+    picture = picture_of(pose, view, body, sight)
+    if sight.measure == INTERACTION:
+        distance = distance_by_its_graph(centred(picture), annotation, sight.prepared, apart, terms)
+    else:
+        # These distances have no graph: nothing is cheaper.
+        seen = look(picture, sight.prepared, sight.measure, sight.graph, sight.epsilon)
+        one, found = np.array([annotation]), np.empty(1)
+        distances_to(*seen, one, sight.prepared, sight.measure, found)
+        distance = found[0]
+    return -0.5 * (distance / sight.noise) ** 2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -133,63 +183,79 @@ def judge(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) ->
     """Write a person's part of ‖X − X̂‖² and the number of invalid angles."""
     poses = pose.reshape(1, len(pose), 3)
     valid, nearest = project_poses(poses, physics.trees[person : person + 1], physics.limits)
-    apart = ((poses - nearest) ** 2).sum()
+    apart = 0.0
+    for joint in range(len(pose)):
+        for i in range(3):
+            apart += (pose[joint, i] - nearest[0, joint, i]) ** 2
     parts[2 + person] = -0.5 * apart / physics.position_noise**2
     parts[2 + len(physics.trees) + person] = valid.size - valid.sum()
 
 
 @numba.njit(cache=True, nogil=True)
 def picture_of(pose: np.ndarray, view: int, body: Body, sight: Sight) -> np.ndarray:
-    """Return a pose as seen in a view, (J, 2), metres."""
-    frame, picture = np.empty((3, 3)), np.empty((len(pose), 2))
-    _local_frame(pose, body, frame)
-    _project(pose, frame, sight.vectors[view], picture)
+    """Return a pose as seen in a view, (J, 2), metres.
+
+    An orthographic picture, as :func:`~probmotion.interaction.views.project_to_views` takes it, in
+    which anything across the view may be up: annotations are turned to fit.
+    """
+    i, j, k = _local_frame(pose, body)
+    a, b, c = sight.vectors[view]
+    towards = _unit(
+        (
+            a * i[0] + b * j[0] + c * k[0],
+            a * i[1] + b * j[1] + c * k[1],
+            a * i[2] + b * j[2] + c * k[2],
+        )
+    )
+    x, y, z = abs(towards[0]), abs(towards[1]), abs(towards[2])
+    if x <= y and x <= z:
+        across = (1.0, 0.0, 0.0)
+    elif y <= z:
+        across = (0.0, 1.0, 0.0)
+    else:
+        across = (0.0, 0.0, 1.0)
+    right = _unit(_cross(across, towards))
+    up = _cross(towards, right)
+    picture = np.empty((len(pose), 2))
+    for joint in range(len(pose)):
+        x, y, z = pose[joint, 0], pose[joint, 1], pose[joint, 2]
+        picture[joint, 0] = right[0] * x + right[1] * y + right[2] * z
+        picture[joint, 1] = up[0] * x + up[1] * y + up[2] * z
     return picture
 
 
 @numba.njit(cache=True, nogil=True)
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(np.sqrt((vector**2).sum()), 1e-300)
-
-
-@numba.njit(cache=True, nogil=True)
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    found = np.empty(3)
-    found[0] = a[1] * b[2] - a[2] * b[1]
-    found[1] = a[2] * b[0] - a[0] * b[2]
-    found[2] = a[0] * b[1] - a[1] * b[0]
-    return found
-
-
-@numba.njit(cache=True, nogil=True)
-def _local_frame(pose: np.ndarray, body: Body, frame: np.ndarray) -> None:
-    """Write i, j and k of :func:`~probmotion.interaction.local_frames.local_frames` as columns."""
-    up = np.zeros(3)
+def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vector]:
+    """Return i, j and k of :func:`~probmotion.interaction.local_frames.local_frames`."""
+    x, y, z = 0.0, 0.0, 0.0
     for person in range(len(body.roots)):
-        up += _unit(pose[body.chests[person]] - pose[body.roots[person]])
-    frame[:, 0] = _unit(pose[body.roots[1]] - pose[body.roots[0]])
-    frame[:, 1] = _unit(up)
-    frame[:, 2] = _cross(frame[:, 0], frame[:, 1])
+        along = _unit(_between(pose, body.roots[person], body.chests[person]))
+        x, y, z = x + along[0], y + along[1], z + along[2]
+    i = _unit(_between(pose, body.roots[0], body.roots[1]))
+    j = _unit((x, y, z))
+    return i, j, _cross(i, j)
+
+
+# Numbers in tuples: arrays of three would take longer to make than to fill.
+@numba.njit(cache=True, nogil=True)
+def _between(pose: np.ndarray, start: int, end: int) -> _Vector:
+    return (
+        pose[end, 0] - pose[start, 0],
+        pose[end, 1] - pose[start, 1],
+        pose[end, 2] - pose[start, 2],
+    )
 
 
 @numba.njit(cache=True, nogil=True)
-def _project(pose: np.ndarray, frame: np.ndarray, vector: np.ndarray, picture: np.ndarray) -> None:
-    """Write the orthographic picture, as :func:`~probmotion.interaction.views.project_to_views`.
+def _unit(v: _Vector) -> _Vector:
+    size = max(np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), 1e-300)
+    return (v[0] / size, v[1] / size, v[2] / size)
 
-    Up is anything across the view here: annotations are turned to fit.
-    """
-    towards = np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            towards[i] += frame[i, k] * vector[k]
-    towards = _unit(towards)
-    other = np.zeros(3)
-    other[np.abs(towards).argmin()] = 1.0
-    right = _unit(_cross(other, towards))
-    up = _cross(towards, right)
-    for joint in range(len(pose)):
-        x, y = 0.0, 0.0
-        for i in range(3):
-            x += right[i] * pose[joint, i]
-            y += up[i] * pose[joint, i]
-        picture[joint, 0], picture[joint, 1] = x, y
+
+@numba.njit(cache=True, nogil=True)
+def _cross(a: _Vector, b: _Vector) -> _Vector:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )

@@ -8,16 +8,27 @@ it keeps areas and volumes as they are, so that densities alone decide.
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
-__all__ = ["SHIFT", "TURN", "Body", "log_places", "moves_of", "place_anew", "propose"]
+__all__ = [
+    "HINGE",
+    "SHIFT",
+    "STRETCH",
+    "TURN",
+    "Body",
+    "log_places",
+    "moves_of",
+    "place_anew",
+    "propose",
+]
 
-SWING, SLIDE, STRETCH, CRANK, TURN, SHIFT = range(6)
+SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)
 _HALF_TURN = 0.3
-"""How often a crank turns by any angle."""
+"""How often a crank or hinge turns by any angle."""
 
 
 class Body(NamedTuple):
@@ -27,8 +38,6 @@ class Body(NamedTuple):
     """(J,) int64, −1 for roots."""
     below: np.ndarray
     """(J, J) bool: whether a joint is another, or hangs from it."""
-    only_child: np.ndarray
-    """(J,) int64: the one joint that hangs from a bone's end, or −1."""
     roots: np.ndarray
     """(K,) int64."""
     chests: np.ndarray
@@ -42,25 +51,32 @@ class Body(NamedTuple):
 
 
 def moves_of(body: Body) -> np.ndarray:
-    """Return every move, its kind and the joint or root that it is of: (moves, 2)."""
-    bones = np.flatnonzero(body.parents >= 0)
-    found = [(kind, joint) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
-    found += [(CRANK, joint) for joint in bones if body.only_child[joint] >= 0]
-    found += [(kind, root) for kind in (TURN, SHIFT) for root in body.roots]
+    """Return every move, its kind and the joint or root that it is of: (moves, 3).
+
+    Last comes a crank's only child, or the sibling that a hinge moves along; else −1.
+    """
+    bones = np.flatnonzero(body.parents >= 0).tolist()
+    children = [
+        np.flatnonzero(body.parents == joint).tolist() for joint in range(len(body.parents))
+    ]
+    found = [(kind, joint, -1) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
+    found += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
+    found += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
+    found += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots]
     return np.array(found, dtype=np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
 def propose(
     pose: np.ndarray,
-    kind: int,
-    joint: int,
+    move: np.ndarray,
     size: float,
     body: Body,
     rng: np.random.Generator,
     proposed: np.ndarray,
 ) -> None:
-    """Write where a move of a joint or root takes a pose; ``size``: radians, metres or a share."""
+    """Write where one of :func:`moves_of` takes a pose; ``size``: radians, metres or a share."""
+    kind, joint, other = move
     proposed[:] = pose
     parent = body.parents[joint]
     turn, vector, centre = np.empty((3, 3)), np.empty(3), np.zeros(3)
@@ -102,13 +118,20 @@ def propose(
         angle = vector[0]
         if rng.random() < _HALF_TURN:
             angle = np.pi * (2.0 * rng.random() - 1.0)
-        axis = pose[body.only_child[joint]] - pose[parent]
+        # What a crank or hinge turns leaves its axis as it is.
+        axis = pose[other] - pose[parent if kind == CRANK else joint]
         length = np.sqrt((axis**2).sum())
-        if length > 0:
-            _rotation(axis * (angle / length), turn)
-            alone = np.zeros(len(pose), dtype=np.bool_)
-            alone[joint] = True
-            _turn_about(proposed, alone, pose[parent], turn)
+        if length == 0:
+            return
+        _rotation(axis * (angle / length), turn)
+        alone = np.zeros(len(pose), dtype=np.bool_)
+        alone[joint] = True
+        _turn_about(proposed, alone, pose[parent], turn)
+        if kind == HINGE:
+            vector[:] = proposed[joint] - pose[joint]
+            for k in range(len(pose)):
+                if body.below[joint, k] or body.below[other, k]:
+                    proposed[k] = pose[k] + vector
 
 
 @numba.njit(cache=True, nogil=True)

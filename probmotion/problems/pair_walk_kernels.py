@@ -1,24 +1,28 @@
-"""Compiled: a Metropolis walk over pose-pairs in joint positions, given one view."""
+"""Compiled: a Metropolis walk over pose-pairs in joint positions, and over the views of them."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-from probmotion.interaction.nearest_kernels import centred, distance_to, look, nearest_to
+from probmotion.interaction.graph_kernels import edge_room
 from probmotion.problems.pair_densities import (
     Physics,
     Sight,
-    choose_view,
     judge,
+    log_annotations,
     log_measure,
     log_penetration,
     log_prior,
-    picture_of,
+    log_sketch,
+    log_view,
 )
 from probmotion.problems.pair_moves import SHIFT, TURN, Body, place_anew, propose
 
-__all__ = ["scan", "walk"]
+__all__ = ["walk"]
+
+_LOT = 40
+_VIEWS_ASKED = 6
 
 
 @numba.njit(cache=True, nogil=True)
@@ -36,13 +40,17 @@ def walk(
     physics: Physics,
     sight: Sight,
     rng: np.random.Generator,
-) -> None:
-    """Take Metropolis steps on prior · L_v^power, moves drawn at random; ``pose`` changes in place.
+) -> tuple[int, float]:
+    """Walk on prior · L_v^power in pose and view; return the view and log L_v.
+
+    Lots of steps go by a sketch of L_v, which is of one annotation and its own graph, and each lot
+    is taken or left as things are (surrogate transitions, Liu 2001). Meanwhile the annotation is a
+    part of the state: drawn in proportion to its likelihood to the power, given the pose.
 
     Parameters
     ----------
     pose : ndarray, (J, 3)
-        Metres.
+        Metres; changes in place.
     parts : ndarray, (2 + 2 K,)
         Of :func:`weigh`; kept up to date.
     view : int
@@ -50,84 +58,55 @@ def walk(
     power : float
         Inverse temperature.
     n_steps : int
-        Steps.
-    moves, sizes : ndarray, (moves, 2) and (moves,)
+        Steps of the pose.
+    moves, sizes : ndarray, (moves, 3) and (moves,)
         Of :func:`moves_of`, and how large each is: radians, metres, or shares of a length.
     tried, taken : ndarray, (moves,)
-        Counts, added to.
+        Counts of steps by the sketch, added to.
     body, physics, sight
         The posterior's arrays.
     rng : numpy.random.Generator
         Of the chain.
     """
-    proposed, weighed = np.empty_like(pose), np.empty_like(parts)
-    near, prepared, measure = sight.near[view], sight.prepared, sight.measure
-    energy = -0.5 * power / sight.noise**2
-    picture = picture_of(pose, view, body, sight)
-    joints, edges, weights, n_edges, bins = look(
-        picture, prepared, measure, sight.graph, sight.epsilon
-    )
-    distance, nearest = nearest_to(
-        joints, edges, weights, n_edges, bins, near, prepared, measure, np.inf
-    )
-    for _ in range(n_steps):
-        number = int(rng.random() * len(moves))
-        kind, joint = moves[number]
-        tried[number] += 1
-        propose(pose, kind, joint, sizes[number], body, rng, proposed)
-        weighed[:] = parts
-        weighed[0] = log_measure(proposed, body)
-        # First by the graph and the annotation of the pose that is left: a guess, for a tenth of
-        # the price (Christen and Fox 2005).
-        guess = weighed[0] - parts[0]
+    logs, new_logs = np.empty(sight.near.shape[1]), np.empty(sight.near.shape[1])
+    there, parts_there = np.empty_like(pose), np.empty_like(parts)
+    log_annotations(pose, view, body, sight, logs)
+    for done in range(0, n_steps, _LOT):
+        there[:], parts_there[:] = pose, parts
+        chosen = _drawn(power * logs, rng) if power > 0 else 0
+        gained = _walk_by_sketch(
+            there, parts_there, view, sight.near[view, chosen], power, min(_LOT, n_steps - done),
+            moves, sizes, tried, taken, body, physics, sight, rng,
+        )  # fmt: skip
         if power > 0:
-            picture = picture_of(proposed, view, body, sight)
-            guessed = distance_to(
-                centred(picture), edges, weights, n_edges, bins, nearest, prepared, measure
-            )
-            guess += energy * (guessed**2 - distance**2)
-        if not -rng.standard_exponential() < guess:
-            continue
-        # Then as things are, less what the guess has asked already. What is cheap comes first: no
-        # other part can lift a pose again, all are 0 at most.
-        least = log_prior(parts, physics) + min(0.0, guess) - rng.standard_exponential()
-        least += energy * distance**2 if power > 0 else 0.0
-        weighed[1] = log_penetration(proposed, physics)
-        if weighed[0] + weighed[1] < least:
-            continue
-        if kind != TURN and kind != SHIFT:
-            judge(proposed, body.person[joint], physics, weighed)
-        found = log_prior(weighed, physics)
-        if not found >= least:
-            continue
-        back = parts[0] - weighed[0]
-        if power == 0:
-            if not found + min(0.0, back) >= least:
+            log_annotations(there, view, body, sight, new_logs)
+            ratio = power * (new_logs[chosen] - logs[chosen] - gained)
+            ratio += _share_of_best(power * logs) - _share_of_best(power * new_logs)
+            if not -rng.standard_exponential() < ratio:
                 continue
-        else:
-            seen = look(picture, prepared, measure, sight.graph, sight.epsilon)
-            within = np.sqrt((least - found) / energy)
-            new, which = nearest_to(*seen, near, prepared, measure, within)
-            if which < 0:
-                continue
-            left = distance_to(joints, *seen[1:], which, prepared, measure)
-            back += energy * (left**2 - new**2)
-            if not found + energy * new**2 + min(0.0, back) >= least:
-                continue
-            joints, edges, weights, n_edges, bins = seen
-            distance, nearest = new, which
-        pose[:], parts[:] = proposed, weighed
-        taken[number] += 1
+            logs[:] = new_logs
+        pose[:], parts[:] = there, parts_there
     place_anew(pose, parts, body, rng)
+    if power == 0:
+        view = int(rng.random() * len(sight.vectors))
+        return view, log_view(pose, view, body, sight)
+    log_l = logs.max()
+    for _ in range(_VIEWS_ASKED):
+        other = int(rng.random() * len(sight.vectors))
+        least = log_l - rng.standard_exponential() / power
+        found = log_view(pose, other, body, sight, least)
+        if found >= least:
+            view, log_l = other, found
+    return view, log_l
 
 
 @numba.njit(cache=True, nogil=True)
-def scan(
-    poses: np.ndarray,
+def _walk_by_sketch(
+    pose: np.ndarray,
     parts: np.ndarray,
-    seen: np.ndarray,
-    views: np.ndarray,
-    powers: np.ndarray,
+    view: int,
+    annotation: int,
+    power: float,
     n_steps: int,
     moves: np.ndarray,
     sizes: np.ndarray,
@@ -137,16 +116,49 @@ def scan(
     physics: Physics,
     sight: Sight,
     rng: np.random.Generator,
-) -> None:
-    """Let every level walk and choose its view anew: arguments as :func:`walk`'s, one a level.
+) -> float:
+    """Take Metropolis steps on prior · sketch^power; return by how much the log sketch rose."""
+    proposed, weighed = np.empty_like(pose), np.empty_like(parts)
+    apart, terms = np.empty((2, len(pose))), np.empty(edge_room(len(pose), sight.graph))
+    start = 0.0
+    if power > 0:
+        start = log_sketch(pose, view, annotation, body, sight, apart, terms)
+    here = start
+    for _ in range(n_steps):
+        number = int(rng.random() * len(moves))
+        kind, joint = moves[number, 0], moves[number, 1]
+        tried[number] += 1
+        propose(pose, moves[number], sizes[number], body, rng, proposed)
+        weighed[:] = parts
+        # First by what is cheap, then by what is not (Christen and Fox 2005).
+        weighed[0] = log_measure(proposed, body)
+        new = 0.0
+        if power > 0:
+            new = log_sketch(proposed, view, annotation, body, sight, apart, terms)
+        if not -rng.standard_exponential() < weighed[0] - parts[0] + power * (new - here):
+            continue
+        weighed[1] = log_penetration(proposed, physics)
+        least = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
+        # Limits take away at most: without them, some are known to be left already.
+        if weighed[1] < least:
+            continue
+        if kind != TURN and kind != SHIFT:
+            judge(proposed, body.person[joint], physics, weighed)
+        if not log_prior(weighed, physics) - weighed[0] >= least:
+            continue
+        pose[:], parts[:], here = proposed, weighed, new
+        taken[number] += 1
+    return here - start
 
-    ``seen`` (levels, 2) gets log L_v of each level's view, and log L of all views.
-    """
-    for level in range(len(poses)):
-        walk(
-            poses[level], parts[level], views[level], powers[level], n_steps,
-            moves, sizes[level], tried[level], taken[level], body, physics, sight, rng,
-        )  # fmt: skip
-        views[level], seen[level, 0], seen[level, 1] = choose_view(
-            poses[level], powers[level], body, sight, rng
-        )
+
+@numba.njit(cache=True, nogil=True)
+def _drawn(logs: np.ndarray, rng: np.random.Generator) -> int:
+    """Return one of several, drawn in proportion to exp(logs)."""
+    total = np.cumsum(np.exp(logs - logs.max()))
+    return min(int(np.searchsorted(total, rng.random() * total[-1], side="right")), len(logs) - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _share_of_best(logs: np.ndarray) -> float:
+    """Return log Σ exp(logs) − max logs."""
+    return np.log(np.exp(logs - logs.max()).sum())

@@ -6,10 +6,10 @@ walk stays where it began. Here the view is a part of the state,
 
     π(Θ, v) ∝ f(Θ) L(Θ_v; v),
 
-whose sum over v is the posterior. A step that keeps the view asks one view of the likelihood in
-place of all; the view is drawn anew, given the pair, after every few steps. Levels with L to a
-power between 0 and 1 stand below it, and neighbours exchange their states (Swendsen and Wang 1986):
-at power 0 pairs move through the prior, and come back in other views and near other annotations.
+whose sum over v is the posterior: a step asks one view of the likelihood in place of all. Levels
+with L to a power between 0 and 1 stand below it, and neighbours exchange their states (Swendsen and
+Wang 1986): at power 0 pairs move through the prior, and come back in other views and near other
+annotations.
 Exchanges take even and odd neighbours in turn, and powers are set so that all exchanges are
 rejected alike (Syed et al. 2022).
 
@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from probmotion import seeds
+from probmotion.arrays import logsumexp
 from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
@@ -69,7 +70,7 @@ class TemperedPairs:
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
 
     levels: int = 24
-    steps: int = 60
+    steps: int = 120
     warmup: int = 2000
     thin: int = 60
 
@@ -170,7 +171,7 @@ class _Ladder:
         chain: int,
     ) -> None:
         from probmotion.models.pose_pairs import PosePairPrior
-        from probmotion.problems.pair_densities import choose_view, weigh
+        from probmotion.problems.pair_densities import log_view, weigh
         from probmotion.problems.pair_moves import moves_of
 
         prior = posterior.prior
@@ -184,13 +185,12 @@ class _Ladder:
         self.tried, self.taken = np.zeros_like(self.log_sizes), np.zeros_like(self.log_sizes)
         pose = prior.seed[chain % len(prior.seed)]
         self.poses = np.repeat(pose[None], levels, axis=0)
-        self.parts = np.zeros((levels, 2 + 2 * len(body.roots)))
-        self.seen, self.views = np.zeros((levels, 2)), np.zeros(levels, dtype=np.int64)
-        for level in range(levels):
-            weigh(self.poses[level], body, physics, self.parts[level])
-            self.views[level], *self.seen[level] = choose_view(
-                self.poses[level], self.powers[level], body, sight, rng
-            )
+        self.parts = np.empty((levels, 2 + 2 * len(body.roots)))
+        weigh(pose, body, physics, self.parts[0])
+        self.parts[:] = self.parts[0]
+        self.views = rng.integers(len(sight.vectors), size=levels)
+        # log L_v of each level's view.
+        self.seen = np.array([log_view(pose, view, body, sight) for view in self.views])
         self.cut = _Cut(self, posterior) if _is_cut(posterior) else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
         self.odd = False
@@ -235,7 +235,7 @@ class _Ladder:
                 end_of_round += length
         self.round_trips = 0
         if self.cut is not None:
-            self.cut.check(self)
+            self.cut.check()
 
     def _set_powers(self) -> None:
         """Move the powers to where the rejected exchanges so far say that all reject alike."""
@@ -248,28 +248,29 @@ class _Ladder:
         self.rejected[:], self.asked = 0, 0
 
     def _exchange_after_walking(self, stop: Event) -> None:
-        from probmotion.problems.pair_walk_kernels import scan
+        from probmotion.problems.pair_walk_kernels import walk
 
         if stop.is_set():
             raise KeyboardInterrupt
-        scan(
-            self.poses,
-            self.parts,
-            self.seen,
-            self.views,
-            self.powers,
-            self.sampler.steps,
-            self.moves,
-            np.exp(self.log_sizes),
-            self.tried,
-            self.taken,
-            *self.arrays,
-            self.rng,
-        )
+        sizes = np.exp(self.log_sizes)
+        for level, power in enumerate(self.powers):
+            self.views[level], self.seen[level] = walk(
+                self.poses[level],
+                self.parts[level],
+                self.views[level],
+                power,
+                self.sampler.steps,
+                self.moves,
+                sizes[level],
+                self.tried[level],
+                self.taken[level],
+                *self.arrays,
+                self.rng,
+            )
         self.evaluations += self.sampler.steps * len(self.poses)
         if self.cut is not None:
             self.cut.exchange(self)
-        log_ratio = np.diff(self.powers) * (self.seen[:-1, 0] - self.seen[1:, 0])
+        log_ratio = np.diff(self.powers) * (self.seen[:-1] - self.seen[1:])
         probability = np.exp(np.minimum(log_ratio, 0.0))
         self.rejected += 1 - probability
         self.asked += 1
@@ -294,34 +295,36 @@ class _Cut:
         assert isinstance(posterior, TruncatedPosterior)
         self.floor, self.cap = posterior.log_floor, posterior.log_cap
         self.pose, self.parts = ladder.poses[-1].copy(), ladder.parts[-1].copy()
-        self.seen, self.view = ladder.seen[-1].copy(), ladder.views[-1]
+        self.seen, self.view = ladder.seen[-1], ladder.views[-1]
+        self.log_share = self._log_share(ladder)
 
     def exchange(self, ladder: _Ladder) -> None:
         """Exchange states with the top level, or not."""
-        ratio = self._log_share(ladder.parts[-1], ladder.seen[-1], ladder)
-        ratio -= self._log_share(self.parts, self.seen, ladder)
-        if -ladder.rng.standard_exponential() < ratio:
-            for own, theirs in (
-                (self.pose, ladder.poses),
-                (self.parts, ladder.parts),
-                (self.seen, ladder.seen),
-            ):
-                own[:], theirs[-1] = theirs[-1].copy(), own.copy()
-            self.view, ladder.views[-1] = ladder.views[-1], self.view
+        theirs = self._log_share(ladder)
+        # Of two states without share neither is taken for the other: no number is below none.
+        if not -ladder.rng.standard_exponential() < theirs - self.log_share:
+            return
+        for own, top in ((self.pose, ladder.poses[-1]), (self.parts, ladder.parts[-1])):
+            own[:], top[:] = top.copy(), own.copy()
+        self.seen, ladder.seen[-1] = ladder.seen[-1], self.seen
+        self.view, ladder.views[-1] = ladder.views[-1], self.view
+        self.log_share = theirs
 
-    def check(self, ladder: _Ladder) -> None:
+    def check(self) -> None:
         """Raise ``ValueError`` if no state was met that the cut leaves."""
-        if self._log_share(self.parts, self.seen, ladder) == -math.inf:
+        if self.log_share == -math.inf:
             raise ValueError(
                 f"posterior is cut at {self.floor:.4g} nats and nothing above that was met in the "
                 "warm-up, expected a greater limit"
             )
 
-    def _log_share(self, parts: np.ndarray, seen: np.ndarray, ladder: _Ladder) -> float:
-        """Return log f*/f; f is relative to the measure, which is the first part."""
-        from probmotion.problems.pair_densities import log_prior
+    def _log_share(self, ladder: _Ladder) -> float:
+        """Return log f*/f of the top level's state, f relative to the measure, its first part."""
+        from probmotion.problems.pair_densities import log_prior, log_views
 
-        log_f = log_prior(parts, ladder.arrays[1]) - parts[0] + seen[1]
+        body, physics, sight = ladder.arrays
+        parts, logs = ladder.parts[-1], log_views(ladder.poses[-1], body, sight)
+        log_f = log_prior(parts, physics) - parts[0] + logsumexp(logs) - math.log(len(logs))
         return -math.inf if log_f < self.floor else min(0.0, self.cap - log_f)
 
 
@@ -343,13 +346,11 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
     below = np.eye(skeleton.n_joints, dtype=bool)
     for joint in range(skeleton.n_joints):
         below[list(skeleton.ancestors(joint)), joint] = True
-    children = [np.flatnonzero(parents == joint) for joint in range(skeleton.n_joints)]
     roots = np.array(skeleton.roots)
     return (
         Body(
             parents=parents,
             below=below,
-            only_child=np.array([each[0] if len(each) == 1 else -1 for each in children]),
             roots=roots,
             chests=np.array(chests(skeleton)),
             person=np.searchsorted(roots, trees(skeleton)),

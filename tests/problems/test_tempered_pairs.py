@@ -11,6 +11,7 @@ from threading import Event
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from scipy.special import logsumexp
 
 from probmotion import MotionPosterior
 from probmotion.data.dances import make_dances
@@ -18,8 +19,15 @@ from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotation_sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior
 from probmotion.problems import load_problem, tempered_pairs
-from probmotion.problems.pair_densities import choose_view, log_prior, weigh
-from probmotion.problems.pair_moves import moves_of
+from probmotion.problems.pair_densities import (
+    log_annotations,
+    log_prior,
+    log_sketch,
+    log_views,
+    picture_of,
+    weigh,
+)
+from probmotion.problems.pair_moves import HINGE, STRETCH, moves_of, propose
 from probmotion.problems.pair_walk_kernels import walk
 from probmotion.problems.tempered_pairs import TemperedPairs, pair_arrays
 from probmotion.truncation import TruncatedPosterior
@@ -76,14 +84,60 @@ def test_what_compiled_code_weighs_is_the_posterior(prior, evidence):
     parts, found = np.zeros(6), []
     for pose in poses:
         weigh(pose, body, physics, parts)
-        found.append(log_prior(parts, physics) + choose_view(pose, 1.0, body, sight, rng)[2])
+        found.append(log_prior(parts, physics) + logsumexp(log_views(pose, body, sight)))
     stretches, places = theta[:, 12:].reshape(40, -1, 3)[..., 2], theta[:, 6:12]
     normal = -0.5 * ((stretches / 0.05) ** 2).sum(axis=-1) - 0.5 * (places**2).sum(axis=-1)
     expected = normal + prior.log_plausibility(poses[:, None])
     allowed = np.isfinite(expected)
     assert 5 < allowed.sum() < 40
     expected[allowed] += posterior.likelihood.log_density(poses[allowed][:, None])
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(np.array(found) - math.log(5), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("measure", ["interaction", "cartesian"])
+def test_a_sketch_is_of_one_annotation_and_its_own_graph(prior, evidence, measure):
+    """Joints in the complex plane: where there is no graph, the sketch is the distance itself."""
+    evidence = replace(evidence, measure=measure)
+    body, _, sight = pair_arrays(MotionPosterior(prior, evidence))
+    held, view, rng = sight.prepared, 3, np.random.default_rng(0)
+    pose = prior.seed[0] + 0.1 * rng.standard_normal(prior.seed[0].shape)
+    apart, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(sight.near.shape[1])
+    log_annotations(pose, view, body, sight, logs)
+    picture = picture_of(pose, view, body, sight) @ [1, 1j]
+    picture -= picture.mean()
+    for annotation, exact in zip(sight.near[view], logs, strict=True):
+        target = held.joints[annotation].T @ [1, 1j]
+        turn = np.vdot(picture, target)
+        error = picture * turn / abs(turn) - target
+        if measure == "cartesian":
+            known = math.sqrt(np.mean(np.abs(error) ** 2))
+            assert exact == pytest.approx(-0.5 * (known / evidence.noise) ** 2, rel=1e-9)
+        else:
+            edges = slice(*held.edge_start[annotation : annotation + 2])
+            i, j = held.edges[:, edges]
+            known = 2 * np.sum(held.weights[edges] * np.abs(error[i] - error[j]))
+        found = log_sketch(pose, view, annotation, body, sight, apart, terms)
+        assert found == pytest.approx(-0.5 * (known / evidence.noise) ** 2, rel=1e-9)
+
+
+def test_moves_keep_the_lengths_of_bones(prior, evidence):
+    """But for the one that a stretch is of; a hinge keeps how far apart its two joints are."""
+    body, _, _ = pair_arrays(MotionPosterior(prior, evidence))
+    pose, rng = prior.seed[0], np.random.default_rng(0)
+    ends, starts = np.array(prior.skeleton.bones).T
+    before = np.linalg.norm(pose[ends] - pose[starts], axis=1)
+    proposed = np.empty_like(pose)
+    for move in moves_of(body):
+        kind, joint, other = move
+        propose(pose, move, 0.5, body, rng, proposed)
+        assert np.abs(proposed - pose).max() > 1e-6
+        after = np.linalg.norm(proposed[ends] - proposed[starts], axis=1)
+        kept = (ends != joint) | (kind != STRETCH)
+        np.testing.assert_allclose(after[kept], before[kept], rtol=1e-12)
+        assert kept.all() or after[~kept] != pytest.approx(before[~kept], rel=1e-9)
+        if kind == HINGE:
+            shift = proposed[[joint, other]] - pose[[joint, other]]
+            np.testing.assert_allclose(shift[0], shift[1], atol=1e-12)
 
 
 def test_a_walk_keeps_its_books(prior, evidence):
@@ -93,11 +147,11 @@ def test_a_walk_keeps_its_books(prior, evidence):
     pose, parts, moves = prior.seed[0].copy(), np.zeros(6), moves_of(body)
     weigh(pose, body, physics, parts)
     sizes, tried, taken = np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves))
-    view, _, _ = choose_view(pose, 1.0, body, sight, rng)
-    walk(
-        pose, parts, view, 1.0, 4000, moves, sizes, tried, taken, body, physics, sight, rng
-    )  # fmt: skip
+    view, log_l = walk(
+        pose, parts, 2, 1.0, 4000, moves, sizes, tried, taken, body, physics, sight, rng
+    )
     again = np.zeros(6)
+    assert log_l == pytest.approx(log_views(pose, body, sight)[view], rel=1e-9)
     weigh(pose, body, physics, again)
     np.testing.assert_allclose(parts, again, rtol=1e-9, atol=1e-9)
     assert (taken[tried > 0] > 0).mean() > 0.9
