@@ -94,29 +94,34 @@ class TransformerLayer(nn.Module):
         -------
         Tensor, (N, first, width)
         """
-        found = self._attention(self.attention_norm(tokens), seen, first)
-        tokens = tokens[:, :first] + found
+        normalised = self.attention_norm(tokens)
+        if first is None:
+            found = _looked_up(self.asked_keys_values(normalised), self.heads, seen)
+        else:
+            found = self._looked_up_by(first, normalised, seen)
+        tokens = tokens[:, :first] + self.attended(found)
         if memory is not None:
             tokens = tokens + self.told(memory)[:, None]
         return tokens + self.perceptron(self.perceptron_norm(tokens))
 
-    def _attention(
-        self, tokens: torch.Tensor, seen: torch.Tensor | None, first: int | None
+    def _looked_up_by(
+        self, first: int, tokens: torch.Tensor, seen: torch.Tensor | None
     ) -> torch.Tensor:
-        width = tokens.shape[-1]
-        if first is None:
-            parts = self.asked_keys_values(tokens).chunk(3, dim=-1)
-        else:
-            weight, bias = self.asked_keys_values.weight, self.asked_keys_values.bias
-            asked = functional.linear(tokens[:, :first], weight[:width], bias[:width])
-            known = functional.linear(tokens, weight[width:], bias[width:])
-            parts = (asked, *known.chunk(2, dim=-1))
-        asked, keys, values = (
-            part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts
-        )
-        mask = None if seen is None else seen[:, None, None]
-        found = _looked_up(asked, keys, values, mask)
-        return self.attended(found.transpose(1, 2).flatten(2))
+        """Return what the first tokens find, ``(N, first, width)``.
+
+        They are fewer than those that they look at: Qᵀ(W_K x) is computed as (W_Kᵀ Q)ᵀ x, and what
+        is found as W_V of a mean over tokens. Whatever is added to all keys alike has no effect.
+        """
+        linear, width = self.asked_keys_values, tokens.shape[-1]
+        of_asked, of_keys, of_values = linear.weight.unflatten(0, (3, self.heads, -1))
+        asked = functional.linear(tokens[:, :first], of_asked.flatten(0, 1), linear.bias[:width])
+        asked = torch.einsum("nqhd,hdw->nhqw", asked.unflatten(-1, (self.heads, -1)), of_keys)
+        scores = torch.einsum("nhqw,nkw->nhqk", asked, tokens) * of_keys.shape[1] ** -0.5
+        if seen is not None:
+            scores = scores.masked_fill(~seen[:, None, None], -torch.inf)
+        mean = torch.einsum("nhqk,nkw->nhqw", scores.softmax(dim=-1), tokens)
+        found = torch.einsum("nhqw,hdw->nqhd", mean, of_values).flatten(2)
+        return found + linear.bias[2 * width :]
 
 
 class Readout(nn.Linear):
@@ -240,12 +245,15 @@ class BoneDecoder(nn.Module):
 
 
 def _looked_up(
-    asked: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, mask: torch.Tensor | None
+    asked_keys_values: torch.Tensor, heads: int, seen: torch.Tensor | None
 ) -> torch.Tensor:
-    """Return what attention finds, ``(N, heads, K, d)``."""
-    if asked.dtype != torch.bfloat16 or asked.device.type != "cpu":
-        return functional.scaled_dot_product_attention(asked, keys, values, attn_mask=mask)
-    return short_attention(asked, keys, values, mask)
+    """Return what attention finds; arguments as :func:`short_attention`'s."""
+    if asked_keys_values.dtype == torch.bfloat16 and asked_keys_values.device.type == "cpu":
+        return short_attention(asked_keys_values, heads, seen)
+    asked, keys, values = asked_keys_values.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
+    mask = None if seen is None else seen[:, None, None]
+    found = functional.scaled_dot_product_attention(asked, keys, values, attn_mask=mask)
+    return found.transpose(1, 2).flatten(2)
 
 
 def mixed_precision(network: nn.Module, device: torch.device) -> torch.autocast:

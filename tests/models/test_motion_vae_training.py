@@ -105,10 +105,17 @@ def test_a_view_is_chosen_with_the_body_at_rest(first) -> None:
             log_lengths=guesses.log_lengths + 0.5,
         )
         after = first._at_rest(bent, keypoints, seen)
-        turned = replace(guesses, rotation=guesses.rotation.roll(1, dims=1))
-        rolled = first._at_rest(turned, keypoints, seen)
+        others = replace(
+            guesses,
+            rotation=guesses.rotation.roll(1, dims=1),
+            translation=guesses.translation.roll(1, dims=1),
+        )
+        rolled = first._at_rest(others, keypoints, seen)
     torch.testing.assert_close(after, before, rtol=0, atol=0)
-    assert (rolled.argmin(dim=1) != before.argmin(dim=1)).float().mean() > 0.8
+    torch.testing.assert_close(rolled, before.roll(1, dims=1))
+    # The least of four losses that differ: no view is chosen for its place in the row.
+    assert (before.max(dim=1).values > 1.1 * before.min(dim=1).values).all()
+    assert len(before.argmin(dim=1).unique()) > 1
 
 
 @pytest.mark.parametrize("step", [1, 500, 501])
