@@ -15,7 +15,7 @@ demo: install
 	$(BIN)/probmotion compare gait gait-monocular --quick --workers 2 --out demo --pictures
 
 test: install
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 tests
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests
 
 slow: install
 	$(BIN)/python -m pytest -m slow tests

@@ -98,13 +98,13 @@ class TransformerLayer(nn.Module):
         if first is None:
             found = _looked_up(self.asked_keys_values(normalised), self.heads, seen)
         else:
-            found = self._looked_up_by(first, normalised, seen)
+            found = self._first_look_up(first, normalised, seen)
         tokens = tokens[:, :first] + self.attended(found)
         if memory is not None:
             tokens = tokens + self.told(memory)[:, None]
         return tokens + self.perceptron(self.perceptron_norm(tokens))
 
-    def _looked_up_by(
+    def _first_look_up(
         self, first: int, tokens: torch.Tensor, seen: torch.Tensor | None
     ) -> torch.Tensor:
         """Return what the first tokens find, ``(N, first, width)``.

@@ -1,8 +1,8 @@
 """Attention among few tokens in bfloat16 on the CPU, with a backward pass of its own.
 
 Products of so few tokens take less time than what moves numbers about between them. Here heads are
-parted once and put together once each way, and of what autograd would keep the weights alone are
-kept, in bfloat16.
+parted once and put together once each way, and of what autograd would keep beside Q, K and V the
+weights alone are kept, in bfloat16.
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ __all__ = [
     "nearest_in_batch",
     "nearest_in_batch_on_threads",
     "nearest_of",
-    "nearest_to",
 ]
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
@@ -116,22 +115,6 @@ def nearest_of(
     Where none is within ``within`` that is what is returned, and −1.
     """
     joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
-    return nearest_to(joints, edges, weights, n_edges, bins, candidates, prepared, measure, within)
-
-
-@numba.njit(cache=True)
-def nearest_to(
-    joints: np.ndarray,
-    edges: np.ndarray,
-    weights: np.ndarray,
-    n_edges: int,
-    bins: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    within: float,
-) -> tuple[float, int]:
-    """Return what :func:`nearest_of` does, of a projection that was looked at before."""
     n_candidates = candidates.shape[0]
     turns, left = np.empty((2, n_candidates)), np.empty(n_candidates)
     n_joints, square = joints.shape[1], 0.0

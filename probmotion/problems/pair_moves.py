@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)
-_HALF_TURN = 0.3
+_ANY_ANGLE = 0.3
 """How often a crank or hinge turns by any angle."""
 
 
@@ -116,7 +116,7 @@ def propose(
                 proposed[k] += vector
     else:
         angle = vector[0]
-        if rng.random() < _HALF_TURN:
+        if rng.random() < _ANY_ANGLE:
             angle = np.pi * (2.0 * rng.random() - 1.0)
         # What a crank or hinge turns leaves its axis as it is.
         axis = pose[other] - pose[parent if kind == CRANK else joint]

@@ -22,7 +22,9 @@ from probmotion.problems.pair_moves import SHIFT, TURN, Body, place_anew, propos
 __all__ = ["walk"]
 
 _LOT = 40
+"""Steps by a sketch: of so many, two lots in three are taken."""
 _VIEWS_ASKED = 6
+"""Of any number of views: all would take longer than the steps between."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -70,7 +72,8 @@ def walk(
     """
     logs, new_logs = np.empty(sight.near.shape[1]), np.empty(sight.near.shape[1])
     there, parts_there = np.empty_like(pose), np.empty_like(parts)
-    log_annotations(pose, view, body, sight, logs)
+    if power > 0:
+        log_annotations(pose, view, body, sight, logs)
     for done in range(0, n_steps, _LOT):
         there[:], parts_there[:] = pose, parts
         chosen = _drawn(power * logs, rng) if power > 0 else 0
@@ -81,7 +84,7 @@ def walk(
         if power > 0:
             log_annotations(there, view, body, sight, new_logs)
             ratio = power * (new_logs[chosen] - logs[chosen] - gained)
-            ratio += _share_of_best(power * logs) - _share_of_best(power * new_logs)
+            ratio += _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
             if not -rng.standard_exponential() < ratio:
                 continue
             logs[:] = new_logs
@@ -92,6 +95,7 @@ def walk(
         return view, log_view(pose, view, body, sight)
     log_l = logs.max()
     for _ in range(_VIEWS_ASKED):
+        # What a view must reach is drawn first: that it does not is sooner known than what it is.
         other = int(rng.random() * len(sight.vectors))
         least = log_l - rng.standard_exponential() / power
         found = log_view(pose, other, body, sight, least)
@@ -159,6 +163,6 @@ def _drawn(logs: np.ndarray, rng: np.random.Generator) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _share_of_best(logs: np.ndarray) -> float:
+def _log_sum_over_best(logs: np.ndarray) -> float:
     """Return log Σ exp(logs) − max logs."""
     return np.log(np.exp(logs - logs.max()).sum())

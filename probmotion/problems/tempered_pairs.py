@@ -72,7 +72,7 @@ class TemperedPairs:
     levels: int = 24
     steps: int = 120
     warmup: int = 2000
-    thin: int = 60
+    thin: int = 80
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
@@ -325,7 +325,7 @@ class _Cut:
         body, physics, sight = ladder.arrays
         parts, logs = ladder.parts[-1], log_views(ladder.poses[-1], body, sight)
         log_f = log_prior(parts, physics) - parts[0] + logsumexp(logs) - math.log(len(logs))
-        return -math.inf if log_f < self.floor else min(0.0, self.cap - log_f)
+        return min(0.0, self.cap - log_f) if log_f >= self.floor else -math.inf
 
 
 def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:

@@ -174,12 +174,18 @@ def test_without_limits_and_evidence_the_measure_is_drawn(loose, evidence):
     stretches = np.log(lengths[..., 0] / first) / loose.bone_noise
     places = poses[:, :, list(loose.skeleton.roots)] - loose.seed[0][list(loose.skeleton.roots)]
     below = [(k, m) for k, joint in enumerate(ends) for m, end in enumerate(starts) if end == joint]
-    bends = np.stack([(ways[:, :, k] * ways[:, :, m]).sum(axis=-1) for k, m in below], axis=-1)
+    beside = [(k, m) for m in range(len(starts)) for k in range(m) if starts[k] == starts[m]]
+    bends, spreads = (
+        np.stack([(ways[:, :, k] * ways[:, :, m]).sum(axis=-1) for k, m in pairs], axis=-1)
+        for pairs in (below, beside)
+    )
     for known, values, mean in (
         ("directions", ways, 0.0),
         ("their squares", ways**2, 1 / 3),
         ("bends", bends, 0.0),
         ("squared bends", bends**2, 1 / 3),
+        ("spreads", spreads, 0.0),
+        ("squared spreads", spreads**2, 1 / 3),
         ("lengths", stretches, 0.0),
         ("squared lengths", stretches**2, 1.0),
         ("places", places, 0.0),
