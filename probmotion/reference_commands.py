@@ -21,8 +21,8 @@ class Reference:
     """Make reference draws of a problem by two long runs that must agree, or exactly.
 
     Writes NAME/draws.npz and NAME/certificate.json, both or neither; what has not mixed or does
-    not agree is not kept. A run that has ended is kept until both have, so that the same command
-    goes on after an interrupt.
+    not agree is not kept. A run that has ended is kept until both have, and pose-pairs before, so
+    that the same command goes on after an interrupt.
     """
 
     problem: Positional[str]
@@ -63,7 +63,7 @@ class Reference:
         except KeyboardInterrupt as stop:
             if unfinished.is_dir() and any(unfinished.iterdir()):
                 raise KeyboardInterrupt(
-                    "interrupted; a run that has ended is kept, and the same command goes on"
+                    "interrupted; what was made is kept, and the same command goes on"
                 ) from stop
             raise
         else:

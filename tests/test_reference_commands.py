@@ -34,8 +34,8 @@ def test_by_default_they_are_where_comparisons_look(tmp_path, monkeypatch):
 def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys, monkeypatch):
     made = references._run
 
-    def narrow(problem, sampler, n, seed, half, progress):
-        run = made(problem, sampler, n, seed, half, progress)
+    def narrow(problem, sampler, n, seed, half, progress, unfinished):
+        run = made(problem, sampler, n, seed, half, progress, unfinished)
         positions = run.dataset["positions"]
         if half:
             run.dataset["positions"] = positions.mean() + 0.9 * (positions - positions.mean())
@@ -50,16 +50,16 @@ def test_runs_that_disagree_end_with_status_2_and_keep_nothing(tmp_path, capsys,
 def test_stopped_in_its_second_run_it_goes_on_there(tmp_path, capsys, monkeypatch):
     made, asked = references._run, []
 
-    def stopped(problem, sampler, n, seed, half, progress):
+    def stopped(problem, sampler, n, seed, half, progress, unfinished):
         asked.append((seed, half))
         if len(asked) in (2, 3):
             raise KeyboardInterrupt
-        return made(problem, sampler, n, seed, half, progress)
+        return made(problem, sampler, n, seed, half, progress, unfinished)
 
     monkeypatch.setattr(references, "_run", stopped)
     words = ["reference", SMALL, "--draws", "80", "--out", str(tmp_path)]
     assert main(words) == 130
-    assert "a run that has ended is kept, and the same command goes on" in capsys.readouterr().err
+    assert "what was made is kept, and the same command goes on" in capsys.readouterr().err
     # Others neither find it nor take it away, whether they are stopped or end.
     assert main([*words, "--seed", "1"]) == 130
     assert "nothing was written" in capsys.readouterr().err

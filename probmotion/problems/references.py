@@ -82,8 +82,9 @@ def make_reference(
         :class:`~probmotion.problems.tempered_pairs.TemperedPairs` where that can, else NUTS with a
         longer warm-up; a random walk where there is no gradient.
     unfinished : str or Path, optional
-        Folder in which each run is kept once it has ended: the same call, stopped in the other
-        run, goes on there. Whoever named it deletes it. By default nothing is written.
+        Folder in which each run is kept once it has ended, and chains of tempered pairs before: the
+        same call, stopped on the way, goes on there. Whoever named it deletes it. By default
+        nothing is written.
 
     Raises
     ------
@@ -112,7 +113,7 @@ def make_reference(
     runs = []
     for half in range(2):
         make = partial(_run, asked, used, made, seed, half, progress)
-        runs.append(make() if folder is None else _kept_or_made(folder, half, made_by, make))
+        runs.append(make(None) if folder is None else _kept_or_made(folder, half, made_by, make))
     return certify(asked, runs, seed, draws)
 
 
@@ -128,9 +129,18 @@ def _long_run(problem: Problem) -> Sampler:
 
 
 def _run(
-    problem: Problem, sampler: Sampler, n: int, seed: int, half: int, progress: bool
+    problem: Problem,
+    sampler: Sampler,
+    n: int,
+    seed: int,
+    half: int,
+    progress: bool,
+    unfinished: Path | None,
 ) -> MotionDraws:
-    return sampler.sample(
+    sample = sampler.sample
+    if isinstance(sampler, TemperedPairs):
+        sample = partial(sampler.sample, unfinished=unfinished)
+    return sample(
         problem.posterior,
         draws=n // _CHAINS,
         chains=_CHAINS,
@@ -140,11 +150,12 @@ def _run(
 
 
 def _kept_or_made(
-    folder: Path, half: int, made_by: list[Any], make: Callable[[], MotionDraws]
+    folder: Path, half: int, made_by: list[Any], make: Callable[[Path], MotionDraws]
 ) -> MotionDraws:
     """Return a run that has ended, or make it and keep it; a file that fails stops neither.
 
-    The file's name tells by what it was made, and of what.
+    The file's name tells by what it was made, and of what. A run that keeps its chains before it
+    has ended does so beside it.
     """
     told = json.dumps([*made_by, library_versions()])
     path = folder / f"run-{half}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.nc"
@@ -153,9 +164,11 @@ def _kept_or_made(
             return MotionDraws.load(path)
         except ValueError as error:
             warnings.warn(f"{error}; the run is made anew", stacklevel=3)
-    run = make()
+    run = make(path.with_suffix(""))
     try:
         run.save(path)
+        for chain in folder.glob(f"{path.stem}-*.npz"):
+            chain.unlink()
     except OSError as error:
         reason = error.strerror or str(error)
         warnings.warn(f"cannot keep the run in {path}: {reason}", stacklevel=3)

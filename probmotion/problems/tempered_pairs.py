@@ -21,8 +21,11 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -34,6 +37,7 @@ from probmotion.checks import check_count
 from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import HasLogDensity
+from probmotion.problems.kept_chains import KeptChain
 from probmotion.sampling import progress_bar
 from probmotion.truncation import TruncatedPosterior
 
@@ -48,6 +52,11 @@ _FIRST_SIZE = 0.1
 _LARGEST_SIZE = math.e
 _FIRST_ROUND = 16
 _SMALLEST_POWER = 1e-5
+_STATE = (
+    "poses", "parts", "seen", "views", "powers", "log_sizes", "tried", "taken", "rejected", "asked",
+    "odd", "been_down", "round_trips", "evaluations",
+)  # fmt: skip
+_CUT_STATE = ("pose", "parts", "seen", "view", "log_share")
 
 
 @dataclass(frozen=True)
@@ -72,7 +81,7 @@ class TemperedPairs:
     levels: int = 24
     steps: int = 120
     warmup: int = 2000
-    thin: int = 80
+    thin: int = 160
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
@@ -102,8 +111,12 @@ class TemperedPairs:
         seed: int = 0,
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
+        unfinished: Path | None = None,
     ) -> MotionDraws:
         """Return ``draws`` states of each of ``chains`` chains; see the sampler's protocol.
+
+        Where each chain is, is kept in ``unfinished`` and the chain's number, twice a minute: the
+        same call goes on there after it was stopped. Whoever named it deletes these files.
 
         Chains run side by side on threads, one a processor, wherever this is called: each has
         random numbers of its own and shares nothing, so that bits do not depend on threads.
@@ -136,8 +149,15 @@ class TemperedPairs:
                 _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
                 for chain in range(chains)
             ]
+            kept = [
+                KeptChain(unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz"))
+                for chain in range(chains)
+            ]
             try:
-                waiting = [threads.submit(ladder.draw, draws, bar, stop) for ladder in ladders]
+                waiting = [
+                    threads.submit(ladder.draw, draws, bar, stop, own)
+                    for ladder, own in zip(ladders, kept, strict=True)
+                ]
                 # One that fails stops all, not only those that were waited for before it.
                 ended, _ = wait(waiting, return_when=FIRST_EXCEPTION)
                 for each in ended:
@@ -203,16 +223,37 @@ class _Ladder:
         """Sum over neighbours of how often an exchange is rejected: Λ of Syed et al."""
         return float(self.rejected.sum() / max(self.asked, 1))
 
-    def draw(self, draws: int, bar: Any, stop: Event) -> np.ndarray:
+    def draw(self, draws: int, bar: Any, stop: Event, kept: KeptChain) -> np.ndarray:
         """Return the states at the top after a warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
-        self._warm_up(stop)
-        found = np.empty((draws, *self.poses.shape[1:]))
-        for draw in range(draws):
+        found, done, held = np.empty((draws, *self.poses.shape[1:])), 0, kept.load()
+        if held is None:
+            self._warm_up(stop)
+        else:
+            done = len(held["draws"])
+            found[:done] = held["draws"]
+            self._go_on_from(held)
+            bar.update(done)
+        for draw in range(done, draws):
             for _ in range(self.sampler.thin):
                 self._exchange_after_walking(stop)
             found[draw] = self.poses[-1] if self.cut is None else self.cut.pose
             bar.update(1)
+            kept.save(partial(self._held, found[: draw + 1]))
         return found
+
+    def _held(self, draws: np.ndarray) -> dict[str, np.ndarray]:
+        """Return draws so far, all that exchanges change, and what the warm-up has set."""
+        held = {name: np.asarray(getattr(self, name)) for name in _STATE}
+        if self.cut is not None:
+            held |= {f"cut_{name}": np.asarray(getattr(self.cut, name)) for name in _CUT_STATE}
+        return held | {"draws": draws, "random": seeds.state_words(self.rng)}
+
+    def _go_on_from(self, held: Mapping[str, np.ndarray]) -> None:
+        for owner, names, prefix in ((self, _STATE, ""), (self.cut, _CUT_STATE, "cut_")):
+            for name in names if owner is not None else ():
+                value = held[f"{prefix}{name}"]
+                setattr(owner, name, value if value.ndim else value.item())
+        self.rng = seeds.resumed_generator(held["random"])
 
     def _warm_up(self, stop: Event) -> None:
         """Set step sizes after every exchange, and powers after rounds of growing length."""

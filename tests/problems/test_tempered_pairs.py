@@ -18,7 +18,8 @@ from probmotion.data.dances import make_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotation_sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior
-from probmotion.problems import load_problem, tempered_pairs
+from probmotion.problems import kept_chains, load_problem, tempered_pairs
+from probmotion.problems.kept_chains import KeptChain
 from probmotion.problems.pair_densities import (
     log_annotations,
     log_prior,
@@ -246,6 +247,48 @@ def test_a_chain_that_fails_stops_all(prior, evidence, monkeypatch):
     sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
     with pytest.raises(MemoryError, match="no room"):
         sampler.sample(posterior, draws=10**6, chains=2, progress=False)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_run_that_was_stopped_goes_on_with_the_same_bits(
+    prior, evidence, cut, monkeypatch, tmp_path
+):
+    posterior = MotionPosterior(prior, evidence)
+    if cut:
+        posterior = TruncatedPosterior(prior, evidence, limit=1e3)
+    sampler = TemperedPairs(levels=3, steps=30, warmup=20, thin=3)
+    asked = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
+    whole = sampler.sample(posterior, **asked)
+    monkeypatch.setattr(kept_chains, "_SECONDS", 0.0)
+    save = KeptChain.save
+
+    def stopping(kept, held):
+        save(kept, held)
+        if len(held()["draws"]) == 7:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(KeptChain, "save", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
+    kept = sorted(tmp_path.iterdir())
+    assert "run-0.npz" in [path.name for path in kept]
+    walked = []
+    exchange = tempered_pairs._Ladder._exchange_after_walking
+
+    def counted(ladder, stop):
+        walked.append(ladder)
+        exchange(ladder, stop)
+
+    monkeypatch.setattr(tempered_pairs._Ladder, "_exchange_after_walking", counted)
+    again = sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
+    assert len(walked) < 2 * (20 + 3 * 12) - 20
+    assert np.array_equal(again.dataset["positions"], whole.dataset["positions"])
+    for name in ("round_trips", "rejected_exchanges"):
+        assert np.array_equal(again.dataset[name], whole.dataset[name])
+    kept[0].write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"run-0.npz holds no chain \(.*, expected one that was"):
+        sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
 
 
 def test_ctrl_c_stops_every_chain(prior, evidence):
