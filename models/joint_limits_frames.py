@@ -1,6 +1,7 @@
 """Compiled geometry of three numbers: frames from lines, least rotations, cells on a sphere.
 
-Every function writes into an array that it is given: kernels call them by the million.
+Vectors are tuples, and matrices tuples of columns: they live in registers, where an array of three
+would take longer to make than to fill.
 """
 
 from __future__ import annotations
@@ -9,21 +10,27 @@ import numba
 import numpy as np
 
 __all__ = [
+    "NO_LENGTH",
+    "Frame",
+    "Vector",
     "cell_of",
     "closeness_of",
     "from_frame",
     "in_frame",
     "least_rotation",
     "line_frame",
-    "normalise",
     "product",
+    "unit",
 ]
 
+Vector = tuple[float, float, float]
+Frame = tuple[Vector, Vector, Vector]
+NO_LENGTH = (0.0, 0.0, 0.0)
 _TINY = 1e-12
 
 
 @numba.njit(cache=True)
-def cell_of(direction: np.ndarray, rings: np.ndarray) -> int:
+def cell_of(direction: Vector, rings: np.ndarray) -> int:
     """Return the cell of a unit vector on a sphere cut into rings about the second axis."""
     height = min(1.0, max(-1.0, direction[1]))
     ring = min(len(rings) - 1, int(np.arccos(height) / np.pi * len(rings)))
@@ -34,95 +41,98 @@ def cell_of(direction: np.ndarray, rings: np.ndarray) -> int:
 
 
 @numba.njit(cache=True)
-def normalise(v: np.ndarray) -> bool:
-    """Scale ``v`` to length 1; return False, and leave it, where it has no length."""
-    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+def unit(v: Vector) -> Vector:
+    """Return ``v`` at length 1; ``NO_LENGTH`` where it has none."""
+    length = np.sqrt(_dot(v, v))
     if length < _TINY:
-        return False
-    for i in range(3):
-        v[i] /= length
-    return True
+        return NO_LENGTH
+    return (v[0] / length, v[1] / length, v[2] / length)
 
 
 @numba.njit(cache=True)
-def line_frame(left: np.ndarray, right: np.ndarray, up: np.ndarray, frame: np.ndarray) -> None:
-    """Write the frame whose left axis is left − right and whose up axis is nearest ``up``.
+def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
+    """Return the frame whose left axis is left − right and whose up axis is nearest ``up``.
 
     Where the two lines have no direction or the same one, a fixed direction stands in: the bones
     are then far from any that was seen, and are found invalid.
     """
-    x, y = np.empty(3), np.empty(3)
-    for i in range(3):
-        x[i] = left[i] - right[i]
-    if not normalise(x):
-        x[:] = 0.0
-        x[np.argmin(np.abs(up))] = 1.0
-        along = x[0] * up[0] + x[1] * up[1] + x[2] * up[2]
-        for i in range(3):
-            x[i] -= along * up[i]
-        normalise(x)
-    along = x[0] * up[0] + x[1] * up[1] + x[2] * up[2]
-    for i in range(3):
-        y[i] = up[i] - along * x[i]
-    if not normalise(y):
-        y[:] = 0.0
-        axis = np.argmin(np.abs(x))
-        y[axis] = 1.0
-        for i in range(3):
-            y[i] -= x[axis] * x[i]
-        normalise(y)
-    frame[:, 0] = x
-    frame[:, 1] = y
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        frame[i, 2] = x[j] * y[k] - x[k] * y[j]
+    x = unit((left[0] - right[0], left[1] - right[1], left[2] - right[2]))
+    if x == NO_LENGTH:
+        x = _any_across(up)
+    along = _dot(x, up)
+    y = unit((up[0] - along * x[0], up[1] - along * x[1], up[2] - along * x[2]))
+    if y == NO_LENGTH:
+        y = _any_across(x)
+    return (x, y, _cross(x, y))
 
 
 @numba.njit(cache=True)
-def in_frame(frame: np.ndarray, direction: np.ndarray, out: np.ndarray) -> None:
-    """Write a direction's components along the axes of a frame, which are its columns."""
-    for i in range(3):
-        out[i] = (
-            frame[0, i] * direction[0] + frame[1, i] * direction[1] + frame[2, i] * direction[2]
-        )
+def in_frame(frame: Frame, direction: Vector) -> Vector:
+    """Return a direction's components along the axes of a frame, which are its columns."""
+    return (_dot(frame[0], direction), _dot(frame[1], direction), _dot(frame[2], direction))
 
 
 @numba.njit(cache=True)
-def from_frame(frame: np.ndarray, local: np.ndarray, out: np.ndarray) -> None:
-    """Write the direction that has the components ``local`` in a frame."""
-    for i in range(3):
-        out[i] = frame[i, 0] * local[0] + frame[i, 1] * local[1] + frame[i, 2] * local[2]
+def from_frame(frame: Frame, local: Vector) -> Vector:
+    """Return the direction that has the components ``local`` in a frame."""
+    x, y, z = frame
+    return (
+        x[0] * local[0] + y[0] * local[1] + z[0] * local[2],
+        x[1] * local[0] + y[1] * local[1] + z[1] * local[2],
+        x[2] * local[0] + y[2] * local[1] + z[2] * local[2],
+    )
 
 
 @numba.njit(cache=True)
-def least_rotation(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Write the rotation by the least angle that takes the unit vector ``a`` to ``b``."""
-    c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def least_rotation(a: Vector, b: Vector) -> Frame:
+    """Return the rotation by the least angle that takes the unit vector ``a`` to ``b``."""
+    c = _dot(a, b)
     if c < -1.0 + 1e-9:
         # Half a turn about any axis across: the axis is fixed, so that the result is too.
-        axis = np.zeros(3)
-        least = np.argmin(np.abs(a))
-        axis[least] = 1.0
-        for i in range(3):
-            axis[i] -= a[least] * a[i]
-        normalise(axis)
-        for i in range(3):
-            for j in range(3):
-                out[i, j] = 2.0 * axis[i] * axis[j] - (1.0 if i == j else 0.0)
-        return
-    v0, v1, v2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        x, y, z = _any_across(a)
+        return (
+            (2.0 * x * x - 1.0, 2.0 * y * x, 2.0 * z * x),
+            (2.0 * x * y, 2.0 * y * y - 1.0, 2.0 * z * y),
+            (2.0 * x * z, 2.0 * y * z, 2.0 * z * z - 1.0),
+        )
+    v = _cross(a, b)
     k = 1.0 / (1.0 + c)
-    out[0, 0], out[0, 1], out[0, 2] = c + k * v0 * v0, k * v0 * v1 - v2, k * v0 * v2 + v1
-    out[1, 0], out[1, 1], out[1, 2] = k * v0 * v1 + v2, c + k * v1 * v1, k * v1 * v2 - v0
-    out[2, 0], out[2, 1], out[2, 2] = k * v0 * v2 - v1, k * v1 * v2 + v0, c + k * v2 * v2
+    return (
+        (c + k * v[0] * v[0], k * v[0] * v[1] + v[2], k * v[0] * v[2] - v[1]),
+        (k * v[0] * v[1] - v[2], c + k * v[1] * v[1], k * v[1] * v[2] + v[0]),
+        (k * v[0] * v[2] + v[1], k * v[1] * v[2] - v[0], c + k * v[2] * v[2]),
+    )
 
 
 @numba.njit(cache=True)
-def product(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Write the product of two 3 × 3 matrices."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+def product(a: Frame, b: Frame) -> Frame:
+    """Return the product of two 3 × 3 matrices."""
+    return (from_frame(a, b[0]), from_frame(a, b[1]), from_frame(a, b[2]))
+
+
+@numba.njit(cache=True)
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True)
+def _cross(a: Vector, b: Vector) -> Vector:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@numba.njit(cache=True)
+def _any_across(v: Vector) -> Vector:
+    """Return a unit vector across ``v``, always the same: near the axis that ``v`` has least of."""
+    x, y, z = abs(v[0]), abs(v[1]), abs(v[2])
+    if x <= y and x <= z:
+        return unit((1.0 - v[0] * v[0], -v[0] * v[1], -v[0] * v[2]))
+    if y <= z:
+        return unit((-v[1] * v[0], 1.0 - v[1] * v[1], -v[1] * v[2]))
+    return unit((-v[2] * v[0], -v[2] * v[1], 1.0 - v[2] * v[2]))
 
 
 @numba.njit(cache=True)

@@ -1,8 +1,8 @@
 """Compiled: the walk over one person's bones that checks each and corrects it.
 
-Joints are in the order of ``person17``. A frame is a 3 × 3 array whose columns are a body's left,
-up and forward axes; for bones of the right side the left axis is turned about, so that one table
-serves both sides and a mirrored pose is judged as its mirror image.
+Joints are in the order of ``person17``. A frame's columns are a body's left, up and forward axes;
+for bones of the right side the left axis is turned about, so that one table serves both sides and a
+mirrored pose is judged as its mirror image.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ import numba
 import numpy as np
 
 from probmotion.models.joint_limits_frames import (
+    NO_LENGTH,
+    Frame,
+    Vector,
     cell_of,
     from_frame,
     in_frame,
     least_rotation,
     line_frame,
-    normalise,
     product,
+    unit,
 )
 from probmotion.skeleton import Skeleton
 
@@ -36,7 +39,7 @@ LAST_OF_TRUNK = 10
 N_JOINTS = 17
 _PARENTS = np.array(Skeleton.preset("person17").parents)
 
-MIRROR = np.array([-1.0, 1.0, 1.0])
+_UP = (0.0, 1.0, 0.0)
 _BISECTIONS = 12
 
 
@@ -57,46 +60,72 @@ class LimitArrays(NamedTuple):
 
 
 @numba.njit(cache=True)
-def _set_and_turn(directions: np.ndarray, joint: int, new: np.ndarray, last: int) -> None:
-    """Give a bone a new direction; bones up to ``last``, which hang from it, turn along."""
-    turn, old = np.empty((3, 3)), np.empty(3)
-    if not directions[joint].any():
-        directions[joint] = new
-        return
-    least_rotation(directions[joint], new, turn)
-    directions[joint] = new
-    for below in range(joint + 1, last + 1):
-        old[:] = directions[below]
-        for i in range(3):
-            directions[below, i] = turn[i, 0] * old[0] + turn[i, 1] * old[1] + turn[i, 2] * old[2]
-        normalise(directions[below])
+def _row(rows: np.ndarray, number: int) -> Vector:
+    return (rows[number, 0], rows[number, 1], rows[number, 2])
 
 
 @numba.njit(cache=True)
-def _nearest_allowed(
-    u: np.ndarray, allowed: np.ndarray, rings: np.ndarray, centres: np.ndarray
-) -> None:
-    """Move ``u`` to where the way to the nearest allowed cell's centre enters allowed cells."""
+def _put(rows: np.ndarray, number: int, v: Vector) -> None:
+    rows[number, 0], rows[number, 1], rows[number, 2] = v
+
+
+@numba.njit(cache=True)
+def _mirrored(v: Vector) -> Vector:
+    return (-v[0], v[1], v[2])
+
+
+@numba.njit(cache=True)
+def _of_side(frame: Frame, side: int) -> Frame:
+    """Return the frame in which bones of the left side, 0, or of the right, 1, are judged."""
+    left, up, forward = frame
+    return frame if side == 0 else ((-left[0], -left[1], -left[2]), up, forward)
+
+
+@numba.njit(cache=True)
+def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
+    """Give a bone a new direction; bones up to ``last``, which hang from it, turn along."""
+    old = _row(directions, joint)
+    _put(directions, joint, new)
+    if old == NO_LENGTH:
+        return
+    turn = least_rotation(old, new)
+    for below in range(joint + 1, last + 1):
+        _put(directions, below, unit(from_frame(turn, _row(directions, below))))
+
+
+@numba.njit(cache=True)
+def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) -> Vector:
+    """Return where the way from ``u`` to the nearest allowed cell's centre enters allowed cells."""
     best, closest = 0, -2.0
-    for cell in range(len(centres)):
-        if allowed[cell]:
-            c = u[0] * centres[cell, 0] + u[1] * centres[cell, 1] + u[2] * centres[cell, 2]
+    for cell in range(len(limits.centres)):
+        if limits.allowed[part, condition, cell]:
+            x, y, z = _row(limits.centres, cell)
+            c = u[0] * x + u[1] * y + u[2] * z
             if c > closest:
                 best, closest = cell, c
+    centre = _row(limits.centres, best)
     outside, inside = 0.0, 1.0
-    between = np.empty(3)
     for _ in range(_BISECTIONS):
-        t = 0.5 * (outside + inside)
-        for i in range(3):
-            between[i] = (1.0 - t) * u[i] + t * centres[best, i]
-        if normalise(between) and allowed[cell_of(between, rings)]:
-            inside = t
+        middle = 0.5 * (outside + inside)
+        between = _between(u, centre, middle)
+        cell = cell_of(between, limits.cell_rings)
+        if between != NO_LENGTH and limits.allowed[part, condition, cell]:
+            inside = middle
         else:
-            outside = t
-    for i in range(3):
-        between[i] = (1.0 - inside) * u[i] + inside * centres[best, i]
-    normalise(between)
-    u[:] = between
+            outside = middle
+    return _between(u, centre, inside)
+
+
+@numba.njit(cache=True)
+def _between(a: Vector, b: Vector, share: float) -> Vector:
+    """Return the unit vector on the way from one to another."""
+    return unit(
+        (
+            (1.0 - share) * a[0] + share * b[0],
+            (1.0 - share) * a[1] + share * b[1],
+            (1.0 - share) * a[2] + share * b[2],
+        )
+    )
 
 
 @numba.njit(cache=True)
@@ -104,33 +133,33 @@ def _check(
     part: int,
     joint: int,
     last: int,
-    frame: np.ndarray,
+    frame: Frame,
+    condition: Vector,
     limits: LimitArrays,
     correct: bool,
     directions: np.ndarray,
     valid: np.ndarray,
     local: np.ndarray,
-) -> None:
-    """Judge one bone in ``frame``, given ``local[joint, 0]``; correct it where asked.
+) -> Vector:
+    """Judge one bone in ``frame`` given its condition; correct it where asked; return it there.
 
     A bone without length is valid, and stands in its mean direction for what hangs from it.
     """
-    u = local[joint, 1]
-    if not directions[joint].any():
-        new = np.empty(3)
-        valid[joint] = True
-        u[:] = limits.rest[part]
-        from_frame(frame, u, new)
-        _set_and_turn(directions, joint, new, last)
-        return
-    in_frame(frame, directions[joint], u)
-    row = limits.allowed[part, cell_of(local[joint, 0], limits.bin_rings)]
-    valid[joint] = row[cell_of(u, limits.cell_rings)]
-    if correct and not valid[joint]:
-        _nearest_allowed(u, row, limits.cell_rings, limits.centres)
-        new = np.empty(3)
-        from_frame(frame, u, new)
-        _set_and_turn(directions, joint, new, last)
+    direction = _row(directions, joint)
+    valid[joint] = True
+    if direction == NO_LENGTH:
+        u = _row(limits.rest, part)
+        _set_and_turn(directions, joint, from_frame(frame, u), last)
+    else:
+        u = in_frame(frame, direction)
+        met = cell_of(condition, limits.bin_rings)
+        valid[joint] = limits.allowed[part, met, cell_of(u, limits.cell_rings)]
+        if correct and not valid[joint]:
+            u = _nearest_allowed(u, part, met, limits)
+            _set_and_turn(directions, joint, from_frame(frame, u), last)
+    _put(local[joint], 0, condition)
+    _put(local[joint], 1, u)
+    return u
 
 
 @numba.njit(cache=True)
@@ -147,81 +176,78 @@ def _walk_person(
     judged depends on bones that are already right, and no correction changes a frame that was
     used before it; therefore the result is valid throughout.
     """
-    pelvis, trunk, sided = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    swing, below, new = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    up = np.array([0.0, 1.0, 0.0])
-    line_frame(directions[LEFT_HIP], directions[RIGHT_HIP], directions[SPINE], pelvis)
-
-    # The frame holds the spine in its left-up plane: what is left to judge is one angle.
-    u = local[SPINE, 1]
-    local[SPINE, 0] = up
-    if not directions[SPINE].any():
-        directions[SPINE] = pelvis[:, 1]
-    in_frame(pelvis, directions[SPINE], u)
-    valid[SPINE] = abs(u[0]) <= limits.tilt
-    if correct and not valid[SPINE]:
-        # A hair inside, so that rounding does not undo it.
-        u[0] = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
-        u[1] = np.sqrt(1.0 - u[0] * u[0])
-        u[2] = 0.0
-        from_frame(pelvis, u, new)
-        _set_and_turn(directions, SPINE, new, LAST_OF_TRUNK)
+    given = (limits, correct, directions, valid, local)
+    pelvis = line_frame(
+        _row(directions, LEFT_HIP), _row(directions, RIGHT_HIP), _row(directions, SPINE)
+    )
+    spine = _check_spine(pelvis, *given)
 
     # In that frame the hips are mirror images of each other: one is judged, both are moved.
-    local[LEFT_HIP, 0] = up
-    _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, limits, correct, directions, valid, local)
+    hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, *given)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
     local[RIGHT_HIP] = local[LEFT_HIP]
     if correct and not valid[LEFT_HIP]:
-        from_frame(pelvis, local[LEFT_HIP, 1] * MIRROR, new)
-        _set_and_turn(directions, RIGHT_HIP, new, RIGHT_HIP + 2)
+        _set_and_turn(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
     for side in range(2):
-        hip = LEFT_HIP if side == 0 else RIGHT_HIP
-        sided[:] = pelvis
-        if side == 1:
-            sided[:, 0] *= -1.0
-        local[hip + 1, 0] = local[hip, 1]
-        _limb(KNEE, hip, sided, limits, correct, directions, valid, local)
+        joint = LEFT_HIP if side == 0 else RIGHT_HIP
+        _limb(KNEE, joint, _of_side(pelvis, side), hip, *given)
 
-    least_rotation(up, local[SPINE, 1], swing)
-    product(pelvis, swing, trunk)
-    local[CHEST_JOINT, 0] = up
-    _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, limits, correct, directions, valid, local)
-    least_rotation(limits.rest[CHEST], local[CHEST_JOINT, 1], swing)
-    product(trunk, swing, below)
+    trunk = product(pelvis, least_rotation(_UP, spine))
+    chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, *given)
+    below = product(trunk, least_rotation(_row(limits.rest, CHEST), chest))
     for side in range(2):
-        shoulder = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
-        sided[:] = below
-        local[shoulder, 0] = local[CHEST_JOINT, 1]
-        if side == 1:
-            sided[:, 0] *= -1.0
-            local[shoulder, 0, 0] *= -1.0
-        _check(SHOULDER, shoulder, shoulder + 2, sided, limits, correct, directions, valid, local)
+        joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
+        condition = chest if side == 0 else _mirrored(chest)
+        _check(SHOULDER, joint, joint + 2, _of_side(below, side), condition, *given)
 
     # The line of the shoulders tells how the trunk is twisted, which its bones do not.
-    line_frame(
-        directions[LEFT_SHOULDER], directions[RIGHT_SHOULDER], directions[CHEST_JOINT], trunk
+    trunk = line_frame(
+        _row(directions, LEFT_SHOULDER),
+        _row(directions, RIGHT_SHOULDER),
+        _row(directions, CHEST_JOINT),
     )
-    local[NECK_JOINT, 0] = local[CHEST_JOINT, 1]
-    _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, limits, correct, directions, valid, local)
-    least_rotation(limits.rest[NECK], local[NECK_JOINT, 1], swing)
-    product(trunk, swing, below)
-    local[HEAD_JOINT, 0] = local[NECK_JOINT, 1]
-    _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, limits, correct, directions, valid, local)
+    neck = _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, chest, *given)
+    below = product(trunk, least_rotation(_row(limits.rest, NECK), neck))
+    _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, *given)
     for side in range(2):
-        shoulder = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
-        sided[:] = trunk
-        if side == 1:
-            sided[:, 0] *= -1.0
-        in_frame(sided, directions[shoulder], local[shoulder + 1, 0])
-        _limb(ELBOW, shoulder, sided, limits, correct, directions, valid, local)
+        joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
+        sided = _of_side(trunk, side)
+        _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), *given)
+
+
+@numba.njit(cache=True)
+def _check_spine(
+    pelvis: Frame,
+    limits: LimitArrays,
+    correct: bool,
+    directions: np.ndarray,
+    valid: np.ndarray,
+    local: np.ndarray,
+) -> Vector:
+    """Judge the spine; return it in the frame of the pelvis.
+
+    That frame holds the spine in its left-up plane: what is left to judge is one angle.
+    """
+    if _row(directions, SPINE) == NO_LENGTH:
+        _put(directions, SPINE, pelvis[1])
+    u = in_frame(pelvis, _row(directions, SPINE))
+    valid[SPINE] = abs(u[0]) <= limits.tilt
+    if correct and not valid[SPINE]:
+        # A hair inside, so that rounding does not undo it.
+        tilt = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
+        u = (tilt, np.sqrt(1.0 - tilt * tilt), 0.0)
+        _set_and_turn(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
+    _put(local[SPINE], 0, _UP)
+    _put(local[SPINE], 1, u)
+    return u
 
 
 @numba.njit(cache=True)
 def _limb(
     part: int,
     joint: int,
-    frame: np.ndarray,
+    frame: Frame,
+    condition: Vector,
     limits: LimitArrays,
     correct: bool,
     directions: np.ndarray,
@@ -229,22 +255,23 @@ def _limb(
     local: np.ndarray,
 ) -> None:
     """Judge the two bones that hang from ``joint``: thigh and shin, or upper arm and forearm."""
-    swing, below = np.empty((3, 3)), np.empty((3, 3))
-    _check(part, joint + 1, joint + 2, frame, limits, correct, directions, valid, local)
-    least_rotation(limits.rest[part], local[joint + 1, 1], swing)
-    product(frame, swing, below)
-    local[joint + 2, 0] = local[joint + 1, 1]
-    _check(part + 1, joint + 2, joint + 2, below, limits, correct, directions, valid, local)
+    given = (limits, correct, directions, valid, local)
+    first = _check(part, joint + 1, joint + 2, frame, condition, *given)
+    below = product(frame, least_rotation(_row(limits.rest, part), first))
+    _check(part + 1, joint + 2, joint + 2, below, first, *given)
 
 
 @numba.njit(cache=True)
 def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
     """Write each bone's unit vector; that of a bone without length is 0."""
     for joint in range(1, N_JOINTS):
-        for i in range(3):
-            directions[joint, i] = pose[tree[joint], i] - pose[tree[_PARENTS[joint]], i]
-        if not normalise(directions[joint]):
-            directions[joint] = 0.0
+        here, above = tree[joint], tree[_PARENTS[joint]]
+        bone = (
+            pose[here, 0] - pose[above, 0],
+            pose[here, 1] - pose[above, 1],
+            pose[here, 2] - pose[above, 2],
+        )
+        _put(directions, joint, unit(bone))
 
 
 @numba.njit(cache=True)

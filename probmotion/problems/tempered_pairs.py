@@ -81,7 +81,7 @@ class TemperedPairs:
     levels: int = 24
     steps: int = 120
     warmup: int = 2000
-    thin: int = 160
+    thin: int = 120
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
