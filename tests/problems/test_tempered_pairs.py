@@ -195,6 +195,49 @@ def test_without_limits_and_evidence_the_measure_is_drawn(loose, evidence):
         assert np.abs(_errors_apart(values, mean)).max() < _APART, known
 
 
+@pytest.mark.slow
+def test_a_walk_draws_pose_and_view_at_its_power(prior, evidence, exact):
+    """Weights of exact draws, each in every view, say what prior · L_v^power holds.
+
+    Many annotations are near, for that the nearest alone counts is what lots must not forget.
+    """
+    gentle, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
+    posterior = MotionPosterior(gentle, replace(evidence, n_near=30, noise=0.3))
+    body, physics, sight = pair_arrays(posterior)
+
+    def told(poses: np.ndarray) -> np.ndarray:
+        """Log L_v, how many annotations are as near, log L_v less the mean view's: (n, V, 3)."""
+        logs = np.empty((len(poses), *sight.near.shape))
+        for pose, of_pose in zip(poses, logs, strict=True):
+            for view, of_view in enumerate(of_pose):
+                log_annotations(pose, view, body, sight, of_view)
+        best = logs.max(axis=-1)
+        as_near = logsumexp(power * logs, axis=-1) - power * best
+        return np.stack([best, as_near, best - best.mean(axis=1, keepdims=True)], axis=-1)
+
+    known = told(exact)
+    log_weight = gentle.log_plausibility(exact[:, None])[:, None] + power * known[..., 0]
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    mean = np.einsum("nv,nvk->k", weight, known)
+    error = np.sqrt((np.einsum("nv,nvk->nk", weight, known - mean) ** 2).sum(axis=0))
+
+    moves, found = moves_of(body), []
+    sizes, tried, taken = np.full(len(moves), 0.7), np.zeros(len(moves)), np.zeros(len(moves))
+    for chain in range(2):
+        rng, pose, parts, view = np.random.default_rng(chain), prior.seed[0].copy(), np.zeros(6), 0
+        weigh(pose, body, physics, parts)
+        walked = []
+        for _ in range(1100):
+            view, _ = walk(
+                pose, parts, view, power, 400, moves, sizes, tried, taken, body, physics, sight, rng
+            )
+            walked.append((pose.copy(), view))
+        poses, views = zip(*walked[100:], strict=True)
+        found.append(told(np.array(poses))[np.arange(len(views)), list(views)])
+    assert np.abs(_errors_apart(np.array(found), mean, error)).max() < _APART
+
+
 @pytest.mark.parametrize("limit", [2.0, pytest.param(math.inf, marks=pytest.mark.slow)])
 def test_all_that_counts_is_that_of_weighted_exact_draws(prior, evidence, exact, limit):
     """Means under the posterior, of the measure's own draws weighted by what is known of it.
