@@ -73,11 +73,12 @@ def training(
 ) -> tuple[Callable[[], None], float]:
     """Return a step of the second phase, all of it, and what its teacher takes for 1000 frames."""
     skeleton, rng = body.skeleton, np.random.default_rng(0)
-    shape = (4 * settings.frames, skeleton.n_joints)
-    tracks = [
-        KeypointTrack(rng.normal(size=(*shape, 2)), np.ones(shape), skeleton, 10.0, f"made-{n}")
-        for n in range(8)
-    ]
+    seen = np.ones((4 * settings.frames, skeleton.n_joints))
+    tracks = []
+    for n in range(8):
+        keypoints = rng.normal(size=(*seen.shape, 2))
+        keypoints[:, skeleton.roots[0]] = 0.0
+        tracks.append(KeypointTrack(keypoints, seen, skeleton, 10.0, f"made-{n}"))
     teacher = PoseNetwork(settings, skeleton.n_joints, len(body.bones), body.n_groups)
     with warnings.catch_warnings():
         # The bones of a chain have no mirror images.

@@ -13,12 +13,11 @@ import numpy as np
 from probmotion.cameras import Cameras
 from probmotion.checks import check_positive, check_shape
 from probmotion.likelihoods import Keypoints2D
+from probmotion.models.motion_vae_settings import USUAL_THRESHOLD
 from probmotion.skeleton import Skeleton
 
 __all__ = ["EvidencePicture", "picture_of"]
 
-_LEAST = 0.3
-"""Least confidence, of the greatest, of a joint that a network is shown; as in training."""
 _TO_OPENCV = np.array([1.0, -1.0, -1.0])
 """From a frame with y up and z towards the camera to the cameras' own, and back."""
 
@@ -113,8 +112,9 @@ def picture_of(
 ) -> EvidencePicture:
     """Return the evidence as a network's picture.
 
-    Joints of less than three tenths of the greatest confidence are hidden, as in training. Where
-    the root is hidden its place is interpolated in time: only pictures' centres depend on it.
+    Joints of less than three tenths of the greatest confidence are hidden, as in training by
+    default. Where the root is hidden its place is interpolated in time: only pictures' centres
+    depend on it.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def _shown(likelihood: Keypoints2D) -> np.ndarray:
     Only ratios of confidences mean anything, since the noise is free.
     """
     confidence = likelihood.entries.confidence[0]
-    return (confidence > 0) & (confidence >= _LEAST * confidence.max())
+    return (confidence > 0) & (confidence >= USUAL_THRESHOLD * confidence.max())
 
 
 def _interpolated(track: np.ndarray, shown: np.ndarray) -> np.ndarray:

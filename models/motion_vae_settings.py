@@ -8,7 +8,10 @@ import numpy as np
 
 from probmotion.checks import check_count
 
-__all__ = ["MotionVAESettings"]
+__all__ = ["USUAL_THRESHOLD", "MotionVAESettings"]
+
+USUAL_THRESHOLD = 0.3
+"""Least confidence of a joint that is learnt from, and that networks are shown."""
 
 _WEIGHTS = ("reconstruction", "smoothness", "ranges", "lengths", "kl", "teacher")
 
@@ -44,8 +47,8 @@ class MotionVAESettings:
     mixed_precision : bool
         Whether a network in training multiplies matrices in bfloat16. Weights, sums of layers,
         results and losses stay in single precision, and so does all of a network that is used.
-        Worth it on processors with bfloat16 matrix products (AMX), where it is several times as
-        fast.
+        Worth it on processors with bfloat16 products (AVX-512 BF16, AMX), where it is several times
+        as fast.
     reconstruction : float
         Weight of the squared distance of reprojected joints to seen ones, metres squared.
     smoothness : float

@@ -29,7 +29,7 @@ from probmotion.models.motion_vae_losses import (
 )
 from probmotion.models.motion_vae_model import KIND, MotionVAEModel, description_of
 from probmotion.models.motion_vae_network import MotionVAENetwork
-from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.motion_vae_settings import USUAL_THRESHOLD, MotionVAESettings
 from probmotion.models.pose_network import PoseGuesses, PoseNetwork
 from probmotion.models.taught_poses import TaughtPoses, scaled
 from probmotion.models.track_batches import (
@@ -47,6 +47,8 @@ __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 _VALIDATION_BATCH = 256
 # Of the hypotheses that are not chosen, so that none is left behind for good.
 _OTHERS = 0.05
+# Metres: rounding, and no motion.
+_CENTRED = 1e-3
 # Steps in which bones have no say in which hypothesis learns.
 _AT_REST = 500
 
@@ -98,10 +100,17 @@ class _LearnsFromTracks:
                 f"those of the body: {', '.join(body.skeleton.joint_names)}"
             )
         self.batches.check_all_seen()
+        _check_centred("tracks", tracks, threshold)
+        _check_centred("validation", validation, threshold)
         if not body.symmetric:
+            lacks = (
+                "left-right pairs that hang from one joint or from a pair"
+                if body.skeleton.mirrored_pairs
+                else "left-right pairs"
+            )
             warnings.warn(
-                "body has no left-right pairs: no bone is as long as its mirror image, and no "
-                "track is mirrored",
+                f"body has no {lacks}: no bone is as long as its mirror image, and no track is "
+                "mirrored",
                 stacklevel=3,
             )
         self._seed = seed
@@ -142,7 +151,11 @@ class _LearnsFromTracks:
     def _shown(
         self, drawn: Batch, device: torch.device
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return keypoints (n, L, J, 2), what is seen (n, L, J), the rest pose (J, 3)."""
+        """Return what networks are shown: keypoints (n, L, J, 2), seen (n, L, J), rest (J, 3).
+
+        Of confidence no more than whether a joint is seen, 1 or 0: one detector's numbers are not
+        another's, and what networks learnt of the one they would misread in the other.
+        """
         return (
             torch.as_tensor(drawn.keypoints, device=device),
             torch.as_tensor(drawn.seen, dtype=torch.float32, device=device),
@@ -193,7 +206,7 @@ class PoseTrainee(_LearnsFromTracks):
         body: ArticulatedBody,
         *,
         distance: float | None = None,
-        threshold: float = 0.3,
+        threshold: float = USUAL_THRESHOLD,
         seed: int = 0,
     ) -> None:
         super().__init__(tracks, validation, size, body, distance, threshold, seed)
@@ -229,18 +242,20 @@ class PoseTrainee(_LearnsFromTracks):
         n: int,
         device: torch.device,
     ) -> torch.Tensor:
-        keypoints, seen, rest = self._shown(batches.draw(rng, n), device)
+        drawn = batches.draw(rng, n)
+        keypoints, seen, rest = self._shown(drawn, device)
         guesses = network(keypoints, seen, rest)
-        terms = guess_terms(self.body, guesses, keypoints, seen, self.distance)
+        confidence = torch.as_tensor(drawn.confidence, device=device)
+        terms = guess_terms(self.body, guesses, keypoints, confidence, self.distance)
         losses = weighted_sum(terms, self.size)
         at_rest = batches is self.batches and self._step <= _AT_REST
-        judged = self._at_rest(guesses, keypoints, seen) if at_rest else losses
+        judged = self._at_rest(guesses, keypoints, confidence) if at_rest else losses
         best = judged.argmin(dim=1, keepdim=True)
         return losses.gather(1, best).mean() + _OTHERS * losses.mean()
 
     @torch.no_grad()
     def _at_rest(
-        self, guesses: PoseGuesses, keypoints: torch.Tensor, seen: torch.Tensor
+        self, guesses: PoseGuesses, keypoints: torch.Tensor, confidence: torch.Tensor
     ) -> torch.Tensor:
         """Return the loss of every view if no bone turned or grew, (B, H).
 
@@ -252,7 +267,7 @@ class PoseTrainee(_LearnsFromTracks):
             turns=torch.zeros_like(guesses.turns),
             log_lengths=torch.zeros_like(guesses.log_lengths),
         )
-        terms = guess_terms(self.body, stiff, keypoints, seen, self.distance)
+        terms = guess_terms(self.body, stiff, keypoints, confidence, self.distance)
         return weighted_sum(terms, self.size)
 
 
@@ -287,7 +302,7 @@ class MotionVAETrainee(_LearnsFromTracks):
         pose_network: PoseNetwork,
         *,
         distance: float | None = None,
-        threshold: float = 0.3,
+        threshold: float = USUAL_THRESHOLD,
         seed: int = 0,
     ) -> None:
         super().__init__(tracks, validation, size, body, distance, threshold, seed)
@@ -320,7 +335,8 @@ class MotionVAETrainee(_LearnsFromTracks):
         assert isinstance(network, MotionVAEModel)
         drawn = batches.draw(rng, n)
         keypoints, seen, rest = self._shown(drawn, device)
-        guess = self._taught(batches, drawn, keypoints, seen, rest)
+        confidence = torch.as_tensor(drawn.confidence, device=device)
+        guess = self._taught(batches, drawn, keypoints, confidence, rest)
         vae = network.vae
         mean, log_variance = vae.encode(keypoints, seen, rest)
         noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
@@ -330,7 +346,7 @@ class MotionVAETrainee(_LearnsFromTracks):
         positions = self.body.positions(turns, guess.rotation, translation, guess.log_lengths)
         zero = torch.zeros_like(mean)
         terms = {
-            "reconstruction": reconstruction(positions, keypoints, seen, self.distance),
+            "reconstruction": reconstruction(positions, keypoints, confidence, self.distance),
             "smoothness": roughness(turns, guess.rotation, guess.translation),
             "ranges": self.body.range_excess(turns).sum(dim=-1),
             # Equation 6 prints it with σ where σ² belongs.
@@ -345,7 +361,7 @@ class MotionVAETrainee(_LearnsFromTracks):
         batches: TrackBatches,
         drawn: Batch,
         keypoints: torch.Tensor,
-        seen: torch.Tensor,
+        confidence: torch.Tensor,
         rest: torch.Tensor,
     ) -> PoseGuesses:
         """Return the best view hypothesis of the first phase, (B, L, …)."""
@@ -355,7 +371,7 @@ class MotionVAETrainee(_LearnsFromTracks):
         scale = torch.as_tensor(drawn.scale, device=keypoints.device)
         # Which view is best does not depend on how a window is scaled.
         shown = keypoints / scale[:, None, None, None]
-        terms = guess_terms(self.body, guesses, shown, seen, self.distance)
+        terms = guess_terms(self.body, guesses, shown, confidence, self.distance)
         return scaled(best_guess(guesses, weighted_sum(terms, self.size)), scale)
 
 
@@ -386,6 +402,19 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
     if size not in known:
         raise ValueError(f"size is {size!r}, expected one of {', '.join(known)}")
     return known[size]
+
+
+def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float) -> None:
+    """Refuse tracks whose root moves: networks that are asked later see it at the origin."""
+    root = tracks[0].skeleton.roots[0]
+    for track in tracks:
+        seen = (track.confidence[:, root] >= threshold) & (track.confidence[:, root] > 0)
+        away = np.linalg.norm(track.keypoints[seen, root], axis=-1).max(initial=0.0)
+        if away > _CENTRED:
+            raise ValueError(
+                f"{name} has {track.name or 'one'} with its root {away:.2g} m from the origin, "
+                "expected it there in every frame, as prepare_tracks leaves it by default"
+            )
 
 
 def _long_enough(

@@ -62,14 +62,19 @@ class Batch(NamedTuple):
 
     keypoints: np.ndarray
     """(B, L, J, 2) float32, metres; 0 where not seen or not there."""
-    seen: np.ndarray
-    """(B, L, J) bool: joints whose confidence is not below the threshold."""
+    confidence: np.ndarray
+    """(B, L, J) float32: the tracks' own, 0 where it is below the threshold."""
     valid: np.ndarray
     """(B, L) bool: frames that are there and in which something is seen."""
     frames: np.ndarray
     """(B, L): which of :meth:`TrackBatches.all_frames` it shows; -1 where not there."""
     scale: np.ndarray
     """(B,) float32: by which its tracks are scaled."""
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(B, L, J) bool: joints whose confidence is not below the threshold."""
+        return self.confidence > 0
 
 
 class TrackBatches:
@@ -112,7 +117,11 @@ class TrackBatches:
         self.frames = frames
         self.threshold = threshold
         self.augmentation = augmentation
-        self._seen = [(track.confidence >= threshold) & (track.confidence > 0) for track in tracks]
+        self._confidence = [
+            np.where(track.confidence >= threshold, track.confidence, 0.0).astype(np.float32)
+            for track in tracks
+        ]
+        self._seen = [confidence > 0 for confidence in self._confidence]
         if not any(seen.any() for seen in self._seen):
             raise ValueError(
                 f"tracks has no joint of confidence {threshold:g} or more, expected some to learn "
@@ -194,7 +203,7 @@ class TrackBatches:
         J = self.skeleton.n_joints
         batch = Batch(
             np.zeros((n, self.frames, J, 2), np.float32),
-            np.zeros((n, self.frames, J), bool),
+            np.zeros((n, self.frames, J), np.float32),
             np.zeros((n, self.frames), bool),
             np.full((n, self.frames), -1),
             np.ones(n, np.float32),
@@ -205,24 +214,26 @@ class TrackBatches:
 
     def _show(self, rng: np.random.Generator, track: int, batch: Batch, row: int) -> None:
         """Put a random window of a track into a row of a batch."""
-        keypoints, seen = self._keypoints[track], self._seen[track]
+        keypoints, confidence = self._keypoints[track], self._confidence[track]
         longest = min(self.frames, len(keypoints))
         shortest = max(1, int(np.ceil(self.augmentation.shortest * longest)))
         length = int(rng.integers(shortest, longest + 1))
         start = int(rng.integers(0, len(keypoints) - length + 1))
         # Attention needs a frame to look at; a pause in which nothing is seen is no motion.
-        while not seen[start : start + length].any():
+        while not confidence[start : start + length].any():
             start = int(rng.integers(0, len(keypoints) - length + 1))
-        keypoints, seen = keypoints[start : start + length], seen[start : start + length]
+        keypoints = keypoints[start : start + length]
+        confidence = confidence[start : start + length]
         frames = self._first[track] + start + np.arange(length)
         factor = 1 + self.augmentation.scale * rng.uniform(-1, 1)
         moved = self.augmentation.shift * rng.uniform(-1, 1, 2)
         turned = rng.random() < 0.5
         if self.augmentation.mirror and turned:
-            keypoints, seen = self._mirrored(keypoints), seen[:, self._order]
+            keypoints, confidence = self._mirrored(keypoints), confidence[:, self._order]
             frames += self._first[-1]
+        seen = confidence > 0
         batch.keypoints[row, :length] = np.where(seen[..., None], factor * keypoints + moved, 0.0)
-        batch.seen[row, :length] = seen
+        batch.confidence[row, :length] = confidence
         batch.valid[row, :length] = seen.any(axis=-1)
         batch.frames[row, :length] = frames
         batch.scale[row] = factor

@@ -19,7 +19,7 @@ from probmotion.data.projections import DetectorNoise, Filming, centre_motion
 from probmotion.metrics.motion_distances import windows
 from probmotion.models.articulated_body import ArticulatedBody
 from probmotion.models.motion_vae_losses import guess_terms, weighted_sum
-from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.motion_vae_settings import USUAL_THRESHOLD, MotionVAESettings
 from probmotion.models.pose_network import PoseNetwork
 from probmotion.motion import Motion
 
@@ -112,7 +112,8 @@ def judge_hypotheses(
         settings,
         body,
         (keypoints - keypoints[:, :, [body.skeleton.roots[0]]]).astype(np.float32),
-        np.stack([one for _, one in seen]).astype(np.float32),
+        # As in training networks are told which joints are seen, and not how surely.
+        (np.stack([one for _, one in seen]) >= USUAL_THRESHOLD).astype(np.float32),
         shot.distance if shot.perspective else None,
     )
     truth = np.einsum("nij,nlkj->nlki", cameras.rotation, chosen) * _TO_Y_UP

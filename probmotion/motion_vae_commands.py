@@ -35,6 +35,9 @@ class TrainMotionVAE:
     frames: int | None = None
     """Frames of a motion; by default the size's own, 10."""
 
+    kl: float | None = None
+    """Weight of the divergence from N(0, I); by default .001 as published. walk-vae has .01."""
+
     threshold: float = 0.3
     """Least confidence of a joint that is learnt from: .3 for people, .5 for horses."""
 
@@ -65,8 +68,9 @@ class TrainMotionVAE:
         )
         from probmotion.models.training_runs import STATE
 
-        preset = getattr(MotionVAESettings, self.size)()
-        size = preset if self.frames is None else replace(preset, frames=self.frames)
+        given = {"frames": self.frames, "kl": self.kl}
+        changes = {name: value for name, value in given.items() if value is not None}
+        size = replace(getattr(MotionVAESettings, self.size)(), **changes)
         poses, vae = (
             self.training.settings(usual) for usual in usual_motion_vae_training(self.size)
         )

@@ -65,17 +65,19 @@ def test_a_prior_of_3d_motion_comes_from_files_of_2d_tracks(
     assert (out / "poses" / "model.safetensors").read_bytes() == poses
 
 
-def test_a_rest_pose_may_be_given(
+def test_a_rest_pose_and_a_weight_may_be_given(
     tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     walk = make_gaits(1, styles={"walk": 1.0}, frames=2)[0]
     pose = tmp_path / "rest.npz"
     walk.save(pose)
-    assert main(words(tracks, tmp_path / "run", "--steps", 2, "--rest", pose)) == 0
+    more = ["--steps", 2, "--rest", pose, "--kl", 0.02]
+    assert main(words(tracks, tmp_path / "run", *more)) == 0
     assert f"the rest pose is the first frame of {pose}" in capsys.readouterr().out
-    body = MotionVAE.load(tmp_path / "run" / "vae").body
+    prior = MotionVAE.load(tmp_path / "run" / "vae")
+    assert prior.settings.kl == 0.02
     expected = walk.retarget(PERSON).positions[0]
-    np.testing.assert_allclose(body.rest_positions, expected - expected[0], atol=1e-6)
+    np.testing.assert_allclose(prior.body.rest_positions, expected - expected[0], atol=1e-6)
 
 
 def table_of(track: KeypointTrack, path: Path) -> None:
@@ -125,6 +127,7 @@ def test_an_animal_of_one_s_own_comes_from_a_detector_s_tables(
         (["--distance", "0"], "distance is 0.0, expected a finite number above 0"),
         (["--threshold", "0"], "threshold is 0.0, expected a finite number above 0"),
         (["--rest", "no.npz"], "no.npz"),
+        (["--kl", "-1"], "kl is -1.0, expected"),
     ],
 )
 def test_wrong_options_are_one_sentence(

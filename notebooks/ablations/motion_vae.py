@@ -28,7 +28,7 @@ import torch
 
 from probmotion import seeds
 from probmotion.comparison import compare
-from probmotion.data.learning import film_clips
+from probmotion.data.learning import certain, film_clips
 from probmotion.data.projections import Filming, centre_motion
 from probmotion.data.walks import made_walks, walk_clips
 from probmotion.draws import MotionDraws
@@ -101,7 +101,9 @@ class Study:
         """What is learnt from, by part: prepared 2D tracks."""
         views = dict.fromkeys(("train", "validation"), 4 if self.quick else 64)
         return {
-            part: film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
+            part: certain(
+                film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
+            )
             for part, clips in self.clips.items()
         }
 

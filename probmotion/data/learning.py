@@ -22,6 +22,7 @@ from probmotion.skeleton import Skeleton
 
 __all__ = [
     "LearningTracks",
+    "certain",
     "film_clips",
     "film_windows",
     "made_walks",
@@ -78,6 +79,18 @@ def film_clips(
     # Cameras are alone with their clip: no other track stands in the same picture.
     alone = [track.name for track in tracks]
     return prepare_tracks(tracks, fps=fps, videos=alone, centre=shot.centre)
+
+
+def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
+    """Return tracks whose joints count whole or not at all: confidence 1 from the threshold on.
+
+    Of filmed tracks confidences tell which joints are lost; among those that are found the made
+    detector draws them at random, and to weigh errors by them would weigh by noise.
+    """
+    return [
+        replace(track, confidence=np.where(track.confidence >= threshold, 1.0, 0.0))
+        for track in tracks
+    ]
 
 
 def film_windows(

@@ -15,6 +15,7 @@ from probmotion import Cameras, Motion, Skeleton
 from probmotion.data.gaits import make_gait
 from probmotion.data.learning import (
     body_sizes,
+    certain,
     film_clips,
     film_windows,
     made_walks,
@@ -93,6 +94,19 @@ def test_the_path_stays_where_sequences_are_centred(clips: list[Motion]) -> None
     for track in still.tracks:
         np.testing.assert_allclose(np.nanmean(track.keypoints[:, 0], axis=0), 0.0, atol=1e-9)
     assert max(np.nanmax(np.ptp(track.keypoints[:, 0], axis=0)) for track in still.tracks) > 0.5
+
+
+def test_of_certain_tracks_joints_count_whole_or_not_at_all(clips: list[Motion]) -> None:
+    tracks = film_clips(clips, clips[0].skeleton, 10.0, views=2).tracks
+    edge = np.where(tracks[0].confidence > 0, 0.3, 0.0)
+    edge[0] = np.minimum(edge[0], 0.29)
+    low = replace(tracks[0], confidence=edge)
+    counted = certain([*tracks, low])
+    for before, after in zip([*tracks, low], counted, strict=True):
+        np.testing.assert_array_equal(after.confidence, before.confidence >= 0.3)
+        np.testing.assert_array_equal(after.keypoints, before.keypoints)
+    assert counted[-1].confidence[1:].sum() == (edge[1:] > 0).sum()
+    assert not counted[-1].confidence[0].any()
 
 
 def test_a_clip_is_filmed_alike_in_any_company(clips: list[Motion]) -> None:

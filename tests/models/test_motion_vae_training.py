@@ -127,11 +127,13 @@ def test_who_learns_is_first_who_fits_at_rest_and_a_little_of_the_others(first, 
     asked = copy.copy(first)
     asked.anneal(step)
     loss = asked.training_loss(network, np.random.default_rng(0), 16, CPU)
-    keypoints, seen, rest = first._shown(first.batches.draw(np.random.default_rng(0), 16), CPU)
+    drawn = first.batches.draw(np.random.default_rng(0), 16)
+    keypoints, seen, rest = first._shown(drawn, CPU)
+    confidence = torch.as_tensor(drawn.confidence)
     guesses = network(keypoints, seen, rest)
-    terms = guess_terms(first.body, guesses, keypoints, seen, 7.0)
+    terms = guess_terms(first.body, guesses, keypoints, confidence, 7.0)
     losses = weighted_sum(terms, TINY)
-    best = first._at_rest(guesses, keypoints, seen).argmin(dim=1)
+    best = first._at_rest(guesses, keypoints, confidence).argmin(dim=1)
     assert (best != losses.argmin(dim=1)).any()
     if step > 500:
         best = losses.argmin(dim=1)
@@ -283,6 +285,37 @@ def test_what_cannot_be_learnt_with_is_refused_in_a_sentence(tracks, validation,
         MotionVAETrainee(tracks, validation, TINY, body, wide, distance=7.0)
 
 
+@pytest.mark.parametrize("phase", [1, 2])
+def test_what_is_seen_less_surely_counts_less(tracks, validation, body, phase) -> None:
+    """Where a body has one view to choose from, the loss is linear in a joint's confidence."""
+    size, losses = replace(TINY, hypotheses=1), {}
+    ankles = [PERSON.index("left_ankle"), PERSON.index("right_ankle")]
+    for confidence in (1.0, 0.7, 0.4):
+        doubted = []
+        for track in tracks:
+            held = track.confidence.copy()
+            held[:, ankles] = np.where(held[:, ankles] > 0, confidence, 0.0)
+            doubted.append(replace(track, confidence=held))
+        trainee = PoseTrainee(doubted, validation, size, body, distance=7.0)
+        if phase == 2:
+            teacher = trainee.network
+            trainee = MotionVAETrainee(doubted, validation, size, body, teacher, distance=7.0)
+        with torch.no_grad():
+            network = trainee.network.eval()
+            loss = trainee.training_loss(network, np.random.default_rng(0), 16, CPU)
+        losses[confidence] = float(loss)
+    assert losses[1.0] > 1.01 * losses[0.4]
+    assert losses[0.7] == pytest.approx((losses[1.0] + losses[0.4]) / 2, rel=1e-5)
+
+
+def test_tracks_that_are_not_centred_in_every_frame_are_refused(tracks, validation, body) -> None:
+    moving = film_clips(walks(3), PERSON, 10.0, views=2, filming=Filming(centre="sequence")).tracks
+    with pytest.raises(ValueError, match=r"tracks has .* with its root .* m from the origin, expe"):
+        PoseTrainee(moving, validation, TINY, body, distance=7.0)
+    with pytest.raises(ValueError, match=r"validation has .* with its root .* m from the origin"):
+        PoseTrainee(tracks, moving, TINY, body, distance=7.0)
+
+
 def test_short_tracks_among_long_ones_are_left_out_and_counted(tracks, validation, body) -> None:
     short = replace(
         tracks[0], keypoints=tracks[0].keypoints[:5], confidence=tracks[0].confidence[:5]
@@ -296,9 +329,21 @@ def test_a_body_without_pairs_is_said_to_have_none() -> None:
     arm = Skeleton(["root", "elbow", "hand"], [-1, 0, 1])
     rng = np.random.default_rng(0)
     keypoints = 0.3 * rng.normal(size=(20, 3, 2))
+    keypoints[:, 0] = 0.0
     track = KeypointTrack(keypoints, np.ones((20, 3)), arm, 10.0, "arm/0")
     body = ArticulatedBody(arm, np.array([[0, 0, 0], [0, 0.3, 0], [0, 0.2, 0.1]]))
-    with pytest.warns(UserWarning, match="body has no left-right pairs"):
+    with pytest.warns(UserWarning, match="body has no left-right pairs: no bone is"):
+        trainee = PoseTrainee([track], [track], TINY, body)
+    assert not trainee.batches.augmentation.mirror
+
+
+def test_a_body_whose_pairs_hang_from_different_joints_is_said_to_be_lopsided() -> None:
+    lopsided = Skeleton(["root", "chest", "left_hand", "right_hand"], [-1, 0, 1, 0])
+    keypoints = 0.3 * np.random.default_rng(0).normal(size=(20, 4, 2))
+    keypoints[:, 0] = 0.0
+    track = KeypointTrack(keypoints, np.ones((20, 4)), lopsided, 10.0, "lopsided/0")
+    body = ArticulatedBody(lopsided, np.array([[0, 0, 0], [0, 0.3, 0], [0.2, 0, 0], [-0.2, 0, 0]]))
+    with pytest.warns(UserWarning, match="body has no left-right pairs that hang from one joint"):
         trainee = PoseTrainee([track], [track], TINY, body)
     assert not trainee.batches.augmentation.mirror
 

@@ -66,7 +66,9 @@ def test_joints_below_the_threshold_are_as_if_they_were_not_there():
     wild = replace(low, keypoints=keypoints)
     keypoints = keypoints.copy()
     keypoints[3:9, 4] = np.nan
-    unseen = replace(given, keypoints=keypoints, confidence=np.where(confidence < 0.3, 0, 1))
+    unseen = replace(
+        given, keypoints=keypoints, confidence=np.where(confidence < 0.3, 0, confidence)
+    )
     drawn = [draw(TrackBatches([one], 30, 0.3, Augmentation()), 20) for one in (low, wild, unseen)]
     for other in drawn[1:]:
         for ours, theirs in zip(drawn[0], other, strict=True):
@@ -78,6 +80,7 @@ def test_joints_below_the_threshold_are_as_if_they_were_not_there():
     whole = draw(TrackBatches([low], 30, 0.3, NONE))
     assert not whole.seen[0, 3:9, 4].any()
     assert whole.seen[0, 5, 6]
+    np.testing.assert_array_equal(whole.confidence[0, 5, 5:7], np.float32([1.0, 0.3]))
     assert whole.seen.sum() == whole.seen.size - 6
     # Even a threshold of 0 does not show what was never seen.
     assert not draw(TrackBatches([unseen], 30, 0.0, NONE)).seen[0, 3:9, 4].any()

@@ -57,10 +57,8 @@ def test_the_right_view_is_chosen_for_bodies_of_the_same_kind(name: str) -> None
     clips = walks if name == "walk-vae" else made_animals(4, seed=5)
     judged = judge_hypotheses(prior.model.pose, prior.settings, prior.body, clips, n=300)
     assert judged.depth_right > 0.9
-    # Neighbouring views of an animal are nearly as good: what is lost by the choice is small.
+    assert judged.right > 0.9
     assert judged.error < 1.1 * judged.least_error
-    if name == "walk-vae":
-        assert judged.right > 0.9
 
 
 @pytest.mark.parametrize("name", NAMES)
