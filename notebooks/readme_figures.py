@@ -22,7 +22,8 @@ SHOWN = ("exact", "mas", "mvpc", "nuts")
 ADVICE = {
     "exact": "prior and evidence have a closed form, or there is no evidence and a prior that can "
     "be drawn from: nothing else is needed",
-    "ensemble": "there is a log density of at most about 20 dimensions",
+    "ensemble": "there is a log density of at most about 20 dimensions, and modes are not far "
+    "apart",
     "nuts": "there is a log density with a gradient; start many chains, and look at R-hat: chains "
     "that began in different modes stay there",
     "mh": "there is a log density without a gradient; the same warning",
@@ -32,7 +33,7 @@ ADVICE = {
     "dvae": "a network that reads the evidence comes with the prior; else it trains one first",
     "sds": "one plausible motion is enough: it does not sample",
 }
-"""When to take which sampler, from the surest down."""
+"""When to take which sampler, from what is right of itself to what does not sample."""
 
 
 def replace_block(text: str, name: str, block: str) -> str:

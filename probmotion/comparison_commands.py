@@ -154,6 +154,9 @@ class Compare:
         from probmotion.calibration import calibrate
 
         simulated = [problem for problem in problems if problem.simulate is not None]
+        for problem in problems:
+            if problem.simulate is None:
+                print(f"{problem.name} cannot be simulated: it is not calibrated")
         found = calibrate(
             simulated,
             samplers,

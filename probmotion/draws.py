@@ -300,11 +300,12 @@ def settings_of(sampler: Any) -> dict[str, Any]:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of the packages that draws depend on."""
+    """Return the versions of the packages that draws, and what is measured of them, depend on."""
     return dict(_versions())
 
 
 @cache
 def _versions() -> dict[str, str]:
-    packages = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
+    samplers = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
+    packages = (*samplers, "arviz-stats", "scikit-learn")
     return {package: version(package) for package in packages}

@@ -259,12 +259,13 @@ def one_frame(folder: Path) -> str:
 
 
 def test_calibration_within_a_budget_goes_on(tmp_path, capsys):
-    words = ["compare", "gait-sparse(frames=4, components=6)", "--samplers", "mh"]
+    words = ["compare", "gait-sparse(frames=4, components=6)", "walk2d", "--samplers", "mh"]
     words += ["--draws", "20", "--evaluations", "9000", "--calibrate", "10", "--out", str(tmp_path)]
     for _ in range(2):
         assert main(words) == 0
         told = capsys.readouterr().out
     assert "in 10 simulations" in told
+    assert "walk2d cannot be simulated: it is not calibrated" in told
     cells = list((tmp_path / "calibration/cells").rglob("cell.json"))
     assert len(cells) == 10
     held = json.loads(cells[0].read_text())

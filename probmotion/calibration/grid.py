@@ -105,7 +105,8 @@ def calibrate(
                 f"problems has {name!r}, which cannot be simulated, expected a Problem with "
                 "simulate; problems.problem.simulated() gives it one if its prior can be drawn from"
             )
-    given = Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else Path(out)
+    # Workers may stand in another folder.
+    given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out).absolute()
     folder = writable_folder(given / Calibration.FOLDER)
     Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, simulations, budget, per="simulation")

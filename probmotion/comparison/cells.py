@@ -107,6 +107,11 @@ class Cell:
     def __str__(self) -> str:
         return f"{self.problem}/{self.sampler}/{self.seed}"
 
+    def answered(self) -> bool:
+        """Whether its result is there, made with the same settings."""
+        result = read_result(self.folder)
+        return result is not None and result.fingerprint == self.fingerprint
+
     def finished(self) -> bool:
         """Whether its result is there, made with the same settings, and no accident."""
         result = read_result(self.folder)

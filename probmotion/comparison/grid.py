@@ -99,9 +99,9 @@ def compare(
     check_budget(budget)
     chosen = named_problems(problems)
     used = named_samplers(samplers)
-    folder = (
-        Path(tempfile.mkdtemp(prefix="probmotion-")) if out is None else writable_folder(Path(out))
-    )
+    given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out)
+    # Workers may stand in another folder.
+    folder = writable_folder(given).absolute()
     Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, seeds, budget)
     with locked(folder, chosen):

@@ -38,6 +38,9 @@ class Task(Protocol):
     def fail(self, error: BaseException) -> None:
         """Keep an error as the result."""
 
+    def answered(self) -> bool:
+        """Whether the result, or the failure, is there."""
+
 
 Done = Callable[[Any, BaseException | None], None]
 """Told of every task that ended, with the error that it could not keep itself."""

@@ -49,6 +49,10 @@ def run_tasks(
         def done(task: Any, error: BaseException | None) -> None:
             if isinstance(error, CellNotKept):
                 raise error
+            if error is None and not task.answered():
+                error = FileNotFoundError(
+                    f"{task} ended and its result is not in out, expected workers that see out"
+                )
             if error is not None:
                 task.fail(error)
             bar.update(1)

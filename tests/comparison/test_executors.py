@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from concurrent.futures import Future, ThreadPoolExecutor
+import os
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
 
 import pandas as pd
 import pytest
@@ -68,6 +70,37 @@ def test_what_an_executor_loses_is_a_row():
         found = compare(generation(), SAMPLERS, executor=executor, **SMALL)
     assert {result.failure.message for result in found.results} == {"the cluster is gone"}
     assert len(found.results) == 6
+
+
+class _Forgetful(ThreadPoolExecutor):
+    """Ends every task without a word, and without having done anything."""
+
+    def submit(self, function, *arguments, **settings):
+        future = Future()
+        future.set_result(None)
+        return future
+
+
+def test_what_workers_keep_where_nobody_sees_it_is_a_row():
+    with _Forgetful() as executor:
+        found = compare(generation(), SAMPLERS, executor=executor, **SMALL)
+    assert len(found.results) == 6
+    for result in found.results:
+        assert result.failure.word == "FileNotFoundError"
+        assert "expected workers that see out" in result.failure.message
+
+
+def test_workers_in_another_folder_keep_cells_where_they_belong(here, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    workers = ProcessPoolExecutor(
+        1, get_context("spawn"), initializer=os.chdir, initargs=[tmp_path / "elsewhere"]
+    )
+    with workers as executor:
+        found = compare([generation(), monocular()], SAMPLERS, executor=executor, out="o", **SMALL)
+    assert numbers(found) == here
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_a_full_disk_on_an_executor_stops_the_run():
