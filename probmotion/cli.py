@@ -43,13 +43,13 @@ class List:
     def run(self) -> None:
         """Print three lists."""
         from probmotion.problems import problem_descriptions
-        from probmotion.sampling import load_sampler, sampler_names
+        from probmotion.sampling import importable_samplers
         from probmotion.settings_options import presets_of
         from probmotion.skeleton import Skeleton
         from probmotion.skeleton_presets import PRESETS
 
         _print_list("problems", problem_descriptions())
-        kinds = {name: load_sampler(name) for name in sampler_names()}
+        kinds = importable_samplers()
         _print_list("samplers", {name: _first_line(kind) for name, kind in kinds.items()})
         presets = {
             f"{name}.{preset}": _first_line(getattr(kind, preset))

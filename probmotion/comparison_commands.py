@@ -187,10 +187,10 @@ class Compare:
             raise ValueError("calibrate is given, but none of the problems can be simulated")
 
     def _samplers(self) -> dict[str, Any]:
-        from probmotion.sampling import sampler_names
+        from probmotion.sampling import importable_samplers
         from probmotion.settings_options import sampler_called
 
-        names = self.samplers or sampler_names()
+        names = self.samplers or importable_samplers()
         return {name: sampler_called(name, self.settings) for name in names}
 
     def _problems(self) -> list[Problem]:

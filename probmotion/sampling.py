@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -20,6 +21,7 @@ __all__ = [
     "Interrupted",
     "Sampler",
     "UnsupportedPosterior",
+    "importable_samplers",
     "load_sampler",
     "missing",
     "progress_bar",
@@ -138,7 +140,7 @@ def suited(posterior: MotionPosterior) -> list[str]:
     """
     return [
         name
-        for name, kind in _importable()
+        for name, kind in _imported({}).items()
         if not missing(kind, posterior)
         and (posterior.differentiable or not getattr(kind, "needs_gradient", False))
         and posterior.dim <= getattr(kind, "largest_dim", posterior.dim)
@@ -146,13 +148,27 @@ def suited(posterior: MotionPosterior) -> list[str]:
     ]
 
 
-def _importable() -> Iterator[tuple[str, type[Any]]]:
+def importable_samplers() -> dict[str, type[Any]]:
+    """Return the classes of all registered samplers, by name.
+
+    One that cannot be imported, as of a package that is half removed, is left out, and a warning
+    says so: whoever asks for all is not stopped by one.
+    """
+    refused: dict[str, ValueError] = {}
+    found = _imported(refused)
+    for error in refused.values():
+        warnings.warn(f"{error}; it is left out", stacklevel=2)
+    return found
+
+
+def _imported(refused: dict[str, ValueError]) -> dict[str, type[Any]]:
+    found = {}
     for name in sampler_names():
         try:
-            kind = load_sampler(name)
-        except ValueError:
-            continue
-        yield name, kind
+            found[name] = load_sampler(name)
+        except ValueError as error:
+            refused[name] = error
+    return found
 
 
 @cache

@@ -15,7 +15,7 @@ from functools import partial
 from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, Union, get_args
 
-from probmotion.sampling import load_sampler, sampler_names
+from probmotion.sampling import importable_samplers, load_sampler
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -50,8 +50,7 @@ def settings_of_samplers(quick: bool = False) -> type[Any]:
 
         begin = quick_samplers()
     entries = []
-    for name in sampler_names():
-        kind = load_sampler(name)
+    for name, kind in importable_samplers().items():
         default = partial(_same, begin[name]) if quick else kind
         entries.append((option_name(name), kind, field(default_factory=default)))
     settings = make_dataclass("Settings", entries, frozen=True)

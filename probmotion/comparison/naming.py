@@ -8,7 +8,7 @@ from typing import Any
 
 from probmotion.posterior import MotionPosterior
 from probmotion.problems import Problem, load_problem, problem_names
-from probmotion.sampling import Sampler, load_sampler, sampler_names
+from probmotion.sampling import Sampler, importable_samplers, load_sampler
 
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
 
@@ -53,7 +53,9 @@ def _registered_name(problem: Problem) -> str | None:
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
     """Return the samplers by what the table calls them; all registered ones for None."""
     found: dict[str, Sampler] = {}
-    for label, given in _labelled(sampler_names() if samplers is None else samplers, AnySampler):
+    for label, given in _labelled(
+        list(importable_samplers()) if samplers is None else samplers, AnySampler
+    ):
         if isinstance(given, str):
             _add("samplers", found, label or given, load_sampler(given)())
         elif isinstance(given, Sampler) and not isinstance(given, type):

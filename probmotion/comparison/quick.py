@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from probmotion.comparison.budgets import Budget
-from probmotion.sampling import Sampler, load_sampler, sampler_names
+from probmotion.sampling import Sampler, importable_samplers, load_sampler
 
 __all__ = ["QUICK", "QUICK_BUDGET", "QUICK_LIMIT", "quick_samplers"]
 
@@ -32,5 +32,5 @@ def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:
     ValueError
         If a name is unknown; the message lists the known ones.
     """
-    chosen = sampler_names() if names is None else list(names)
+    chosen = importable_samplers() if names is None else names
     return {name: load_sampler(name)(**QUICK.get(name, {})) for name in chosen}
