@@ -18,7 +18,7 @@ from probmotion.data.cmu_clips import cmu_clip
 from probmotion.likelihoods import Joints3D
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
-from probmotion.problems.problem import Problem
+from probmotion.problems.problem import Problem, simulated
 
 if TYPE_CHECKING:
     from probmotion.models import MotionDVAE
@@ -86,7 +86,7 @@ def denoising_problem(
         truth, noise, seed, hidden=hidden, degrees_of_freedom=degrees_of_freedom
     )
     fitted = prior.of(frames=truth.frames, body=body_of(evidence, prior))
-    return Problem(name, description, MotionPosterior(fitted, evidence), truth.positions)
+    return simulated(Problem(name, description, MotionPosterior(fitted, evidence), truth.positions))
 
 
 def body_of(evidence: Joints3D, prior: MotionDVAE) -> np.ndarray:

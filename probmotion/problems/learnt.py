@@ -15,6 +15,7 @@ from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics.generation import GenerationReference
 from probmotion.motion import Motion
 from probmotion.posterior import MotionPosterior
+from probmotion.priors import Samplable
 from probmotion.problems.evidence import observe
 from probmotion.problems.problem import Problem, simulated
 
@@ -50,8 +51,9 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
             float(kept["elevation"]),
             float(kept["distance"]),
         )
-    prior: type[MotionDiffusion] | type[MotionVAE] = getattr(models, kind)
-    return Problem(name, description, MotionPosterior(prior.load(name)), generation=reference)
+    prior: MotionDiffusion | MotionVAE = getattr(models, kind).load(name)
+    problem = Problem(name, description, MotionPosterior(prior), generation=reference)
+    return simulated(problem) if isinstance(prior, Samplable) else problem
 
 
 def seen_draw_problem(

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from probmotion import models, seeds
+from probmotion.calibration import calibrate
 from probmotion.data.cmu_clips import cmu_clip
 from probmotion.data.walks import made_walks
 from probmotion.likelihoods import Joints3D
@@ -125,6 +126,25 @@ def test_the_evidence_is_of_the_truth_with_the_stated_noise(prior, walks):
     # P(|t| > 5) of 3 degrees of freedom is 1.5 %, of a Gaussian nothing.
     assert (strays > 5).mean() == pytest.approx(0.0154, abs=0.006)
     assert (abs(residual) < 5).all()
+
+
+def test_it_can_be_simulated_and_so_calibrated(prior, walks):
+    """Other motions of the same body, with the same joints hidden and noise of the same size."""
+    hidden = np.zeros(walks[0].positions.shape[:2], dtype=bool)
+    hidden[3:9, 4] = True
+    problem = denoising_problem(walks[0], prior, noise=0.04, hidden=hidden)
+    again = problem.simulate(3)
+    np.testing.assert_array_equal(again.truth, problem.simulate(3).truth)
+    assert (again.truth != problem.simulate(4).truth).any()
+    evidence, before = again.posterior.likelihood, problem.posterior.likelihood
+    np.testing.assert_array_equal(evidence.entries.visible, before.entries.visible)
+    residual = (evidence.joints - again.truth)[~hidden] / 0.04
+    assert abs(residual.var() - 1) < 5 * np.sqrt(2 / residual.size)
+    assert again.posterior.prior is problem.posterior.prior
+    ranked = calibrate(problem, DVAEInference(), simulations=10, draws=20, chains=2, progress=False)
+    assert not ranked.failures
+    # The network learnt from other motions than the prior draws, and for seconds.
+    assert "dvae on denoise: too sure" in ranked.verdict(problem.name, "dvae")
 
 
 @pytest.mark.parametrize(("freedom", "error"), [(None, 0.0045), (3.0, 0.006)])

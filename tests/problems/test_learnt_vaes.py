@@ -62,6 +62,16 @@ def test_the_right_view_is_chosen_for_bodies_of_the_same_kind(name: str) -> None
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_it_can_be_simulated(name: str) -> None:
+    """There is no evidence: another truth is another draw of the prior."""
+    problem = load_problem(name)
+    again = problem.simulate(3)
+    assert again.posterior.likelihood is None
+    np.testing.assert_array_equal(again.truth, problem.simulate(3).truth)
+    assert (again.truth != problem.simulate(4).truth).any()
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_draws_are_nearer_to_held_out_motion_than_a_still_body_is(name: str, real_data) -> None:
     prior = MotionVAE.load(name)
     clips = (walk_clips if name == "walk-vae" else animal_clips)(real_data)["test"]
