@@ -73,7 +73,7 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
     data |= {"advice/measured.csv", "advice/measured.json"}
     data |= {
         f"problems/references/{name}/{file}"
-        for name in ("dance-pairs", "gait-noisy3d", "walk-vae-monocular")
+        for name in ("dance-pairs", "gait-noisy3d", "salsa-pairs", "walk-vae-monocular")
         for file in ("draws.npz", "certificate.json")
     }
     learnt = ("joint_limits.npz", "walk2d.md", "walk2d.safetensors", "walk2d-evaluator.safetensors")

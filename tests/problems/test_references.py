@@ -449,6 +449,16 @@ def test_a_prior_without_any_density_has_no_reference():
 @pytest.mark.parametrize("name", ["dance-pairs", "gait-noisy3d", "walk-vae-monocular"])
 def test_shipped_references_are_of_their_problems(name, monkeypatch, tmp_path):
     monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    check_shipped(name)
+
+
+def test_the_reference_of_real_pairs_is_of_their_problem(real_data, monkeypatch, tmp_path):
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    (tmp_path / "cmu_salsa_pairs").symlink_to(real_data / "cmu_salsa_pairs")
+    check_shipped("salsa-pairs")
+
+
+def check_shipped(name: str) -> None:
     problem = load_problem(name)
     assert problem.has_reference
     told = problem.kept.certificate
