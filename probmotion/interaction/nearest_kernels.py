@@ -58,7 +58,10 @@ class Prepared(NamedTuple):
     """(J, 2) what degenerate joints are moved by."""
 
 
-def _nearest(
+# Two functions and not one that is compiled twice: files of compiled code are found by a function's
+# name, whatever it was compiled for, and one thread would be given the code for several.
+@numba.njit(cache=True)
+def nearest_in_batch(
     projections: np.ndarray,
     candidates: np.ndarray,
     prepared: Prepared,
@@ -70,6 +73,27 @@ def _nearest(
     n_items, n_views = projections.shape[0], projections.shape[1]
     distances = np.empty((n_items, n_views))
     indices = np.empty((n_items, n_views), dtype=np.int64)
+    for flat in range(n_items * n_views):
+        item, view = flat // n_views, flat % n_views
+        distances[item, view], indices[item, view] = nearest_of(
+            projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
+        )
+    return distances, indices
+
+
+@numba.njit(cache=True, parallel=True)
+def nearest_in_batch_on_threads(
+    projections: np.ndarray,
+    candidates: np.ndarray,
+    prepared: Prepared,
+    measure: int,
+    graph: int,
+    epsilon: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what :func:`nearest_in_batch` does, on as many threads as Numba has."""
+    n_items, n_views = projections.shape[0], projections.shape[1]
+    distances = np.empty((n_items, n_views))
+    indices = np.empty((n_items, n_views), dtype=np.int64)
     for flat in numba.prange(n_items * n_views):
         item, view = flat // n_views, flat % n_views
         best, index = nearest_of(
@@ -78,10 +102,6 @@ def _nearest(
         distances[item, view] = best
         indices[item, view] = index
     return distances, indices
-
-
-nearest_in_batch = numba.njit(cache=True)(_nearest)
-nearest_in_batch_on_threads = numba.njit(cache=True, parallel=True)(_nearest)
 
 
 @numba.njit(cache=True)

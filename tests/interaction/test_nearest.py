@@ -270,6 +270,15 @@ def test_real_pairs_agree_with_the_plain_formulas(real_data: Path) -> None:
             assert distance == pytest.approx(wanted, abs=1e-12)
 
 
+def test_kept_code_for_several_threads_is_not_found_by_one() -> None:
+    """Numba's files go by a function's name: two that share it would be given either's code."""
+    from probmotion.interaction import nearest_kernels
+
+    serial = nearest_kernels.nearest_in_batch.py_func
+    parallel = nearest_kernels.nearest_in_batch_on_threads.py_func
+    assert serial.__qualname__ != parallel.__qualname__
+
+
 def test_inside_one_thread_the_serial_kernel_runs(monkeypatch) -> None:
     """As under a comparison's clock, whatever the number of cores."""
     from probmotion.interaction import nearest
