@@ -58,7 +58,23 @@ class Prepared(NamedTuple):
     """(J, 2) what degenerate joints are moved by."""
 
 
-# Two functions and not one that is compiled twice: files of compiled code are found by a function's
+@numba.njit(cache=True)
+def _nearest_at(
+    flat: int,
+    projections: np.ndarray,
+    candidates: np.ndarray,
+    prepared: Prepared,
+    measure: int,
+    graph: int,
+    epsilon: float,
+) -> tuple[float, int]:
+    item, view = divmod(flat, projections.shape[1])
+    return nearest_of(
+        projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
+    )
+
+
+# Two loops, and not one that is compiled twice: files of compiled code are found by a function's
 # name, whatever it was compiled for, and one thread would be given the code for several.
 @numba.njit(cache=True)
 def nearest_in_batch(
@@ -70,15 +86,13 @@ def nearest_in_batch(
     epsilon: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the least distance and its annotation for (B, V, J, 2) and (V, N)."""
-    n_items, n_views = projections.shape[0], projections.shape[1]
-    distances = np.empty((n_items, n_views))
-    indices = np.empty((n_items, n_views), dtype=np.int64)
-    for flat in range(n_items * n_views):
-        item, view = flat // n_views, flat % n_views
-        distances[item, view], indices[item, view] = nearest_of(
-            projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
+    shape = projections.shape[:2]
+    distances, indices = np.empty(shape[0] * shape[1]), np.empty(shape[0] * shape[1], np.int64)
+    for flat in range(distances.size):
+        distances[flat], indices[flat] = _nearest_at(
+            flat, projections, candidates, prepared, measure, graph, epsilon
         )
-    return distances, indices
+    return distances.reshape(shape), indices.reshape(shape)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -91,17 +105,13 @@ def nearest_in_batch_on_threads(
     epsilon: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what :func:`nearest_in_batch` does, on as many threads as Numba has."""
-    n_items, n_views = projections.shape[0], projections.shape[1]
-    distances = np.empty((n_items, n_views))
-    indices = np.empty((n_items, n_views), dtype=np.int64)
-    for flat in numba.prange(n_items * n_views):
-        item, view = flat // n_views, flat % n_views
-        best, index = nearest_of(
-            projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
+    shape = projections.shape[:2]
+    distances, indices = np.empty(shape[0] * shape[1]), np.empty(shape[0] * shape[1], np.int64)
+    for flat in numba.prange(distances.size):
+        distances[flat], indices[flat] = _nearest_at(
+            np.int64(flat), projections, candidates, prepared, measure, graph, epsilon
         )
-        distances[item, view] = best
-        indices[item, view] = index
-    return distances, indices
+    return distances.reshape(shape), indices.reshape(shape)
 
 
 @numba.njit(cache=True)
