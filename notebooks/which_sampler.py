@@ -1,59 +1,50 @@
-"""Every sampler on every problem: the table that ``probmotion which`` and the README advise from.
+"""The tables that ``probmotion which`` and the README advise from, of the whole grid.
 
-    python notebooks/which_sampler.py --out grid    # resumes; two cores: 8 minutes and 4 a seed
+    probmotion compare all --quick --workers 2 --seeds 5 --out grid --report
+    python notebooks/which_sampler.py              # reads grid/
 
-Every sampler may spend as many seconds on a cell, by :data:`~probmotion.comparison.QUICK_BUDGET`;
-one that cannot is a row that says so. Problems whose data is not at hand are left out, and said.
-Beside the comparison's own files and its page, ``measured.csv`` and ``measured.json`` are written
-to ``probmotion/advice`` and the README's table is replaced.
+It writes ``measured.csv`` and ``measured.json`` to ``probmotion/advice`` and the README's tables.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from readme_figures import replace_block
 
+from probmotion import Comparison
 from probmotion.advice import Advice, Standing, advise, keep_measured
-from probmotion.comparison import QUICK_BUDGET, QUICK_LIMIT, compare, quick_samplers
-from probmotion.problems import load_problem, problem_names
 
 ROOT = Path(__file__).parents[1]
-DRAWS = 40
+SHOWN = ("gait", "gait-monocular", "gait-sparse", "cmu-monocular")
+WHEN = {
+    "exact": "prior and evidence have a closed form, or there is no evidence and a prior that can "
+    "be drawn from: nothing else is needed",
+    "ensemble": "there is a log density of at most about 20 dimensions, and modes are not far "
+    "apart",
+    "nuts": "there is a log density with a gradient; start many chains, and look at R-hat: chains "
+    "that began in different modes stay there",
+    "mh": "there is a log density without a gradient; the same warning",
+    "ancestral3d": "there is a 3D denoiser",
+    "mvpc": "there is a 2D denoiser only",
+    "mas": "to compare with the published method; `mvpc` costs the same",
+    "dvae": "a network that reads the evidence comes with the prior; else it trains one first",
+    "sds": "one plausible motion is enough: it does not sample",
+}
+"""When to take which sampler, from what is right of itself to what does not sample."""
 
 
 def main() -> None:
-    """Run the grid and write what it found."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("grid"))
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=2)
-    asked = parser.parse_args()
-    problems = at_hand()
-    start = time.perf_counter()
-    found = compare(
-        problems,
-        quick_samplers(),
-        draws=DRAWS,
-        chains=4,
-        seeds=asked.seeds,
-        out=asked.out,
-        workers=asked.workers,
-        budget=QUICK_BUDGET,
-        time_limit=QUICK_LIMIT,
-    )
-    print(f"grid_minutes: {(time.perf_counter() - start) / 60:.1f}")
-    print(f"grid_cells: {len(found.results)}")
-    print(found.table())
-    found.report(asked.out / "report.html")
-    keep_measured(found, "python notebooks/which_sampler.py")
+    """Rewrite what was measured."""
+    found = Comparison.load(ROOT / "grid")
+    keep_measured(found, f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}")
+    advices = {name: advise(name) for name in found.plan.problems}
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    text = replace_block(text, "which", "\n".join(table_of(map(advise, problems))))
+    text = replace_block(text, "which", "\n".join(table_of(advices.values())))
+    text = replace_block(text, "advice", "\n".join(when_table(advices)))
     readme.write_text(text, encoding="utf-8")
 
 
@@ -86,17 +77,21 @@ def in_brief(standings: Sequence[Standing]) -> str:
     )
 
 
-def at_hand() -> list[str]:
-    """Return the names of the problems that can be made here, and say which cannot."""
-    found = []
-    for name in problem_names():
-        try:
-            load_problem(name)
-        except FileNotFoundError as error:
-            print(f"left out: {name}: {error}")
-        else:
-            found.append(name)
-    return found
+def when_table(advices: Mapping[str, Advice]) -> Iterator[str]:
+    """Yield the lines of the table that says when to take which sampler."""
+    yield f"| take | when | {' | '.join(f'`{name}`' for name in SHOWN)} |"
+    yield "|---" * (2 + len(SHOWN)) + "|"
+    for sampler, when in WHEN.items():
+        cells = [how_far(advices[name], sampler) for name in SHOWN]
+        yield f"| `{sampler}` | {when} | {' | '.join(cells)} |"
+
+
+def how_far(advice: Advice, sampler: str) -> str:
+    """Return a sampler's mean on a problem, or why it has none."""
+    for each in (advice.take, *advice.alike, *advice.doubtful, *advice.worse):
+        if each.sampler == sampler:
+            return f"{each.value:.3g}"
+    return advice.without[sampler]
 
 
 if __name__ == "__main__":

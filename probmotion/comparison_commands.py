@@ -58,13 +58,13 @@ class Compare:
     """
 
     problems: Positional[tuple[str, ...]] = ()
-    """Names of problems (see probmotion list)."""
+    """Names of problems (see probmotion list); all: every one whose data is at hand."""
 
     samplers: tuple[str, ...] = ()
     """Names of samplers or their presets (see probmotion list); all samplers by default."""
 
-    draws: int = 200
-    """Draws of each sampler in all."""
+    draws: int | None = None
+    """Draws of each sampler in all; 200, or 40 with --quick."""
 
     chains: int | None = None
     """Chains that they are spread over; by default the most, up to 4, that divide the draws."""
@@ -73,23 +73,24 @@ class Compare:
     """Independent repeats, with seeds 0, 1, …"""
 
     workers: int = 1
-    """Processes; they never change the draws."""
+    """Processes; they never change the draws. 0: in this one."""
 
     out: Path = Path("comparison")
     """Folder for table.csv and all draws; made where it is missing."""
 
     quick: bool = False
-    """Begin from settings that cost less, as a demonstration wants; the table names them."""
+    """A look: 40 draws, six seconds a cell, ended after a minute, unless told otherwise, and
+    settings to begin from that cost less; the table says so."""
 
     evaluations: int | None = None
     """What every sampler may spend on a cell: evaluations of a density or a denoiser, a gradient
     counting as two. Pilot runs find the settings that do. By default samplers run as they are."""
 
     seconds: float | None = None
-    """The same in seconds of this machine."""
+    """The same in seconds of this machine; 6 with --quick."""
 
     time_limit: float | None = None
-    """Seconds after which a cell is ended, and a row that says so."""
+    """Seconds after which a cell is ended, and a row that says so; 60 with --quick."""
 
     calibrate: int = 0
     """Also simulate every problem that can be so many times, and rank the truth among each
@@ -119,23 +120,12 @@ class Compare:
         samplers = self._samplers()
         problems = self._problems()
         self._check_calibrate(problems)
-        fitting = max(n for n in (1, 2, 3, 4) if self.draws % n == 0)
-        chains = fitting if self.chains is None else self.chains
-        comparison = compare(
-            problems,
-            samplers,
-            draws=self.draws,
-            chains=chains,
-            seeds=self.seeds,
-            workers=self.workers,
-            out=self.out,
-            budget=self._budget(),
-            time_limit=self.time_limit,
-        )
+        asked = self._asked()
+        comparison = compare(problems, samplers, seeds=self.seeds, **asked)
         comparison.write(self.out)
         print(comparison.table())
         print(f"\ntable and draws are in {self.out}")
-        calibration = self._calibration(problems, samplers, chains) if self.calibrate else None
+        calibration = self._calibration(problems, samplers, asked) if self.calibrate else None
         if self.report:
             print(f"wrote {comparison.report(self.out / 'report.html', calibration)}")
         if self.pictures:
@@ -143,31 +133,38 @@ class Compare:
 
             draw_comparison(comparison, problems, self.out)
 
-    def _budget(self) -> Any:
-        from probmotion.comparison import Budget
+    def _asked(self) -> dict[str, Any]:
+        """Return what cells are given, of a comparison and of a calibration."""
+        from probmotion.comparison import QUICK_BUDGET, QUICK_DRAWS, QUICK_LIMIT, Budget
 
-        if self.evaluations is None and self.seconds is None:
-            return None
-        return Budget(evaluations=self.evaluations, seconds=self.seconds)
+        usual = (QUICK_DRAWS, QUICK_BUDGET, QUICK_LIMIT) if self.quick else (200, None, None)
+        draws, budget, limit = usual
+        if self.draws is not None:
+            draws = self.draws
+        if self.evaluations is not None or self.seconds is not None:
+            budget = Budget(evaluations=self.evaluations, seconds=self.seconds)
+        if self.time_limit is not None:
+            limit = self.time_limit
+        fitting = max(n for n in (1, 2, 3, 4) if draws % n == 0)
+        return {
+            "draws": draws,
+            "chains": fitting if self.chains is None else self.chains,
+            "workers": self.workers,
+            "out": self.out,
+            "budget": budget,
+            "time_limit": limit,
+        }
 
-    def _calibration(self, problems: list[Problem], samplers: dict[str, Any], chains: int) -> Any:
+    def _calibration(
+        self, problems: list[Problem], samplers: dict[str, Any], asked: dict[str, Any]
+    ) -> Any:
         from probmotion.calibration import calibrate
 
         simulated = [problem for problem in problems if problem.simulate is not None]
         for problem in problems:
             if problem.simulate is None:
                 print(f"{problem.name} cannot be simulated: it is not calibrated")
-        found = calibrate(
-            simulated,
-            samplers,
-            simulations=self.calibrate,
-            draws=self.draws,
-            chains=chains,
-            workers=self.workers,
-            out=self.out,
-            budget=self._budget(),
-            time_limit=self.time_limit,
-        )
+        found = calibrate(simulated, samplers, simulations=self.calibrate, **asked)
         for problem in simulated:
             for sampler in samplers:
                 print(found.verdict(problem.name, sampler))
@@ -199,19 +196,31 @@ class Compare:
         if not self.problems and not self.own.clips and self.prior is None:
             raise ValueError(
                 "no problem is given, expected names of problems (probmotion list shows them), "
-                "clips of your own (--clips FILE…) or a prior of your own (--prior FOLDER)"
+                "all, clips of your own (--clips FILE…) or a prior of your own (--prior FOLDER)"
             )
         if not self.own.clips and self.own != Clips():
             changed = [entry.name for entry in fields(Clips) if self._differs(entry.name)]
             raise ValueError(
                 f"{', '.join(changed)} is given without clips, expected --clips FILE… beside it"
             )
-        problems = [load_problem(name) for name in self.problems]
+        problems = [load_problem(name) for name in self._names()]
         if self.own.clips:
             problems.append(_problem_of_clips(self.own))
         if self.prior is not None:
             problems.append(_problem_of_prior(self.prior))
         return problems
+
+    def _names(self) -> tuple[str, ...]:
+        from probmotion.problems import problems_at_hand
+
+        if "all" not in self.problems:
+            return self.problems
+        if len(self.problems) > 1:
+            raise ValueError(f"problems is {' '.join(self.problems)}, expected all, or some names")
+        found, left_out = problems_at_hand()
+        for name, reason in left_out.items():
+            print(f"left out: {name}: {reason}")
+        return tuple(found)
 
     def _differs(self, option: str) -> bool:
         return getattr(self.own, option) != getattr(Clips(), option)

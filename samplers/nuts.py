@@ -25,7 +25,7 @@ __all__ = ["NUTS"]
 class NUTS:
     """The No-U-Turn sampler (Hoffman and Gelman 2014), NumPyro's (Phan et al. 2019).
 
-    A budget sets ``warmup`` (:mod:`probmotion.comparison.budgets`).
+    A budget sets ``warmup`` and ``thin`` (:mod:`probmotion.comparison.budgets`).
 
     Parameters
     ----------
@@ -35,6 +35,9 @@ class NUTS:
         Mean acceptance that the step size is adapted towards.
     max_tree_depth : int
         A trajectory has at most 2^max_tree_depth − 1 steps.
+    thin : int
+        Iterations per draw. Of those that a draw stands for, ``acceptance`` is the mean,
+        ``divergent`` whether any was, ``steps`` the sum.
     candidates : int
         Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
 
@@ -42,23 +45,27 @@ class NUTS:
     -----
     Chains run one after the other with the same compiled code, so that chain k is the same to the
     last bit however many there are. Everything runs in float64, whatever JAX is set to elsewhere.
+    ``seconds`` of the draws leave out compiling: some seconds, once per posterior and settings in
+    a process, the number of warm-up iterations among them.
     """
 
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
     needs_gradient: ClassVar[bool] = True
-    effort: ClassVar[tuple[str, ...]] = ("warmup",)
+    effort: ClassVar[tuple[str, ...]] = ("warmup", "thin")
     least_effort: ClassVar[int] = 50
 
     warmup: int = 500
     target_acceptance: float = 0.8
     max_tree_depth: int = 10
+    thin: int = 1
     candidates: int = 1000
 
     def __post_init__(self) -> None:
         check_count("candidates", self.candidates)
         check_count("warmup", self.warmup)
         check_count("max_tree_depth", self.max_tree_depth)
+        check_count("thin", self.thin)
         if not 0 < self.target_acceptance < 1:
             raise ValueError(
                 f"target_acceptance is {self.target_acceptance!r}, expected a number between 0 "
@@ -95,11 +102,11 @@ class NUTS:
         import jax
 
         check_count("draws", draws)
-        start = time.perf_counter()
         require(self, posterior)
         self._require_gradient(posterior)
         with jax.enable_x64(True):
             kernel = compiled(self, posterior)
+            start = time.perf_counter()
             earlier = continued(self, kernel.log_densities, initial, chains, seed)
             densities = 0
             if earlier is None:
@@ -177,20 +184,20 @@ class _Run:
 
     def sample(self, draws: int, progress: bool) -> None:
         """Warm up all chains, unless they go on, then draw with each in turn, chunk by chunk."""
-        chains = len(self.points)
+        chains, thin = len(self.points), self.sampler.thin
         warmup = self.sampler.warmup if self.earlier is None else 0
-        with progress_bar(chains * (warmup + draws), self.sampler.name, progress) as bar:
+        with progress_bar(chains * (warmup + draws * thin), self.sampler.name, progress) as bar:
             states = [self._begin(chain) for chain in range(chains)]
             for chain in range(chains):
-                for some in _chunks(warmup):
-                    states[chain], _ = self._advance(states[chain], some)
+                for some in _chunks(warmup, 1):
+                    states[chain], _ = self._advance(states[chain], some, 1)
                     bar.update(some)
-            for some in _chunks(draws):
+            for some in _chunks(draws, thin):
                 rows = []
                 for chain in range(chains):
-                    states[chain], kept = self._advance(states[chain], some)
+                    states[chain], kept = self._advance(states[chain], some, thin)
                     rows.append(kept)
-                    bar.update(some)
+                    bar.update(some * thin)
                 self._keep(rows, list(states))
 
     def state(self) -> dict[str, np.ndarray]:
@@ -209,10 +216,11 @@ class _Run:
         self.gradients += 1
         return self.kernel.begin(seeds.jax_key(self.seed, "chain", chain), self.points[chain])
 
-    def _advance(self, state: Any, steps: int) -> tuple[Any, dict[str, np.ndarray]]:
-        state, kept, gradients = self.kernel.advance(state, steps)
-        self.gradients += int(gradients)
-        return state, {name: np.asarray(values)[:steps] for name, values in kept.items()}
+    def _advance(self, state: Any, draws: int, thin: int) -> tuple[Any, dict[str, np.ndarray]]:
+        state, rows = self.kernel.advance(state, draws, thin)
+        kept = {name: np.asarray(values)[:draws] for name, values in rows.items()}
+        self.gradients += int(kept["steps"].sum())
+        return state, kept
 
     def _keep(self, rows: list[dict[str, np.ndarray]], states: list[Any]) -> None:
         """Take in one chunk of every chain."""
@@ -222,5 +230,6 @@ class _Run:
         self.kept, self.chains, self.finished = grown, states, grown["log_density"].shape[1]
 
 
-def _chunks(n: int) -> list[int]:
-    return [min(CHUNK, n - start) for start in range(0, n, CHUNK)]
+def _chunks(draws: int, thin: int) -> list[int]:
+    most = max(1, CHUNK // thin)
+    return [min(most, draws - start) for start in range(0, draws, most)]

@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 CHUNK = 50
-"""Most iterations in one call, between two looks at the progress bar and at Ctrl-C."""
+"""Most draws in one call, and iterations if they are thinned by less, between two looks at the
+progress bar and at Ctrl-C."""
 
 
 @lru_cache(maxsize=8)
 def compiled(sampler: NUTS, posterior: MotionPosterior) -> NutsKernel:
-    """Return the compiled kernel; compiling takes seconds and serves every seed and restart."""
+    """Return the kernel, compiled: that takes seconds, and serves every seed and restart."""
     return NutsKernel(sampler, posterior)
 
 
@@ -49,6 +50,7 @@ class NutsKernel:
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
         self.log_likelihood = jax.jit(let_in(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
+        self._compile(posterior)
 
     def begin(self, key: Any, theta: np.ndarray) -> Any:
         """Return NumPyro's state at ``theta``; one evaluation of the gradient."""
@@ -94,6 +96,16 @@ class NutsKernel:
                 out.append(np.asarray(leaf))
         return out
 
+    def _compile(self, posterior: MotionPosterior) -> None:
+        """Go through all that runs go through, so that their clocks count no compiling."""
+        import jax
+
+        theta = posterior.initial(seeds.generator(0, "compile"), 1)[0]
+        if posterior.likelihood is not None:
+            self.log_likelihoods(theta[None])
+        state = self._init(jax.random.key(0), theta, *self.value_and_gradient(theta))
+        self.advance(state, 0, 1)
+
     def _init(self, key: Any, theta: np.ndarray, potential: Any, gradient: Any) -> Any:
         import jax.numpy as jnp
         from numpyro.infer.util import ParamInfo
@@ -101,31 +113,40 @@ class NutsKernel:
         start = ParamInfo(jnp.asarray(theta), jnp.asarray(potential), jnp.asarray(gradient))
         return self.kernel.init(key, self.sampler.warmup, start)
 
-    def _advance(self, state: Any, steps: int) -> tuple[Any, dict[str, Any], Any]:
-        """Take at most ``CHUNK`` iterations; return what each kept and the gradients of all."""
+    def _advance(self, state: Any, draws: Any, thin: Any) -> tuple[Any, dict[str, Any]]:
+        """Take at most ``CHUNK`` draws, of ``thin`` iterations each; return what each kept."""
         import jax
         import jax.numpy as jnp
 
-        def kept(state: Any) -> dict[str, Any]:
-            return {
+        def iteration(_: Any, carry: tuple[Any, Any, Any, Any]) -> Any:
+            state, accepted, divergent, steps = carry
+            state = self.kernel.sample(state, (), {})
+            divergent = divergent | state.diverging
+            return state, accepted + state.accept_prob, divergent, steps + state.num_steps
+
+        def draw(i: Any, carry: tuple[Any, dict[str, Any]]) -> Any:
+            state, rows = carry
+            none = (jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int64))
+            state, accepted, divergent, steps = jax.lax.fori_loop(
+                0, thin, iteration, (state, *none)
+            )
+            kept = {
                 "theta": state.z,
                 "log_density": -state.potential_energy,
-                "acceptance": state.accept_prob,
-                "divergent": state.diverging,
-                "steps": state.num_steps,
+                "acceptance": accepted / thin,
+                "divergent": divergent,
+                "steps": steps,
             }
-
-        def iteration(i: Any, carry: tuple[Any, dict[str, Any], Any]) -> Any:
-            state, rows, gradients = carry
-            state = self.kernel.sample(state, (), {})
-            rows = {name: rows[name].at[i].set(value) for name, value in kept(state).items()}
-            return state, rows, gradients + state.num_steps
+            return state, {name: rows[name].at[i].set(value) for name, value in kept.items()}
 
         empty = {
-            name: jnp.zeros((CHUNK, *value.shape), value.dtype)
-            for name, value in kept(state).items()
+            "theta": jnp.zeros((CHUNK, *state.z.shape)),
+            "log_density": jnp.zeros(CHUNK),
+            "acceptance": jnp.zeros(CHUNK),
+            "divergent": jnp.zeros(CHUNK, bool),
+            "steps": jnp.zeros(CHUNK, jnp.int64),
         }
-        return jax.lax.fori_loop(0, steps, iteration, (state, empty, jnp.zeros((), jnp.int64)))
+        return jax.lax.fori_loop(0, draws, draw, (state, empty))
 
 
 def _bridge(

@@ -156,14 +156,14 @@ def test_a_prior_of_one_s_own_is_drawn_from(named, tmp_path, capsys):
 
 def test_a_preset_runs_beside_its_sampler(tmp_path):
     words = "compare gait --samplers mas mas.reference_code --draws 10 --settings.mas.steps 2"
-    assert main([*words.split(), "--out", str(tmp_path)]) == 0
+    assert main([*words.split(), "--workers", "0", "--out", str(tmp_path)]) == 0
     table = pd.read_csv(tmp_path / "table.csv")
     assert set(table["sampler"]) == {"mas", "mas.reference_code"}
 
 
 def test_own_clips_of_two_formats_make_a_problem(tmp_path):
     walks(tmp_path, 6)
-    words = "--held-out walk2 --samplers exact --draws 12 --rank 2 --styles 1 --out"
+    words = "--held-out walk2 --samplers exact --draws 12 --rank 2 --styles 1 --workers 0 --out"
     pattern = str(tmp_path / "walk*")
     assert main(["compare", "--clips", pattern, *words.split(), str(tmp_path / "out")]) == 0
     table = pd.read_csv(tmp_path / "out" / "table.csv")
@@ -260,7 +260,8 @@ def one_frame(folder: Path) -> str:
 
 def test_calibration_within_a_budget_goes_on(tmp_path, capsys):
     words = ["compare", "gait-sparse(frames=4, components=6)", "walk2d", "--samplers", "mh"]
-    words += ["--draws", "20", "--evaluations", "9000", "--calibrate", "10", "--out", str(tmp_path)]
+    words += ["--draws", "20", "--evaluations", "9000", "--calibrate", "10", "--workers", "0"]
+    words += ["--out", str(tmp_path)]
     for _ in range(2):
         assert main(words) == 0
         told = capsys.readouterr().out
@@ -346,10 +347,33 @@ def test_a_folder_that_cannot_be_written_to(out, tmp_path, capsys, monkeypatch):
     assert "Traceback" not in sentence
 
 
+def test_a_quick_look_is_of_few_draws_in_few_seconds_unless_told_otherwise(tmp_path, capsys):
+    words = ["compare", "gait", "--samplers", "exact", "--quick", "--workers", "0"]
+    assert main([*words, "--out", str(tmp_path / "a")]) == 0
+    assert "every sampler had 6 seconds per cell" in capsys.readouterr().out
+    assert json.loads((tmp_path / "a" / "comparison.json").read_text())["draws"] == 40
+    more = ["--draws", "12", "--evaluations", "100", "--out", str(tmp_path / "b")]
+    assert main([*words, *more]) == 0
+    assert "every sampler had 100 evaluations" in capsys.readouterr().out
+    assert json.loads((tmp_path / "b" / "comparison.json").read_text())["draws"] == 12
+
+
+def test_all_problems_are_those_whose_data_is_at_hand(tmp_path, capsys, monkeypatch):
+    at_hand = (["gait", "gait-sparse"], {"cmu": "no clips here"})
+    monkeypatch.setattr("probmotion.problems.problems_at_hand", lambda: at_hand)
+    words = ["--samplers", "exact", "--draws", "12", "--workers", "0", "--out", str(tmp_path)]
+    assert main(["compare", "all", *words]) == 0
+    assert "left out: cmu: no clips here" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert set(table["problem"]) == {"gait", "gait-sparse"}
+    assert main(["compare", "all", "gait", *words]) == 2
+    assert "problems is all gait, expected all, or some names" in said(capsys)
+
+
 # Ctrl-C.
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", ["0", "2"])
 def test_an_interrupted_comparison_keeps_what_is_finished(workers, tmp_path):
     words = ["compare", "gait", "--samplers", "exact", "mas", "--draws", "40"]
     words = [*words, "--out", str(tmp_path)]

@@ -212,6 +212,7 @@ class Study:
             draws=self.draws,
             chains=1,
             out=self.out / "comparisons" / part,
+            workers=0,
             progress=not self.quick,
         )
 

@@ -450,6 +450,7 @@ def posterior(study: Study) -> pd.DataFrame:
             draws=draws,
             chains=1,
             out=study.out / "comparisons" / name,
+            workers=0,
             progress=not study.quick,
         )
         for cell in found.results:

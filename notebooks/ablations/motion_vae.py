@@ -292,6 +292,7 @@ def generation(study: Study) -> pd.DataFrame:
             draws=draws,
             chains=1,
             out=study.out / "comparisons" / name,
+            workers=0,
             progress=not study.quick,
         )
         for cell in found.results:

@@ -168,6 +168,7 @@ class Study:
             draws=draws or self.draws // 10,
             chains=self.chains,
             out=self.out / "comparisons" / part,
+            workers=0,
             progress=not self.quick,
         )
         for cell in found.failures:

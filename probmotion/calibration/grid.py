@@ -90,7 +90,7 @@ def calibrate(
     check_count("simulations", simulations, least=FEWEST_SIMULATIONS)
     check_count("draws", draws, least=_FEWEST_DRAWS)
     check_count("chains", chains)
-    check_count("workers", workers)
+    check_count("workers", workers, least=0)
     if draws % chains:
         raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
     if time_limit is not None:

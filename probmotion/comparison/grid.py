@@ -62,9 +62,10 @@ def compare(
     out : str or Path, optional
         Folder for cells, ``table.csv`` and ``failures.json``; a temporary one by default.
     workers : int
-        Processes; 1 runs in this one.
+        Processes that are spawned; what one of them dies of is a row. 0 runs in this one, as a
+        debugger wants: where memory ends, all ends.
     executor : concurrent.futures.Executor, optional
-        Run the cells there; it must see the same ``out``.
+        Run the cells there instead; it must see the same ``out``.
     budget : Budget, optional
         What every sampler may spend on a cell, by the setting that it names as its ``effort``;
         pilot runs, once per problem and sampler, find out how much of it that is, and cost about
@@ -74,7 +75,7 @@ def compare(
         is a failure. It is ended in time in processes of our own, and in the main thread of a
         system with interval timers; elsewhere, as on an executor's threads, it runs to its end.
     progress : bool
-        Show bars, of cells and (with one worker) of draws.
+        Show bars, of cells and (in this process) of draws.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def compare(
     check_count("draws", draws, least=_FEWEST_DRAWS)
     check_count("chains", chains)
     check_count("seeds", seeds)
-    check_count("workers", workers)
+    check_count("workers", workers, least=0)
     if draws % chains:
         raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
     if time_limit is not None:

@@ -1,4 +1,8 @@
-"""Processes of our own that run tasks: what one of them dies of fails no other's task."""
+"""Processes of our own that run tasks: what one of them dies of fails no other's task.
+
+They are spawned, and do not import the script or notebook that asks for them: what is defined
+there travels by value, so a script needs no ``if __name__ == "__main__"``.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from types import ModuleType
 from typing import Any, Protocol
+
+import cloudpickle
 
 from probmotion.comparison.failures import TimeIsUp, WorkerDied
 from probmotion.threads import one_thread
@@ -57,7 +64,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=False)
-        with _born_deaf():
+        with _born_deaf(), _without_main():
             self.process.start()
         theirs.close()
         self.ready = False
@@ -66,8 +73,9 @@ class _Worker:
 
     def give(self, task: Task) -> None:
         """Hand over a task; raises what keeps it from travelling."""
-        # By value: multiprocessing's own pickler would share the memory of torch's tensors.
-        self.connection.send_bytes(pickle.dumps(task))
+        # multiprocessing's own pickler would share the memory of torch's tensors, and know classes
+        # of a notebook by name alone.
+        self.connection.send_bytes(cloudpickle.dumps(task))
         self.task = task
 
     def heard(self) -> bytes | None:
@@ -104,7 +112,7 @@ def run_in_processes(tasks: Sequence[Task], workers: int, done: Done) -> None:
     Raises
     ------
     RuntimeError
-        If processes do not start, as in a script without ``if __name__ == "__main__"``.
+        If processes do not start.
     """
     waiting = deque(tasks)
     crew: list[_Worker] = []
@@ -163,10 +171,7 @@ def _act(crew: list[_Worker], worker: _Worker, done: Done) -> None:
     elif said is not None:
         done(worker.rest(), pickle.loads(said))
     elif not worker.ready:
-        raise RuntimeError(
-            "a worker process ended before it had begun, and says why above; a script that asks "
-            'for workers does so below if __name__ == "__main__"'
-        )
+        raise RuntimeError("a worker process ended before it had begun, and says why above")
     else:
         crew.remove(worker)
         worker.connection.close()
@@ -219,6 +224,17 @@ def _born_deaf() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Processes that begin in the block do not run the caller's script."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _begin_worker() -> None:

@@ -1,5 +1,8 @@
-"""Settings that make a demonstration quick. They are never used unless asked for, and are printed
-under the table and stored with the draws like any others."""
+"""What makes a look at many problems quick: few draws, few seconds, and settings that cost less.
+
+Nothing of it is used unless asked for, and all of it is printed under the table and stored with the
+draws like any other.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import Any
 from probmotion.comparison.budgets import Budget
 from probmotion.sampling import Sampler, importable_samplers, load_sampler
 
-__all__ = ["QUICK", "QUICK_BUDGET", "QUICK_LIMIT", "quick_samplers"]
+__all__ = ["QUICK", "QUICK_BUDGET", "QUICK_DRAWS", "QUICK_LIMIT", "quick_samplers"]
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
     "sds": {"iterations": 2000},
@@ -17,11 +20,14 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
 }
 """By sampler: the settings that differ from its own defaults."""
 
+QUICK_DRAWS = 40
+"""Of a cell."""
+
 QUICK_BUDGET = Budget(seconds=6.0)
-"""Of a cell of 40 draws, for a look at many problems."""
+"""Of a cell."""
 
 QUICK_LIMIT = 60.0
-"""Seconds after which a cell of that grid, or its pilots, is given up (``time_limit``)."""
+"""Seconds after which a cell, or the pilots of its budget, is given up (``time_limit``)."""
 
 
 def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:

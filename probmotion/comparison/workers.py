@@ -27,7 +27,7 @@ def run_tasks(
     tasks : sequence of Task
         What to run.
     workers : int
-        1: in this process, with a bar for the draws of each cell; more: that many processes.
+        That many processes; 0: in this one, with a bar for the draws of each cell.
     executor : Executor, optional
         Run there instead.
     progress : bool
@@ -59,7 +59,7 @@ def run_tasks(
 
         if executor is not None:
             _run_on(executor, tasks, done)
-        elif workers == 1:
+        elif workers == 0:
             for task in tasks:
                 run_task(task, progress)
                 done(task, None)

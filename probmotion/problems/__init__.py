@@ -26,6 +26,7 @@ __all__ = [
     "problem_descriptions",
     "problem_names",
     "problem_without_reference",
+    "problems_at_hand",
 ]
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
@@ -36,6 +37,19 @@ _SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")
 def problem_names() -> list[str]:
     """Return the names of all problems that :func:`load_problem` knows."""
     return [*_GAITS, *_OTHERS]
+
+
+def problems_at_hand() -> tuple[list[str], dict[str, str]]:
+    """Return the names of the problems whose data is here, and of the others why they are not."""
+    found, left_out = [], {}
+    for name in problem_names():
+        try:
+            load_problem(name)
+        except FileNotFoundError as error:
+            left_out[name] = str(error)
+        else:
+            found.append(name)
+    return found, left_out
 
 
 def problem_descriptions() -> dict[str, str]:

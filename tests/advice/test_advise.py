@@ -122,7 +122,7 @@ def test_a_problem_that_was_not_measured_is_refused():
 def test_what_a_comparison_finds_is_kept_and_read(tmp_path):
     problem = load_problem("gait", frames=4)
     asked = {"exact": ExactSampler(), "sds": ScoreDistillation(iterations=3)}
-    comparison = compare(problem, asked, draws=12, chains=2, seeds=2, progress=False)
+    comparison = compare(problem, asked, draws=12, chains=2, seeds=2, workers=0, progress=False)
     keep_measured(comparison, "a test", tmp_path)
     found = measured(tmp_path)
     assert (found.command, found.draws, found.seeds) == ("a test", 12, 2)

@@ -95,7 +95,7 @@ class Unfit(Batch):
         raise UnsupportedPosterior("unfit", "takes no evidence", "evidence", ["exact"])
 
 
-SMALL = {"draws": 30, "chains": 2, "progress": False}
+SMALL = {"draws": 30, "chains": 2, "workers": 0, "progress": False}
 
 
 # Direct ranks: a Gaussian posterior N(μ, 1) of θ, draws of N(μ + shift, width²).

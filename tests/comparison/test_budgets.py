@@ -16,7 +16,7 @@ from probmotion.comparison.budgets import affordable, effort_of
 from probmotion.samplers import MetropolisHastings, MultiViewAncestral
 from probmotion.sampling import load_sampler, sampler_names
 
-SMALL = {"draws": 20, "chains": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 
 
 def line(fixed, slope):
@@ -140,7 +140,7 @@ def test_the_same_settings_in_processes_and_when_a_run_goes_on(tmp_path):
         return [result.budget for result in found.results]
 
     here = compare(generation(), Walking(), **settings)
-    there = compare(generation(), Walking(), workers=2, **settings)
+    there = compare(generation(), Walking(), **(settings | {"workers": 2}))
     assert used(here) == used(there)
     sampler = Walking(diary=str(diary))
     for seeds, runs in ((1, 1), (1, 0), (3, 2)):

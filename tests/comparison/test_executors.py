@@ -14,7 +14,7 @@ from toy_samplers import Crashing, PriorDraws, generation, monocular
 from probmotion.comparison import Budget, compare
 from probmotion.comparison.failures import CellNotKept
 
-SMALL = {"draws": 20, "chains": 2, "seeds": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "seeds": 2, "workers": 0, "progress": False}
 SAMPLERS = {"toy": PriorDraws(), "wide": PriorDraws(2.0), "crashing": Crashing()}
 
 

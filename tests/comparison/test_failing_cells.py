@@ -29,7 +29,7 @@ from probmotion.comparison import Comparison, compare
 from probmotion.comparison.failures import CellNotKept, Failure, TimeIsUp, WorkerDied
 from probmotion.comparison.time_limits import time_limit
 
-SMALL = {"draws": 20, "chains": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 WORDS = {
     NotANumber(): "nan",
     Unchecked(): "nan",
@@ -85,7 +85,9 @@ def test_a_cell_that_takes_longer_than_its_limit_is_a_row():
 
 def test_processes_are_killed_where_an_alarm_is_not_heard():
     samplers = {"deaf": Endless(deaf=True), "dying": Dying(), "right": PriorDraws()}
-    comparison = compare(generation(), samplers, time_limit=6.0, workers=2, seeds=2, **SMALL)
+    comparison = compare(
+        generation(), samplers, time_limit=6.0, seeds=2, **(SMALL | {"workers": 2})
+    )
     words = {(r.sampler, r.seed): r.failure and r.failure.word for r in comparison.results}
     assert words == {
         **{("deaf", seed): "time" for seed in (0, 1)},
@@ -153,16 +155,16 @@ def test_on_another_thread_a_limit_is_told_at_the_end():
     assert found == ["ended", "told"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [0, 2])
 def test_draws_that_no_file_can_hold_are_a_row(tmp_path, workers):
     samplers = {"odd": Unwritable(), "right": PriorDraws()}
-    found = compare(generation(), samplers, out=tmp_path, workers=workers, **SMALL)
+    found = compare(generation(), samplers, out=tmp_path, **(SMALL | {"workers": workers}))
     words = {result.sampler: result.failure and result.failure.word for result in found.results}
     assert words == {"odd": "TypeError", "right": None}
     assert not list(tmp_path.glob("cells/*/*/.unfinished*"))
 
 
-@pytest.mark.parametrize(("workers", "how"), [(1, ()), (2, ()), (2, ("slow",))])
+@pytest.mark.parametrize(("workers", "how"), [(0, ()), (2, ()), (2, ("slow",))])
 def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers, how):
     script = tmp_path / "run.py"
     script.write_text(FULL_DISK)
@@ -180,7 +182,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, workers, how):
     assert "OSError: out cannot be written to any more" in last
     finished = int(re.search(r"with (\d) of 4 cells finished, which are kept in", last)[1])
     # Of two workers one may still be at its first cell when the other's disk is full.
-    assert finished == 2 if workers == 1 else 1 <= finished <= 2
+    assert finished == 2 if workers == 0 else 1 <= finished <= 2
     assert len(Comparison.load(out).results) == finished
     # Not even what a worker was killed at while it wrote.
     assert (out / "began to write").exists() == bool(how)
@@ -201,19 +203,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 from toy_samplers import PriorDraws, generation
-from probmotion.comparison import compare
+from probmotion.comparison import compare, plan
 from probmotion.draws import MotionDraws
 
-if "slow" in sys.argv:
-    save = MotionDraws.save
 
-    def save_slowly(draws, path):
-        save(draws, path)
-        if path.parent.name.startswith(".unfinished-0"):
-            Path(sys.argv[1], "began to write").touch()
-            time.sleep(100)
-
-    MotionDraws.save = save_slowly
+def save_slowly(draws, path, save=MotionDraws.save):
+    save(draws, path)
+    if path.parent.name.startswith(".unfinished-0"):
+        Path(sys.argv[1], "began to write").touch()
+        time.sleep(100)
 
 
 @dataclass(frozen=True)
@@ -222,6 +220,8 @@ class Filling(PriorDraws):
     room: ClassVar[bool] = "room" in sys.argv
 
     def sample(self, posterior, **settings):
+        if "slow" in sys.argv:
+            MotionDraws.save = save_slowly
         if self.spread > 1 and not self.room:
             while "slow" in sys.argv and not Path(sys.argv[1], "began to write").exists():
                 time.sleep(0.01)
@@ -229,13 +229,10 @@ class Filling(PriorDraws):
         return super().sample(posterior, **settings)
 
 
-if __name__ == "__main__":
-    samplers = {"a": Filling(1.0), "b": Filling(2.0)}
-    names = list(samplers)
-    from probmotion.comparison import plan
-    # All cells of one sampler first.
-    plan.Plan.cells = lambda self: (("generation", s, k) for s in self.samplers for k in (0, 1))
-    out, workers, *_ = sys.argv[1:]
-    compare(generation(), samplers, seeds=2, draws=20, chains=2, out=out, workers=int(workers),
-            progress=False)
+samplers = {"a": Filling(1.0), "b": Filling(2.0)}
+# All cells of one sampler first.
+plan.Plan.cells = lambda self: (("generation", s, k) for s in self.samplers for k in (0, 1))
+out, workers, *_ = sys.argv[1:]
+compare(generation(), samplers, seeds=2, draws=20, chains=2, out=out, workers=int(workers),
+        progress=False)
 """

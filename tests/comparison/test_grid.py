@@ -27,7 +27,7 @@ from probmotion.comparison.plan import Plan
 from probmotion.problems import Problem
 from probmotion.samplers import ExactSampler
 
-SMALL = {"draws": 20, "chains": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 
 
 def numbers(comparison):
@@ -107,7 +107,7 @@ def test_the_bits_are_the_same_wherever_cells_run(grid, where, capsys):
     problems = [generation(), monocular()]
     settings = {**SMALL, "seeds": 2}
     if where == "processes":
-        found = compare(problems, samplers, workers=2, **settings)
+        found = compare(problems, samplers, **(settings | {"workers": 2}))
     elif where == "threads":
         with ThreadPoolExecutor(2) as executor:
             found = compare(problems, samplers, executor=executor, **settings)
@@ -127,7 +127,7 @@ def test_the_bits_are_the_same_wherever_cells_run(grid, where, capsys):
 
 def test_registered_problems_are_the_same_in_every_process():
     here, there = (
-        compare("quadruped", ExactSampler(), workers=workers, **SMALL) for workers in (1, 2)
+        compare("quadruped", ExactSampler(), **(SMALL | {"workers": workers})) for workers in (1, 2)
     )
     assert numbers(here) == numbers(there)
 
@@ -170,7 +170,7 @@ def test_failures_are_recorded_and_stop_nothing(tmp_path):
 
 def test_a_worker_that_dies_fails_its_own_cell():
     samplers = [Dying(), PriorDraws(), ExactSampler()]
-    comparison = compare(generation(), samplers, workers=2, seeds=2, **SMALL)
+    comparison = compare(generation(), samplers, seeds=2, **(SMALL | {"workers": 2}))
     metrics = {
         (result.sampler, result.seed): result.metrics or result.failure.message
         for result in comparison.results
@@ -178,9 +178,8 @@ def test_a_worker_that_dies_fails_its_own_cell():
     assert len(metrics) == 6
     assert "a worker process died" in metrics["dying", 0]
     assert "a worker process died" in metrics["dying", 1]
-    # At most one neighbour can have been under way in each of the two accidents.
-    failed = [key for key, value in metrics.items() if isinstance(value, str)]
-    assert len(failed) <= 4
+    failed = {key for key, value in metrics.items() if isinstance(value, str)}
+    assert failed == {("dying", 0), ("dying", 1)}
 
 
 def test_what_cannot_travel_to_a_worker_fails_its_own_cell():
@@ -188,9 +187,12 @@ def test_what_cannot_travel_to_a_worker_fails_its_own_cell():
     class Local(PriorDraws):
         name: ClassVar[str] = "local"
 
-    comparison = compare(generation(), [Local(), PriorDraws()], workers=2, **SMALL)
+        def __reduce__(self):
+            raise TypeError("Local holds a telescope")
+
+    comparison = compare(generation(), [Local(), PriorDraws()], **(SMALL | {"workers": 2}))
     found = {result.sampler: result for result in comparison.results}
-    assert "Local" in found["local"].failure.message
+    assert found["local"].failure.message == "Local holds a telescope"
     assert found["prior-draws"].failure is None
 
 
@@ -219,7 +221,7 @@ def test_a_bare_posterior_and_other_names():
         ("gait", {"../up": "exact"}, {}, "samplers has the name '../up', expected letters"),
         ("gait", "exact", {"draws": 9}, "draws is 9, expected an integer of at least 10"),
         ("gait", "exact", {"draws": 21}, "draws is 21, expected a multiple of chains, 2"),
-        ("gait", "exact", {"workers": 0}, "workers is 0, expected an integer of at least 1"),
+        ("gait", "exact", {"workers": -1}, "workers is -1, expected an integer of at least 0"),
         ("gait", "exact", {"seeds": 1.5}, "seeds is 1.5, expected an integer of at least 1"),
     ],
 )

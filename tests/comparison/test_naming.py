@@ -25,7 +25,7 @@ def settings_of(sampler: Any) -> dict[str, str]:
 def test_a_problem_of_one_s_own_may_be_called_like_a_registered_one(name):
     mine = replace(generation(), name=name)
     assert named_problems(mine) == {name: mine}
-    found = compare(mine, PriorDraws(), draws=10, chains=1, progress=False)
+    found = compare(mine, PriorDraws(), draws=10, chains=1, workers=0, progress=False)
     assert found.failures == []
     assert set(found.table()["problem"]) == {name}
 

@@ -15,7 +15,7 @@ from probmotion.comparison import Comparison, compare, tasks
 from probmotion.comparison.locks import locked
 from probmotion.samplers import ExactSampler
 
-SMALL = {"draws": 20, "chains": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 HOLDER = """
 import sys, time
 from pathlib import Path

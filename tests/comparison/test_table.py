@@ -17,7 +17,7 @@ from probmotion.comparison.table import ComparisonTable, _mean_and_sd
 from probmotion.samplers import ExactSampler, ScoreDistillation
 from probmotion.sampling import sampler_names
 
-SMALL = {"draws": 20, "chains": 2, "progress": False}
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_quick_settings_are_shown_and_stored():
     assert quick["sds"] == ScoreDistillation(**QUICK["sds"])
     assert quick["sds"] != ScoreDistillation()
     comparison = compare(
-        generation(), {"sds": ScoreDistillation(iterations=3)}, draws=10, chains=1, progress=False
+        generation(), {"sds": ScoreDistillation(iterations=3)}, **(SMALL | {"draws": 10})
     )
     assert "sds ran with iterations=3; its other settings are its defaults" in str(comparison)
     settings = json.loads(comparison.draws("generation", "sds").dataset.attrs["settings"])

@@ -141,7 +141,9 @@ def test_it_can_be_simulated_and_so_calibrated(prior, walks):
     residual = (evidence.joints - again.truth)[~hidden] / 0.04
     assert abs(residual.var() - 1) < 5 * np.sqrt(2 / residual.size)
     assert again.posterior.prior is problem.posterior.prior
-    ranked = calibrate(problem, DVAEInference(), simulations=10, draws=20, chains=2, progress=False)
+    ranked = calibrate(
+        problem, DVAEInference(), simulations=10, draws=20, chains=2, workers=0, progress=False
+    )
     assert not ranked.failures
     # The network learnt from other motions than the prior draws, and for seconds.
     assert "dvae on denoise: too sure" in ranked.verdict(problem.name, "dvae")

@@ -104,7 +104,9 @@ def test_compare_runs_it_with_no_download(tmp_path):
         "sds": ScoreDistillation(iterations=3),
         "nuts": NUTS(),
     }
-    table = compare("walk2d", samplers, draws=12, chains=2, out=tmp_path, progress=False).table()
+    table = compare(
+        "walk2d", samplers, draws=12, chains=2, out=tmp_path, workers=0, progress=False
+    ).table()
     kept = table.pivot_table(index="sampler", columns="metric", values="value")
     assert set(kept["fid"].dropna().index) == {"mas", "sds"}
     text = str(table)

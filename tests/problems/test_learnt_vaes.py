@@ -107,7 +107,7 @@ def test_compare_draws_from_it_by_every_kind_of_sampler() -> None:
     samplers = {"sds": {"iterations": 20}, "mh": {"warmup": 50}, "dvae": {}}
     made = {name: load_sampler(name)(**given) for name, given in samplers.items()}
     table = compare(
-        "walk-vae-monocular", made, draws=20, seeds=1, progress=False, workers=1
+        "walk-vae-monocular", made, draws=20, seeds=1, progress=False, workers=0
     ).table()
     found = table[table["metric"] == "mpjpe_mm"].set_index("sampler")["value"]
     assert set(found.index) == set(samplers)

@@ -104,6 +104,7 @@ def test_compare_says_who_can_and_why_others_cannot(problem, tmp_path):
         draws=20,
         chains=2,
         out=tmp_path,
+        workers=0,
         progress=False,
     )
     text = str(comparison.table())

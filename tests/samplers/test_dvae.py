@@ -450,7 +450,7 @@ def test_compare_runs_it_in_two_processes(posterior, walks, denoiser, tmp_path):
     problem = Problem("walk", "noisy joints of a made walk", posterior, truth)
     samplers = {"answered": DVAEInference(network=denoiser), "fitted": replace(FIT, iterations=3)}
     tables = []
-    for workers in (2, 1):
+    for workers in (2, 0):
         found = compare(
             problem,
             samplers,
