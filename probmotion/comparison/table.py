@@ -14,7 +14,7 @@ __all__ = ["ComparisonTable"]
 
 _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
     (
-        "against exact draws",
+        "against reference draws",
         {
             "seconds": "seconds",
             "swd": "swd",
