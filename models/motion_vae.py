@@ -40,8 +40,8 @@ class MotionVAE(StandardNormalPrior):
     """Motions of an articulated body, as learnt from 2D tracks alone.
 
     θ is the latent code z, all of it N(0, 1). The rigid path is given: by default the body stands
-    at the origin, upright, and looks along +Z. With keypoints of a known camera,
-    :meth:`placed_by` puts it where the pose network sees it.
+    at the origin, upright, and looks along +Z, where it has no evidence. With keypoints of a known
+    camera, :meth:`placed_by` puts it where the pose network sees it.
 
     Parameters
     ----------
@@ -95,6 +95,7 @@ class MotionVAE(StandardNormalPrior):
         self.body = body
         self.card = dict(card or {})
         self.rigid = RigidPath.upright(body, settings.frames) if rigid is None else rigid
+        self._placed = rigid is not None
         if self.rigid.frames != settings.frames:
             raise ValueError(
                 f"rigid has {self.rigid.frames} frames, expected {settings.frames}, as many as a "
@@ -201,6 +202,19 @@ class MotionVAE(StandardNormalPrior):
             )
         seen = see_body(self.model.pose, self.settings, self.body, likelihood)
         return self.placed(seen.path, seen.log_lengths)
+
+    def check_evidence(self, likelihood: Likelihood) -> None:
+        """Raise ``ValueError`` if no one has said where the body is that the evidence is of.
+
+        No code can move or turn the body: of one that stands elsewhere, codes would be bent to
+        explain where it is.
+        """
+        if not self._placed:
+            raise ValueError(
+                "prior has a body that no one has placed: it stands at the origin and looks along "
+                "+Z; expected MotionVAE.placed_by(likelihood), or MotionVAE.placed(path) where its "
+                "path is known"
+            )
 
     @property
     def skeleton(self) -> Skeleton:

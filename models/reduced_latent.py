@@ -16,7 +16,9 @@ import torch
 from probmotion import seeds
 from probmotion.arrays import Array, constant
 from probmotion.checks import check_count, check_shape
+from probmotion.likelihoods import Likelihood
 from probmotion.models.standard_normal import StandardNormalPrior
+from probmotion.priors import ChecksEvidence
 from probmotion.skeleton import Skeleton
 
 __all__ = ["ReducedLatent"]
@@ -94,6 +96,11 @@ class ReducedLatent(StandardNormalPrior):
     def dim(self) -> int:
         """Length k of θ."""
         return self.directions.shape[1]
+
+    def check_evidence(self, likelihood: Likelihood) -> None:
+        """Raise ``ValueError`` if the prior does."""
+        if isinstance(self.prior, ChecksEvidence):
+            self.prior.check_evidence(likelihood)
 
     def latent(self, theta: Array) -> Array:
         """Return z = U θ, ``(…, k) → (…, Z)``."""

@@ -73,6 +73,8 @@ def seen_draw_problem(
         Of the draw and its noise.
     """
     vae = models.MotionVAE.load(prior)
+    # Where the body stands is known here: the draw and its evidence are of one that stands there.
+    vae = vae.placed(vae.rigid)
     truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
     seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
     assert isinstance(seen, Keypoints2D)

@@ -329,6 +329,17 @@ def test_evidence_that_cannot_be_seen_is_refused(prior, options, sentence):
         prior.placed_by(evidence(prior, **options))
 
 
+def test_a_body_that_no_one_has_placed_has_no_evidence(prior):
+    seen = evidence(prior)
+    for unplaced in (prior, fresh(log_lengths=np.zeros(BODY.n_groups)), ReducedLatent(prior, 2)):
+        with pytest.raises(ValueError, match=r"^prior has a body that no one has placed: .*_by\("):
+            MotionPosterior(unplaced, seen)
+        assert MotionPosterior(unplaced).likelihood is None
+    known = prior.placed(prior.rigid)
+    for placed in (prior.placed_by(seen), fresh(rigid=some_path()), known, ReducedLatent(known, 2)):
+        assert MotionPosterior(placed, seen).likelihood is seen
+
+
 def test_wrong_parts_are_refused(prior):
     joints = Joints3D(np.zeros((6, 9, 3)), 0.1)
     with pytest.raises(ValueError, match="likelihood is Joints3D, expected Keypoints2D"):

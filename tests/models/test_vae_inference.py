@@ -1,4 +1,4 @@
-"""The encoder as an inference network: the bound, its fit, its draws, and NUTS beside it."""
+"""The encoder as an inference network: the bound, its fit, its draws, and samplers beside it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from probmotion.models.articulated_body import ArticulatedBody
 from probmotion.models.motion_vae import MotionVAE
 from probmotion.models.motion_vae_model import MotionVAEModel
 from probmotion.models.motion_vae_settings import MotionVAESettings
+from probmotion.models.reduced_latent import ReducedLatent
 from probmotion.models.rigid_paths import RigidPath
 from probmotion.models.vae_inference import VAEEncoder
 from probmotion.priors import InferenceNetwork
-from probmotion.samplers import NUTS, DVAEInference
+from probmotion.samplers import NUTS, DVAEInference, Ensemble, MetropolisHastings
 from probmotion.seeds import NormalStreams
 
 ARM = Skeleton(["pelvis", "neck", "left_shoulder", "left_elbow"], [-1, 0, 1, 2])
@@ -28,12 +29,17 @@ SIZE = replace(MotionVAESettings.tiny(), frames=4, latent=2)
 CAMERA = Cameras.around(np.array([0.4]), np.array([0.1]))
 
 
-@pytest.fixture(scope="module")
-def prior():
-    model = MotionVAEModel.of(SIZE, BODY)
+def fresh(size=SIZE):
+    model = MotionVAEModel.of(size, BODY)
     with torch.no_grad():
         model.vae.bone_decoder.leave.weight.mul_(15)
-    return MotionVAE(model.vae, model.pose, SIZE, BODY, 20.0)
+    rigid = RigidPath.upright(BODY, size.frames)
+    return MotionVAE(model.vae, model.pose, size, BODY, 20.0, rigid=rigid)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return fresh()
 
 
 def seen_of(prior, z=(0.7, -0.5), noise=0.03, camera=CAMERA, **options):
@@ -221,6 +227,25 @@ def test_nuts_agrees_with_the_posterior(prior):
     theta = draws.dataset["theta"].values.reshape(-1, 2)
     np.testing.assert_allclose(theta.mean(axis=0), mean, atol=0.4 * deviation.min())
     np.testing.assert_allclose(theta.std(axis=0), deviation, rtol=0.3)
+
+
+def test_ensemble_and_mh_agree_in_the_reduced_latent():
+    """Of five dimensions two are kept: what walkers find in them is what chains find."""
+    whole = fresh(replace(SIZE, latent=5))
+    reduced = ReducedLatent(whole, 2)
+    posterior = MotionPosterior(reduced, seen_of(reduced))
+    mean, deviation = on_a_grid(posterior)
+    # Evidence says much: neither finds the prior's N(0, 1).
+    assert deviation.max() < 0.5
+    for sampler in (
+        Ensemble(walkers=16, warmup=200, thin=10, candidates=16),
+        MetropolisHastings(warmup=200, thin=5, candidates=16),
+    ):
+        draws = sampler.sample(posterior, draws=300, chains=2, seed=0, progress=False)
+        theta = draws.dataset["theta"].values.reshape(-1, 2)
+        np.testing.assert_allclose(draws.flat(), whole.motion(reduced.latent(theta)), atol=1e-12)
+        np.testing.assert_allclose(theta.mean(axis=0), mean, atol=0.3 * deviation.min())
+        np.testing.assert_allclose(theta.std(axis=0), deviation, rtol=0.3)
 
 
 def on_a_grid(posterior):
