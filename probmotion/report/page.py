@@ -6,6 +6,7 @@ One file that asks nothing of the network: what is in it can be put into a paper
 from __future__ import annotations
 
 import base64
+import io
 import tempfile
 from collections.abc import Mapping
 from html import escape
@@ -19,7 +20,7 @@ from probmotion.pictures.colours import CYCLE, LEFT, RIGHT
 from probmotion.report.heads import contents, facts, note_ids, notes, reading
 from probmotion.report.motions import Shown
 from probmotion.report.overview import overview
-from probmotion.report.players import players, shown_problems
+from probmotion.report.players import BUDGET, players, shown_problems
 from probmotion.report.plots import quality_against_cost
 from probmotion.report.tables import Outcome, problem_tables
 
@@ -35,6 +36,8 @@ _ON_DARK = (
 )  # fmt: skip
 """The colours of CYCLE where paper is dark."""
 _LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
+_LEAST = BUDGET // 9
+"""Bytes that are left for motions however large a calibration's picture is."""
 
 
 def write_report(
@@ -69,7 +72,8 @@ def write_report(
 
 def _page(comparison: Comparison, calibration: Calibration | None) -> str:
     plan, table = comparison.plan, comparison.table()
-    shown = shown_problems(comparison)
+    picture = b"" if calibration is None else _picture(calibration)
+    shown = shown_problems(comparison, max(_LEAST, BUDGET - len(picture)))
     ids = note_ids(comparison)
     outcomes = {
         name: {sampler: _outcome(comparison, name, sampler, ids) for sampler in plan.samplers}
@@ -80,7 +84,7 @@ def _page(comparison: Comparison, calibration: Calibration | None) -> str:
         for place, name in enumerate(plan.problems)
     ]
     if calibration is not None:
-        sections.append(_calibration(calibration))
+        sections.append(_calibration(calibration, picture))
     count = len(plan.samplers), len(plan.problems)
     title = " on ".join(
         f"{n} {kind}{'s' * (n != 1)}" for n, kind in zip(count, ("sampler", "problem"), strict=True)
@@ -168,12 +172,24 @@ def _outcome(
     )
 
 
-def _calibration(calibration: Calibration) -> str:
-    """The plot as it is written for paper, and the numbers in it as words."""
+def _picture(calibration: Calibration) -> bytes:
+    """Return the plot of a calibration as it is written for paper: PNG of as few bytes as serve."""
+    from PIL import Image
+
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder) / "calibration.png"
         calibration.plot(picture)
-        coded = base64.b64encode(picture.read_bytes()).decode("ascii")
+        with Image.open(picture) as drawn:
+            # A palette takes a third of the bytes, and nobody sees it in lines and bars.
+            few = drawn.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    coded = io.BytesIO()
+    few.save(coded, "png")
+    return coded.getvalue()
+
+
+def _calibration(calibration: Calibration, picture: bytes) -> str:
+    """The plot, and the numbers in it as words."""
+    coded = base64.b64encode(picture).decode("ascii")
     return f"""\
 <section id="calibration" aria-labelledby="calibration-name">
 <header><h2 id="calibration-name">Calibration</h2></header>

@@ -15,17 +15,17 @@ from probmotion.report.motions import Shown, choose_draws, motion_numbers
 if TYPE_CHECKING:
     from probmotion.comparison import Comparison
 
-__all__ = ["players", "shown_problems"]
+__all__ = ["BUDGET", "players", "shown_problems"]
 
 _MOST = 4
 _MOST_POSES = 6
-_BUDGET = 9_000_000
-"""Bytes of numbers that a page may have: written in letters they are a third more."""
+BUDGET = 9_000_000
+"""Bytes of numbers and pictures that a page may have: written in letters they are a third more."""
 _HELD_OUT = "held-out poses"
 _REFERENCE = "reference draws"
 
 
-def shown_problems(comparison: Comparison, budget: int = _BUDGET) -> dict[str, Shown]:
+def shown_problems(comparison: Comparison, budget: int = BUDGET) -> dict[str, Shown]:
     """Return what can be seen of each problem, by name: 4 draws of each sampler, or as many as fit.
 
     Where one of each is still too much, frames are left out as well. A problem that no sampler drew

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
+from PIL import Image
 
 from probmotion import Cameras, MotionDraws, MotionPosterior, seeds
 from probmotion.comparison.cells import CellResult, Failure
@@ -20,11 +22,12 @@ from probmotion.comparison.table import ComparisonTable
 from probmotion.data.gaits import make_gait
 from probmotion.likelihoods import Joints3D, Keypoints2D
 from probmotion.models import GaussianMixtureMotion
+from probmotion.pictures.rank_plots import draw_ranks
 from probmotion.problems import Problem
 from probmotion.report.label_places import place_labels
 from probmotion.report.motions import Shown, motion_numbers
 from probmotion.report.page import write_report
-from probmotion.report.players import shown_problems
+from probmotion.report.players import BUDGET, shown_problems
 
 SCRIPT = "</script><script>alert(1)</script><b onclick='x'>&\"'"
 WALK = make_gait("walk", frames=12)
@@ -312,17 +315,62 @@ def test_what_is_no_page_is_refused(made, tmp_path):
 
 
 class Calibrated:
-    """A calibration of which only a picture and a table are there."""
+    """A calibration of which only a picture and a table are there, a block per sampler."""
+
+    def __init__(self, blocks: int) -> None:
+        self.blocks = blocks
 
     def table(self) -> ComparisonTable:
         return ComparisonTable([], columns=["problem", "sampler", "seed", "metric", "value"])
 
     def plot(self, path: Path) -> None:
-        Path(path).write_bytes(b"a picture")
+        rng = np.random.default_rng(0)
+        ranks = {name: rng.random(150) for name in "abcdefgh"}
+        draw_ranks({"a sampler: no deviation found": ranks}, path)
+        with Image.open(path) as one:
+            whole = Image.new(one.mode, (one.width, self.blocks * one.height))
+            for place in range(self.blocks):
+                whole.paste(one, (0, place * one.height))
+        whole.save(path)
 
 
 def test_calibration_is_in_the_page(made, tmp_path):
-    page = write_report(made, tmp_path / "report.html", Calibrated()).read_text(encoding="utf-8")
-    assert f"data:image/png;base64,{base64.b64encode(b'a picture').decode()}" in page
-    assert re.search(r'<img[^>]* alt="[^"]+', page, re.DOTALL)
+    page = write_report(made, tmp_path / "report.html", Calibrated(1)).read_text(encoding="utf-8")
+    coded = re.search(r'<img[^>]* src="data:image/png;base64,([^"]*)"\s+alt="[^"]', page)
+    drawn, shown = tmp_path / "drawn.png", tmp_path / "shown.png"
+    Calibrated(1).plot(drawn)
+    shown.write_bytes(base64.b64decode(coded[1]))
+    # The same picture in fewer bytes.
+    off = np.abs(imread(drawn)[..., :3] - imread(shown)[..., :3])
+    assert off.mean() < 0.002
+    assert off.max() < 0.25
+    assert shown.stat().st_size < drawn.stat().st_size / 2
     assert "calibration" in read(page).ids
+
+
+class Long(Made):
+    """Motions of minutes, which fill a page."""
+
+    def __init__(self, folder: Path) -> None:
+        walk = make_gait("walk", frames=8700)
+        noise = np.random.default_rng(0).normal(size=(1, 1, *walk.positions.shape))
+        prior = GaussianMixtureMotion(
+            skeleton=walk.skeleton, fps=30.0, means=walk.positions[None], factors=0.02 * noise,
+            weights=np.ones(1), noise=0.01, azimuths=1, styles=("walk",),
+        )  # fmt: skip
+        super().__init__(folder, [Problem("long", "minutes", MotionPosterior(prior))], numbers=1)
+
+    def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
+        posterior = self.problems[problem].posterior
+        drawn = posterior.prior.sample(seeds.generator(seed, problem, sampler), 4)
+        return MotionDraws.of(posterior, Named(), drawn[None], seed=seed, seconds=1.0)
+
+
+def test_no_page_is_heavy(tmp_path):
+    long = Long(tmp_path)
+    rows = shown_problems(long)["long"].rows
+    assert [len(row) for row in rows.values()] == [2, 4, 4]
+    assert 0.95 * BUDGET < 2 * sum(row.size for row in rows.values()) < BUDGET
+    path = write_report(long, tmp_path / "report.html", Calibrated(18))
+    # Of 15 MB; the tables and plots of a larger grid take some.
+    assert path.stat().st_size < 13e6

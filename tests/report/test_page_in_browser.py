@@ -5,12 +5,12 @@ from __future__ import annotations
 import html
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from live_browser import browser_command
 
 from probmotion import Cameras, Keypoints2D, MotionDraws, MotionPosterior, seeds
 from probmotion.comparison.cells import CellResult, Failure
@@ -64,7 +64,8 @@ class Filmed(Comparison):
         return MotionDraws.of(self.problem.posterior, Named(), drawn, seed=0, seconds=1.0)
 
 
-# Where time is virtual, chromium draws no frames and sees no place: clocks stand for them.
+# Where time is virtual, chromium draws no frames and sees no place: clocks stand for them. The
+# test of a live page has it draw.
 WATCH = """
 window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now() - 30), 16);
 window.cancelAnimationFrame = clearTimeout;
@@ -183,9 +184,7 @@ def places(camera: Cameras, height: float) -> list[list[list[float]]]:
 
 def watched(folder: Path, *words: str) -> dict:
     """Write the page, let a browser play it, and return what was seen."""
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("there is no chromium to play the page in")
+    browser = browser_command()
     comparison = Filmed(folder)
     path = write_report(comparison, folder / "report.html")
     data = motion_numbers(shown_problems(comparison)["filmed"])
