@@ -2,8 +2,8 @@
 
 A sampler's class names in ``effort`` the settings that its cost grows with, the first one counted
 in its own units and the others kept in proportion to it, and in ``least_effort`` the smallest
-value that makes sense. Pilot runs, each of twice the effort of the one before, show what a unit of
-it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of seconds
+value that makes sense. Pilot runs, each of 2 to 8 times the effort of the one before, show what a
+unit of it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of seconds
 the first pilot is run twice: libraries compile at the first.
 """
 
@@ -23,6 +23,8 @@ __all__ = ["Budget", "affordable", "check_budget", "effort_of"]
 _WORTH = {"gradient": 2}
 # The pilots end when they have shown this share of what the effort may cost.
 _SHOWN = 0.25
+# How much more effort the next pilot has: the less has been spent, the more.
+_GROWTH = 2, 8
 # A sampler whose cost has not grown at this multiple of the effort that it was given has none, as
 # one whose network is trained already. Evaluations are counted; seconds vary by this share.
 _MULTIPLE = 4
@@ -138,13 +140,19 @@ def affordable(
     noise = _NOISE if budget.evaluations is None else 0.0
     wanted = _SHOWN * (budget.amount - costs[0][1])
     while costs[-1][1] - costs[0][1] <= wanted:
-        effort = 2 * costs[-1][0]
+        effort = costs[-1][0] * _growth(costs[0][1] + wanted, costs[-1][1])
         if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[0][1]:
             return {}
         if not _accepts(sampler, effort):
             break
         costs.append((effort, pilot(_with(sampler, effort))))
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))
+
+
+def _growth(wanted: float, spent: float) -> int:
+    """Return by how much to multiply the effort: to what is wanted, if nothing costs at rest."""
+    least, most = _GROWTH
+    return max(least, int(min(most, wanted / spent))) if spent > 0 else most
 
 
 def _solve(costs: list[tuple[int, float]], amount: float) -> int:

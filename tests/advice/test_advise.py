@@ -74,12 +74,13 @@ def test_a_ratio_of_half_is_as_wrong_as_of_double():
         ("tr", 0.5, "spread wrong: trace of covariance 0.5 of the exact"),
         ("tr", 1.6, "spread wrong: trace of covariance 1.6 of the exact"),
         ("off", 3.0, "variance off the prior's manifold 3 of the exact"),
+        ("c2st", 0.9, "a classifier tells its draws from exact ones: C2ST 0.9"),
         ("share_error", 0.4, "styles' shares wrong by 0.4"),
         ("rhat", 1.4, "chains do not agree: R-hat 1.4"),
     ],
 )
 def test_what_tells_against_a_sampler_is_said_with_its_figure(metric, value, said):
-    usual = [("a", metric, {"share_error": 0.0}.get(metric, 1.0))]
+    usual = [("a", metric, {"share_error": 0.0, "c2st": 0.5}.get(metric, 1.0))]
     slightly = [1.2, 1.21, 1.19]
     found = advise("p", made(a=NEAR, b=slightly, more=[*usual, ("b", metric, value)]))
     assert found.take.warnings == ()

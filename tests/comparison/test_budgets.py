@@ -39,6 +39,7 @@ def test_the_largest_effort_within_the_budget_is_found(fixed, slope, amount):
     assert fixed + slope * found <= amount < fixed + slope * (found + 1)
     # Pilots spend about a cell's budget besides what every run of the sampler must spend.
     assert sum(slope * stride for stride in asked) <= 1.1 * amount
+    assert len(asked) <= 7
 
 
 def test_other_settings_of_effort_keep_their_proportion():
