@@ -3,8 +3,8 @@
 A sampler's class names in ``effort`` the settings that its cost grows with, the first one counted
 in its own units and the others kept in proportion to it, and in ``least_effort`` the smallest
 value that makes sense. Pilot runs, each of 2 to 8 times the effort of the one before, show what a
-unit of it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of seconds
-the first pilot is run twice: libraries compile at the first.
+unit of it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of
+seconds the first pilot is run twice: libraries compile at the first.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def affordable(
     noise = _NOISE if budget.evaluations is None else 0.0
     wanted = _SHOWN * (budget.amount - costs[0][1])
     while costs[-1][1] - costs[0][1] <= wanted:
-        effort = costs[-1][0] * _growth(costs[0][1] + wanted, costs[-1][1])
+        effort = _next_effort(costs, costs[0][1] + wanted)
         if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[0][1]:
             return {}
         if not _accepts(sampler, effort):
@@ -149,10 +149,13 @@ def affordable(
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))
 
 
-def _growth(wanted: float, spent: float) -> int:
-    """Return by how much to multiply the effort: to what is wanted, if nothing costs at rest."""
-    least, most = _GROWTH
-    return max(least, int(min(most, wanted / spent))) if spent > 0 else most
+def _next_effort(costs: list[tuple[int, float]], wanted: float) -> int:
+    """Return the next pilot's effort: towards what is wanted, within bounds on its growth."""
+    effort, spent = costs[-1]
+    # Of one pilot's cost it is not known how much every run must spend: no more than all of it.
+    whole = wanted / spent if spent > 0 else float(_GROWTH[1])
+    growth = whole if len(costs) == 1 else _solve(costs, wanted) / effort
+    return effort * int(min(max(growth, _GROWTH[0]), _GROWTH[1]))
 
 
 def _solve(costs: list[tuple[int, float]], amount: float) -> int:
