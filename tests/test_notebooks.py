@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -35,6 +36,16 @@ def run(name: str, folder: Path, pictures: int, monkeypatch) -> str:
     return "".join(
         output.get("text", output.get("data", {}).get("text/plain", "")) for output in outputs
     )
+
+
+def played(page: Path) -> dict[str, np.ndarray]:
+    """Return the motions that a page plays, by label, (n, L, J, 3), metres; it fetches nothing."""
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|src=|href=|@import", text)
+    (given,) = re.findall(r"parentElement, (\{.*\})\);</script>", text)
+    data = json.loads(given)
+    shape = (-1, data["frames"], data["joints"], 3)
+    return {row["label"][0]: np.reshape(row["motions"], shape) / 1000 for row in data["rows"]}
 
 
 # Jupyter's own libraries warn about themselves.
@@ -147,7 +158,17 @@ def test_animals(tmp_path, monkeypatch):
     assert number(r"greatest acceleration is ([\d.]+) of that within") <= 1
     rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
     assert rows["optimization"] < rows["regression"]
-    assert (tmp_path / "animals.html").exists()
+    assert 0.2 < number(r"new motions are ([\d.]+) as fast") < 1
+    for name, labels in {
+        "long": ["several codes"],
+        "animals": ["drawn", "seen by one camera", "the truth"],
+        "own": ["of the prior that ships", "of these animals"],
+    }.items():
+        shown = played(tmp_path / f"{name}.html")
+        assert list(shown) == labels
+        for motions in shown.values():
+            # In every skeleton some joint goes somewhere.
+            assert (np.ptp(motions, axis=1).max(axis=(1, 2)) > 0.02).all()
 
 
 @pytest.mark.slow
