@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+import platform
+import re
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["writable_folder", "written_whole"]
+__all__ = ["forget_killed", "writable_folder", "written_whole"]
+
+_MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
+_UNFINISHED = re.compile(rf"\..*\.{_MACHINE}\.(\d+)\.unfinished(\.[^.]*)?")
 
 
 @contextmanager
@@ -22,7 +28,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     # The ending is kept last, because writers choose a format or append a suffix by it.
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
+    whose = f"{_MACHINE}.{os.getpid()}"
+    unfinished = path.with_name(f".{path.stem}.{whose}.unfinished{path.suffix}")
     try:
         yield unfinished
         os.replace(unfinished, path)
@@ -35,6 +42,30 @@ def written_whole(path: Path) -> Iterator[Path]:
         # Where the folder is none, this fails as the writing did, and must not hide its message.
         with suppress(OSError):
             unfinished.unlink()
+
+
+def forget_killed(folder: Path) -> None:
+    """Remove what processes of this machine that were killed had begun to write in ``folder``.
+
+    Other machines may share the folder, and their processes may still be at it.
+    """
+    # Elsewhere there is no asking whether a process lives that does not disturb it.
+    if os.name != "posix" or not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        begun = _UNFINISHED.fullmatch(path.name)
+        if begun and not _lives(int(begun[1])):
+            path.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def writable_folder(folder: Path) -> Path:

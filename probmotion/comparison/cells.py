@@ -22,6 +22,7 @@ from probmotion.comparison.failures import CellNotKept, Failure, NotFinite
 from probmotion.comparison.memory import watched_memory
 from probmotion.comparison.time_limits import time_limit
 from probmotion.draws import MotionDraws
+from probmotion.files import forget_killed
 from probmotion.posterior import MotionPosterior
 from probmotion.problems import Problem, load_problem
 from probmotion.sampling import Sampler
@@ -255,10 +256,13 @@ def used_of_budget(results: Iterable[CellResult]) -> list[str]:
 
 
 def forget_unfinished(cells: Path, problems: Iterable[str]) -> None:
-    """Remove what cells of a killed run left half-written below ``cells``."""
+    """Remove what a killed run left half-written, of cells below ``cells`` and of all beside it."""
     for problem in problems:
         for place in (cells / problem).glob("*/"):
             _forget(place, "*")
+        for kept in ("pilots", "problems"):
+            forget_killed(cells.parent / kept / problem)
+    forget_killed(cells.parent)
 
 
 def _forget(place: Path, seed: str) -> None:

@@ -32,16 +32,17 @@ def here():
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_dask(here, tmp_path):
+def test_dask_in_processes(here, tmp_path):
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
-        processes=False,
         dashboard_address=None,
         silence_logs=logging.CRITICAL,
     )
     with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
+        workers = set(client.run(os.getpid).values())
+        assert len(workers - {os.getpid()}) == 2
         problems = [generation(), monocular()]
         found = compare(problems, SAMPLERS, executor=executor, out=tmp_path, **SMALL)
     assert numbers(found) == here
