@@ -27,7 +27,7 @@ _SHOWN = 0.25
 _GROWTH = 2, 8
 # A sampler whose cost has not grown at this multiple of the effort that it was given has none, as
 # one whose network is trained already. Evaluations are counted; seconds vary by this share.
-_MULTIPLE = 4
+_MULTIPLE = 64
 _NOISE = 0.1
 
 
@@ -151,11 +151,16 @@ def affordable(
 
 def _next_effort(costs: list[tuple[int, float]], wanted: float) -> int:
     """Return the next pilot's effort: towards what is wanted, within bounds on its growth."""
+    least, most = _GROWTH
     effort, spent = costs[-1]
-    # Of one pilot's cost it is not known how much every run must spend: no more than all of it.
-    whole = wanted / spent if spent > 0 else float(_GROWTH[1])
-    growth = whole if len(costs) == 1 else _solve(costs, wanted) / effort
-    return effort * int(min(max(growth, _GROWTH[0]), _GROWTH[1]))
+    if len(costs) == 1 and spent > 0:
+        # Of this it is not known how much every run must spend: no more than all of it.
+        growth = wanted / spent
+    elif len(costs) > 1 and spent > costs[-2][1]:
+        growth = _solve(costs, wanted) / effort
+    else:
+        growth = most
+    return effort * int(min(max(growth, least), most))
 
 
 def _solve(costs: list[tuple[int, float]], amount: float) -> int:
