@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor, Future, as_completed
 from typing import Any
 
 from probmotion.comparison.failures import CellNotKept
@@ -73,8 +73,13 @@ def run_task(task: Task, progress: bool = False) -> None:
 
 
 def _run_on(executor: Executor, tasks: Sequence[Task], done: Done) -> None:
-    running = {executor.submit(run_task, task): task for task in tasks}
+    running: dict[Future[None], Task] = {}
     try:
+        for task in tasks:
+            try:
+                running[executor.submit(run_task, task)] = task
+            except Exception as error:  # as of what cannot be sent
+                done(task, error)
         for future in as_completed(running):
             done(running[future], future.exception())
     except BaseException:

@@ -73,6 +73,26 @@ def test_what_an_executor_loses_is_a_row():
     assert len(found.results) == 6
 
 
+class _Choosy(ThreadPoolExecutor):
+    """Refuses one sampler's tasks."""
+
+    def submit(self, function, task, **settings):
+        if task.sampler == "wide":
+            raise TypeError("wide cannot be sent")
+        return super().submit(function, task, **settings)
+
+
+def test_what_an_executor_does_not_take_is_a_row_and_the_rest_runs():
+    with _Choosy() as executor:
+        found = compare(generation(), SAMPLERS, executor=executor, **SMALL)
+    words = {
+        (result.sampler, result.failure and result.failure.message) for result in found.results
+    }
+    assert words == {
+        ("toy", None), ("wide", "wide cannot be sent"), ("crashing", "the floor gave way")
+    }  # fmt: skip
+
+
 class _Forgetful(ThreadPoolExecutor):
     """Ends every task without a word, and without having done anything."""
 
