@@ -3,13 +3,14 @@
     python notebooks/ablations/motion_vae.py --out vae
     python notebooks/ablations/motion_vae.py --quick --out quick    (made walks, tiny networks)
 
-Parts: views (how often the right view hypothesis wins), table (the shapes of tables 3, 4, 6, 7 and
-8 of the paper), generation (beside MAS and SDS on the same 2D data); ``--parts`` chooses. All
-variants learn here, from the same tracks, their second phase as long as ``--steps`` says; what is
-left in ``--out/networks`` is not learnt again. The part generation draws through the grid; its
-comparisons are in ``--out/comparisons``, where what is finished is not drawn again. Clips are
-looked for in ``--data``, by default ../shared/data beside the repository. 3D clips are filmed to be
-learnt from, and measured against.
+Parts: views (how often the right view hypothesis wins), table (the shapes of tables 6, 7 and 8 of
+the paper), data (of tables 3 and 4: more clips, then smoothness), generation (beside MAS and SDS on
+the same 2D data); ``--parts`` chooses. All variants learn here, from the same tracks but where the
+part data leaves clips out, their second phase as long as ``--steps`` says; what is left in
+``--out/networks`` is not learnt again. The part generation draws through the grid; its comparisons
+are in ``--out/comparisons``, where what is finished is not drawn again. Clips are looked for in
+``--data``, by default ../shared/data beside the repository. 3D clips are filmed to be learnt from,
+and measured against.
 """
 
 from __future__ import annotations
@@ -73,13 +74,20 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "KL 0.0001": {"kl": 0.0001},
     "no smoothness": {"smoothness": 0.0},
 }
+# Of the clips one in how many is learnt from, and the variant that learns: the paper's MagicPony
+# data, with its own videos, with smoothness.
+DATA: Mapping[str, tuple[int, str]] = {
+    "a quarter of the clips": (4, "no smoothness"),
+    "all clips": (1, "no smoothness"),
+    "all clips, smoothness": (1, "final"),
+}
 OF_POSES = ("smoothness", "hypotheses")
 SEEDS = 3
 
 
 @dataclass(frozen=True)
 class Study:
-    """The clips, how they are filmed, and how long networks learn."""
+    """The clips, how they are filmed, and how long networks learn: from one clip in ``every``."""
 
     out: Path
     data: Path
@@ -87,6 +95,7 @@ class Study:
     steps: int | None
     draws: int
     seed: int = 0
+    every: int = 1
 
     @cached_property
     def clips(self) -> dict[str, list[Motion]]:
@@ -100,11 +109,12 @@ class Study:
     def tracks(self) -> dict[str, list[KeypointTrack]]:
         """What is learnt from, by part: prepared 2D tracks."""
         views = dict.fromkeys(("train", "validation"), 4 if self.quick else 64)
+        some = self.clips | {"train": self.clips["train"][:: self.every]}
         return {
             part: certain(
                 film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
             )
-            for part, clips in self.clips.items()
+            for part, clips in some.items()
         }
 
     @cached_property
@@ -169,11 +179,12 @@ class Study:
 def views(study: Study) -> pd.DataFrame:
     """Return how often the right view hypothesis wins, by their number."""
     rows = []
+    n = 100 if study.quick else 1000
     for hypotheses in (1, 2, 4):
         changes = {} if hypotheses == 4 else {"hypotheses": hypotheses}
         network, size = study.poses(changes), study.size(changes)
         for part in ("train", "test"):
-            judged = judge_hypotheses(network, size, study.body, study.clips[part], fps=FPS)
+            judged = judge_hypotheses(network, size, study.body, study.clips[part], n=n, fps=FPS)
             rows.append(
                 {
                     "hypotheses": hypotheses,
@@ -188,9 +199,11 @@ def views(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def reconstructed(study: Study, prior: MotionVAE | None, poses: PoseNetwork) -> dict[str, float]:
+def reconstructed(
+    study: Study, changes: Mapping[str, Any], prior: MotionVAE | None = None
+) -> dict[str, float]:
     """Return PCK@0.1 and velocity error, both %, of held-out tracks; of poses alone without VAE."""
-    size = study.size({}) if prior is None else prior.settings
+    poses, size = study.poses(changes), study.size(changes)
     tracks = study.tracks["test"]
     keypoints = np.concatenate([pieces(track.keypoints, size.frames) for track in tracks])
     visible = np.concatenate([pieces(track.confidence, size.frames) for track in tracks]) >= 0.3
@@ -239,30 +252,45 @@ def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
     return row
 
 
+def measured(study: Study, name: str) -> dict[str, float]:
+    """Return what a variant reconstructs and generates."""
+    begun = time.perf_counter()
+    prior = study.variant(name)
+    row = {"seconds": time.perf_counter() - begun} | reconstructed(study, VARIANTS[name], prior)
+    repeats = pd.DataFrame(
+        [
+            generated(study, prior.sample(seeds.generator(seed, "draws"), study.draws), seed)
+            for seed in range(SEEDS)
+        ]
+    )
+    return row | repeats.mean().to_dict() | {"mcd_test_sd": repeats["mcd_test"].std()}
+
+
 def table(study: Study) -> pd.DataFrame:
     """Return what each variant reconstructs and generates."""
-    rows = []
-    for name, changes in VARIANTS.items():
-        begun = time.perf_counter()
-        prior, poses = study.variant(name), study.poses(changes)
-        row = {"variant": name, "seconds": time.perf_counter() - begun}
-        row |= reconstructed(study, prior, poses)
-        repeats = pd.DataFrame(
-            [
-                generated(study, prior.sample(seeds.generator(seed, "draws"), study.draws), seed)
-                for seed in range(SEEDS)
-            ]
-        )
-        row |= repeats.mean().to_dict() | {"mcd_test_sd": repeats["mcd_test"].std()}
-        rows.append(row)
-        print(row, flush=True)
-    rows.append({"variant": "no motion VAE"} | reconstructed(study, None, study.poses({})))
+    rows: list[dict[str, Any]] = []
+    for name in VARIANTS:
+        rows.append({"variant": name} | measured(study, name))
+        print(rows[-1], flush=True)
+    rows.append({"variant": "no motion VAE"} | reconstructed(study, {}))
     rng = seeds.generator(study.seed, "real draws")
     every = study.real_windows("train", FRAMES)
     real = every[rng.integers(0, len(every), study.draws)]
     rows.append({"variant": "real motion that was learnt from"} | generated(study, real, 0))
     for row in rows[-2:]:
         print(row, flush=True)
+    return pd.DataFrame(rows)
+
+
+def data(study: Study) -> pd.DataFrame:
+    """Return what more clips, and then smoothness, are worth: to poses alone and to the VAE."""
+    rows: list[dict[str, Any]] = []
+    for name, (every, variant) in DATA.items():
+        some = study if every == 1 else replace(study, out=study.out / name, every=every)
+        alone = reconstructed(some, VARIANTS[variant])
+        row = {f"poses_{measure}": value for measure, value in alone.items()}
+        rows.append({"learnt from": name} | row | measured(some, variant))
+        print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
 
@@ -275,12 +303,13 @@ def generation(study: Study) -> pd.DataFrame:
     n = max(10, study.draws // 10)
     ours = MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
     iterations = 50 if study.quick else 1000
+    mas = MultiViewAncestral(steps=10, trained_steps=100) if study.quick else MultiViewAncestral()
     grids: tuple[tuple[str, Problem | MotionPosterior, dict[str, Sampler], int], ...] = (
         ("motion-vae", ours, {"motion VAE": ExactSampler()}, n * per_motion),
         (
             "walk2d",
             other,
-            {"MAS": MultiViewAncestral(), "SDS": ScoreDistillation(iterations=iterations)},
+            {"MAS": mas, "SDS": ScoreDistillation(iterations=iterations)},
             n,
         ),
     )
@@ -331,7 +360,7 @@ def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
     return row | {"mirrored": mirror_share(centred, truth["test"])}
 
 
-PARTS = {"views": views, "table": table, "generation": generation}
+PARTS = {"views": views, "table": table, "data": data, "generation": generation}
 
 
 def main() -> None:
