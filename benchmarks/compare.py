@@ -1,12 +1,12 @@
 """What two workers gain on a grid of equal cells: random walks on ``gait``, 32 of 5 seconds each.
 
-``efficiency_two_workers``: seconds with one worker over twice those with two, both from the call of
-``compare`` to its table, so that the start of processes and what they import is in it.
+``efficiency_two_workers``: seconds in this process over twice those with two workers, both from the
+call of ``compare`` to its table, so that the start of processes and what they import is in it.
 ``worker_import_seconds``, ``worker_problem_seconds``: what a worker does first;
-``seconds_beyond_half``: what two workers take longer than half of one's time, all in all, of which
+``seconds_beyond_half``: what two workers take longer than half of that, all in all, of which
 starting them is some 4 seconds and waiting for the last cell at most one cell's time;
-``slowdown_in_samplers``: seconds within samplers with two workers over those with one, which is the
-machine's doing. Run it on a machine with two idle cores.
+``slowdown_in_samplers``: seconds within samplers with two workers over those in one process, which
+is the machine's doing. Run it on a machine with two idle cores.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=32)
     parser.add_argument("--cell-seconds", type=float, default=5.0)
     given = parser.parse_args()
-    # Everything is imported and the problem made before the clock of either run starts.
+    # Here everything is imported and the problem made before the clock starts.
     thin = 2000
-    seconds(1, cells=1, thin=thin)
-    _, one = seconds(1, cells=1, thin=thin)
+    seconds(0, cells=1, thin=thin)
+    _, one = seconds(0, cells=1, thin=thin)
     thin = max(1, round(thin * given.cell_seconds / one))
     start = subprocess.check_output([sys.executable, "-c", _START], text=True).split()
     print(f"worker_import_seconds: {float(start[0]):.2f}")
     print(f"worker_problem_seconds: {float(start[1]):.2f}")
-    alone, within_one = seconds(1, given.cells, thin)
+    alone, within_one = seconds(0, given.cells, thin)
     together, within_two = seconds(2, given.cells, thin)
-    print(f"seconds_one_worker: {alone:.2f}")
+    print(f"seconds_in_one_process: {alone:.2f}")
     print(f"seconds_two_workers: {together:.2f}")
     print(f"seconds_beyond_half: {together - alone / 2:.2f}")
     print(f"slowdown_in_samplers: {within_two / within_one:.3f}")

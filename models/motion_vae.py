@@ -40,9 +40,9 @@ class MotionVAE(StandardNormalPrior):
     """Motions of an articulated body, as learnt from 2D tracks alone.
 
     θ is the latent code z, all of it N(0, 1). The rigid path is given: by default the body stands
-    at the origin, upright, and looks along +Z. So it may where there is no evidence; evidence is of
-    a body that was placed: with keypoints of a known camera, :meth:`placed_by` puts it where the
-    pose network sees it.
+    at the origin, upright, and looks along +Z, which will do where there is no evidence.
+    Evidence is of a body that was placed: with keypoints of a known camera, :meth:`placed_by` puts
+    it where the pose network sees it.
 
     Parameters
     ----------

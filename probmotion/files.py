@@ -13,7 +13,18 @@ from pathlib import Path
 
 __all__ = ["forget_killed", "writable_folder", "written_whole"]
 
-_MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
+
+def _machine() -> str:
+    """Return what tells processes of this machine from those of another that has the same name."""
+    known = [platform.node()]
+    with suppress(OSError):
+        known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
+    with suppress(OSError):
+        known.append(os.readlink("/proc/self/ns/pid"))
+    return f"{zlib.crc32(' '.join(known).encode()):08x}"
+
+
+_MACHINE = _machine()
 _UNFINISHED = re.compile(rf"\..*\.{_MACHINE}\.(\d+)\.unfinished(\.[^.]*)?")
 
 
@@ -55,7 +66,9 @@ def forget_killed(folder: Path) -> None:
     for path in folder.iterdir():
         begun = _UNFINISHED.fullmatch(path.name)
         if begun and not _lives(int(begun[1])):
-            path.unlink(missing_ok=True)
+            # Another user's file may stay.
+            with suppress(OSError):
+                path.unlink()
 
 
 def _lives(process: int) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +25,7 @@ __all__ = ["NUTS"]
 class NUTS:
     """The No-U-Turn sampler (Hoffman and Gelman 2014), NumPyro's (Phan et al. 2019).
 
-    A budget sets ``warmup`` and ``thin`` (:mod:`probmotion.comparison.budgets`).
+    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.budgets`).
 
     Parameters
     ----------
@@ -45,15 +45,14 @@ class NUTS:
     -----
     Chains run one after the other with the same compiled code, so that chain k is the same to the
     last bit however many there are. Everything runs in float64, whatever JAX is set to elsewhere.
-    ``seconds`` of the draws leave out compiling: some seconds, once per posterior and settings in
-    a process, the number of warm-up iterations among them.
+    ``seconds`` of the draws leave out compiling: some seconds, once per posterior in a process.
+    Another ``warmup`` is compiled again.
     """
 
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
     needs_gradient: ClassVar[bool] = True
-    effort: ClassVar[tuple[str, ...]] = ("warmup", "thin")
-    least_effort: ClassVar[int] = 50
+    effort: ClassVar[tuple[str, ...]] = ("thin", "warmup")
 
     warmup: int = 500
     target_acceptance: float = 0.8
@@ -105,7 +104,8 @@ class NUTS:
         require(self, posterior)
         self._require_gradient(posterior)
         with jax.enable_x64(True):
-            kernel = compiled(self, posterior)
+            # What the compiled code does not depend on is the same for all.
+            kernel = compiled(replace(self, thin=1, candidates=1), posterior)
             start = time.perf_counter()
             earlier = continued(self, kernel.log_densities, initial, chains, seed)
             densities = 0

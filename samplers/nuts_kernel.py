@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 CHUNK = 50
-"""Most draws in one call, and iterations if they are thinned by less, between two looks at the
-progress bar and at Ctrl-C."""
+"""Most draws in one call, between two looks at the progress bar and at Ctrl-C; and most iterations,
+unless one draw takes more."""
 
 
 @lru_cache(maxsize=8)

@@ -18,12 +18,11 @@ from probmotion.calibration.ranks import ranks_of_truth
 from probmotion.calibration.result import Calibration
 from probmotion.checks import check_count, check_positive
 from probmotion.comparison.budgets import Budget, check_budget
-from probmotion.comparison.cells import Cell, forget_unfinished
+from probmotion.comparison.cells import Cell
 from probmotion.comparison.locks import locked
 from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
 from probmotion.comparison.plan import Plan
-from probmotion.comparison.tasks import Grid, finished_kept, missing, refuse_taken
-from probmotion.comparison.workers import run_tasks
+from probmotion.comparison.tasks import Grid, refuse_taken, run_grid
 from probmotion.draws import MotionDraws
 from probmotion.files import writable_folder
 from probmotion.problems import Problem, load_problem
@@ -113,12 +112,8 @@ def calibrate(
     with locked(folder, chosen):
         grid = CalibrationGrid(folder, plan, chosen, used, budget, time_limit)
         refuse_taken(folder, [*grid.pilots(), *grid.cells()])
-        forget_unfinished(folder / "cells", chosen)
         plan.save(folder)
-        with finished_kept(grid):
-            where = (workers, executor, progress)
-            run_tasks(missing(grid.pilots()), *where, label="pilots")
-            run_tasks(missing(grid.cells()), *where, label="simulations")
+        run_grid(grid, workers, executor, progress, label="simulations")
         # A run of other problems in this folder may have left its own plan.
         plan.save(folder)
         calibration = Calibration(folder, plan, temporary=out is None)

@@ -140,11 +140,12 @@ def affordable(
     noise = _NOISE if budget.evaluations is None else 0.0
     wanted = _SHOWN * (budget.amount - costs[0][1])
     while costs[-1][1] - costs[0][1] <= wanted:
-        effort = _next_effort(costs, costs[0][1] + wanted)
-        if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[0][1]:
-            return {}
-        if not _accepts(sampler, effort):
+        next_one = _next_effort(costs, costs[0][1] + wanted)
+        effort = _within_range(sampler, costs[-1][0], next_one)
+        if effort == costs[-1][0]:
             break
+        if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[-2][1]:
+            return {}
         costs.append((effort, pilot(_with(sampler, effort))))
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))
 

@@ -10,14 +10,12 @@ from pathlib import Path
 from probmotion import seeds as addressed
 from probmotion.checks import check_count, check_positive
 from probmotion.comparison.budgets import Budget, check_budget
-from probmotion.comparison.cells import forget_unfinished
 from probmotion.comparison.kept_problems import keep_problem
 from probmotion.comparison.locks import locked
 from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
 from probmotion.comparison.plan import Plan
 from probmotion.comparison.result import Comparison
-from probmotion.comparison.tasks import Grid, finished_kept, missing, refuse_taken
-from probmotion.comparison.workers import run_tasks
+from probmotion.comparison.tasks import Grid, refuse_taken, run_grid
 from probmotion.files import writable_folder
 from probmotion.problems import load_problem
 
@@ -108,22 +106,13 @@ def compare(
     with locked(folder, chosen):
         grid = Grid(folder, plan, chosen, used, budget, time_limit)
         refuse_taken(folder, [*grid.pilots(), *grid.cells()])
-        forget_unfinished(folder / "cells", chosen)
         for name, source in chosen.items():
             problem = load_problem(source) if isinstance(source, str) else source
             # Pictures show reference draws that the first seed is measured against.
             seed = addressed.integer(0, "exact", name)
             keep_problem(problem, folder / "problems" / name, seed=seed)
         plan.save(folder)
-        try:
-            with finished_kept(grid):
-                where = (workers, executor, progress)
-                run_tasks(missing(grid.pilots()), *where, label="pilots")
-                run_tasks(missing(grid.cells()), *where)
-        finally:
-            # Of workers killed while they wrote; an executor's may still be at it.
-            if executor is None:
-                forget_unfinished(folder / "cells", chosen)
+        run_grid(grid, workers, executor, progress)
         # A run of other problems in this folder may have left its own plan.
         plan.save(folder)
         comparison = Comparison(folder, plan, temporary=out is None)

@@ -6,6 +6,7 @@ there travels by value, so a script needs no ``if __name__ == "__main__"``.
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import pickle
@@ -24,6 +25,7 @@ from typing import Any, Protocol
 import cloudpickle
 
 from probmotion.comparison.failures import TimeIsUp, WorkerDied
+from probmotion.problems import Problem
 from probmotion.threads import one_thread
 
 __all__ = ["Done", "Task", "run_in_processes"]
@@ -52,6 +54,8 @@ class Task(Protocol):
 Done = Callable[[Any, BaseException | None], None]
 """Told of every task that ended, with the error that it could not keep itself."""
 
+# What a process is born with is set for all threads of this one.
+_ONE_STARTS = threading.Lock()
 _READY, _BEGUN = b"ready", b"begun"
 # A task ends itself at its limit, but for compiled code that does not return: then it is killed.
 _GRACE = 1.2, 1.0
@@ -64,18 +68,26 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=False)
-        with _born_deaf(), _without_main():
+        with _ONE_STARTS, _born_deaf(), _without_main():
             self.process.start()
         theirs.close()
         self.ready = False
+        self.known: set[int] = set()
         self.task: Task | None = None
         self.until: float | None = None
 
     def give(self, task: Task) -> None:
-        """Hand over a task; raises what keeps it from travelling."""
+        """Hand over a task; raises what keeps it from travelling.
+
+        A problem travels once: what is compiled or kept of it serves all of its tasks.
+        """
         # multiprocessing's own pickler would share the memory of torch's tensors, and know classes
         # of a notebook by name alone.
-        self.connection.send_bytes(cloudpickle.dumps(task))
+        packed = io.BytesIO()
+        pickler = _TaskPickler(packed, known=self.known)
+        pickler.dump(task)
+        self.connection.send_bytes(pickle.dumps((pickler.new, packed.getvalue())))
+        self.known |= pickler.new.keys()
         self.task = task
 
     def heard(self) -> bytes | None:
@@ -106,14 +118,52 @@ class _Worker:
         self.connection.close()
 
 
+class _TaskPickler(cloudpickle.Pickler):
+    """Leaves problems out; those that the other side does not know yet are in ``new``, packed."""
+
+    def __init__(self, file: io.BytesIO, known: set[int]) -> None:
+        super().__init__(file)
+        self.known = known
+        self.new: dict[int, bytes] = {}
+
+    def persistent_id(self, value: Any) -> int | None:
+        """Return the number of a problem; the tasks keep it alive, and so the number its own."""
+        if not isinstance(value, Problem):
+            return None
+        if id(value) not in self.known:
+            self.new[id(value)] = cloudpickle.dumps(value)
+        return id(value)
+
+
+class _TaskUnpickler(pickle.Unpickler):
+    """Puts problems in, each unpacked for the first task that is of it."""
+
+    def __init__(self, packed: bytes, problems: dict[int, bytes | Problem]) -> None:
+        super().__init__(io.BytesIO(packed))
+        self.problems = problems
+
+    def persistent_load(self, number: Any) -> Problem:
+        """Return the problem of a number."""
+        held = self.problems[number]
+        if isinstance(held, bytes):
+            held = self.problems[number] = pickle.loads(held)
+        return held
+
+
 def run_in_processes(tasks: Sequence[Task], workers: int, done: Done) -> None:
     """Run every task in one of ``workers`` spawned processes.
 
     Raises
     ------
+    ValueError
+        If this process may have no children.
     RuntimeError
         If processes do not start.
     """
+    if multiprocessing.current_process().daemon:
+        raise ValueError(
+            f"workers is {workers} in a daemonic process, which may have no children, expected 0"
+        )
     waiting = deque(tasks)
     crew: list[_Worker] = []
     try:
@@ -140,7 +190,13 @@ def _hand_out(crew: list[_Worker], waiting: deque[Task], done: Done) -> None:
                 waiting.appendleft(task)
                 break
             except Exception as error:
-                done(task, error)
+                done(
+                    task,
+                    TypeError(
+                        f"{task} cannot be sent to a process, {error}; expected what can be "
+                        "pickled, or workers=0"
+                    ),
+                )
 
 
 def _listen(crew: list[_Worker], done: Done) -> None:
@@ -183,6 +239,7 @@ def _act(crew: list[_Worker], worker: _Worker, done: Done) -> None:
 def _work(connection: Connection) -> None:
     """Run what comes, until nothing does."""
     _begin_worker()
+    problems: dict[int, bytes | Problem] = {}
     connection.send_bytes(_READY)
     while True:
         error: BaseException | None = None
@@ -192,7 +249,9 @@ def _work(connection: Connection) -> None:
             sys.stdout.flush()
             os._exit(0)
         try:
-            task = pickle.loads(sent)
+            new, packed = pickle.loads(sent)
+            problems |= new
+            task = _TaskUnpickler(packed, problems).load()
             with suppress(Exception):  # which running it meets again
                 task.prepare()
             connection.send_bytes(_BEGUN)

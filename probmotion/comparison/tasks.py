@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from probmotion.comparison.budgets import Budget
-from probmotion.comparison.cells import Cell
+from probmotion.comparison.cells import Cell, forget_unfinished
 from probmotion.comparison.failures import CellNotKept
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.comparison.pilots import Pilot
 from probmotion.comparison.plan import Plan
+from probmotion.comparison.workers import run_tasks
 from probmotion.draws import library_versions
 from probmotion.problems import Problem, load_problem
 from probmotion.sampling import Sampler
 
-__all__ = ["Grid", "finished_kept", "missing", "refuse_taken"]
+__all__ = ["Grid", "refuse_taken", "run_grid"]
 
 
 class Grid:
@@ -119,7 +121,32 @@ class Grid:
         )
 
 
-def missing(tasks: Sequence[Any]) -> list[Any]:
+def run_grid(
+    grid: Grid, workers: int, executor: Executor | None, progress: bool, label: str = "cells"
+) -> None:
+    """Run what is not finished: pilots, then cells; arguments as :func:`run_tasks`'s.
+
+    Raises
+    ------
+    OSError
+        If a result cannot be written.
+    KeyboardInterrupt
+        At Ctrl-C; the messages of both say what is finished, and that it is kept.
+    """
+    cells = grid.folder / "cells"
+    forget_unfinished(cells, grid.problems)
+    try:
+        with _finished_kept(grid):
+            where = (workers, executor, progress)
+            run_tasks(_missing(grid.pilots()), *where, label="pilots")
+            run_tasks(_missing(grid.cells()), *where, label=label)
+    finally:
+        # Of workers killed while they wrote; an executor's may still be at it.
+        if executor is None:
+            forget_unfinished(cells, grid.problems)
+
+
+def _missing(tasks: Sequence[Any]) -> list[Any]:
     """Return the tasks that are not finished."""
     return [task for task in tasks if not task.finished()]
 
@@ -137,7 +164,7 @@ def refuse_taken(folder: Path, tasks: Iterable[Cell | Pilot]) -> None:
 
 
 @contextmanager
-def finished_kept(grid: Grid) -> Iterator[None]:
+def _finished_kept(grid: Grid) -> Iterator[None]:
     """Say what is finished, and that it is kept, when the block is stopped."""
     try:
         yield

@@ -60,6 +60,24 @@ def test_a_sampler_that_cannot_go_as_low_says_so():
     assert affordable(Budget(evaluations=120), Walking(), pilot)["stride"] == 2
 
 
+@pytest.mark.parametrize("most", [10, 12, 15])
+def test_a_range_that_ends_before_the_budget_does_is_used_to_its_end(most):
+    pilot, asked = line(0, 1)
+    assert affordable(Budget(evaluations=5000), Walking(most=most), pilot)["stride"] == most
+    assert max(asked) <= most
+
+
+def test_cost_that_rises_once_and_then_stays_ends_the_pilots():
+    asked = []
+
+    def pilot(sampler):
+        asked.append(sampler.stride)
+        return 10.0 if len(asked) < 3 else 11.5
+
+    assert affordable(Budget(seconds=60.0), Walking(), pilot) == {}
+    assert len(asked) < 10
+
+
 def test_the_settings_own_range_is_kept():
     pilot, asked = line(0, 1)
     assert affordable(Budget(evaluations=5000), Walking(most=37), pilot)["stride"] == 37

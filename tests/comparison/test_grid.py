@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from toy_samplers import (
+    Counting,
     Crashing,
     Dying,
     PriorDraws,
@@ -182,6 +183,14 @@ def test_a_worker_that_dies_fails_its_own_cell():
     assert failed == {("dying", 0), ("dying", 1)}
 
 
+def test_a_problem_travels_to_a_worker_once(tmp_path):
+    """What is compiled of a user's own posterior is found again."""
+    diary = tmp_path / "diary"
+    settings = SMALL | {"workers": 1}
+    compare([generation(), monocular()], Counting(diary=str(diary)), seeds=3, **settings)
+    assert diary.read_text() == "1 1 1 2 2 2 "
+
+
 def test_what_cannot_travel_to_a_worker_fails_its_own_cell():
     @dataclass(frozen=True)
     class Local(PriorDraws):
@@ -192,7 +201,10 @@ def test_what_cannot_travel_to_a_worker_fails_its_own_cell():
 
     comparison = compare(generation(), [Local(), PriorDraws()], **(SMALL | {"workers": 2}))
     found = {result.sampler: result for result in comparison.results}
-    assert found["local"].failure.message == "Local holds a telescope"
+    assert found["local"].failure.message == (
+        "generation/local/0 cannot be sent to a process, Local holds a telescope; expected what "
+        "can be pickled, or workers=0"
+    )
     assert found["prior-draws"].failure is None
 
 

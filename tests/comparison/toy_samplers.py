@@ -92,6 +92,23 @@ class PriorDraws:
         )
 
 
+SEEN = []
+
+
+@dataclass(frozen=True)
+class Counting(PriorDraws):
+    """Notes how many posteriors this process has met."""
+
+    name: ClassVar[str] = "counting"
+
+    def sample(self, posterior, **settings):
+        if all(posterior is not each for each in SEEN):
+            SEEN.append(posterior)
+        with open(self.diary, "a") as file:
+            file.write(f"{len(SEEN)} ")
+        return PriorDraws().sample(posterior, **settings)
+
+
 @dataclass(frozen=True)
 class Unwritable(PriorDraws):
     """Its draws hold what no file can."""
