@@ -14,7 +14,7 @@ __all__ = ["ComparisonTable"]
 
 _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
     (
-        "against reference draws",
+        "against references",
         {
             "seconds": "seconds",
             "swd": "swd",

@@ -56,7 +56,7 @@ def test_it_prints_means_and_deviations_with_cost_beside_quality(folder):
     swd = table.query("problem == 'generation' and sampler == 'wide' and metric == 'swd'")["value"]
     assert f"{swd.mean():.2f} ± " in text or f"{swd.mean():.1f} ± " in text
     heads = next(line for line in text.splitlines() if line.startswith("against reference"))
-    assert heads.split()[3:6] == ["seconds", "swd", "tr"]
+    assert heads.split()[2:5] == ["seconds", "swd", "tr"]
     assert text.index("generation: no evidence") < text.index("monocular: one camera")
     assert ["wide", "evidence"] in [line.split() for line in text.splitlines()]
     assert "wide ran with spread=2.0; its other settings are its defaults" in text
