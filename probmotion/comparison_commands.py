@@ -94,7 +94,7 @@ class Compare:
 
     calibrate: int = 0
     """Also simulate every problem that can be so many times, and rank the truth among each
-    sampler's draws."""
+    sampler's draws. A simulation costs each sampler as much as a cell."""
 
     report: bool = False
     """Also write report.html: the table, the plots, and draws that play in a browser."""

@@ -27,6 +27,8 @@ _LEVEL = 0.95
 _MOST_BINS, _PER_BIN = 20, 10
 _ACROSS = 5
 _LETTERS = 130
+# Inches: the figure's width; above a block's panels, a line of its title, and below; and a row.
+_WIDTH, _HEAD, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
 
 
 def draw_ranks(
@@ -62,29 +64,49 @@ def draw_ranks(
             raise ValueError(f"blocks[{title!r}] is empty, expected at least one quantity")
         for name, values in ranks.items():
             check_shape(f"blocks[{title!r}][{name!r}]", values, ("n",))
-    heights = [0.9 + 1.25 * max(2, -(-len(ranks) // _ACROSS)) for ranks in blocks.values()]
-    figure = Figure(figsize=(15.5, sum(heights)), layout="constrained")
+    titles = [textwrap.fill(title, _LETTERS) for title in blocks]
+    heads = [_HEAD + _LINE * (1 + title.count("\n")) for title in titles]
+    heights = [
+        head + _PANEL * max(2, -(-len(ranks) // _ACROSS)) + _FOOT
+        for head, ranks in zip(heads, blocks.values(), strict=True)
+    ]
+    # A layout that is solved for takes time with the square of the number of panels.
+    figure = Figure(figsize=(_WIDTH, sum(heights)))
     parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
-    for part, (title, ranks) in zip(parts, blocks.items(), strict=True):
+    for part, title, head, height, ranks in zip(
+        parts, titles, heads, heights, blocks.values(), strict=True
+    ):
         part.suptitle(
-            textwrap.fill(title, _LETTERS), size=12, color=INK, weight="bold", x=0.01, ha="left"
-        )
+            title, size=12, color=INK, weight="bold", x=0.01, ha="left", va="top",
+            y=1 - 0.3 * _LINE / height,
+        )  # fmt: skip
+        place = {"top": 1 - head / height, "bottom": _FOOT / height}
         left, middle, right = part.subfigures(1, 3, width_ratios=[1.9, 1, 1])
-        colours = {name: CYCLE[place % len(CYCLE)] for place, name in enumerate(ranks)}
-        _draw_histograms(left, ranks, colours)
-        _draw_difference(middle.subplots(), ranks, colours)
-        _draw_coverage(right.subplots(), ranks, colours)
+        colours = {name: CYCLE[at % len(CYCLE)] for at, name in enumerate(ranks)}
+        _draw_histograms(left, ranks, colours, {"left": 0.065, "right": 0.985, **place})
+        wide = {"left": 0.13, "right": 0.97, **place}
+        _draw_difference(middle.subplots(gridspec_kw=wide), ranks, colours)
+        _draw_coverage(right.subplots(gridspec_kw=wide), ranks, colours)
     if path is not None:
         save_figure(figure, path)
     return figure
 
 
 def _draw_histograms(
-    part: Any, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]
+    part: Any,
+    ranks: Mapping[str, np.ndarray],
+    colours: Mapping[str, str],
+    place: Mapping[str, float],
 ) -> None:
     """A panel per quantity; the band holds all its bars at once (Bonferroni)."""
     columns = min(_ACROSS, len(ranks))
-    panels = part.subplots(-(-len(ranks) // columns), columns, squeeze=False, sharex=True).ravel()
+    panels = part.subplots(
+        -(-len(ranks) // columns),
+        columns,
+        squeeze=False,
+        sharex=True,
+        gridspec_kw={"hspace": 0.4, "wspace": 0.3, **place},
+    ).ravel()
     for axes, (name, values) in zip(panels, ranks.items(), strict=False):
         n = len(values)
         bins = max(2, min(_MOST_BINS, n // _PER_BIN))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from probmotion.metrics.uniformity import ecdf_band, evaluation_points
 from probmotion.pictures.rank_plots import draw_ranks
@@ -68,6 +71,22 @@ def test_the_band_is_that_of_the_test():
         corners = band.get_paths()[0].vertices
         assert corners[:, 1].max() == pytest.approx((upper - less * points).max())
         assert corners[:, 1].min() == pytest.approx((lower - less * points).min())
+
+
+def test_nothing_is_cut_off_or_drawn_over():
+    many = {f"direction {k}": values for k, values in enumerate([*ranks().values()] * 2)}
+    figure = draw_ranks({"exact: right": many, "mas: too sure " * 20: ranks(150)})
+    FigureCanvasAgg(figure).draw()
+    renderer = figure.canvas.get_renderer()
+    for part in figure.subfigs:
+        shown = [axes for axes in figure.axes if axes.get_visible() and axes.figure in part.subfigs]
+        boxes = [axes.get_tightbbox(renderer) for axes in shown]
+        assert len(boxes) >= 6
+        for box in boxes:
+            assert part.bbox.x0 <= box.x0 < box.x1 <= part.bbox.x1
+            assert part.bbox.y0 <= box.y0 < box.y1 < part._suptitle.get_window_extent(renderer).y0
+        for one, other in itertools.combinations(boxes, 2):
+            assert one.x1 < other.x0 or other.x1 < one.x0 or one.y1 < other.y0 or other.y1 < one.y0
 
 
 def test_wrong_input_is_named():
