@@ -85,7 +85,7 @@ def training(
         warnings.simplefilter("ignore")
         trainee = MotionVAETrainee(tracks, tracks, settings, body, teacher)
     network = trainee.network.train()
-    optimiser = torch.optim.AdamW(network.vae.parameters(), lr=1e-4)
+    optimiser = torch.optim.AdamW(network.vae.parameters(), lr=1e-4, fused=True)
 
     def step() -> None:
         loss = trainee.training_loss(network, rng, BATCH, torch.device("cpu"))

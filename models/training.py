@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -185,7 +186,7 @@ def train(
 def _start(trainee: Trainee, settings: TrainingSettings, device: torch.device) -> Run:
     network = trainee.network.to(device)
     average = copy.deepcopy(network).requires_grad_(False)
-    kinds = {"adamw": torch.optim.AdamW, "adamax": torch.optim.Adamax}
+    kinds = {"adamw": partial(torch.optim.AdamW, fused=True), "adamax": torch.optim.Adamax}
     learnt = [weights for weights in network.parameters() if weights.requires_grad]
     optimiser = kinds[settings.optimiser](
         learnt, lr=settings.learning_rate, weight_decay=settings.weight_decay
