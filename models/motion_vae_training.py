@@ -38,6 +38,7 @@ from probmotion.models.track_batches import (
     TrackBatches,
     learning_and_held_out,
 )
+from probmotion.models.training_runs import check_same_run
 from probmotion.models.training_settings import TrainingSettings
 from probmotion.models.variational_terms import gaussian_kl
 from probmotion.motion import KeypointTrack
@@ -76,6 +77,10 @@ class _LearnsFromTracks:
             raise ValueError(
                 f"size has image_features={size.image_features}, expected 0: tracks have none; "
                 "networks read them, see MotionVAENetwork.encode"
+            )
+        if not body.skeleton.bones:
+            raise ValueError(
+                f"body has the one joint {body.skeleton.joint_names[0]}, expected bones"
             )
         if distance is not None:
             check_positive("distance", distance)
@@ -228,10 +233,14 @@ class PoseTrainee(_LearnsFromTracks):
             If the file is damaged or of another network.
         FileNotFoundError
             If there is none.
+        ValueError
+            If the run had other settings or data.
         """
         size, body = self.size, self.body
         found = PoseNetwork(size, body.skeleton.n_joints, len(body.bones), body.n_groups)
-        load_weights(found, load_checkpoint(folder, self.kind).tensors)
+        kept = load_checkpoint(folder, self.kind)
+        check_same_run(kept.settings, {"network": dict(self.settings)}, Path(folder))
+        load_weights(found, kept.tensors)
         return found
 
     def _loss(
@@ -288,7 +297,7 @@ class MotionVAETrainee(_LearnsFromTracks):
     Raises
     ------
     ValueError
-        As for the first phase, or if the pose network is of another size.
+        As for the first phase, or if the pose network is of another size or body.
     """
 
     kind = KIND
@@ -315,6 +324,14 @@ class MotionVAETrainee(_LearnsFromTracks):
             raise ValueError(
                 f"pose_network has width, layers, heads, feedforward and image_features {theirs}, "
                 f"expected the size's {own}"
+            )
+        of_body = (body.skeleton.n_joints, len(body.bones), body.n_groups)
+        found = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
+        if found != of_body:
+            raise ValueError(
+                f"pose_network is of a body with {found[0]} joints, {found[1]} bones that turn and "
+                f"{found[2]} lengths, expected the body's {of_body[0]}, {of_body[1]} and "
+                f"{of_body[2]}"
             )
         teacher = pose_network.eval().requires_grad_(False)
         if size.spatial:

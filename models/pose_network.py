@@ -80,6 +80,7 @@ class PoseNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.settings, width = settings, settings.width
+        self.n_joints, self.n_bones, self.n_groups = n_joints, n_bones, n_groups
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "pose weights"))
             self.frame_encoder = FrameEncoder(settings, n_joints)

@@ -73,12 +73,14 @@ def denoiser_of(
     if not isinstance(prior, Samplable):
         raise ValueError(f"prior is {type(prior).__name__}, expected one that can be sampled")
     check_count("motions", motions, least=2)
-    usual = usual_training(size)
     sizes = {
         "tiny": DiffusionSettings.tiny,
         "small": DiffusionSettings.small,
         "paper": DiffusionSettings.paper,
     }
+    if size not in sizes:
+        raise ValueError(f"size is {size!r}, expected one of {', '.join(sizes)}")
+    usual = usual_training(size)
     tracks = _filmed(prior, motions, views, filming, seed)
     held_out = views * max(1, motions // _HELD_OUT)
     trainee = DiffusionTrainee(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from probmotion.models.checkpoints import (
 )
 from probmotion.models.training_settings import TrainingSettings
 
-__all__ = ["LOSSES", "STATE", "Run", "keep_run", "resume_run", "steps_taken"]
+__all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run", "steps_taken"]
 
 STATE, LOSSES = "state.safetensors", "losses.csv"
 """Beside the model, in the folder of a run: what it goes on from, and its losses."""
@@ -95,19 +96,7 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
         If the run has other settings or data; nothing is written then.
     """
     kept = load_checkpoint(folder / STATE, _state_of(kind))
-    # A run that was kept before there was a setting ran with what is now the usual one.
-    usual = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
-    for part in ("network", "training"):
-        for name, wanted in described[part].items():
-            got = kept.settings[part].get(name, usual[part].get(name))
-            # Checkpoints may come more often and the end later: no step is changed by it.
-            if got != wanted and name not in ("steps", "checkpoint_every"):
-                known = f"{name} {got}, expected {wanted}"
-                if len(known) > _READABLE:
-                    known = f"another {name}, expected the same"
-                raise ValueError(
-                    f"out is {folder}, which holds a run with {known}; give it a folder of its own"
-                )
+    check_same_run(kept.settings, described, folder)
     parts: dict[str, dict[str, torch.Tensor]] = {}
     for name, tensor in kept.tensors.items():
         part, _, rest = name.partition(".")
@@ -129,6 +118,35 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
     except (CheckpointError, FileNotFoundError):
         card = {name: value for name, value in kept.settings.items() if name != "recent"}
         save_checkpoint(folder / MODEL, Checkpoint(kind, card, parts["average"]))
+
+
+def check_same_run(
+    kept: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
+) -> None:
+    """Raise ``ValueError`` unless the run in a folder is the one that is described.
+
+    Parameters
+    ----------
+    kept : mapping
+        Settings of its checkpoint.
+    described : mapping of mapping
+        What it should be: its parts ``network`` and ``training``, or one of them.
+    folder : Path
+        Where it is.
+    """
+    # A run that was kept before there was a setting ran with what is now the usual one.
+    usual = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
+    for part, settings in described.items():
+        for name, wanted in settings.items():
+            got = kept[part].get(name, usual[part].get(name))
+            # Checkpoints may come more often and the end later: no step is changed by it.
+            if got != wanted and name not in ("steps", "checkpoint_every"):
+                known = f"{name} {got}, expected {wanted}"
+                if len(known) > _READABLE:
+                    known = f"another {name}, expected the same"
+                raise ValueError(
+                    f"out is {folder}, which holds a run with {known}; give it a folder of its own"
+                )
 
 
 def _state_of(kind: str) -> str:

@@ -30,7 +30,7 @@ class TrainMotionVAE:
     """Folder for the folders poses and vae, each with model.safetensors and losses.csv."""
 
     size: Literal["tiny", "small", "paper"] = "small"
-    """tiny: seconds, for trying out; small: an hour on two cores; paper: a GPU."""
+    """tiny: seconds, for trying out; small: twenty minutes of a core; paper: a GPU."""
 
     frames: int | None = None
     """Frames of a motion; by default the size's own, 10."""
@@ -78,7 +78,15 @@ class TrainMotionVAE:
         if self.distance is not None:
             check_positive("distance", self.distance)
         check_out(self.out)
-        found = learning_tracks(self.data, self.threshold)
+        if self.data.centre != "frame":
+            raise ValueError(
+                f"centre is {self.data.centre!r}, expected 'frame': where the body is, is no part "
+                "of the motions"
+            )
+        check_positive("fps", self.data.fps)
+        # Motions may be shorter than what is otherwise worth keeping.
+        shortest = min(1.0, size.frames / self.data.fps)
+        found = learning_tracks(self.data, self.threshold, shortest)
         filmed = None if self.data.tracks else Filming().distance
         shared: dict[str, Any] = {
             "distance": filmed if self.distance is None else self.distance,

@@ -130,7 +130,7 @@ def _shared_skeleton(tracks: Sequence[KeypointTrack]) -> Skeleton:
         if parents[order[joint]] != mirrored:
             raise ValueError(
                 f"tracks has {skeleton.joint_names[joint]} on another joint than its mirror image "
-                "is, expected a skeleton that is its own mirror image"
+                "is, expected a skeleton that is its own mirror image, or a rest pose that is given"
             )
     return skeleton
 
@@ -221,7 +221,8 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
         np.fill_diagonal(filled, diagonal)
         if change <= _SETTLED * bound.max():
             break
-    return factor
+    # Of fewer bones than axes there is nothing along the others.
+    return np.pad(factor, ((0, 0), (0, rank - factor.shape[1])))
 
 
 def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:

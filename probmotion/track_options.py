@@ -36,7 +36,8 @@ class TrackData:
     """How many people to follow in JSON that does not say who is who."""
 
     skeleton: str = "person14"
-    """The joints to learn (see probmotion list), which clips or tracks must have."""
+    """The joints to learn (see probmotion list), which clips or tracks must have; own: those that
+    the files of tracks hold."""
 
     fps: float = 20.0
     """Frames per second to learn at."""
@@ -57,8 +58,20 @@ class TrackData:
     """Seed of cameras, detection errors and, where no clips are named, of the split."""
 
 
-def learning_tracks(data: TrackData, threshold: float = 0.3) -> LearningTracks:
-    """Return the tracks that the options name, and print what preparing them dropped."""
+def learning_tracks(
+    data: TrackData, threshold: float = 0.3, shortest: float = 1.0
+) -> LearningTracks:
+    """Return the tracks that the options name, and print what preparing them dropped.
+
+    Parameters
+    ----------
+    data : TrackData
+        The options.
+    threshold : float
+        Least confidence that counts.
+    shortest : float
+        Seconds of the shortest track that is kept.
+    """
     from probmotion.data.learning import film_clips, read_tracks, split_tracks
     from probmotion.data.projections import Filming
     from probmotion.data.splits import clip_of
@@ -73,8 +86,11 @@ def learning_tracks(data: TrackData, threshold: float = 0.3) -> LearningTracks:
             raise ValueError(f"{name} is given without tracks, expected --tracks FILE… beside it")
     if data.tracks and data.views is not None:
         raise ValueError("views is given with tracks, expected it only where clips are filmed")
-    skeleton = Skeleton.preset(data.skeleton)
-    if data.tracks:
+    own = data.skeleton == "own"
+    if own and not data.tracks:
+        raise ValueError("skeleton is 'own' without tracks, expected --tracks FILE… that hold one")
+    skeleton = None if own else Skeleton.preset(data.skeleton)
+    if skeleton is None or data.tracks:
         prepared = read_tracks(
             data.tracks,
             skeleton,
@@ -84,6 +100,7 @@ def learning_tracks(data: TrackData, threshold: float = 0.3) -> LearningTracks:
             people=data.people,
             threshold=threshold,
             centre=data.centre,
+            shortest=shortest,
         )
     else:
         # A file may hold another name; options name clips by their files.
@@ -95,6 +112,7 @@ def learning_tracks(data: TrackData, threshold: float = 0.3) -> LearningTracks:
             views=64 if data.views is None else data.views,
             seed=data.data_seed,
             filming=Filming(centre=data.centre),
+            shortest=shortest,
         )
     print(prepared)
     if not (data.validation or data.test):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from probmotion.cli import main
 from probmotion.data.animals import ANIMAL_SKELETON, made_animals
 from probmotion.data.gaits import make_gaits
 from probmotion.data.projections import DetectorNoise, project_clips
+from probmotion.formats import read_keypoints
 from probmotion.models.motion_vae import MotionVAE
 from probmotion.motion import KeypointTrack
 
@@ -124,6 +127,7 @@ def test_an_animal_of_one_s_own_comes_from_a_detector_s_tables(
     ("more", "said"),
     [
         (["--frames", "80"], "tracks has at most "),
+        (["--centre", "sequence"], "centre is 'sequence', expected 'frame'"),
         (["--distance", "0"], "distance is 0.0, expected a finite number above 0"),
         (["--threshold", "0"], "threshold is 0.0, expected a finite number above 0"),
         (["--rest", "no.npz"], "no.npz"),
@@ -138,3 +142,77 @@ def test_wrong_options_are_one_sentence(
         part for part in capsys.readouterr().err.splitlines() if part.startswith("probmotion: ")
     )
     assert said in line
+
+
+def changed(pattern: str, folder: Path, change: Callable[[KeypointTrack], KeypointTrack]) -> str:
+    """Write the tracks of other files anew, each of them changed; return their pattern."""
+    for path in Path(pattern).parent.glob(Path(pattern).name):
+        keep(change(read_keypoints(path)[0]), folder / path.name)
+    return str(folder / Path(pattern).name)
+
+
+def first(frames: int) -> Callable[[KeypointTrack], KeypointTrack]:
+    def change(track: KeypointTrack) -> KeypointTrack:
+        return replace(
+            track, keypoints=track.keypoints[:frames], confidence=track.confidence[:frames]
+        )
+
+    return change
+
+
+def test_tracks_as_long_as_the_motions_are_long_enough(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    brief = changed(tracks, tmp_path, first(14))
+    assert main(words(brief, tmp_path / "run", "--steps", 2, "--frames", 5)) == 0
+    capsys.readouterr()
+    assert main(words(brief, tmp_path / "other", "--steps", 2)) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.endswith("10 frames at 10 per second, of which the longest has 5")
+
+
+def test_a_root_that_is_never_seen_is_named(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def hidden(track: KeypointTrack) -> KeypointTrack:
+        confidence = track.confidence.copy()
+        confidence[:, PERSON.index("pelvis")] = 0.0
+        return replace(track, confidence=confidence)
+
+    assert main(words(changed(tracks, tmp_path, hidden), tmp_path / "run", "--steps", 2)) == 2
+    assert "tracks never showed it (pelvis)" in capsys.readouterr().err
+
+
+def test_a_folder_of_another_size_is_refused(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert main(words(tracks, out, "--steps", 2)) == 0
+    assert main([*words(tracks, out, "--steps", 2), "--size", "small"]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.endswith("another size, expected the same; give it a folder of its own")
+
+
+@pytest.mark.filterwarnings("always:body has no left-right pairs")
+def test_a_skeleton_of_one_s_own_without_pairs_is_learnt_and_said_so(
+    tracks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    leg = Skeleton(["trunk", "thigh", "knee", "foot", "top"], [-1, 0, 1, 2, 0])
+    joints = ["pelvis", "right_hip", "right_knee", "right_ankle", "neck"]
+    held = [PERSON.index(joint) for joint in joints]
+
+    def one_leg(track: KeypointTrack) -> KeypointTrack:
+        return replace(
+            track,
+            keypoints=track.keypoints[:, held],
+            confidence=track.confidence[:, held],
+            skeleton=leg,
+        )
+
+    own = changed(tracks, tmp_path, one_leg)
+    more = ["--steps", 2, "--skeleton", "own", "--front", "knee"]
+    assert main(words(own, tmp_path / "run", *more)) == 0, capsys.readouterr().err
+    assert "body has no left-right pairs: no bone is as long as its" in capsys.readouterr().err
+    assert MotionVAE.load(tmp_path / "run" / "vae").skeleton == leg
+    assert main(["train", "motion-vae", "--skeleton", "own", "--out", str(tmp_path / "no")]) == 2
+    assert "skeleton is 'own' without tracks, expected --tracks" in capsys.readouterr().err

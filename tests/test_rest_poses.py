@@ -209,6 +209,10 @@ def test_what_shows_no_body_is_refused():
     chain = rigid_tracks(CHAIN, np.ones((6, 3)), azimuths)
     with pytest.raises(ValueError, match="of other joints than the first, expected one skeleton"):
         estimate_rest_pose([*tracks, *chain])
+    bone = rigid_tracks(Skeleton(["a", "b"], [-1, 0]), np.array([[0, 0, 0], [0, 1, 0.5]]), azimuths)
+    with pytest.raises(ValueError, match="no joint of the mean pose tells front from back"):
+        estimate_rest_pose(bone)
+    assert estimate_rest_pose(bone, front="b")[1] == pytest.approx([0, 1, 0.5], abs=1e-6)
     pair = Skeleton(["a", "b"], [-1, -1])
     with pytest.raises(ValueError, match="tracks has 2 roots, expected one"):
         estimate_rest_pose(rigid_tracks(pair, np.ones((2, 3)), azimuths))

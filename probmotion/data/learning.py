@@ -59,6 +59,7 @@ def film_clips(
     seed: int = 0,
     filming: Filming | None = None,
     noise: DetectorNoise | None = None,
+    shortest: float = 1.0,
 ) -> PreparedTracks:
     """Return what cameras around 3D clips and a detector would have given, prepared.
 
@@ -72,13 +73,15 @@ def film_clips(
         Frames per second of the tracks.
     views, seed, filming, noise
         See :func:`~probmotion.data.projections.project_clips`.
+    shortest : float
+        Seconds of the shortest track that is kept.
     """
     shot = Filming() if filming is None else filming
     clips = [motion.retarget(skeleton) for motion in motions]
     tracks = project_clips(clips, views=views, seed=seed, filming=shot, noise=noise)
     # Cameras are alone with their clip: no other track stands in the same picture.
     alone = [track.name for track in tracks]
-    return prepare_tracks(tracks, fps=fps, videos=alone, centre=shot.centre)
+    return prepare_tracks(tracks, fps=fps, videos=alone, centre=shot.centre, shortest=shortest)
 
 
 def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
@@ -132,7 +135,7 @@ def film_windows(
 
 def read_tracks(
     paths: Iterable[str | Path],
-    skeleton: Skeleton,
+    skeleton: Skeleton | None,
     fps: float,
     *,
     file_fps: float | None = None,
@@ -141,6 +144,7 @@ def read_tracks(
     threshold: float = 0.3,
     centre: Centre = "frame",
     sizes: Mapping[str, float] | None = None,
+    shortest: float = 1.0,
 ) -> PreparedTracks:
     """Return the tracks of files of 2D keypoints, prepared, in metres.
 
@@ -152,8 +156,8 @@ def read_tracks(
     ----------
     paths : iterable of str or Path
         Files, or patterns of them, each of its own name. A track is called ``"<file>/<name>"``.
-    skeleton : Skeleton
-        The joints to bring tracks to.
+    skeleton : Skeleton, optional
+        The joints to bring tracks to; None: their own, which must be the same in all.
     fps : float
         Frames per second of the data set.
     file_fps : float, optional
@@ -168,13 +172,16 @@ def read_tracks(
     sizes : mapping of str to float, optional
         Bone sizes that pixels are brought to, of all bones or some; those of :func:`body_sizes` by
         default.
+    shortest : float
+        Seconds of the shortest track that is kept.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file.
     ValueError
-        If two files have one name, which is that of their clip, or no track shows a bone.
+        If two files have one name, which is that of their clip, no track shows a bone, or tracks
+        have several skeletons and none is given to bring them to.
     """
     raw: list[KeypointTrack] = []
     videos: list[str] = []
@@ -193,10 +200,11 @@ def read_tracks(
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
             videos.append(name if archive else _video(path, track))
-    known = (body_sizes(skeleton) or None) if sizes is None else sizes
+    own = raw[0].skeleton if skeleton is None and raw else skeleton
+    known = sizes if sizes is not None or own is None else body_sizes(own) or None
     prepared = prepare_tracks(
         raw, fps=fps, skeleton=skeleton, sizes=known, videos=videos, threshold=threshold,
-        centre=centre,
+        centre=centre, shortest=shortest,
     )  # fmt: skip
     if known is not None:
         return prepared

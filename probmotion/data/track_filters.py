@@ -6,6 +6,7 @@ which prints no limits; the numbers here are ours, but for the confidence thresh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -92,7 +93,14 @@ def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step
     check_positive("seconds", seconds)
     # A hundredth of a frame for frame rates that files round: 60 frames of .016666 s are a second.
     lasts = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
-    return _kept("short", tracks, lasts, f"dropped tracks of less than {seconds:g} s")
+    why = f"dropped tracks of less than {seconds:g} s"
+    if tracks and not any(lasts):
+        longest = max(tracks, key=lambda track: track.frames / track.fps)
+        why += (
+            f", {math.ceil(seconds * longest.fps - 0.01)} frames at {longest.fps:g} per second, of "
+            f"which the longest has {longest.frames}"
+        )
+    return _kept("short", tracks, lasts, why)
 
 
 def drop_low_quality(

@@ -58,7 +58,8 @@ def centre_tracks(tracks: Sequence[KeypointTrack], *, per: str = "frame") -> Ste
         keypoints = np.where((confidence > 0)[..., np.newaxis], keypoints, np.nan)
         centred.append(replace(track, keypoints=keypoints, confidence=confidence))
     lost = len(tracks) - len(rooted)
-    why = f"root at the origin per {per}; {lost} tracks never showed it"
+    roots = ", ".join(sorted({t.skeleton.joint_names[t.skeleton.roots[0]] for t in tracks}))
+    why = f"root at the origin per {per}; {lost} tracks never showed it ({roots})"
     return centred, StepReport.of(
         "centre",
         tracks,

@@ -25,6 +25,7 @@ from probmotion.models.motion_vae_training import (
     PoseTrainee,
     usual_motion_vae_training,
 )
+from probmotion.models.pose_network import PoseNetwork
 from probmotion.models.training import train
 from probmotion.models.variational_terms import gaussian_kl
 from probmotion.models.view_hypotheses import judge_hypotheses
@@ -283,6 +284,13 @@ def test_what_cannot_be_learnt_with_is_refused_in_a_sentence(tracks, validation,
     wide = asked(replace(TINY, width=64)).network
     with pytest.raises(ValueError, match=r"pose_network has width, .* expected the size's \(32, "):
         MotionVAETrainee(tracks, validation, TINY, body, wide, distance=7.0)
+    of_another = PoseNetwork(TINY, 12, len(body.bones), body.n_groups)
+    with pytest.raises(ValueError, match=r"pose_network is of a body with 12 joints, .* body's 14"):
+        MotionVAETrainee(tracks, validation, TINY, body, of_another, distance=7.0)
+    point = Skeleton(["point"], [-1])
+    still = [KeypointTrack(np.zeros((20, 1, 2)), np.ones((20, 1)), point, 10.0, "still")]
+    with pytest.raises(ValueError, match="body has the one joint point, expected bones"):
+        PoseTrainee(still, still, TINY, ArticulatedBody(point, np.zeros((1, 3))))
 
 
 @pytest.mark.parametrize("phase", [1, 2])

@@ -88,6 +88,11 @@ def test_wrong_numbers_are_refused(prior, tmp_path, options, sentence):
         learnt(prior, tmp_path, **options)
 
 
+def test_a_size_that_has_no_network_is_refused(prior, tmp_path):
+    with pytest.raises(ValueError, match="size is 'reference-code', expected one of tiny, small"):
+        denoiser_of(prior, tmp_path, size="reference-code")
+
+
 def test_a_prior_that_cannot_be_sampled_is_refused(tmp_path):
     with pytest.raises(ValueError, match="prior is object, expected one that can be sampled"):
         denoiser_of(object(), tmp_path)
