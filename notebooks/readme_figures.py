@@ -5,6 +5,7 @@ python notebooks/readme_figures.py            # reads demo/, writes README.md, n
 
 from __future__ import annotations
 
+import argparse
 import re
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def save_small(path: Path) -> None:
 
 def main() -> None:
     """Rewrite the README's figures."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     comparison = Comparison.load(ROOT / "demo")
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")

@@ -218,8 +218,8 @@ def card(
     return f"""# {name}
 
 {kind.about}: a motion VAE learnt from 2D tracks alone. Motions of {size.frames} frames of
-{prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z of {size.latent} numbers, λ_KL = {size.kl:g};
-{weights:.1f} MB.
+{prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z of {size.latent} numbers,
+λ_KL = {size.kl:g}; {weights:.1f} MB.
 
 - **Data**: {network["data"]["tracks"]} tracks of {network["data"]["frames"]} frames, filmed
   {network["distance"]:g} m away from random sides, of

@@ -8,6 +8,7 @@ It writes ``measured.csv`` and ``measured.json`` to ``probmotion/advice`` and th
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -38,6 +39,7 @@ WHEN = {
 
 def main() -> None:
     """Rewrite what was measured."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     found = Comparison.load(ROOT / "grid")
     keep_measured(found, f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}")
     advices = {name: advise(name) for name in found.plan.problems}

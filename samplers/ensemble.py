@@ -20,6 +20,9 @@ from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar,
 
 __all__ = ["Ensemble"]
 
+_TIMES_TO_TELL = 3
+"""Autocorrelation times that a run has to be long for its own to be believed."""
+
 
 @dataclass(frozen=True)
 class Ensemble:
@@ -257,15 +260,20 @@ class _Run:
         """Return per ensemble the share of moves accepted and the autocorrelation time.
 
         The latter is the slowest coordinate's, in draws: 1 where kept iterations are independent,
-        NaN after too few iterations to tell, which have no share of moves either.
+        NaN after too few iterations to tell, which have no share of moves either. Of a run that is
+        not three times as long, which its own estimate is too short for, it is all kept
+        iterations: then one of them counts, whose walkers the target has independent of each other
+        (Goodman and Weare 2010). Whether they have come there, R-hat of several ensembles tells.
         """
         if len(self.trace) < 4:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
         # A stretch is never by a factor of exactly 1: a walker that moved has changed.
         moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
         traces = zip(*self.trace, strict=True)
-        slowest = [autocorrelation_time(np.array(trace)).max() for trace in traces]
-        times = np.maximum(np.array(slowest) * self._stride / self.thin, 1.0)
+        slowest = np.array([autocorrelation_time(np.array(trace)).max() for trace in traces])
+        times = np.maximum(slowest * self._stride / self.thin, 1.0)
+        too_short = len(self.trace) < _TIMES_TO_TELL * slowest
+        times = np.where(too_short, np.maximum(times, len(self.kept)), times)
         return {"acceptance": moved.mean(axis=(0, 2)), "autocorrelation_time": times}
 
     @property

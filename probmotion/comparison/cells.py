@@ -118,6 +118,8 @@ class Cell:
         result = read_result(self.folder)
         if result is None or result.fingerprint != self.fingerprint:
             return False
+        if result.failure is None and self.keeps_draws:
+            return (self.folder / _DRAWS).exists()
         return result.failure is None or result.failure.unsupported
 
     def taken(self) -> bool:
@@ -181,6 +183,12 @@ class Cell:
             seed=seed,
             progress=progress,
         )
+        if not isinstance(draws, MotionDraws):
+            raise TypeError(f"{self.sampler} returned {type(draws).__name__}, expected MotionDraws")
+        if draws.skeleton != posterior.skeleton:
+            raise ValueError(
+                f"{self.sampler} returned draws of another skeleton, expected the posterior's"
+            )
         n = draws.positions.sizes["chain"] * draws.positions.sizes["draw"]
         if n != self.draws:
             raise ValueError(f"{self.sampler} returned {n} draws, expected {self.draws}")

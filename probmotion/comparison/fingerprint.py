@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import random
+import sys
+import sysconfig
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cached_property, partial
@@ -16,6 +19,11 @@ from array_api_compat import is_array_api_obj
 from probmotion.arrays import to_numpy
 
 __all__ = ["fingerprint"]
+
+_INSTALLED = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
+"""Folders of packages, whose classes change with their versions alone."""
+
+_RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
 _SIMPLE = bool | int | float | complex | str | bytes | EllipsisType | np.generic
 
@@ -34,16 +42,17 @@ def fingerprint(value: Any) -> str:
     Numbers, strings, arrays, lists, mappings, dataclasses (by the fields they are made with, so
     that caches do not count), classes, modules and functions written in C (by name), functions of
     Python (by name, compiled code, defaults and what they close over), bound methods (by what
-    they are bound to as well), networks (by layers and weights), and other objects by their
-    attributes.
+    they are bound to as well), networks (by layers and weights), other objects by their
+    attributes, and what has none by what it is pickled as. Of an object whose class is in no
+    installed package, but in a script or notebook, the methods count as functions do.
 
-    Globals that a function reads, and methods of an object's class, count by their names alone.
+    Globals that a function reads, and methods of an installed class, count by their names alone.
     Another version of Python compiles other code, so that it has other fingerprints of functions.
 
     Raises
     ------
     ValueError
-        If an object has nothing of that kind to tell it by.
+        If an object has nothing of that kind to tell it by; the message says where it is held.
     """
     digest = hashlib.sha256()
     _add(digest, value, ())
@@ -78,7 +87,10 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     elif is_array_api_obj(value):
         array = np.ascontiguousarray(to_numpy(value))
         digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(array.tobytes())
+        if array.dtype.hasobject:
+            parts += array.ravel().tolist()
+        else:
+            digest.update(array.tobytes())
     elif callable(getattr(value, "state_dict", None)):
         # A network: its layers and its weights, not what hangs on them while it runs.
         parts += [repr(value), dict(value.state_dict())]
@@ -95,10 +107,9 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         # What was computed from the rest, once asked for, says nothing new.
         parts.append({name: part for name, part in held if not _computed(kind, name)})
     elif not _plain(kind):
-        raise ValueError(
-            f"value holds a {kind.__name__}, which cannot be told from another, expected numbers, "
-            "strings, arrays, dataclasses or objects with attributes"
-        )
+        parts += _as_pickled(value)
+    if _of_a_script(kind):
+        parts.append(_methods(kind))
     for part in parts:
         _add(digest, part, (*above, id(value)))
     digest.update(b"</>")
@@ -142,6 +153,54 @@ def _held(cell: CellType) -> list[Any]:
 def _or_marker(value: Any) -> Any:
     """Return the value, or for a bare object, which libraries use for "not given", its class."""
     return object if type(value) is object else value
+
+
+def _as_pickled(value: Any) -> list[Any]:
+    """Return what an object without attributes is made anew from, where it can be."""
+    try:
+        # What draws is another after every draw, and a bare object stands for itself.
+        told = type(value) is not object and not isinstance(value, _RANDOM)
+        made: Any = value.__reduce_ex__(2) if told else None
+    except TypeError:
+        made = None
+    if isinstance(made, str):
+        return [made]  # The name of what there is one of.
+    if made is None:
+        name = type(value).__name__
+        raise ValueError(
+            f"value holds a {name}, which cannot be told from another, expected numbers, strings, "
+            "arrays, dataclasses, objects with attributes or what can be pickled, and randomness "
+            "that comes from seeds"
+        )
+    made_by, given, *rest = made
+    # What follows the state are iterators, over the items of lists and mappings.
+    state, items, pairs = (*rest, None, None, None)[:3]
+    return [made_by, given, state, list(items or ()), list(pairs or ())]
+
+
+def _of_a_script(kind: type) -> bool:
+    """Whether a class is in no installed package or library: it may change at any time."""
+    package = kind.__module__.partition(".")[0]
+    if package in (*sys.builtin_module_names, __name__.partition(".")[0]):
+        return False
+    # A notebook has no file.
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
+    return not file.startswith(_INSTALLED)
+
+
+def _methods(kind: type) -> dict[str, Any]:
+    """Return the methods that a class and those it inherits from define in scripts."""
+    found: dict[str, Any] = {}
+    for each in reversed(kind.__mro__):
+        if each is object or not _of_a_script(each):
+            continue
+        for name, value in vars(each).items():
+            function = getattr(value, "__func__", getattr(value, "fget", value))
+            # Those that dataclasses write are told by the fields.
+            made = isinstance(function, FunctionType)
+            if made and not function.__code__.co_filename.startswith("<string>"):
+                found[name] = function
+    return found
 
 
 def _computed(kind: type, name: str) -> bool:

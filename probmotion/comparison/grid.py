@@ -96,6 +96,8 @@ def compare(
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     check_budget(budget)
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise ValueError(f"executor is {executor!r}, expected one that has submit(), or None")
     chosen = named_problems(problems)
     used = named_samplers(samplers)
     given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out)

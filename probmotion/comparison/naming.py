@@ -35,6 +35,8 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
                 f"problems has a {type(given).__name__}, expected names, Problem or "
                 "MotionPosterior objects"
             )
+    if not found:
+        raise ValueError("problems is empty, expected at least one")
     return found
 
 
@@ -65,6 +67,8 @@ def named_samplers(samplers: Any) -> dict[str, Sampler]:
             raise ValueError(
                 f"samplers has {what}, expected names or objects with name, requires and sample()"
             )
+    if not found:
+        raise ValueError("samplers is empty, expected at least one")
     return found
 
 

@@ -104,8 +104,9 @@ manifold / exact (1); log p: mean log density less exact, nats (0); shares: tota
 styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
 The frame and table.csv hold more measures."""
 _SEEDS_LEGEND = """\
-±: standard deviation over seeds; *: best of its column; °: not to be told from the best (intervals
-of 95 % of paired differences over seeds, Student's at Holm's levels, hold 0)."""
+±: standard deviation over seeds; *: best of its column, of those with draws at every seed; °: not
+to be told from it (intervals of 95 % of paired differences over seeds, Student's at Holm's levels,
+hold 0)."""
 _TESTS_LEGEND = """\
 C2ST: how often a classifier tells a draw from an exact one (0.5: it guesses); MMD²: squared maximum
 mean discrepancy from exact draws (0); KSD²: squared kernel Stein discrepancy from density (0)."""

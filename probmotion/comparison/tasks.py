@@ -56,9 +56,11 @@ class Grid:
         self.budget = budget
         self.limit = limit
         self._asked = {
-            name: fingerprint(load_problem(source) if isinstance(source, str) else source)
+            name: _told(name, load_problem(source) if isinstance(source, str) else source)
             for name, source in problems.items()
         }
+        for name, sampler in samplers.items():
+            _told(name, sampler)
         self._versions = library_versions()
 
     def pilots(self) -> list[Pilot]:
@@ -119,6 +121,14 @@ class Grid:
             settings=None if found is None else found.settings,
             beforehand=None if found is None else found.failure,
         )
+
+
+def _told(name: str, value: Any) -> str:
+    """Return a problem's or sampler's fingerprint; an error says whose it is."""
+    try:
+        return fingerprint(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def run_grid(

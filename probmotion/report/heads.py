@@ -61,8 +61,8 @@ def reading(comparison: Comparison, table: ComparisonTable) -> str:
     marks = (
         "With one seed no sampler can be told from another, and none is marked."
         if comparison.plan.seeds == 1
-        else "★ is the best of its column, ☆ cannot be told from it: 95 % intervals of the "
-        "differences seed by seed, at Holm's levels, hold zero."
+        else "★ is the best of its column, of those with draws at every seed, ☆ cannot be told "
+        "from it: 95 % intervals of the differences seed by seed, at Holm's levels, hold zero."
     )
     return f"""\
 <details open><summary>How to read this page</summary>

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from toy_samplers import (
     generation,
 )
 
+from probmotion import MotionPosterior, Skeleton
 from probmotion.comparison import Comparison, compare
 from probmotion.comparison.failures import CellNotKept, Failure, TimeIsUp, WorkerDied
 from probmotion.comparison.time_limits import time_limit
@@ -236,3 +238,44 @@ out, workers, *_ = sys.argv[1:]
 compare(generation(), samplers, seeds=2, draws=20, chains=2, out=out, workers=int(workers),
         progress=False)
 """
+
+
+class Returning(PriorDraws):
+    """Returns something else than it should."""
+
+    def sample(self, posterior, **settings):
+        drawn = super().sample(posterior, **settings)
+        if self.name == "nothing":
+            return None
+        if self.name == "array":
+            return drawn.positions.values
+        names = [f"{name} of another" for name in drawn.skeleton.joint_names]
+        other = replace(posterior.prior, skeleton=Skeleton(names, drawn.skeleton.parents))
+        settings = {key: value for key, value in settings.items() if key != "initial"}
+        return PriorDraws().sample(MotionPosterior(other), **settings)
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        ("nothing", "nothing returned NoneType, expected MotionDraws"),
+        ("array", "array returned ndarray, expected MotionDraws"),
+        ("other", "other returned draws of another skeleton, expected the posterior's"),
+    ],
+)
+def test_what_is_no_motion_of_the_posterior_is_a_row_that_says_so(tmp_path, what, sentence):
+    kind = type("Kind", (Returning,), {"name": what})
+    (cell,) = compare(generation(), kind(), out=tmp_path, **SMALL).results
+    assert str(cell.failure.message) == sentence
+
+
+def test_a_cell_whose_draws_were_lost_is_computed_again(tmp_path):
+    asked = {"out": tmp_path / "out", **SMALL}
+    sampler = PriorDraws(diary=str(tmp_path / "diary"))
+    first = compare(generation(), sampler, **asked)
+    (lost,) = (tmp_path / "out").rglob("draws.nc")
+    lost.unlink()
+    again = compare(generation(), sampler, **asked)
+    assert len((tmp_path / "diary").read_text().splitlines()) == 2
+    assert lost.exists()
+    assert len(again.table()) == len(first.table())

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import os
+from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from decimal import Decimal
 from functools import cached_property, lru_cache, partial, update_wrapper, wraps
 from multiprocessing import get_context
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import pytest
@@ -270,14 +273,72 @@ def test_an_object_that_holds_itself_ends():
 @pytest.mark.parametrize(
     "value",
     [
-        *(Slotted(), np.random.default_rng(0), object(), (x for x in "a")),
+        *(Lock(), np.random.default_rng(0), object(), (x for x in "a")),
         *(scaled(np.random.default_rng(0)), np.random.default_rng(0).normal),
     ],
-    ids=["slots", "generator", "object", "iteration", "closed over", "bound"],
+    ids=["lock", "generator", "object", "iteration", "closed over", "bound"],
 )
 def test_what_cannot_be_told_apart_is_refused(value):
     with pytest.raises(ValueError, match="which cannot be told from another"):
         fingerprint([value])
+
+
+def slotted(value):
+    made = Slotted()
+    made.value = value
+    return made
+
+
+@pytest.mark.parametrize(
+    ("one", "again", "other"),
+    [
+        (slotted(1), slotted(1), slotted(2)),
+        (torch.device("cpu"), torch.device("cpu"), torch.device("meta")),
+        (torch.float32, torch.float32, torch.float64),
+        (np.dtype("f4"), np.dtype("float32"), np.dtype("f8")),
+        (range(3), range(3), range(4)),
+        (Decimal("1.5"), Decimal("1.5"), Decimal("1.6")),
+        (deque([1, 2]), deque([1, 2]), deque([2, 1])),
+        (
+            np.array([[1], "a"], dtype=object),
+            np.array([[1], "a"], dtype=object),
+            np.array([[2], "a"], dtype=object),
+        ),
+    ],
+    ids=["slots", "device", "torch dtype", "dtype", "range", "decimal", "deque", "objects"],
+)
+def test_what_a_sampler_may_hold_is_told_by_its_value(one, again, other):
+    assert fingerprint(Plain(one)) == fingerprint(Plain(again))
+    assert fingerprint(Plain(one)) != fingerprint(Plain(other))
+
+
+def test_methods_of_a_script_s_classes_count_and_an_installed_package_s_do_not(monkeypatch):
+    def of(factor):
+        """Return an object of a class as it is after an edit."""
+
+        class Mine:
+            width = property(lambda self: factor)
+
+            def sample(self):
+                return [2.0] if factor == 3 else [factor]
+
+            @staticmethod
+            def name():
+                return "mine"
+
+        return Mine()
+
+    class Heir(type(of(1))):
+        pass
+
+    assert fingerprint(of(1)) == fingerprint(of(1))
+    assert fingerprint(of(1)) != fingerprint(of(2))
+    before = fingerprint(Heir())
+    monkeypatch.setattr(Heir.__mro__[1], "name", staticmethod(lambda: "other"))
+    assert fingerprint(Heir()) != before
+    before = fingerprint(norm)
+    monkeypatch.setattr(type(norm), "_pdf", lambda self, x: x)
+    assert fingerprint(norm) == before
 
 
 def threads():

@@ -99,7 +99,7 @@ def test_the_best_and_those_that_are_not_told_from_it_are_marked():
     # Seconds are neither right nor wrong, and numbers stay one below the other.
     assert [line.count("*") + line.count("°") for line in rows.values()] == [1, 0, 1]
     assert len(rows["near"]) == len(rows["alike"]) == len(rows["far"]) + 1
-    assert "±: standard deviation over seeds; *: best of its column; °: not to be told from" in text
+    assert "±: standard deviation over seeds; *: best of its column, of those with draws" in text
 
 
 def test_what_says_most_is_the_first_that_was_measured():
