@@ -187,7 +187,9 @@ class Compare:
         from probmotion.sampling import importable_samplers
         from probmotion.settings_options import sampler_called
 
-        names = self.samplers or importable_samplers()
+        names = self.samplers or tuple(importable_samplers())
+        if len(set(names)) < len(names):
+            raise ValueError(f"samplers is {' '.join(names)}, expected each once")
         return {name: sampler_called(name, self.settings) for name in names}
 
     def _problems(self) -> list[Problem]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -105,7 +105,6 @@ def test_orthographic_views_of_standard_noise_are_standard_noise(
     np.testing.assert_allclose(covariance, np.tile(np.eye(2), (n_views, 1, 1)), atol=1e-14)
 
 
-@settings(deadline=None)
 @given(
     arrays(np.float64, 3, elements=st.floats(-1, 1)),
     st.floats(1.5, 100),

@@ -278,6 +278,7 @@ def test_calibration_within_a_budget_goes_on(tmp_path, capsys):
     ("words", "expected"),
     [
         ("compare gait --samplers mcmc", ("'mcmc'", "exact", "nuts")),
+        ("compare gait --samplers exact mh exact", ("samplers is exact mh exact", "each once")),
         ("compare gait --samplers mas.best", ("'mas.best'", "mas.reference_code")),
         ("compare jump", ("'jump'", "gait-monocular")),
         ("compare", ("no problem is given", "--clips", "--prior")),

@@ -233,7 +233,7 @@ unit = st.floats(-1, 1, width=64)
 turns = arrays(np.float64, 3, elements=unit).map(lambda v: r.vector_to_matrix(np.pi * v))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(turns, turns, turns)
 def test_group_axioms(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
     p, q, s = (r.matrix_to_quaternion(m) for m in (a, b, c))
@@ -259,7 +259,7 @@ def test_group_axioms(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
     np.testing.assert_allclose(r.vector_to_matrix(-r.matrix_to_vector(a)), a.T, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(turns, turns, turns, st.floats(0, 1))
 def test_the_angle_is_a_metric_and_slerp_its_geodesic(
     a: np.ndarray, b: np.ndarray, c: np.ndarray, fraction: float

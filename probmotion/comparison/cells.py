@@ -40,6 +40,7 @@ __all__ = [
 
 _DRAWS, _RESULT = "draws.nc", "cell.json"
 _UNFINISHED = ".unfinished-"
+_FARTHEST = 1e100
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Cell:
     fingerprint : str
         Digest of all that decides the result.
     limit : float, optional
-        Seconds that it may take, the making of its problem not counted.
+        Seconds that it may take, the making of its problem and what measures import not counted.
     budget : Budget, optional
         What it was allowed.
     settings : dict, optional
@@ -131,8 +132,9 @@ class Cell:
 
     def prepare(self) -> None:
         """Load what it needs."""
-        import probmotion.metrics  # noqa: F401
+        from probmotion.metrics import load_libraries
 
+        load_libraries()
         if isinstance(self.source, str):
             load_problem(self.source)
 
@@ -153,6 +155,7 @@ class Cell:
             return
         try:
             with one_thread():
+                self.prepare()
                 problem = load_problem(self.source) if isinstance(self.source, str) else self.source
                 with time_limit(self.limit):
                     draws, metrics = self._measured(problem, progress)
@@ -192,8 +195,12 @@ class Cell:
         n = draws.positions.sizes["chain"] * draws.positions.sizes["draw"]
         if n != self.draws:
             raise ValueError(f"{self.sampler} returned {n} draws, expected {self.draws}")
-        if bad := int((~np.isfinite(draws.positions.values)).sum()):
-            raise NotFinite(f"{self.sampler} returned draws of which {bad} numbers are not finite")
+        # Measures take squares, and sums of them.
+        if bad := int((~(np.abs(draws.positions.values) < _FARTHEST)).sum()):
+            raise NotFinite(
+                f"{self.sampler} returned draws of which {bad} numbers are not finite or beyond "
+                f"{_FARTHEST:g} metres"
+            )
         return draws
 
     def _keep(

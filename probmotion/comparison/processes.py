@@ -256,7 +256,8 @@ def _work(connection: Connection) -> None:
                 task.prepare()
             connection.send_bytes(_BEGUN)
             task.run(False)
-        except Exception as caught:
+        # Ctrl-C is not heard here: what says so is the sampler.
+        except (Exception, KeyboardInterrupt) as caught:
             error = caught
         connection.send_bytes(_pickled(error))
 

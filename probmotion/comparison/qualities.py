@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +50,7 @@ _RIGHT: Mapping[str, Mapping[str, Any]] = {
 }
 _LESS_BEGIN = ("coverage_", "fid")
 _LESS_END = ("_mm", "_cm2")
+_NEAR_THE_TRUTH = ("acceleration_error", "velocity_error", "pck")
 
 
 def first_quality(table: pd.DataFrame) -> str | None:
@@ -60,13 +61,17 @@ def first_quality(table: pd.DataFrame) -> str | None:
 
 
 def best_of(
-    metric: str, values: Mapping[str, pd.Series], seeds: Iterable[int]
+    metric: str,
+    values: Mapping[str, pd.Series],
+    seeds: Iterable[int],
+    beside: Collection[str] = (),
 ) -> tuple[str | None, set[str]]:
     """Return the best sampler and all that are not distinguishable from it, itself among them.
 
     Nobody is where fewer than two samplers have a number, none has one at two seeds, without which
-    nothing can be told apart, or no value of the metric is right, as of costs and of what describes
-    a run.
+    nothing can be told apart, or no value of the metric is right, as of costs, of what describes a
+    run, and of how near draws are to the truth where references show how far right ones are: draws
+    that vary too little are nearer.
 
     Parameters
     ----------
@@ -76,11 +81,13 @@ def best_of(
         By sampler, its values by seed.
     seeds : iterable of int
         Those that were asked for.
+    beside : collection of str
+        What else was measured on the problem.
     """
     rule = _RIGHT.get(metric)
     if rule is None and (metric.startswith(_LESS_BEGIN) or metric.endswith(_LESS_END)):
         rule = _LESS
-    if rule is None:
+    if rule is None or ("swd" in beside and _is_nearness(metric)):
         return None, set()
     rows = {name: row.reindex(list(seeds)).to_numpy(float) for name, row in values.items()}
     # A ratio of 0 is infinitely wrong, and an infinite value as well.
@@ -94,3 +101,8 @@ def best_of(
     if len(errors) < 2 or max(np.isfinite(row).sum() for row in errors.values()) < 2:
         return None, set()
     return best_and_tied(errors, **rule)
+
+
+def _is_nearness(metric: str) -> bool:
+    """Whether a metric is how near single draws are to the truth, as that of their mean is not."""
+    return metric in _NEAR_THE_TRUTH or (metric.endswith("_mm") and "_mean_" not in metric)

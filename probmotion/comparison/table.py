@@ -113,6 +113,9 @@ mean discrepancy from exact draws (0); KSD²: squared kernel Stein discrepancy f
 _WORLD_LEGEND = """\
 in the world: G-MPJPE, without alignment, of the draws and of their mean; acceleration: mean size of
 a joint's acceleration over the truth's (0.5 to 2 is plausible)."""
+_TRUTH_LEGEND = """\
+against the truth: where references show how far right draws are, nobody's draws are marked as the
+nearest, for those that vary too little are nearer."""
 _COVERAGE_LEGEND = """\
 D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
 joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
@@ -160,12 +163,14 @@ class ComparisonTable(pd.DataFrame):
 
     def legends(self) -> list[str]:
         """Return how to read the measures that it has, a paragraph per kind."""
+        several = self["seed"].nunique() > 1
         return [
             legend
             for metric, legend in (
                 ("swd", _LEGEND),
                 ("c2st|ksd", _TESTS_LEGEND),
                 ("g_mpjpe_mean_mm", _WORLD_LEGEND),
+                *([("mpjpe_mm", _TRUTH_LEGEND)] if several else []),
                 ("coverage_cartesian", _COVERAGE_LEGEND),
                 ("fid", _GENERATION_LEGEND),
             )
@@ -212,7 +217,7 @@ def _marks(
 ) -> dict[str, str]:
     """Return what stands behind each sampler's number; nothing where none is the best."""
     found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-    best, tied = best_of(metric, found, seeds)
+    best, tied = best_of(metric, found, seeds, {measured for _, measured in values})
     if best is None:
         return {}
     return {name: "*" if name == best else "°" if name in tied else " " for name in found}

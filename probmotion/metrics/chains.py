@@ -15,6 +15,7 @@ __all__ = [
 ]
 
 _FEW = 32
+_TO_CORRELATE = 10
 _PRINCIPAL = 10
 _NOTHING = 1e-9
 
@@ -23,7 +24,9 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
     """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
 
     ``ess_bulk``, ``ess_tail``: the smallest over ``values``, (chain, draw, n), by default
-    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ).
+    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ). Chains of
+    fewer than 10 draws have no ESS: halves of them are too short to show that draws depend on each
+    other, and stuck chains would have that of independent ones.
     ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
 
     Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
@@ -44,7 +47,7 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
         slowest = float(np.max(data["autocorrelation_time"].values))
         if not np.isnan(slowest):
             found["ess_bulk"] = n_chains * n_draws / slowest
-    else:
+    elif n_draws >= _TO_CORRELATE:
         found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
         found["ess_tail"] = float(np.min(tails))

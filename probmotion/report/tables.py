@@ -101,7 +101,7 @@ def _table(
     best = {}
     for metric in heads:
         found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-        best[metric] = best_of(metric, found, seeds)
+        best[metric] = best_of(metric, found, seeds, {measured for _, measured in values})
     body = []
     for place, sampler in enumerate(samplers):
         outcome = outcomes[sampler]

@@ -15,9 +15,11 @@ from pathlib import Path
 
 import pytest
 from toy_samplers import (
+    Diverged,
     Dying,
     Endless,
     Hungry,
+    Interrupted,
     NotANumber,
     PriorDraws,
     Quitting,
@@ -35,6 +37,7 @@ SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 WORDS = {
     NotANumber(): "nan",
     Unchecked(): "nan",
+    Diverged(): "nan",
     Hungry(): "memory",
     Quitting(): "SystemExit",
 }
@@ -86,7 +89,12 @@ def test_a_cell_that_takes_longer_than_its_limit_is_a_row():
 
 
 def test_processes_are_killed_where_an_alarm_is_not_heard():
-    samplers = {"deaf": Endless(deaf=True), "dying": Dying(), "right": PriorDraws()}
+    samplers = {
+        "deaf": Endless(deaf=True),
+        "dying": Dying(),
+        "interrupted": Interrupted(),
+        "right": PriorDraws(),
+    }
     comparison = compare(
         generation(), samplers, time_limit=6.0, seeds=2, **(SMALL | {"workers": 2})
     )
@@ -94,9 +102,39 @@ def test_processes_are_killed_where_an_alarm_is_not_heard():
     assert words == {
         **{("deaf", seed): "time" for seed in (0, 1)},
         **{("dying", seed): "died" for seed in (0, 1)},
+        **{("interrupted", seed): "KeyboardInterrupt" for seed in (0, 1)},
         # What one process dies of fails no other's cell.
         **{("right", seed): None for seed in (0, 1)},
     }
+
+
+def test_what_measures_import_is_there_before_a_cells_clock_starts():
+    program = """
+import sys
+from toy_samplers import PriorDraws, generation
+from probmotion.metrics import load_libraries, measure
+
+problem = generation()
+draws = PriorDraws().sample(problem.posterior, draws=10, chains=2, seed=0, progress=False)
+if {prepared}:
+    load_libraries()
+known = set(sys.modules)
+measure(problem, draws, 0)
+heavy = {{name.partition(".")[0] for name in set(sys.modules) - known}}
+print(sorted(heavy & {{"arviz_stats", "scipy", "sklearn"}}))
+"""
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", program.format(prepared=prepared)],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        for prepared in (True, False)
+    ]
+    assert said[0] == "[]"
+    assert "sklearn" in said[1]
 
 
 def test_the_limit_is_no_part_of_the_question(tmp_path):

@@ -198,6 +198,28 @@ class Unchecked(PriorDraws):
 
 
 @dataclass(frozen=True)
+class Diverged(PriorDraws):
+    """Its draws are numbers, but of what measures make of them squares are not."""
+
+    name: ClassVar[str] = "diverged"
+
+    def sample(self, posterior, **settings):
+        found = super().sample(posterior, **settings)
+        found.dataset["positions"].values[0, 0] *= 1e200
+        return found
+
+
+@dataclass(frozen=True)
+class Interrupted(PriorDraws):
+    """Asks to be stopped where nobody pressed a key."""
+
+    name: ClassVar[str] = "interrupted"
+
+    def sample(self, posterior, **settings):
+        raise KeyboardInterrupt("of its own")
+
+
+@dataclass(frozen=True)
 class Hungry(PriorDraws):
     name: ClassVar[str] = "hungry"
 

@@ -182,26 +182,26 @@ def test_the_undamaged_files_read(
     assert read(path)
 
 
-@settings(derandomize=True, max_examples=400, deadline=None)
+@settings(derandomize=True, max_examples=400)
 @given(damaged([BVH]))
 def test_damaged_bvh(content: bytes) -> None:
     read_damaged(content, ".bvh", read_with_end_sites)
 
 
-@settings(derandomize=True, max_examples=150, deadline=None)
+@settings(derandomize=True, max_examples=150)
 @given(damaged(ARCHIVES))
 def test_damaged_npz(content: bytes) -> None:
     read_damaged(content, ".npz", read_motion)
     read_damaged(content, ".npz", read_tracks)
 
 
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(derandomize=True, max_examples=300)
 @given(damaged(JSONS))
 def test_damaged_json(content: bytes) -> None:
     read_damaged(content, ".json", read_tracks)
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
+@settings(derandomize=True, max_examples=200)
 @given(st.binary(max_size=200), st.binary(max_size=300))
 def test_damaged_arrays_in_a_whole_archive(head: bytes, body: bytes) -> None:
     """The zip's checksums hold here, so that the damage reaches the array's own header."""
@@ -227,7 +227,7 @@ KEYS = st.sampled_from(
 )
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
+@settings(derandomize=True, max_examples=200)
 @given(
     st.recursive(
         st.one_of(SCALARS, st.lists(st.floats(0, 9), min_size=51, max_size=51)),
@@ -241,7 +241,7 @@ def test_any_json(content: object) -> None:
     read_damaged(json.dumps(content).encode(), ".json", read_tracks)
 
 
-@settings(derandomize=True, max_examples=100, deadline=None)
+@settings(derandomize=True, max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from((b"", b"HIERARCHY\n", b"PK\x03\x04", b"[")))
 def test_random_bytes(tail: bytes, head: bytes) -> None:
     for ending in (".bvh", ".npz"):

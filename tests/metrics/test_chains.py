@@ -65,6 +65,12 @@ def test_white_noise_is_worth_all_its_draws(rng):
     assert set(found) == {"rhat", "ess_bulk", "ess_tail"}
 
 
+def test_chains_too_short_to_show_that_draws_depend_have_no_size(rng):
+    stuck = rng.normal(size=(CHAINS, 10, 1)) + 3 * np.arange(CHAINS)[:, None, None]
+    assert set(chain_diagnostics(run(stuck))) == {"rhat", "ess_bulk", "ess_tail"}
+    assert set(chain_diagnostics(run(stuck[:, :9]))) == {"rhat"}
+
+
 def test_an_autoregression_is_worth_what_theory_says(rng):
     phi, draws = 0.8, 4000
     theta = np.empty((CHAINS, draws, 1))
