@@ -45,6 +45,7 @@ def of_motion_vae(folder: Path, *parts: str, monkeypatch) -> list[pd.DataFrame]:
     return [pd.read_csv(folder / f"{part}.csv", index_col=0) for part in parts]
 
 
+@pytest.mark.slow
 def test_what_the_motion_vae_s_parts_are_worth_comes_in_tables(tmp_path, monkeypatch):
     brief = [
         replace(phase, steps=2) for phase in motion_vae_training.usual_motion_vae_training("tiny")

@@ -299,7 +299,8 @@ def test_compare_draws_from_a_prior_of_one_s_own(
 ) -> None:
     out = tmp_path / "out"
     given = "compare --samplers mh mas --draws 12 --settings.mh.warmup 10 --settings.mh.thin 2"
-    assert main([*given.split(), "--prior", str(prior), "--out", str(out)]) == 0
+    where = ["--workers", "0", "--prior", str(prior), "--out", str(out)]
+    assert main([*given.split(), *where]) == 0
     table = pd.read_csv(out / "table.csv")
     assert set(table["problem"]) == {"prior"}
     assert "density_evaluations" in set(table[table["sampler"] == "mh"]["metric"])

@@ -110,15 +110,15 @@ def test_compare_writes_the_table(tmp_path, capsys):
 
 
 def test_compare_draws_pictures(tmp_path):
-    words = "compare gait-monocular --samplers exact --draws 12 --pictures --out"
+    words = "compare gait-monocular --samplers exact --draws 12 --pictures --workers 0 --out"
     assert main([*words.split(), str(tmp_path)]) == 0
     for name in ("quality_against_cost.png", "skeletons_gait-monocular.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_problem_without_exact_draws_has_pictures_too(tmp_path):
-    words = "compare walk2d --samplers mas --draws 12 --settings.mas.steps 2 --pictures --out"
-    assert main([*words.split(), str(tmp_path)]) == 0
+    words = "compare walk2d --samplers mas --draws 12 --settings.mas.steps 2 --pictures"
+    assert main([*words.split(), "--workers", "0", "--out", str(tmp_path)]) == 0
     for name in ("quality_against_cost.png", "skeletons_walk2d.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
@@ -128,7 +128,7 @@ def test_the_table_is_printed_before_pictures_are_drawn(tmp_path, capsys, monkey
         raise ValueError("no picture today")
 
     monkeypatch.setattr("probmotion.pictures.comparisons.draw_comparison", fail)
-    words = "compare gait --samplers exact --draws 12 --pictures --out"
+    words = "compare gait --samplers exact --draws 12 --pictures --workers 0 --out"
     assert main([*words.split(), str(tmp_path)]) == 2
     printed = capsys.readouterr()
     assert "no picture today" in printed.err
@@ -141,9 +141,9 @@ def test_a_prior_of_one_s_own_is_drawn_from(named, tmp_path, capsys):
 
     (tmp_path / "mine").mkdir()
     shutil.copy(WEIGHTS / "walk2d.safetensors", tmp_path / "mine" / "model.safetensors")
-    words = "compare --samplers mas mh --draws 12 --settings.mas.steps 2 --pictures --prior"
+    words = "compare --samplers mas mh --draws 12 --settings.mas.steps 2 --workers 0 --pictures"
     out = tmp_path / "out"
-    assert main([*words.split(), str(tmp_path / named), "--out", str(out)]) == 0
+    assert main([*words.split(), "--prior", str(tmp_path / named), "--out", str(out)]) == 0
     table = pd.read_csv(out / "table.csv")
     assert set(table["problem"]) == {"mine"}
     drawn = table[table["sampler"] == "mas"]
@@ -216,7 +216,7 @@ def test_show_reads_the_tables_of_deeplabcut(tmp_path, capsys):
 
 
 def test_show_and_convert_read_draws(tmp_path, capsys):
-    words = "compare gait --samplers exact --draws 12 --out"
+    words = "compare gait --samplers exact --draws 12 --workers 0 --out"
     assert main([*words.split(), str(tmp_path)]) == 0
     (path,) = tmp_path.rglob("draws.nc")
     assert main(["show", str(path)]) == 0

@@ -49,6 +49,7 @@ def played(page: Path) -> dict[str, np.ndarray]:
 
 
 # Jupyter's own libraries warn about themselves.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     printed = run("01_one_posterior_many_samplers.py", tmp_path, 5, monkeypatch)
@@ -121,6 +122,7 @@ def test_motion_from_2d(tmp_path, monkeypatch):
     assert wrong[~caught].max() < 0.5 * numbers("without evidence: ")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_denoising(tmp_path, monkeypatch):
     monkeypatch.delenv("PROBMOTION_DATA", raising=False)

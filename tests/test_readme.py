@@ -55,8 +55,17 @@ def test_the_library_example_runs(tmp_path, monkeypatch, capsys):
         clip.save(f"walks/{clip.name}.bvh")
     (code,) = blocks("python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
-    # As printed, but for the number of draws and seeds.
-    exec(code.replace("draws=200", "draws=12").replace("seeds=3", "seeds=1"), {})
+    # As printed, but for the number of draws, seeds and steps.
+    smaller = {
+        "draws=200": "draws=12",
+        "seeds=3": "seeds=1",
+        "n_views=5": "n_views=5, steps=20",
+        "MultiViewAncestral(),": "MultiViewAncestral(steps=20),",
+    }
+    for printed, run in smaller.items():
+        assert printed in code
+        code = code.replace(printed, run)
+    exec(code, {})
     printed = capsys.readouterr().out
     for name in ("exact", "mas", "nuts", "swd"):
         assert name in printed

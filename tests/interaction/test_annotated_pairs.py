@@ -65,6 +65,7 @@ def test_with_fixed_views_the_density_is_a_function(drawn, poses):
     assert not np.array_equal(first.log_density(poses), other.log_density(poses))
 
 
+@pytest.mark.slow
 def test_fresh_views_estimate_the_integral_without_bias(drawn, poses):
     """The mean of many small estimates is that of one with as many views, the standard error apart.
 

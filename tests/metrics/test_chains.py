@@ -69,6 +69,8 @@ def test_chains_too_short_to_show_that_draws_depend_have_no_size(rng):
     stuck = rng.normal(size=(CHAINS, 10, 1)) + 3 * np.arange(CHAINS)[:, None, None]
     assert set(chain_diagnostics(run(stuck))) == {"rhat", "ess_bulk", "ess_tail"}
     assert set(chain_diagnostics(run(stuck[:, :9]))) == {"rhat"}
+    assert chain_diagnostics(run(stuck[:, :4]))["rhat"] > 1.5
+    assert chain_diagnostics(run(stuck[:, :3])) == {}
 
 
 def test_an_autoregression_is_worth_what_theory_says(rng):
@@ -167,7 +169,7 @@ def test_the_limit_of_r_hat_is_of_the_runs_and_the_level():
 
 
 def test_of_short_chains_even_independent_draws_have_an_r_hat_far_from_1(rng):
-    assert rhat_of_independent(4, 2000) < 1.02
+    assert rhat_of_independent(4, 500) < 1.05
     limit = rhat_of_independent(4, 10)
     found = [chain_diagnostics(run(rng.normal(size=(4, 10, 32))))["rhat"] for _ in range(40)]
     assert limit > 1.25

@@ -367,6 +367,7 @@ def per_frame_linear(seen, observed, deviation):
     return (mean + (flat - mean) @ gain).reshape(observed.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "share"), [(30, 0.9), (50, 0.65), (70, 0.55), (80, 0.55)])
 def test_a_trained_network_approaches_the_exact_denoiser(gait, learnt, level, share):
     alpha_bar = float(learnt.settings.schedule.alpha_bar[level])

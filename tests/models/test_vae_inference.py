@@ -229,6 +229,7 @@ def test_nuts_agrees_with_the_posterior(prior):
     np.testing.assert_allclose(theta.std(axis=0), deviation, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_ensemble_and_mh_agree_in_the_reduced_latent():
     """Of five dimensions two are kept: what walkers find in them is what chains find."""
     whole = fresh(replace(SIZE, latent=5))

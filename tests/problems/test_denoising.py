@@ -128,11 +128,17 @@ def test_the_evidence_is_of_the_truth_with_the_stated_noise(prior, walks):
     assert (abs(residual) < 5).all()
 
 
-def test_it_can_be_simulated_and_so_calibrated(prior, walks):
-    """Other motions of the same body, with the same joints hidden and noise of the same size."""
+@pytest.fixture
+def problem_to_simulate(prior, walks):
+    """Joint 4 is hidden for six frames."""
     hidden = np.zeros(walks[0].positions.shape[:2], dtype=bool)
     hidden[3:9, 4] = True
-    problem = denoising_problem(walks[0], prior, noise=0.04, hidden=hidden)
+    return denoising_problem(walks[0], prior, noise=0.04, hidden=hidden)
+
+
+def test_it_can_be_simulated(problem_to_simulate):
+    """Other motions of the same body, with the same joints hidden and noise of the same size."""
+    problem, hidden = problem_to_simulate, ~problem_to_simulate.posterior.likelihood.entries.visible
     again = problem.simulate(3)
     np.testing.assert_array_equal(again.truth, problem.simulate(3).truth)
     assert (again.truth != problem.simulate(4).truth).any()
@@ -141,6 +147,11 @@ def test_it_can_be_simulated_and_so_calibrated(prior, walks):
     residual = (evidence.joints - again.truth)[~hidden] / 0.04
     assert abs(residual.var() - 1) < 5 * np.sqrt(2 / residual.size)
     assert again.posterior.prior is problem.posterior.prior
+
+
+@pytest.mark.slow
+def test_it_can_be_calibrated(problem_to_simulate):
+    problem = problem_to_simulate
     ranked = calibrate(
         problem, DVAEInference(), simulations=10, draws=20, chains=2, workers=0, progress=False
     )

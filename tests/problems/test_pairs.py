@@ -72,6 +72,7 @@ def test_runs_are_measured_by_coverage_and_wherever_pairs_stand(problem):
     assert found["swd"] > 1.5
 
 
+@pytest.mark.slow
 def test_draws_cover_better_than_the_seed_and_than_the_prior(problem):
     """What the whole is for, on made data; on real data it is measured by the ablations."""
     sampler = MetropolisHastings(Isotropic(0.02), warmup=1000, thin=4)

@@ -302,6 +302,7 @@ def test_a_run_that_has_ended_is_not_made_again(tmp_path, heavy, made, halves, m
     assert kept.certificate == made.certificate
 
 
+@pytest.mark.slow
 def test_runs_of_anything_else_are_made(tmp_path, heavy, halves, monkeypatch):
     """Other evidence has the same density where all joints are at the origin."""
     kept_by(heavy, tmp_path)

@@ -159,6 +159,7 @@ def test_a_walk_keeps_its_books(prior, evidence):
     assert again[4:].sum() <= prior.max_invalid
 
 
+@pytest.mark.slow
 def test_without_limits_and_evidence_the_measure_is_drawn(loose, evidence):
     """Directions are uniform whatever others are, log lengths and places normal."""
     posterior = MotionPosterior(loose, replace(evidence, noise=1e6))
@@ -238,7 +239,8 @@ def test_a_walk_draws_pose_and_view_at_its_power(prior, evidence, exact):
     assert np.abs(_errors_apart(np.array(found), mean, error)).max() < _APART
 
 
-@pytest.mark.parametrize("limit", [2.0, pytest.param(math.inf, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [2.0, math.inf])
 def test_all_that_counts_is_that_of_weighted_exact_draws(prior, evidence, exact, limit):
     """Means under the posterior, of the measure's own draws weighted by what is known of it.
 
@@ -371,6 +373,7 @@ def test_a_cut_above_all_that_was_met_is_said(prior, evidence):
         sampler.sample(posterior, draws=2, progress=False)
 
 
+@pytest.mark.slow
 def test_powers_reject_alike_and_states_go_up_and_down(prior, evidence):
     posterior = MotionPosterior(prior, replace(evidence, noise=0.05))
     sampler = TemperedPairs(levels=10, steps=40, warmup=500, thin=1)

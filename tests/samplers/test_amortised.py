@@ -77,7 +77,15 @@ def front():
 # --- what is drawn
 
 
-@pytest.mark.parametrize("evidence", ["none", "joints", "keypoints", "hidden"])
+@pytest.mark.parametrize(
+    "evidence",
+    [
+        "none",
+        "joints",
+        pytest.param("keypoints", marks=pytest.mark.slow),
+        pytest.param("hidden", marks=pytest.mark.slow),
+    ],
+)
 def test_a_linear_gaussian_posterior_is_learnt(gaussian_motion, evidence):
     """Mean within a fifth of the posterior's spread, trace within a fifth, each in one seed."""
     prior = smooth_gaussian(gaussian_motion)
@@ -108,6 +116,7 @@ def test_a_linear_gaussian_posterior_is_learnt(gaussian_motion, evidence):
     assert np.all(ratio[-3:] < 1.6)
 
 
+@pytest.mark.slow
 def test_both_modes_are_drawn_as_often_as_they_are_likely():
     prior = TwoHeights()
     likelihood = Keypoints2D(np.zeros((1, 3, 1, 2)), front(), 0.1)

@@ -246,6 +246,7 @@ def test_degrees_of_freedom_are_the_caller_s_or_the_evidence_s(prior, walks, den
     assert float(inference.windows.tails[0]) == (0.25 if heavy else 0.0)
 
 
+@pytest.mark.slow
 def test_without_the_first_entropy_first_frames_are_narrow(posterior, denoiser):
     sampler = replace(FIT, iterations=40, learning_rate=0.01)
     spread = {}
@@ -255,6 +256,7 @@ def test_without_the_first_entropy_first_frames_are_narrow(posterior, denoiser):
     assert spread[False] < 0.8 * spread[True]
 
 
+@pytest.mark.slow
 def test_without_the_motion_prior_latents_go_where_they_like(posterior, denoiser):
     kl = {}
     for weight in (0.0, 1.0, 30.0):
@@ -445,6 +447,7 @@ def test_draws_say_how_they_were_made(posterior, denoiser, tmp_path):
     assert hash(replace(sampler)) == hash(sampler)
 
 
+@pytest.mark.slow
 def test_compare_runs_it_in_two_processes(posterior, walks, denoiser, tmp_path):
     truth = walks[0].window(10, WINDOW).positions
     problem = Problem("walk", "noisy joints of a made walk", posterior, truth)
