@@ -3,6 +3,10 @@
 Weights are fresh: what is computed does not depend on them. A training step is one of the second
 phase, in mixed precision as the settings say. Its teacher is asked once of every frame, before the
 first step: ``teacher_seconds_per_1000_frames``.
+
+How fast the processor is just then is measured beside it: ``product_gigaflops``, of bfloat16
+products of two matrices of 2048 rows. ``training_step_gigaflop`` is what a step has to multiply;
+``training_step_share_of_products`` is the share of its seconds that products alone would take.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from probmotion.models.articulated_body import ArticulatedBody
 from probmotion.models.motion_vae_network import MotionVAENetwork
@@ -40,9 +45,22 @@ def main() -> None:
     report("generation_seconds", fastest(lambda: generate(network.eval(), body), 1))
     step, seconds = training(body, settings)
     report("teacher_seconds_per_1000_frames", seconds)
-    report("training_step_seconds", fastest(step, 8))
+    taken = fastest(step, 8)
+    report("training_step_seconds", taken)
+    with FlopCounterMode(display=False) as counter:
+        step()
+    needed, speed = counter.get_total_flops() / 1e9, product_gigaflops()
+    report("product_gigaflops", speed)
+    report("training_step_gigaflop", needed)
+    report("training_step_share_of_products", needed / speed / taken)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     report("memory_gib", peak / (2**30 if sys.platform == "darwin" else 2**20))
+
+
+def product_gigaflops(rows: int = 2048) -> float:
+    """Return how many operations of bfloat16 products the processor does in a nanosecond."""
+    one = torch.randn(rows, rows, generator=torch.Generator().manual_seed(0)).bfloat16()
+    return 2 * rows**3 / fastest(lambda: one @ one, 20) / 1e9
 
 
 def made_body() -> ArticulatedBody:

@@ -25,7 +25,7 @@ __all__ = ["Measured", "keep_measured", "measured"]
 
 _FOLDER = Path(__file__).parent
 _ROWS, _ABOUT = "measured.csv", "measured.json"
-_KEPT = (*QUALITIES, "seconds", "tr", "off", "share_error", "c2st", "rhat", "ess_bulk")
+_KEPT = (*QUALITIES, "seconds", "tr", "off", "share_error", "c2st", "rhat")
 _DIGITS = 5
 
 
