@@ -208,7 +208,10 @@ class Study:
             else:
                 about |= {name: cell.metrics[name] for name in ("acceptance", *also)}
                 about["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
-                about |= {"ess": cell.metrics["ess_bulk"], "seconds": cell.metrics["seconds"]}
+                about |= {
+                    "ess": cell.metrics.get("ess_bulk", np.nan),
+                    "seconds": cell.metrics["seconds"],
+                }
                 covered = self.covered(step_by_step(draws), fewer) | covered
             rows += [
                 {"measure": measure, "draws": count, "coverage": value, **about}

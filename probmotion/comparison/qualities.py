@@ -50,6 +50,8 @@ _RIGHT: Mapping[str, Mapping[str, Any]] = {
 }
 _LESS_BEGIN = ("coverage_", "fid")
 _LESS_END = ("_mm", "_cm2")
+# Of how many sets of draws a value is a share, and so moves by steps.
+_SHARES = {"precision": 1, "recall": 1, "share_error": 1, "c2st": 2}
 _NEAR_THE_TRUTH = ("acceleration_error", "velocity_error", "pck")
 
 
@@ -65,6 +67,7 @@ def best_of(
     values: Mapping[str, pd.Series],
     seeds: Iterable[int],
     beside: Collection[str] = (),
+    draws: int | None = None,
 ) -> tuple[str | None, set[str]]:
     """Return the best sampler and all that are not distinguishable from it, itself among them.
 
@@ -83,6 +86,8 @@ def best_of(
         Those that were asked for.
     beside : collection of str
         What else was measured on the problem.
+    draws : int, optional
+        That each value is of.
     """
     rule = _RIGHT.get(metric)
     if rule is None and (metric.startswith(_LESS_BEGIN) or metric.endswith(_LESS_END)):
@@ -100,7 +105,8 @@ def best_of(
     }
     if len(errors) < 2 or max(np.isfinite(row).sum() for row in errors.values()) < 2:
         return None, set()
-    return best_and_tied(errors, **rule)
+    step = 1 / (_SHARES[metric] * draws) if draws and metric in _SHARES else 0.0
+    return best_and_tied(errors, **rule, step=step)
 
 
 def _is_nearness(metric: str) -> bool:

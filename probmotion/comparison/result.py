@@ -116,6 +116,7 @@ class Comparison:
             "problems": self.plan.problems,
             "words": {f"{problem}/{sampler}": word for (problem, sampler), word in words.items()},
             "notes": self.notes,
+            "draws": self.plan.draws,
         }
         return table
 

@@ -114,8 +114,8 @@ _WORLD_LEGEND = """\
 in the world: G-MPJPE, without alignment, of the draws and of their mean; acceleration: mean size of
 a joint's acceleration over the truth's (0.5 to 2 is plausible)."""
 _TRUTH_LEGEND = """\
-against the truth: where references show how far right draws are, nobody's draws are marked as the
-nearest, for those that vary too little are nearer."""
+against the truth: where references show how far right draws are, single draws are not marked as the
+nearest, for those that vary too little are nearer; their mean is."""
 _COVERAGE_LEGEND = """\
 D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
 joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
@@ -163,19 +163,23 @@ class ComparisonTable(pd.DataFrame):
 
     def legends(self) -> list[str]:
         """Return how to read the measures that it has, a paragraph per kind."""
-        several = self["seed"].nunique() > 1
         return [
             legend
             for metric, legend in (
                 ("swd", _LEGEND),
                 ("c2st|ksd", _TESTS_LEGEND),
                 ("g_mpjpe_mean_mm", _WORLD_LEGEND),
-                *([("mpjpe_mm", _TRUTH_LEGEND)] if several else []),
                 ("coverage_cartesian", _COVERAGE_LEGEND),
                 ("fid", _GENERATION_LEGEND),
             )
             if self["metric"].isin(metric.split("|")).any()
-        ]
+        ] + [_TRUTH_LEGEND] * self._leaves_nearness_unmarked()
+
+    def _leaves_nearness_unmarked(self) -> bool:
+        """Whether some problem has references beside a truth, and seeds enough for marks."""
+        return self["seed"].nunique() > 1 and any(
+            {"swd", "mpjpe_mm"} <= set(rows) for _, rows in self.groupby("problem")["metric"]
+        )
 
     def _problem(self, problem: str) -> str:
         """The blocks of one problem, each a measure per column and a sampler per row."""
@@ -193,7 +197,7 @@ class ComparisonTable(pd.DataFrame):
             if not set(shown) - {"seconds"}:
                 continue
             body = []
-            marks = {metric: _marks(metric, values, samplers, seeds) for metric in shown}
+            marks = {metric: self._marks(metric, values, samplers, seeds) for metric in shown}
             for sampler in samplers:
                 cells = [
                     _mean_and_sd(values.get((sampler, metric))) + marks[metric].get(sampler, "")
@@ -208,19 +212,20 @@ class ComparisonTable(pd.DataFrame):
             lines.append(_aligned(["no draws", ""], failed))
         return "\n".join(lines)
 
-
-def _marks(
-    metric: str,
-    values: Mapping[tuple[str, str], pd.Series],
-    samplers: Sequence[str],
-    seeds: Sequence[int],
-) -> dict[str, str]:
-    """Return what stands behind each sampler's number; nothing where none is the best."""
-    found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-    best, tied = best_of(metric, found, seeds, {measured for _, measured in values})
-    if best is None:
-        return {}
-    return {name: "*" if name == best else "°" if name in tied else " " for name in found}
+    def _marks(
+        self,
+        metric: str,
+        values: Mapping[tuple[str, str], pd.Series],
+        samplers: Sequence[str],
+        seeds: Sequence[int],
+    ) -> dict[str, str]:
+        """Return what stands behind each sampler's number; nothing where none is the best."""
+        found = {name: values[name, metric] for name in samplers if (name, metric) in values}
+        measured = {other for _, other in values}
+        best, tied = best_of(metric, found, seeds, measured, self.attrs.get("draws"))
+        if best is None:
+            return {}
+        return {name: "*" if name == best else "°" if name in tied else " " for name in found}
 
 
 def _mean_and_sd(values: Any) -> str:

@@ -15,7 +15,7 @@ __all__ = [
 ]
 
 _FEW = 32
-_TO_SPLIT, _TO_CORRELATE = 4, 10
+_TO_CORRELATE = 10
 _PRINCIPAL = 10
 _NOTHING = 1e-9
 
@@ -24,9 +24,9 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
     """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
 
     ``ess_bulk``, ``ess_tail``: the smallest over ``values``, (chain, draw, n), by default
-    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ), of halves of
-    chains, which need two draws each. Chains of fewer than 10 draws have no ESS: they are too short
-    to show that draws depend on each other, and stuck chains would have that of independent draws.
+    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ), NaN of fewer
+    than 4 draws a chain. Chains of fewer than 10 have no ESS: they are too short to show that draws
+    depend on each other, and stuck chains would have that of independent draws.
     ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
 
     Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
@@ -51,7 +51,7 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
         found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
         found["ess_tail"] = float(np.min(tails))
-    if n_draws >= _TO_SPLIT and (n_chains > 1 or "autocorrelation_time" not in data):
+    if n_chains > 1 or "autocorrelation_time" not in data:
         found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance" in data:
         found["acceptance"] = float(data["acceptance"].mean())

@@ -7,7 +7,7 @@ compared seed by seed: what a seed makes hard for all of them drops out of the d
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -57,6 +57,7 @@ def best_and_tied(
     ratio: bool = False,
     lower_is_better: bool = True,
     level: float = 0.95,
+    step: float = 0.0,
 ) -> tuple[str, set[str]]:
     """Return the best sampler, and all that are not distinguishable from it, itself among them.
 
@@ -66,13 +67,8 @@ def best_and_tied(
     1), and so on until one holds 0; it and all after it are tied. With one seed nothing is
     distinguishable, and all are tied.
 
-    Differences scatter at least as two roundings do: a share of 20 draws moves by twentieths, and
-    two seeds with the same difference do not show that it has no spread. What values are rounded to
-    is not known; it is no more than the least distance of two of them.
-
-    So the truly best is among the tied with probability .95 or more, and one of equals stands alone
-    with .05 or less. That *some* one of many equals is left out is likelier, about .1 of ten,
-    because the best is chosen by the same values.
+    Differences of values that are rounded scatter at least as two roundings do: a share of 20 draws
+    moves by twentieths, and two seeds with the same difference do not show that it has no spread.
 
     Parameters
     ----------
@@ -89,6 +85,8 @@ def best_and_tied(
         For a measure without a target.
     level : float
         Of the intervals together.
+    step : float
+        What values are rounded to; 0 if they are not.
 
     Raises
     ------
@@ -104,8 +102,7 @@ def best_and_tied(
     for name, row in errors.items():
         differences = row - errors[best]
         apart[name] = differences[np.isfinite(differences)]
-    least_spread = _step(errors.values()) * _TWO_ROUNDINGS
-    chance = {name: _tail(apart[name], least_spread) for name in set(errors) - {best}}
+    chance = {name: _tail(apart[name], _TWO_ROUNDINGS * step) for name in set(errors) - {best}}
     tied = set(errors)
     for rank, name in enumerate(sorted(chance, key=lambda name: chance[name])):
         if 2 * chance[name] >= (1 - level) / (len(chance) - rank):
@@ -149,17 +146,6 @@ def _errors(
 _TWO_ROUNDINGS = 1 / math.sqrt(6)
 """Standard deviation of the difference of two values that are rounded to whole numbers."""
 
-_ARITHMETIC = 1e-9
-
-
-def _step(errors: Iterable[np.ndarray]) -> float:
-    """Return the least distance of two values, but for arithmetic's; 0 if all are equal."""
-    values = np.concatenate(list(errors))
-    values = np.unique(values[np.isfinite(values)])
-    gaps = np.diff(values)
-    gaps = gaps[gaps > _ARITHMETIC * np.abs(values).max()]
-    return float(gaps.min()) if len(gaps) else 0.0
-
 
 def _tail(differences: np.ndarray, least_spread: float) -> float:
     """Return the probability of differences so clearly above 0 by chance."""
@@ -168,7 +154,8 @@ def _tail(differences: np.ndarray, least_spread: float) -> float:
     n = len(differences)
     if n < 2:
         return 1.0
+    middle = float(differences.mean())
     spread = max(float(differences.std(ddof=1)), least_spread)
     if spread == 0:
-        return 1.0
-    return float(stats.t.sf(float(differences.mean()) / (spread / math.sqrt(n)), n - 1))
+        return 0.0 if middle > 0 else 1.0
+    return float(stats.t.sf(middle / (spread / math.sqrt(n)), n - 1))

@@ -73,20 +73,21 @@ def problem_tables(
         for (sampler, metric), cells in rows.groupby(["sampler", "metric"], sort=False)
     }
     measured = list(dict.fromkeys(str(name) for name in rows["metric"]))
+    draws = table.attrs.get("draws")
     parts, shown = [], {"seconds"}
     for title, columns in _BLOCKS:
         heads = {name: words for name, words in columns.items() if name in measured}
         if set(heads) - {"seconds"}:
             shown |= set(heads)
-            parts.append(_table(title, heads, samplers, values, outcomes))
+            parts.append(_table(title, heads, samplers, values, outcomes, draws))
     others = {name: name for name in measured if name not in shown}
     if others:
-        inside = _table("further measures", others, samplers, values, outcomes)
+        inside = _table("further measures", others, samplers, values, outcomes, draws)
         parts.append(
             f"<details><summary>{len(others)} further measures</summary>{inside}</details>"
         )
     if not parts:
-        parts.append(_table("no draws", {"seconds": "seconds"}, samplers, values, outcomes))
+        parts.append(_table("no draws", {"seconds": "seconds"}, samplers, values, outcomes, draws))
     return "\n".join(parts)
 
 
@@ -96,12 +97,13 @@ def _table(
     samplers: Sequence[str],
     values: Mapping[tuple[str, str], pd.Series],
     outcomes: Mapping[str, Outcome],
+    draws: int | None,
 ) -> str:
     seeds = range(max(outcome.seeds for outcome in outcomes.values()))
     best = {}
     for metric in heads:
         found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-        best[metric] = best_of(metric, found, seeds, {measured for _, measured in values})
+        best[metric] = best_of(metric, found, seeds, {other for _, other in values}, draws)
     body = []
     for place, sampler in enumerate(samplers):
         outcome = outcomes[sampler]

@@ -84,6 +84,38 @@ def test_marks_are_of_what_can_be_right_or_wrong():
     assert best_of("tr", first, range(4)) == (None, set())
 
 
+def test_shares_of_few_draws_differ_by_more_than_one_at_two_seeds():
+    values = {"a": pd.Series([0.9, 0.95]), "b": pd.Series([0.85, 0.9])}
+    for metric in ("precision", "c2st"):
+        assert len(best_of(metric, values, range(2))[1]) == 1
+        assert len(best_of(metric, values, range(2), draws=20)[1]) == 2
+        assert len(best_of(metric, values, range(2), draws=2000)[1]) == 1
+    table = ComparisonTable(
+        [
+            {"problem": "p", "sampler": name, "seed": seed, "metric": "precision", "value": value}
+            for name, row in values.items()
+            for seed, value in row.items()
+        ]
+    )
+    for draws, marked in ((None, False), (20, True), (2000, False)):
+        table.attrs = {"draws": draws}
+        assert ("0.875 ± 0.035°" in str(table)) == marked
+
+
+def test_where_nearness_to_the_truth_is_not_marked_is_said():
+    near = {"p": {"swd": 1.0, "mpjpe_mm": 5.0}, "q": {"mpjpe_mm": 5.0}}
+    for problems, seeds, said in (("pq", 2, True), ("q", 2, False), ("p", 1, False)):
+        rows = [
+            {"problem": problem, "sampler": name, "seed": seed, "metric": metric, "value": value}
+            for problem in problems
+            for name in "ab"
+            for seed in range(seeds)
+            for metric, value in near[problem].items()
+        ]
+        text = " ".join(str(ComparisonTable(rows)).split())
+        assert ("single draws are not marked as the nearest" in text) == said
+
+
 def made_table(**swd):
     """Columns of three seeds, with seconds for all."""
     rows = [

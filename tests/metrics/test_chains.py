@@ -70,7 +70,7 @@ def test_chains_too_short_to_show_that_draws_depend_have_no_size(rng):
     assert set(chain_diagnostics(run(stuck))) == {"rhat", "ess_bulk", "ess_tail"}
     assert set(chain_diagnostics(run(stuck[:, :9]))) == {"rhat"}
     assert chain_diagnostics(run(stuck[:, :4]))["rhat"] > 1.5
-    assert chain_diagnostics(run(stuck[:, :3])) == {}
+    assert math.isnan(chain_diagnostics(run(stuck[:, :3]))["rhat"])
 
 
 def test_an_autoregression_is_worth_what_theory_says(rng):
