@@ -18,7 +18,7 @@ test: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests
 
 slow: install
-	$(BIN)/python -m pytest -m slow tests
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 2 --dist worksteal tests
 
 lint: install
 	$(BIN)/ruff check .

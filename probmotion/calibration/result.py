@@ -140,9 +140,10 @@ class Calibration:
         """Return the tidy data frame, a row per problem, sampler and quantity.
 
         ``quantity`` "all" is the sampler as a whole. Columns: ``p_value`` that ranks are uniform
-        (all: the least of those adjusted by Holm's method), ``coverage_90`` of 90 % credible sets,
-        ``coverage_error`` mean |coverage − level| (all: means over quantities), ``simulations``
-        that worked and ``failed`` ones. It prints a line per sampler and its verdict.
+        (all: the least of those adjusted by Holm's method), ``coverage_90`` of 90 % credible sets
+        (all: mean over quantities whose sets are central intervals), ``coverage_error`` mean
+        |coverage − level| (all: mean over quantities), ``simulations`` that worked and ``failed``
+        ones. It prints a line per sampler and its verdict.
         """
         from probmotion.calibration.table import CalibrationTable
 
