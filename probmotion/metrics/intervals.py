@@ -70,6 +70,10 @@ def best_and_tied(
     Differences of values that are rounded scatter at least as two roundings do: a share of 20 draws
     moves by twentieths, and two seeds with the same difference do not show that it has no spread.
 
+    So the truly best is among the tied with probability .95 or more, and one of equals stands alone
+    with .05 or less. That *some* one of many equals is left out is likelier, about .1 of ten,
+    because the best is chosen by the same values.
+
     Parameters
     ----------
     values : mapping of str to sequence of float
