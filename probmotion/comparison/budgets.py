@@ -4,11 +4,14 @@ A sampler's class names in ``effort`` the settings that its cost grows with, the
 in its own units and the others kept in proportion to it, and in ``least_effort`` the smallest
 value that makes sense. Pilot runs, each of 2 to 8 times the effort of the one before, show what a
 unit of it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of
-seconds the first pilot is run twice: libraries compile at the first.
+seconds the first pilot is run twice: libraries compile at the first. And what else a machine does
+adds to some: where the last three are not on a line they are run again, the cheapest first, until
+they are.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,14 +24,17 @@ __all__ = ["Budget", "affordable", "check_budget", "effort_of"]
 
 # What an evaluation counts, if not 1; a gradient comes with its value, which costs about as much.
 _WORTH = {"gradient": 2}
-# The pilots end when they have shown this share of what the effort may cost.
-_SHOWN = 0.25
+# The pilots end when they have shown this share of what the effort may cost; each aims at a little
+# more, so that the last is not missed by as little.
+_SHOWN, _WANTED = 0.25, 0.3
 # How much more effort the next pilot has: the less has been spent, the more.
 _GROWTH = 2, 8
 # A sampler whose cost has not grown at this multiple of the effort that it was given has none, as
 # one whose network is trained already. Evaluations are counted; seconds vary by this share.
 _MULTIPLE = 64
 _NOISE = 0.1
+# The last pilot is off the line through the two before it by more than this share of its seconds.
+_BENT = 0.15
 
 
 @dataclass(frozen=True)
@@ -126,10 +132,10 @@ def affordable(
         return {}
     given = getattr(sampler, effort_of(sampler)[0])
     effort = _least(sampler)
+    costs = [(effort, pilot(_with(sampler, effort)))]
     if budget.seconds is not None:
         # What is compiled at the first run is there for all that follow.
-        pilot(_with(sampler, effort))
-    costs = [(effort, pilot(_with(sampler, effort)))]
+        costs = [(effort, min(costs[0][1], pilot(_with(sampler, effort))))]
     if costs[0][1] > budget.amount:
         raise UnsupportedPosterior(
             sampler.name,
@@ -138,8 +144,8 @@ def affordable(
             word="budget",
         )
     noise = _NOISE if budget.evaluations is None else 0.0
-    wanted = _SHOWN * (budget.amount - costs[0][1])
-    while costs[-1][1] - costs[0][1] <= wanted:
+    shown, wanted = (share * (budget.amount - costs[0][1]) for share in (_SHOWN, _WANTED))
+    while costs[-1][1] - costs[0][1] <= shown:
         next_one = _next_effort(costs, costs[0][1] + wanted)
         effort = _within_range(sampler, costs[-1][0], next_one)
         if effort == costs[-1][0]:
@@ -147,6 +153,11 @@ def affordable(
         if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[-2][1]:
             return {}
         costs.append((effort, pilot(_with(sampler, effort))))
+    if budget.seconds is not None:
+        for place in range(-3, 0):
+            if _bends(costs):
+                effort, seconds = costs[place]
+                costs[place] = effort, min(seconds, pilot(_with(sampler, effort)))
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))
 
 
@@ -161,7 +172,16 @@ def _next_effort(costs: list[tuple[int, float]], wanted: float) -> int:
         growth = _solve(costs, wanted) / effort
     else:
         growth = most
-    return effort * int(min(max(growth, least), most))
+    return math.ceil(effort * min(max(growth, least), most))
+
+
+def _bends(costs: list[tuple[int, float]]) -> bool:
+    """Whether the last pilot did not cost what the line through the two before it says."""
+    if len(costs) < 3:
+        return False
+    (low, cheap), (middle, dearer), (high, dear) = costs[-3:]
+    foreseen = dearer + (dearer - cheap) * (high - middle) / (middle - low)
+    return abs(dear - foreseen) > _BENT * dear
 
 
 def _solve(costs: list[tuple[int, float]], amount: float) -> int:

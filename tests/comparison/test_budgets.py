@@ -212,6 +212,38 @@ def test_what_is_compiled_at_the_first_run_is_no_cost_of_a_cell():
     assert asked[0] == asked[1]
 
 
+@pytest.mark.parametrize("slowed", range(7))
+def test_a_pilot_that_something_slowed_down_is_no_measure(slowed):
+    """Of 6 seconds, at 1/100 for a unit of effort; one pilot takes twice as long."""
+    asked = []
+
+    def pilot(sampler):
+        asked.append(sampler.stride)
+        return (0.05 + 0.01 * sampler.stride) * (2 if len(asked) == 1 + slowed else 1)
+
+    found = affordable(Budget(seconds=6.0), Walking(stride=100), pilot)
+    assert found["stride"] == pytest.approx(595, rel=0.01)
+    # What was suspected is run again, and no more: five pilots do where nothing is slow.
+    assert len(asked) <= (8 if slowed < 5 else 5)
+    assert sum(0.05 + 0.01 * stride for stride in asked) < 1.5 * 6
+
+
+def test_a_cost_that_is_no_line_is_asked_again_once():
+    """As that of trajectories that adapt."""
+    asked = []
+
+    def pilot(sampler):
+        asked.append(sampler.stride)
+        return 1e-3 * sampler.stride**1.5
+
+    found = affordable(Budget(seconds=6.0), Walking(stride=100), pilot)["stride"]
+    assert 0.5 * 6 < 1e-3 * found**1.5 < 1.5 * 6
+    assert all(asked.count(stride) <= 2 for stride in asked)
+    asked.clear()
+    affordable(Budget(evaluations=6), Walking(stride=100), pilot)
+    assert len(asked) == len(set(asked))
+
+
 def test_notes_say_what_was_used_and_not_what_the_budget_has_replaced():
     samplers = {"walking": Walking(stride=7, start=3), "free": PriorDraws(2.0)}
     found = compare(generation(), samplers, seeds=2, budget=Budget(evaluations=2000), **SMALL)
