@@ -5,27 +5,27 @@ from __future__ import annotations
 import hashlib
 import random
 import sys
-import sysconfig
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
+from importlib.metadata import packages_distributions, version
 from pathlib import PurePath
-from types import CellType, CodeType, EllipsisType, FunctionType, MethodType, ModuleType
+from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
 from array_api_compat import is_array_api_obj
 
 from probmotion.arrays import to_numpy
+from probmotion.comparison.script_code import SIMPLE, class_content, is_of_a_script, reached
+from probmotion.draws import library_versions
 
 __all__ = ["fingerprint"]
 
-_INSTALLED = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
-"""Folders of packages, whose classes change with their versions alone."""
-
 _RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
-_SIMPLE = bool | int | float | complex | str | bytes | EllipsisType | np.generic
+_TOLD_ANYWAY = {"sklearn", *(name.replace("-", "_") for name in library_versions())}
+"""Packages whose versions stand beside every fingerprint."""
 
 _NUMPYS_OWN_RANDOMNESS = getattr(np.random.random, "__self__", None)
 
@@ -44,9 +44,11 @@ def fingerprint(value: Any) -> str:
     Python (by name, compiled code, defaults and what they close over), bound methods (by what
     they are bound to as well), networks (by layers and weights), other objects by their
     attributes, and what has none by what it is pickled as. Of an object whose class is in no
-    installed package, but in a script or notebook, the methods count as functions do.
+    installed package, but in a script or notebook, the methods count as functions do, and with a
+    script's functions what they read of their module: other functions, classes, numbers, strings
+    and arrays, but not lists and mappings, which may be filled as it runs. What is of an installed
+    package counts by its name and the package's version.
 
-    Globals that a function reads, and methods of an installed class, count by their names alone.
     Another version of Python compiles other code, so that it has other fingerprints of functions.
 
     Raises
@@ -61,11 +63,11 @@ def fingerprint(value: Any) -> str:
 
 def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     kind = type(value)
-    digest.update(f"<{kind.__module__}.{kind.__qualname__}>".encode())
+    digest.update(f"<{kind.__module__}.{kind.__qualname__}{_edition(kind.__module__)}>".encode())
     parts: list[Any] = []
     if id(value) in above:
         digest.update(f"the object {above.index(id(value))} levels down".encode())
-    elif value is None or isinstance(value, _SIMPLE):
+    elif value is None or isinstance(value, SIMPLE):
         digest.update(repr(value).encode())
     elif isinstance(value, Mapping):
         for key in sorted(value, key=repr):
@@ -75,8 +77,8 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     elif isinstance(value, set | frozenset):
         parts += sorted(value, key=repr)
     elif _has_a_name(value):
-        name = getattr(value, "__qualname__", "")
-        digest.update(f"{getattr(value, '__module__', '')}.{name}".encode())
+        module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
+        digest.update(f"{module}.{name}{_edition(module)}".encode())
         parts += _behind_the_name(value)
     elif isinstance(value, CodeType):
         parts += [getattr(value, f"co_{name}") for name in _CODE]
@@ -108,8 +110,8 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         parts.append({name: part for name, part in held if not _computed(kind, name)})
     elif not _plain(kind):
         parts += _as_pickled(value)
-    if _of_a_script(kind):
-        parts.append(_methods(kind))
+    if is_of_a_script(kind.__module__):
+        parts.append(class_content(kind))
     for part in parts:
         _add(digest, part, (*above, id(value)))
     digest.update(b"</>")
@@ -128,7 +130,7 @@ def _has_a_name(value: Any) -> bool:
 def _behind_the_name(value: Any) -> list[Any]:
     """Return what tells a function or method from another of the same name."""
     if isinstance(value, type):
-        return []
+        return [class_content(value)] if is_of_a_script(value.__module__) else []
     if isinstance(value, ModuleType):
         return [value.__name__]
     if isinstance(value, MethodType):
@@ -137,7 +139,7 @@ def _behind_the_name(value: Any) -> list[Any]:
         defaults = [_or_marker(each) for each in value.__defaults__ or ()]
         named = {name: _or_marker(each) for name, each in (value.__kwdefaults__ or {}).items()}
         cells = [_held(cell) for cell in value.__closure__ or ()]
-        return [value.__code__, defaults, named, cells, vars(value)]
+        return [value.__code__, defaults, named, cells, vars(value), reached(value)]
     # Written in C: a method of an object, or the compiled or caching form of a function.
     return [getattr(value, "__self__", None), getattr(value, "__wrapped__", None)]
 
@@ -178,29 +180,17 @@ def _as_pickled(value: Any) -> list[Any]:
     return [made_by, given, state, list(items or ()), list(pairs or ())]
 
 
-def _of_a_script(kind: type) -> bool:
-    """Whether a class is in no installed package or library: it may change at any time."""
-    package = kind.__module__.partition(".")[0]
-    if package in (*sys.builtin_module_names, __name__.partition(".")[0]):
-        return False
-    # A notebook has no file.
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
-    return not file.startswith(_INSTALLED)
+def _edition(module: str | None) -> str:
+    """Return which version of its package a module is of, where results do not say so anyway."""
+    package = (module or "").partition(".")[0]
+    told = package in sys.stdlib_module_names or package in _TOLD_ANYWAY
+    return "" if told or is_of_a_script(module) else _installed_version(package)
 
 
-def _methods(kind: type) -> dict[str, Any]:
-    """Return the methods that a class and those it inherits from define in scripts."""
-    found: dict[str, Any] = {}
-    for each in reversed(kind.__mro__):
-        if each is object or not _of_a_script(each):
-            continue
-        for name, value in vars(each).items():
-            function = getattr(value, "__func__", getattr(value, "fget", value))
-            # Those that dataclasses write are told by the fields.
-            made = isinstance(function, FunctionType)
-            if made and not function.__code__.co_filename.startswith("<string>"):
-                found[name] = function
-    return found
+@cache
+def _installed_version(package: str) -> str:
+    names = sorted(set(packages_distributions().get(package, ())))
+    return "".join(f" {name} {version(name)}" for name in names)
 
 
 def _computed(kind: type, name: str) -> bool:

@@ -20,6 +20,7 @@ from scipy.stats import expon, norm
 from threadpoolctl import threadpool_info, threadpool_limits
 from toy_samplers import Holder, Plain, PriorDraws, generation, monocular
 
+from probmotion.comparison import fingerprint as fingerprints
 from probmotion.comparison.fingerprint import fingerprint
 from probmotion.threads import one_thread
 
@@ -339,6 +340,75 @@ def test_methods_of_a_script_s_classes_count_and_an_installed_package_s_do_not(m
     before = fingerprint(norm)
     monkeypatch.setattr(type(norm), "_pdf", lambda self, x: x)
     assert fingerprint(norm) == before
+
+
+SCRIPT = """
+import functools
+import numpy as np
+
+SHIFT, TABLE = 1.0, np.zeros(3)
+seen = []
+
+def helper(x):
+    seen.append(x)
+    return innermost(x) + SHIFT if x else helper(x)
+
+def innermost(x):
+    return [each + TABLE for each in x]
+
+@functools.cache
+def kept(x):
+    return 2 * x
+
+class Part:
+    width = 3.0
+
+    def area(self):
+        return kept(self.width)
+
+class Mine:
+    def __init__(self):
+        self.calls = 0
+
+    def sample(self, x):
+        return helper(Part().area())
+
+def density(x):
+    return helper(x)
+"""
+
+
+@pytest.mark.parametrize("asked", ["Mine()", "density"])
+def test_what_a_script_s_functions_read_of_it_counts(asked):
+    def of(source, before=()):
+        space = {"__name__": "a_script"}
+        exec(compile(source, "script.py", "exec"), space)
+        space["seen"] += before
+        return fingerprint(eval(asked, space))
+
+    changes = [
+        ("1.0", "0.0"),
+        ("zeros", "ones"),
+        ("each + T", "each - T"),
+        ("innermost(x) +", "x +"),
+    ]
+    if asked == "Mine()":
+        changes += [("3.0", "4.0"), ("2 * x", "3 * x"), ("kept(self", "abs(self")]
+    found = [of(SCRIPT), *(of(SCRIPT.replace(*change)) for change in changes)]
+    assert len(set(found)) == len(found)
+    # Lists fill as it runs, and what is not read does not matter.
+    assert of(SCRIPT, before=[1]) == of(SCRIPT + "\nother = 5\n") == found[0]
+
+
+def test_another_version_of_an_installed_package_is_another_question(monkeypatch):
+    from tqdm import tqdm
+
+    held = [[tqdm], [tqdm.format_num], [tqdm([], disable=True)]]
+    before = [fingerprint(each) for each in held]
+    monkeypatch.setattr(fingerprints, "version", lambda name: "0.0")
+    fingerprints._installed_version.cache_clear()
+    assert not set(before) & {fingerprint(each) for each in held}
+    fingerprints._installed_version.cache_clear()
 
 
 def threads():
