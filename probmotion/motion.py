@@ -14,6 +14,9 @@ from probmotion.skeleton import Skeleton
 __all__ = ["KeypointTrack", "Motion", "files_named", "load_motion", "load_motions"]
 
 
+_MOST_CONFIDENT = 2
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Joint positions of one clip.
@@ -149,7 +152,8 @@ class KeypointTrack:
         Image coordinates, x right and y down, pixels or the camera's unit. Entries that were not
         seen are NaN and have confidence 0.
     confidence : ndarray, (L, J)
-        Between 0 (not seen) and 1.
+        Between 0 (not seen) and 1; heatmaps peak a little above 1, and COCO's annotations count
+        to 2.
     skeleton : Skeleton
         Names and parents of the J joints.
     fps : float
@@ -160,8 +164,8 @@ class KeypointTrack:
     Raises
     ------
     ValueError
-        If shapes do not fit, a confidence is negative or not finite, or a keypoint that has a
-        confidence above 0 is not finite.
+        If shapes do not fit, a confidence is negative, beyond 2 or not finite, or a keypoint that
+        has a confidence above 0 is not finite.
     """
 
     keypoints: np.ndarray
@@ -180,6 +184,11 @@ class KeypointTrack:
         check_finite("confidence", confidence)
         if confidence.min() < 0:
             raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
+        if confidence.max() > _MOST_CONFIDENT:
+            raise ValueError(
+                f"confidence is {confidence.max():g} at its most, expected 0 (not seen) to 1, or "
+                f"{_MOST_CONFIDENT} where annotations count so far: they are weights of losses"
+            )
         unseen = ~np.isfinite(keypoints).all(axis=-1)
         if (unseen & (confidence > 0)).any():
             frame, joint = np.argwhere(unseen & (confidence > 0))[0]

@@ -87,6 +87,8 @@ def estimate_rest_pose(
     if skeleton.mirrored_pairs:
         even, odd = _sides(skeleton)
         x, z = _halves(gram, even, odd, _trunk_pairs(skeleton))
+        # In the mean of a pair a healthy side hides its degenerate mirror image.
+        _check_long(length, skeleton)
         height, length = (
             even.T @ ((even @ values) / even.sum(axis=1)) for values in (height, length)
         )
@@ -94,13 +96,8 @@ def estimate_rest_pose(
         x, z = _factor(gram, 2).T
     mean = np.stack([x, height, z], axis=-1)
     sizes = np.linalg.norm(mean, axis=-1)
+    _check_long(np.minimum(sizes, length), skeleton)
     joints = [joint for joint, _ in skeleton.bones]
-    for joint, size in zip(joints, np.minimum(sizes, length), strict=True):
-        if not size > _SHORT:
-            raise ValueError(
-                f"tracks show no length or direction of the bone to {skeleton.joint_names[joint]}, "
-                "expected all bones to point somewhere on average"
-            )
     rest = np.zeros((skeleton.n_joints, 3))
     rest[joints] = mean * (length / sizes)[:, None]
     return _facing(rest, skeleton, front)
@@ -164,6 +161,16 @@ def _check_seen(together: np.ndarray, skeleton: Skeleton) -> None:
             f"tracks show the bones to {first} and to {second} together in no frame with "
             "confidence, expected every two bones in some"
         )
+
+
+def _check_long(sizes: np.ndarray, skeleton: Skeleton) -> None:
+    """Refuse bones, (bones,), of no length or direction, metres."""
+    for (joint, _), size in zip(skeleton.bones, sizes, strict=True):
+        if not size > _SHORT:
+            raise ValueError(
+                f"tracks show no length or direction of the bone to {skeleton.joint_names[joint]}, "
+                "expected all bones to point somewhere on average"
+            )
 
 
 def _sides(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
@@ -252,6 +259,10 @@ def _ahead(place: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
     """Return X and Z of a way that points ahead, (2,), metres; 0 where nothing tells it."""
     names, flat = list(skeleton.canonical_names), place[:, [0, 2]]
     if front is not None:
+        if front not in {*skeleton.joint_names, *names}:
+            raise ValueError(
+                f"front is {front!r}, expected one of {', '.join(skeleton.joint_names)}"
+            )
         return flat[skeleton.index(front)] - flat[skeleton.roots[0]]
     if is_four_legged(skeleton):
         heads = [flat[names.index(name)] for name in _HEADS if name in names]

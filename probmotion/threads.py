@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from threading import Lock
+from threading import Lock, current_thread, main_thread
 from typing import Any
 
 __all__ = ["one_thread", "only_one_thread"]
@@ -36,7 +36,11 @@ def one_thread() -> Iterator[None]:
     # SciPy brings a BLAS of its own, which can be limited only once it is loaded.
     import scipy.linalg  # noqa: F401
 
-    # Another thread may be importing torch: import_module waits for it.
+    # Libraries look whether an array is torch's or JAX's as soon as these have begun to load. On
+    # an executor's threads another may be loading them: import_module waits for it.
+    if current_thread() is not main_thread():
+        for name in ("torch", "jax"):
+            importlib.import_module(name)
     torch = importlib.import_module("torch") if "torch" in sys.modules else None
     with _SHARED.limited(torch), _own_numbers_limited(torch):
         token = _ONLY_ONE.set(True)

@@ -230,9 +230,13 @@ def test_what_shows_no_body_is_refused():
     with pytest.raises(ValueError, match="bones to left_wrist and to right_wrist together in no"):
         estimate_rest_pose(rigid_tracks(PERSON, rest, azimuths, hide))
     flat = rest.copy()
-    flat[[PERSON.index("left_wrist"), PERSON.index("right_wrist")]] = 0
-    with pytest.raises(ValueError, match="no length or direction of the bone to left_wrist"):
-        estimate_rest_pose(rigid_tracks(PERSON, flat, azimuths))
+    # The other side's length must not stand for it.
+    for side in ("right", "left"):
+        flat[PERSON.index(f"{side}_wrist")] = 0
+        with pytest.raises(ValueError, match=f"no length or direction of the bone to {side}_wrist"):
+            estimate_rest_pose(rigid_tracks(PERSON, flat, azimuths))
+    with pytest.raises(ValueError, match="front is 'beak', expected one of pelvis"):
+        estimate_rest_pose(rigid_tracks(PERSON, rest, azimuths), front="beak")
     narrow = rest * [0, 1, 1]
     with pytest.raises(ValueError, match="left and right in one place, expected hips"):
         estimate_rest_pose(rigid_tracks(PERSON, narrow, azimuths))

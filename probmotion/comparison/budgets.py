@@ -69,6 +69,8 @@ class Budget:
             check_count("evaluations", self.evaluations)
         if self.seconds is not None:
             check_positive("seconds", self.seconds)
+            # 6 and 6.0 are one budget.
+            object.__setattr__(self, "seconds", float(self.seconds))
 
     @property
     def amount(self) -> float:

@@ -48,7 +48,8 @@ class CellResult:
     """What is kept of a finished cell beside its draws.
 
     ``budget`` says what the cell was allowed, in the words of
-    :class:`~probmotion.comparison.budgets.Budget`, with which settings, and what it used.
+    :class:`~probmotion.comparison.budgets.Budget`, with which settings, and what it used;
+    ``draws_bytes`` how long the file of its draws is.
     """
 
     problem: str
@@ -58,6 +59,7 @@ class CellResult:
     metrics: dict[str, float]
     failure: Failure | None = None
     budget: dict[str, Any] | None = None
+    draws_bytes: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,7 @@ class Cell:
         if result is None or result.fingerprint != self.fingerprint:
             return False
         if result.failure is None and self.keeps_draws:
-            return (self.folder / _DRAWS).exists()
+            return _has_length(self.folder / _DRAWS, result.draws_bytes)
         return result.failure is None or result.failure.unsupported
 
     def taken(self) -> bool:
@@ -192,9 +194,17 @@ class Cell:
             raise ValueError(
                 f"{self.sampler} returned draws of another skeleton, expected the posterior's"
             )
-        n = draws.positions.sizes["chain"] * draws.positions.sizes["draw"]
-        if n != self.draws:
-            raise ValueError(f"{self.sampler} returned {n} draws, expected {self.draws}")
+        found = tuple(draws.positions.sizes[axis] for axis in ("chain", "draw"))
+        if found != (wanted := (self.chains, self.draws // self.chains)):
+            raise ValueError(
+                f"{self.sampler} returned {found[0]} chains of {found[1]} draws, expected "
+                f"{wanted[0]} of {wanted[1]}"
+            )
+        if not (math.isfinite(draws.seconds) and draws.seconds >= 0):
+            raise ValueError(
+                f"{self.sampler} returned draws with seconds={draws.seconds}, expected those that "
+                "they took"
+            )
         # Measures take squares, and sums of them.
         if bad := int((~(np.abs(draws.positions.values) < _FARTHEST)).sum()):
             raise NotFinite(
@@ -214,13 +224,15 @@ class Cell:
                 bought = {f"set_{name}": float(n) for name, n in (self.settings or {}).items()}
                 metrics = {**metrics, "budget_used": used, **bought}
         address = (self.problem, self.sampler, self.seed)
-        result = CellResult(*address, self.fingerprint, metrics, failure, spent)
         _forget(self.folder.parent, self.folder.name)
         unfinished = self.folder.parent / f"{_UNFINISHED}{self.folder.name}-{os.getpid()}"
         try:
             unfinished.mkdir(parents=True, exist_ok=True)
+            length = None
             if draws is not None and self.keeps_draws:
                 draws.save(unfinished / _DRAWS)
+                length = (unfinished / _DRAWS).stat().st_size
+            result = CellResult(*address, self.fingerprint, metrics, failure, spent, length)
             with open(unfinished / _RESULT, "w", encoding="utf-8") as file:
                 json.dump(_without_nan(asdict(result)), file, indent=1)
             if self.folder.exists():
@@ -252,6 +264,14 @@ def read_result(folder: Path) -> CellResult | None:
         )
     except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
         return None
+
+
+def _has_length(file: Path, length: int | None) -> bool:
+    """Whether a file is there and whole; of files of unknown length, whether it is there."""
+    try:
+        return length in (None, file.stat().st_size)
+    except OSError:
+        return False
 
 
 def read_draws(folder: Path) -> MotionDraws:

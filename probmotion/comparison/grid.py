@@ -96,7 +96,8 @@ def compare(
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     check_budget(budget)
-    if executor is not None and not callable(getattr(executor, "submit", None)):
+    submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
+    if executor is not None and not submits:
         raise ValueError(f"executor is {executor!r}, expected one that has submit(), or None")
     chosen = named_problems(problems)
     used = named_samplers(samplers)
@@ -112,7 +113,14 @@ def compare(
             problem = load_problem(source) if isinstance(source, str) else source
             # Pictures show reference draws that the first seed is measured against.
             seed = addressed.integer(0, "exact", name)
-            keep_problem(problem, folder / "problems" / name, seed=seed)
+            try:
+                keep_problem(problem, folder / "problems" / name, seed=seed)
+            except OSError:
+                raise
+            except Exception:
+                # A problem whose references cannot be drawn has no pictures; each of its cells
+                # meets the same error, and says so in its row.
+                continue
         plan.save(folder)
         run_grid(grid, workers, executor, progress)
         # A run of other problems in this folder may have left its own plan.

@@ -13,18 +13,19 @@ from probmotion.sampling import Sampler, importable_samplers, load_sampler
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
 
 _NAME = re.compile(r"\w[\w.,=+() -]*")
+# Bytes of a folder's name, and what stands around it while it is written.
+_LONGEST = 200
 
 AnyProblem = str | Problem | MotionPosterior
 AnySampler = str | Sampler
 
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
-    """Return the problems by what the table calls them; a registered name stands for itself."""
+    """Return the problems by what the table calls them; a registered one by its name in full."""
     found: dict[str, str | Problem] = {}
     for label, given in _labelled(problems, AnyProblem):
         if isinstance(given, str):
-            load_problem(given)
-            _add("problems", found, label or given, given)
+            _add("problems", found, label or load_problem(given).name, given)
         elif isinstance(given, Problem):
             _add("problems", found, label or given.name, _registered_name(given) or given)
         elif isinstance(given, MotionPosterior):
@@ -90,5 +91,10 @@ def _add(argument: str, found: dict[str, Any], name: str, value: Any) -> None:
         raise ValueError(
             f"{argument} has the name {name!r}, expected letters, digits and . , = + ( ) - _ that "
             "make a folder's name"
+        )
+    if (long := len(name.encode())) > _LONGEST:
+        raise ValueError(
+            f"{argument} has a name of {long} bytes, {name[:20]}…, expected at most {_LONGEST}, "
+            "which a folder's name may have"
         )
     found[name] = value

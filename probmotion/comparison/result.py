@@ -22,7 +22,7 @@ __all__ = ["Comparison", "Plan"]
 
 _TABLE, _FAILURES = "table.csv", "failures.json"
 _PICTURE = "quality_against_cost.png"
-_PROBLEMS = "problems"
+_PROBLEMS, _PILOTS = "problems", "pilots"
 
 
 class Comparison:
@@ -168,8 +168,9 @@ class Comparison:
                     dirs_exist_ok=True,
                 )
             for problem in self.plan.problems:
-                kept = Path(_PROBLEMS) / problem
-                shutil.copytree(self.folder / kept, folder / kept, dirs_exist_ok=True)
+                for kept in (Path(_PROBLEMS) / problem, Path(_PILOTS) / problem):
+                    if (self.folder / kept).exists():
+                        shutil.copytree(self.folder / kept, folder / kept, dirs_exist_ok=True)
             self.plan.save(folder)
         with written_whole(folder / _TABLE) as unfinished:
             self.table().to_csv(unfinished, index=False)

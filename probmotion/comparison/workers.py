@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures import CancelledError, Executor, Future
+from queue import SimpleQueue
 from typing import Any
 
 from probmotion.comparison.failures import CellNotKept
@@ -74,14 +75,20 @@ def run_task(task: Task, progress: bool = False) -> None:
 
 def _run_on(executor: Executor, tasks: Sequence[Task], done: Done) -> None:
     running: dict[Future[None], Task] = {}
+    # Of what an executor has cancelled when it was shut down, as_completed would never hear.
+    ended: SimpleQueue[Future[None]] = SimpleQueue()
     try:
         for task in tasks:
             try:
                 running[executor.submit(run_task, task)] = task
             except Exception as error:  # as of what cannot be sent
                 done(task, error)
-        for future in as_completed(running):
-            done(running[future], future.exception())
+        for future in running:
+            future.add_done_callback(ended.put)
+        for _ in running:
+            future = ended.get()
+            cancelled = CancelledError("the executor cancelled it")
+            done(running[future], cancelled if future.cancelled() else future.exception())
     except BaseException:
         for future in running:
             future.cancel()

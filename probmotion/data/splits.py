@@ -101,6 +101,6 @@ def tracks_of_clips(tracks: Sequence[KeypointTrack], clips: Iterable[str]) -> li
     if missing:
         raise ValueError(
             f"clips has {missing[0]!r}, which names no clip of the {len(tracks)} tracks, expected "
-            "only clips that have tracks"
+            "only clips that have tracks, of those that preparation has kept"
         )
     return [track for track in tracks if clip_of(track.name) in wanted]

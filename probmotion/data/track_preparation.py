@@ -181,6 +181,13 @@ def prepare_tracks(
 def _retargeted(
     tracks: list[KeypointTrack], skeleton: Skeleton
 ) -> tuple[list[KeypointTrack], StepReport]:
-    moved = [retarget_track(track, skeleton, derive=True) for track in tracks]
+    try:
+        moved = [retarget_track(track, skeleton, derive=True) for track in tracks]
+    except ValueError as error:
+        own = ", ".join(tracks[0].skeleton.joint_names)
+        raise ValueError(
+            f"skeleton has joints that tracks of {own} do not say: {error}; expected one that fits "
+            "them, or the tracks' own (None, on the command line own)"
+        ) from error
     why = f"brought to the {skeleton.n_joints} joints {skeleton.joint_names[0]}, …"
     return moved, StepReport.of("joints", tracks, moved, why)

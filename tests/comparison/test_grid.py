@@ -163,7 +163,10 @@ def test_failures_are_recorded_and_stop_nothing(tmp_path):
     assert len(said) == len(kept) == 5
     assert said["generation", "crashing"]["message"] == "the floor gave way"
     assert "toy_samplers.py" in said["generation", "crashing"]["traceback"]
-    assert said["generation", "too-few"]["message"] == "too-few returned 18 draws, expected 20"
+    assert (
+        said["generation", "too-few"]["message"]
+        == "too-few returned 2 chains of 9 draws, expected 2 of 10"
+    )
     printed = str(table)
     assert "prior-draws on monocular: prior-draws takes no evidence; exact would do" in printed
     assert "crashing on generation: the floor gave way" in printed

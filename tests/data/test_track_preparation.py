@@ -168,6 +168,12 @@ def test_bad_input_is_one_sentence(raw: list[KeypointTrack], clean: list[Keypoin
         ValueError, match="none left, expected at least one, after pieces: 6 tracks"
     ):
         prepared(raw[:6], clean, threshold=2)
+    snake = Skeleton(["tail", "mid", "head"], [-1, 0, 1])
+    own = KeypointTrack(np.ones((50, 3, 2)), np.ones((50, 3)), snake, 30.0)
+    with pytest.raises(
+        ValueError, match=r"skeleton has joints that tracks of tail, mid, head do not say: .*own"
+    ):
+        prepare_tracks([own], skeleton=Skeleton.preset("person14"), fps=20)
     body = Skeleton.preset("body25b")
     other = KeypointTrack(np.ones((30, 25, 2)), np.ones((30, 25)), body, 30, "other")
     with pytest.raises(

@@ -218,6 +218,7 @@ def test_a_defect_is_one_sentence_with_its_key(
         ({"keypoints": np.zeros((4, 2, 3))}, r"keypoints has shape \(4, 2, 3\)"),
         ({"confidence": np.ones((4, 3))}, r"confidence has shape \(4, 3\), expected \(4, 2\)"),
         ({"confidence": -np.ones((4, 2))}, "confidence is -1 at its least"),
+        ({"confidence": np.full((4, 2), 95.0)}, "confidence is 95 at its most, expected 0 .* to 1"),
         ({"keypoints": np.full((4, 2, 2), np.nan)}, "not finite at frame 0, joint 0"),
     ],
 )
