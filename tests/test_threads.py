@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -153,3 +155,19 @@ def test_many_threads_that_come_and_go_leave_nothing_behind():
     with ThreadPoolExecutor(8) as crowd:
         assert all(found == {1} for found in crowd.map(visit, range(60)))
     assert numbers() == before
+
+
+def test_on_an_executor_s_threads_libraries_are_whole():
+    """While one thread loads JAX, another may ask whether an array is JAX's."""
+    code = (
+        "import sys\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "from probmotion.threads import one_thread\n"
+        "def loaded():\n"
+        "    with one_thread():\n"
+        "        return [hasattr(sys.modules.get(name), kind) for name, kind in kinds]\n"
+        "kinds = [('jax', 'Array'), ('torch', 'Tensor')]\n"
+        "print('jax' in sys.modules, *ThreadPoolExecutor(1).submit(loaded).result())\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["False", "True", "True"]

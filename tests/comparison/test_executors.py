@@ -6,6 +6,7 @@ import logging
 import os
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from threading import Timer
 
 import pandas as pd
 import pytest
@@ -129,3 +130,19 @@ def test_a_full_disk_on_an_executor_stops_the_run():
         executor.error = CellNotKept("No space left on device")
         with pytest.raises(OSError, match="any more, No space left on device, with 0 of 6 cells"):
             compare(generation(), SAMPLERS, executor=executor, **SMALL)
+
+
+def test_what_was_cancelled_with_its_executor_is_a_row():
+    executor = ThreadPoolExecutor(1)
+    slow = {"first": PriorDraws(nap=0.5), "second": PriorDraws(), "third": PriorDraws()}
+    shut = Timer(0.2, executor.shutdown, kwargs={"wait": False, "cancel_futures": True})
+    shut.start()
+    found = compare(generation(), slow, executor=executor, **(SMALL | {"seeds": 1}))
+    shut.join()
+    said = [result.failure and result.failure.message for result in found.results]
+    assert said == [None, *2 * ["the executor cancelled it"]]
+
+
+def test_a_class_of_executors_is_none():
+    with pytest.raises(ValueError, match=r"executor is <class .*>, expected one that has submit"):
+        compare(generation(), PriorDraws(), executor=ThreadPoolExecutor, **SMALL)

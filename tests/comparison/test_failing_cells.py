@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 import pickle
 import re
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -27,12 +28,15 @@ from toy_samplers import (
     Unchecked,
     Unwritable,
     generation,
+    monocular,
+    small_prior,
 )
 
 from probmotion import MotionPosterior, Skeleton
 from probmotion.comparison import Comparison, compare
 from probmotion.comparison.failures import CellNotKept, Failure, TimeIsUp, WorkerDied
 from probmotion.comparison.time_limits import time_limit
+from probmotion.models import GaussianMixtureMotion
 
 SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
 WORDS = {
@@ -332,3 +336,62 @@ def test_a_cell_whose_draws_were_lost_is_computed_again(tmp_path):
     assert len((tmp_path / "diary").read_text().splitlines()) == 2
     assert lost.exists()
     assert len(again.table()) == len(first.table())
+
+
+def test_a_cell_whose_draws_were_cut_off_is_computed_again(tmp_path):
+    asked = {"out": tmp_path / "out", **SMALL}
+    compare(generation(), PriorDraws(), **asked)
+    (cut,) = (tmp_path / "out").rglob("draws.nc")
+    whole = cut.read_bytes()
+    cut.write_bytes(whole[:200])
+    again = compare(generation(), PriorDraws(), **asked)
+    assert len(cut.read_bytes()) == len(whole)
+    assert again.draws("generation", "prior-draws").flat().shape[0] == SMALL["draws"]
+
+
+class Broken(GaussianMixtureMotion):
+    """A prior whose posterior and draws are not written yet."""
+
+    def exact_posterior(self, *given, **named):
+        raise NotImplementedError("to be written")
+
+    def sample(self, rng, n):
+        raise NotImplementedError("to be written")
+
+
+@pytest.mark.parametrize("evidence", [True, False])
+def test_a_problem_whose_references_fail_stops_no_other(evidence):
+    whole = small_prior()
+    prior = Broken(**{each.name: getattr(whole, each.name) for each in fields(whole) if each.init})
+    likelihood = monocular().posterior.likelihood if evidence else None
+    problems = {"broken": MotionPosterior(prior, likelihood), "whole": generation()}
+    found = compare(problems, PriorDraws(), **SMALL)
+    words = {result.problem: result.failure and result.failure.word for result in found.results}
+    assert words == {"broken": "evidence" if evidence else "NotImplementedError", "whole": None}
+
+
+class InOneChain(PriorDraws):
+    """Returns as many draws as it was asked for, in one chain."""
+
+    def sample(self, posterior, *, draws, chains, **settings):
+        return super().sample(posterior, draws=draws * chains, chains=1, **settings)
+
+
+class Timeless(PriorDraws):
+    """Does not know how long it took."""
+
+    def sample(self, posterior, **settings):
+        drawn = super().sample(posterior, **settings)
+        return replace(drawn, dataset=drawn.dataset.assign_attrs(seconds=math.nan))
+
+
+@pytest.mark.parametrize(
+    ("sampler", "sentence"),
+    [
+        (InOneChain(), "prior-draws returned 1 chains of 20 draws, expected 2 of 10"),
+        (Timeless(), "prior-draws returned draws with seconds=nan, expected those that they took"),
+    ],
+)
+def test_draws_of_another_kind_than_asked_for_are_a_row(sampler, sentence):
+    (cell,) = compare(generation(), sampler, **SMALL).results
+    assert cell.failure.message == sentence

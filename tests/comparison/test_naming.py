@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from toy_samplers import PriorDraws, generation
+from toy_samplers import PriorDraws, generation, monocular
 
 from probmotion.comparison import compare
 from probmotion.comparison.naming import named_problems
@@ -86,3 +86,16 @@ CHANGED[1500] = 0  # Where a printed array says "...".
 )
 def test_arrays_are_told_apart_by_what_they_hold(given, changed):
     assert list(settings_of(WithArrays(**given))) == changed
+
+
+def test_names_are_no_longer_than_a_folder_s():
+    with pytest.raises(ValueError, match=r"problems has a name of 400 bytes, ää.*, expected at"):
+        named_problems({200 * "ä": monocular()})
+    assert list(named_problems({200 * "a": monocular()})) == [200 * "a"]
+
+
+def test_a_registered_problem_has_one_name_however_it_is_written():
+    ways = "gait-monocular(noise=0.1, frames=4)", "gait-monocular(frames=4, noise=0.1)"
+    assert list(named_problems(ways[0])) == list(named_problems(ways[1])) == [ways[1]]
+    with pytest.raises(ValueError, match="problems has two called 'gait-monocular"):
+        named_problems(ways)

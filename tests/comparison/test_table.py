@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from toy_samplers import PriorDraws, generation, monocular
+from toy_samplers import PriorDraws, Walking, generation, monocular
 
 from probmotion.citations import CITATIONS, citations_of
-from probmotion.comparison import QUICK, Comparison, compare, quick_samplers
+from probmotion.comparison import QUICK, Budget, Comparison, compare, quick_samplers
 from probmotion.comparison.qualities import best_of, first_quality
 from probmotion.comparison.table import ComparisonTable, _mean_and_sd
 from probmotion.samplers import ExactSampler, ScoreDistillation
@@ -179,6 +179,16 @@ def test_a_comparison_can_be_written_elsewhere_and_read_back(folder, tmp_path):
     np.testing.assert_array_equal(
         copy.draws("generation", "wide", 1).flat(), comparison.draws("generation", "wide", 1).flat()
     )
+
+
+def test_what_was_written_elsewhere_goes_on_there(tmp_path):
+    asked = {**SMALL, "budget": Budget(evaluations=2000)}
+    compare(generation(), Walking(), out=tmp_path / "one", **asked).write(tmp_path / "two")
+    # A budget of seconds is one however it is written.
+    assert Budget(seconds=6) == Budget(seconds=6.0)
+    assert repr(Budget(seconds=6)) == repr(Budget(seconds=6.0))
+    more = compare(generation(), Walking(), out=tmp_path / "two", **asked | {"seeds": 2})
+    assert [result.failure for result in more.results] == [None, None]
 
 
 def test_a_temporary_comparison_takes_its_folder_with_it():
