@@ -167,6 +167,28 @@ def test_behind_a_camera_there_is_no_picture(occluded):
     assert found["g_mpjpe_mm"] > 1000
 
 
+@pytest.mark.parametrize(("n_joints", "frames"), [(1, 1), (5, 1), (1, 4)])
+def test_the_smallest_motions_are_measured_by_what_they_have(n_joints, frames):
+    rng = np.random.default_rng(2)
+    prior = GaussianMixtureMotion(
+        skeleton=Skeleton([*"abcde"][:n_joints], range(-1, n_joints - 1)),
+        fps=30.0,
+        means=rng.normal(size=(1, frames, n_joints, 3)),
+        factors=rng.normal(size=(1, 2, frames, n_joints, 3)),
+        weights=np.ones(1),
+        noise=0.1,
+        azimuths=A,
+        styles=("calm",),
+    )
+    truth = Motion(prior.sample(rng, 1)[0], prior.skeleton, 30.0)
+    posterior = MotionPosterior(prior, observe(truth, "monocular", 0.05, 0))
+    problem = Problem("small", "small", posterior, truth.positions)
+    found = measure(problem, run(problem, problem.reference(0, 20)), 0)
+    assert ("pck" in found) == (n_joints * frames > 1)
+    assert ("velocity_error" in found) == (frames > 1)
+    assert math.isfinite(found["swd"] + found["g_mpjpe_mm"])
+
+
 def test_samplers_of_one_seed_share_their_exact_draws(generation):
     assert _exact_draws(generation, 4, 50) is _exact_draws(generation, 4, 50)
     draws = run(generation, generation.reference(1, 50))
