@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import weakref
+from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
@@ -98,11 +99,37 @@ class Calibration:
 
     def _kept(self, problem: str, sampler: str, kind: str) -> dict[str, np.ndarray]:
         worked = [cell.metrics for cell in self.cells(problem, sampler) if cell.failure is None]
-        names = [name for name in (worked[0] if worked else ()) if name.startswith(kind)]
+        # Where a caller's own simulations differ in kind, what all of them have can be judged.
+        names = [
+            name
+            for name in (worked[0] if worked else ())
+            if name.startswith(kind) and all(name in metrics for metrics in worked)
+        ]
         return {
             name.removeprefix(kind): np.array([metrics[name] for metrics in worked])
             for name in names
         }
+
+    def _of_some(self, problem: str, sampler: str) -> list[str]:
+        """Return the quantities that some simulations have and others have not."""
+        cells = self.cells(problem, sampler)
+        worked = [set(cell.metrics) for cell in cells if cell.failure is None]
+        some = set().union(*worked).difference(set.intersection(*worked)) if worked else set()
+        return sorted(name.removeprefix("rank ") for name in some if name.startswith("rank "))
+
+    @property
+    def ranked(self) -> bool:
+        """Whether any sampler has ranks to draw."""
+        return bool(self._blocks(self.plan.problems))
+
+    def _blocks(self, problems: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Return the ranks of every sampler that has more than one, by its verdict."""
+        found = {}
+        for problem, sampler in product(problems, self.plan.samplers):
+            ranks = self.ranks(problem, sampler)
+            if any(len(values) > 1 for values in ranks.values()):
+                found[self.verdict(problem, sampler)] = ranks
+        return found
 
     @property
     def notes(self) -> list[str]:
@@ -124,6 +151,11 @@ class Calibration:
                     notes.append(
                         f"{sampler} on {problem}: {done} of {self.plan.seeds} simulations are "
                         "finished"
+                    )
+                if only := self._of_some(problem, sampler):
+                    notes.append(
+                        f"{sampler} on {problem}: {', '.join(only)} is left out, which not all "
+                        "simulations have"
                     )
                 among = self.ranked_among(problem, sampler)
                 fewest = min(
@@ -179,13 +211,7 @@ class Calibration:
         from probmotion.pictures.rank_plots import draw_ranks
 
         target = self.folder / _PICTURE if path is None else Path(path)
-        blocks = {}
-        for one in self.plan.problems if problem is None else [problem]:
-            for sampler in self.plan.samplers:
-                ranks = self.ranks(one, sampler)
-                if any(len(values) > 1 for values in ranks.values()):
-                    blocks[self.verdict(one, sampler)] = ranks
-        draw_ranks(blocks, target)
+        draw_ranks(self._blocks(self.plan.problems if problem is None else [problem]), target)
         return target
 
     def write(self) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["QUALITIES", "best_of", "first_quality"]
 
 QUALITIES: Mapping[str, str] = {
-    "swd": "sliced Wasserstein distance to exact draws (1: as far as other exact draws)",
+    "swd": "sliced Wasserstein distance to reference draws (1: as far as others of them)",
     "coverage_interaction": "mean distance of a held-out pose to its nearest draw (D_IC, m)",
     "fid": "Fréchet distance to held-out real views (FID)",
     "g_mpjpe_mm": "mean distance of a joint from the truth (G-MPJPE, mm)",

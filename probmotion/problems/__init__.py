@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Hashable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -102,6 +103,10 @@ def _asked(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
             raise ValueError(
                 f"{name} knows no {number!r}, expected "
                 + (f"one of {', '.join(known)}" if known else "no numbers: it has no scale")
+            )
+        if not isinstance(scale[number], Hashable):
+            raise ValueError(
+                f"{number} is {scale[number]!r}, expected a number such as {known[number]!r}"
             )
     return name, tuple((n, scale[n]) for n in known if n in scale and scale[n] != known[n])
 

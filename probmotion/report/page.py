@@ -72,7 +72,7 @@ def write_report(
 
 def _page(comparison: Comparison, calibration: Calibration | None) -> str:
     plan, table = comparison.plan, comparison.table()
-    picture = b"" if calibration is None else _picture(calibration)
+    picture = b"" if calibration is None or not calibration.ranked else _picture(calibration)
     shown = shown_problems(comparison, max(_LEAST, BUDGET - len(picture)))
     ids = note_ids(comparison)
     outcomes = {
@@ -188,15 +188,20 @@ def _picture(calibration: Calibration) -> bytes:
 
 
 def _calibration(calibration: Calibration, picture: bytes) -> str:
-    """The plot, and the numbers in it as words."""
+    """The plot, where there is one, and its numbers and verdicts as words."""
     coded = base64.b64encode(picture).decode("ascii")
+    shown = (
+        f"""<img class="calibration" src="data:image/png;base64,{coded}"
+ alt="Rank histograms and expected coverage of each sampler; their numbers follow as text.">"""
+        if picture
+        else "<p>No sampler has ranks; why is said below.</p>"
+    )
     return f"""\
 <section id="calibration" aria-labelledby="calibration-name">
 <header><h2 id="calibration-name">Calibration</h2></header>
 <p>Truths are drawn from the prior and evidence from the truths: a truth's rank among an honest
 sampler's draws is uniform, and its intervals hold the truth as often as they say.</p>
-<img class="calibration" src="data:image/png;base64,{coded}"
- alt="Rank histograms and expected coverage of each sampler; their numbers follow as text.">
+{shown}
 <details><summary>The numbers</summary><pre tabindex="0">{escape(str(calibration.table()))}</pre>
 </details>
 </section>"""

@@ -50,7 +50,7 @@ def test_the_best_is_taken_and_the_others_are_told_from_it_or_not():
     assert found.without == {"sds": "evidence"}
     text = str(found)
     assert "take: near 0.997 ± 0.025 in 6 s" in text
-    assert "worse: far 2.05 ± 0.05 in 6 s (far from exact draws: swd 2.05); farther" in text
+    assert "worse: far 2.05 ± 0.05 in 6 s (far from reference draws: swd 2.05); farther" in text
     assert "without draws: sds (evidence)" in text
     assert "40 draws, 3 seeds, all had 6 seconds (made here)" in text
     assert max(map(len, text.splitlines())) <= 100
@@ -73,10 +73,10 @@ def test_a_ratio_of_half_is_as_wrong_as_of_double():
 @pytest.mark.parametrize(
     ("metric", "value", "said"),
     [
-        ("tr", 0.5, "spread wrong: trace of covariance 0.5 of the exact"),
-        ("tr", 1.6, "spread wrong: trace of covariance 1.6 of the exact"),
-        ("off", 3.0, "variance off the prior's manifold 3 of the exact"),
-        ("c2st", 0.9, "a classifier tells its draws from exact ones: C2ST 0.9"),
+        ("tr", 0.5, "spread wrong: trace of covariance 0.5 of the references'"),
+        ("tr", 1.6, "spread wrong: trace of covariance 1.6 of the references'"),
+        ("off", 3.0, "variance off the prior's manifold 3 of the references'"),
+        ("c2st", 0.9, "a classifier tells its draws from reference ones: C2ST 0.9"),
         ("share_error", 0.4, "styles' shares wrong by 0.4"),
         ("rhat", 1.4, "chains do not agree: R-hat 1.4"),
     ],

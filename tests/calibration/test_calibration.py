@@ -392,6 +392,18 @@ def test_wrong_input_is_named():
     assert "toy simulates no truth" in held.verdict("toy", "batch")
 
 
+def test_simulations_that_differ_in_kind_are_judged_by_what_they_share():
+    bare = replace(plain(), posterior=MotionPosterior(prior()))
+    problem = replace(toy(), simulate=lambda n: toy().simulate(n) if n % 3 else bare)
+    held = calibrate(problem, Batch(), simulations=10, **SMALL)
+    assert held.failures == []
+    assert {len(ranks) for ranks in held.ranks("toy", "batch").values()} == {10}
+    assert "log likelihood" not in held.ranks("toy", "batch")
+    (said,) = (note for note in held.notes if "left out" in note)
+    assert said == ("batch on toy: log likelihood is left out, which not all simulations have")
+    assert held.ranked
+
+
 # The negative control.
 
 

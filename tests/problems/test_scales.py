@@ -65,6 +65,7 @@ def test_a_worker_gets_an_equal_problem():
         ("gait-monocular", {"frames": 4, "joints": 18}, "joints is 18, expected at most the 17"),
         ("gait-monocular", {"frames": 4, "noise": -1.0}, "noise is -1.0, expected"),
         ("gait-monocular", {"frames": 4, "hidden": 1.5}, "hidden is 1.5, expected a share"),
+        ("gait(frames=[5])", {}, r"frames is \[5\], expected a number such as"),
         ("gait(frames 5)", {}, "is 'gait.frames 5.', expected numbers such as"),
         ("gate(frames=5)", {}, "problem is 'gate', expected one of gait"),
     ],

@@ -15,6 +15,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from probmotion import Cameras, MotionDraws, MotionPosterior, seeds
+from probmotion.calibration import calibrate
 from probmotion.comparison.cells import CellResult, Failure
 from probmotion.comparison.kept_problems import KeptProblem, keep_problem, read_kept
 from probmotion.comparison.result import Comparison
@@ -28,6 +29,7 @@ from probmotion.report.label_places import place_labels
 from probmotion.report.motions import Shown, motion_numbers
 from probmotion.report.page import write_report
 from probmotion.report.players import BUDGET, shown_problems
+from probmotion.samplers import ScoreDistillation
 
 SCRIPT = "</script><script>alert(1)</script><b onclick='x'>&\"'"
 WALK = make_gait("walk", frames=12)
@@ -317,6 +319,8 @@ def test_what_is_no_page_is_refused(made, tmp_path):
 class Calibrated:
     """A calibration of which only a picture and a table are there, a block per sampler."""
 
+    ranked = True
+
     def __init__(self, blocks: int) -> None:
         self.blocks = blocks
 
@@ -346,6 +350,18 @@ def test_calibration_is_in_the_page(made, tmp_path):
     assert off.max() < 0.25
     assert shown.stat().st_size < drawn.stat().st_size / 2
     assert "calibration" in read(page).ids
+
+
+def test_a_calibration_without_ranks_leaves_the_page_as_it_is(made, tmp_path):
+    settings = {"draws": 10, "chains": 1, "workers": 0, "progress": False}
+    calibration = calibrate(
+        "gait-monocular(frames=4)", ScoreDistillation(), simulations=10, **settings
+    )
+    assert not calibration.ranked
+    page = write_report(made, tmp_path / "report.html", calibration).read_text(encoding="utf-8")
+    assert "No sampler has ranks" in page
+    assert "sds on gait-monocular" in page
+    assert 'class="calibration"' not in page
 
 
 class Long(Made):
