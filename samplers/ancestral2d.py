@@ -18,7 +18,7 @@ from probmotion.diffusion import NoiseSchedule
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import Denoises2D
 from probmotion.samplers.ancestral import ancestral, cosine_schedule
-from probmotion.sampling import UnsupportedPosterior, batches, progress_bar
+from probmotion.sampling import UnsupportedPosterior, batches, progress_bar, suited
 from probmotion.seeds import NormalStreams
 
 __all__ = ["Ancestral2D"]
@@ -135,7 +135,7 @@ class Ancestral2D:
                 self.name,
                 "draws single views of a prior and has no place for evidence",
                 word="evidence",
-                others=("mas", "mvpc"),
+                others=suited(posterior),
             )
         return prior
 

@@ -17,7 +17,7 @@ from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import Denoises3D
 from probmotion.samplers.ancestral import MotionState, ancestral, cosine_schedule
-from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
+from probmotion.samplers.guidance import AnyGuidance, MomentMatched, can_guide, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.views import MotionDenoiser
 from probmotion.sampling import require
@@ -48,6 +48,7 @@ class Ancestral3D:
 
     name: ClassVar[str] = "ancestral3d"
     requires: ClassVar[tuple[type, ...]] = (Denoises3D,)
+    draws_from = staticmethod(can_guide)
     effort: ClassVar[tuple[str, ...]] = ("steps",)
     least_effort: ClassVar[int] = 2
 

@@ -29,6 +29,7 @@ from probmotion.priors import (
 )
 from probmotion.samplers.amortised import AmortisedPosterior, AmortisedSettings
 from probmotion.samplers.independent import draw_independently, refuse_initial, with_coordinates
+from probmotion.samplers.simulated_pairs import observed_entries
 from probmotion.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
@@ -125,6 +126,18 @@ class DVAEInference:
         return cls(
             mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
         )
+
+    @staticmethod
+    def draws_from(posterior: MotionPosterior) -> bool:
+        """Return whether the prior's network reads the evidence, or one can be shown it."""
+        network = getattr(posterior.prior, "inference_network", None)
+        if posterior.likelihood is None or (network and network.reads(posterior.likelihood)):
+            return True
+        try:
+            observed_entries(posterior.likelihood, posterior.frames)
+        except UnsupportedPosterior:
+            return False
+        return True
 
     def sample(
         self,

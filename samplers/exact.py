@@ -90,10 +90,14 @@ class ExactSampler:
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether it can, as far as can be told before the evidence is looked at."""
+        """Return whether it can."""
         if posterior.reshaped:
             return False
         if isinstance(posterior.prior, HasExactPosterior):
+            try:
+                posterior.prior.exact_posterior(posterior.likelihood)
+            except NotConjugate:
+                return False
             return True
         return posterior.likelihood is None and isinstance(posterior.prior, Samplable)
 
@@ -124,5 +128,5 @@ class ExactSampler:
                 self.name,
                 f"needs a posterior in closed form, but {error}",
                 word="not-conjugate",
-                others=("mh", "nuts"),
+                others=suited(posterior),
             ) from error

@@ -18,7 +18,7 @@ from probmotion.posterior import MotionPosterior
 from probmotion.priors import NotConjugate
 from probmotion.samplers.ancestral import Guide, StateDenoiser
 from probmotion.samplers.views import symmetric_power
-from probmotion.sampling import Sampler, UnsupportedPosterior
+from probmotion.sampling import Sampler, UnsupportedPosterior, suited
 
 __all__ = [
     "DPS",
@@ -27,9 +27,26 @@ __all__ = [
     "MomentMatched",
     "Replacement",
     "WeightedTriangulation",
+    "can_guide",
     "conjugate_gradients",
     "guide_towards",
 ]
+
+
+def can_guide(posterior: MotionPosterior) -> bool:
+    """Return whether there is no evidence, or such as a guidance can follow."""
+    try:
+        return posterior.likelihood is None or bool(_linear(posterior))
+    except NotConjugate:
+        return False
+
+
+def _linear(posterior: MotionPosterior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, y and W of the evidence, metres."""
+    linear = getattr(posterior.likelihood, "linear", None)
+    if linear is None:
+        raise NotConjugate(f"{type(posterior.likelihood).__name__} does not offer linear()")
+    return linear()
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +76,14 @@ class Evidence:
         UnsupportedPosterior
             If it is not linear in the positions with Gaussian noise.
         """
-        linear = getattr(posterior.likelihood, "linear", None)
-        if linear is None:
-            raise UnsupportedPosterior(
-                sampler.name,
-                "is guided by linear evidence with Gaussian noise, which "
-                f"{type(posterior.likelihood).__name__} does not offer as linear()",
-                word="evidence",
-            )
         try:
-            axes, target, precision = linear()
+            axes, target, precision = _linear(posterior)
         except NotConjugate as error:
             raise UnsupportedPosterior(
                 sampler.name,
                 f"is guided by linear evidence with Gaussian noise, but {error}",
                 word="evidence",
+                others=suited(posterior),
             ) from error
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return cls(axes, target / scale, precision * scale**2)

@@ -19,7 +19,7 @@ from probmotion.draws import MotionDraws
 from probmotion.posterior import MotionPosterior
 from probmotion.priors import Denoises2D
 from probmotion.samplers.ancestral import MotionState, ancestral, cosine_schedule
-from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
+from probmotion.samplers.guidance import AnyGuidance, MomentMatched, can_guide, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.separate_views import SeparateViews
 from probmotion.samplers.views import MultiViewDenoiser, Views, views_around, warn_of_level_views
@@ -82,6 +82,7 @@ class MultiViewAncestral:
 
     name: ClassVar[str] = "mas"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    draws_from = staticmethod(can_guide)
     effort: ClassVar[tuple[str, ...]] = ("steps",)
     least_effort: ClassVar[int] = 2
 

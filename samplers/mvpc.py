@@ -37,7 +37,7 @@ from probmotion.samplers.ancestral import (
     cosine_schedule,
     sigma,
 )
-from probmotion.samplers.guidance import AnyGuidance, MomentMatched, guide_towards
+from probmotion.samplers.guidance import AnyGuidance, MomentMatched, can_guide, guide_towards
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.views import (
     MultiViewDenoiser,
@@ -93,6 +93,7 @@ class MultiViewPredictorCorrector:
 
     name: ClassVar[str] = "mvpc"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    draws_from = staticmethod(can_guide)
     effort: ClassVar[tuple[str, ...]] = ("steps",)
     least_effort: ClassVar[int] = 2
 

@@ -26,7 +26,7 @@ from probmotion.samplers.adam import Adam
 from probmotion.samplers.coordinate_distillation import distil_coordinates
 from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.views import Views
-from probmotion.sampling import UnsupportedPosterior, require
+from probmotion.sampling import UnsupportedPosterior, require, suited
 from probmotion.seeds import NormalStreams
 
 __all__ = ["ScoreDistillation", "score_distillation_gradient"]
@@ -129,6 +129,11 @@ class ScoreDistillation:
         """The noise levels."""
         return NoiseSchedule.cosine(self.steps, power=self.schedule_power)
 
+    @staticmethod
+    def draws_from(posterior: MotionPosterior) -> bool:
+        """Return whether the evidence, if any, has a place in what it optimises."""
+        return posterior.likelihood is None or not isinstance(posterior.prior, Denoises2D)
+
     def sample(
         self,
         posterior: MotionPosterior,
@@ -154,12 +159,12 @@ class ScoreDistillation:
             return distil_coordinates(
                 self, posterior, draws=draws, chains=chains, seed=seed, progress=progress
             )
-        if posterior.likelihood is not None:
+        if not self.draws_from(posterior):
             raise UnsupportedPosterior(
                 self.name,
                 "optimises towards the modes of the prior and has no place for evidence",
                 word="evidence",
-                others=("mas", "mvpc"),
+                others=suited(posterior),
             )
         counts = {"denoiser": 0}
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)

@@ -89,7 +89,7 @@ def test_levels_are_strided_from_the_longer_schedule():
 
 def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     evidence = MotionPosterior(lively, Joints3D(lively.mean, noise=0.1))
-    with pytest.raises(UnsupportedPosterior, match="has no place for evidence; mas, mvpc would do"):
+    with pytest.raises(UnsupportedPosterior, match=r"place for evidence; .*mas, .*mvpc.* would do"):
         Ancestral2D().sample_views(evidence, draws=1)
     with pytest.raises(ValueError, match="camera has 2 views, expected one"):
         Ancestral2D().sample_views(MotionPosterior(lively), draws=1, camera=Cameras.ring(2))

@@ -259,7 +259,7 @@ def test_a_2d_denoiser_keeps_its_own_way_and_its_refusal_of_evidence(lively):
         distilled(QUICK, MotionPosterior(prior), draws=2).positions,
         distilled(QUICK, MotionPosterior(lively), draws=2).positions,
     )
-    with pytest.raises(UnsupportedPosterior, match="no place for evidence; mas, mvpc would do"):
+    with pytest.raises(UnsupportedPosterior, match=r"place for evidence; .*mas, .*mvpc.* would do"):
         distilled(QUICK, MotionPosterior(prior, Joints3D(lively.mean, noise=0.1)))
 
 

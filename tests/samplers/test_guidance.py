@@ -361,7 +361,7 @@ def test_evidence_that_is_not_linear_is_refused(lively):
     for likelihood, reason in (
         (perspective, "the cameras are perspective"),
         (outliers, "Student-t with 3 degrees"),
-        (Other(), "which Other does not offer"),
+        (Other(), "but Other does not offer linear"),
     ):
         for sampler in (Ancestral3D(), MultiViewAncestral(), MultiViewPredictorCorrector()):
             with pytest.raises(UnsupportedPosterior, match=reason) as refused:

@@ -196,3 +196,35 @@ def test_a_draw_of_the_exact_prior_is_the_same_in_any_company(sampler):
     np.testing.assert_array_equal(alone[0], whole[0])
     small = replace(sampler, batch=2).sample(posterior, draws=2, chains=1, seed=0, progress=False)
     np.testing.assert_array_equal(small.positions.values[0], whole[0, :2])
+
+
+@pytest.mark.parametrize("name", ["exact", "ancestral3d", "mas", "mvpc", "sds"])
+@pytest.mark.parametrize("problem", ["gait", "gait-monocular", "gait-noisy3d"])
+def test_whoever_is_said_to_do_does(problem, name):
+    posterior = load_problem(f"{problem}(frames=4, components=3)").posterior
+    kind = load_sampler(name)
+    effort = {one: getattr(kind, "least_effort", 1) for one in getattr(kind, "effort", ())}
+    if name in suited(posterior):
+        kind(**effort).sample(posterior, draws=1, progress=False)
+        return
+    with pytest.raises(UnsupportedPosterior, match=r"; .*dvae, .*mh, .*nuts would do$"):
+        kind(**effort).sample(posterior, draws=1, progress=False)
+
+
+def test_a_network_is_trained_only_for_evidence_that_it_can_be_shown():
+    posterior = load_problem("gait-monocular(frames=4, components=3)").posterior
+    own = replace(posterior, likelihood=Quiet())
+    assert "dvae" in suited(posterior)
+    assert "dvae" not in suited(own)
+    with pytest.raises(UnsupportedPosterior, match="needs evidence of keypoints or joints"):
+        load_sampler("dvae")().sample(own, draws=1, progress=False)
+
+
+class Quiet:
+    """Evidence of one's own, that says nothing."""
+
+    def log_density(self, positions):
+        return 0 * positions.sum(axis=(-3, -2, -1))
+
+    def simulate(self, rng, positions):
+        return self

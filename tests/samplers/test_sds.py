@@ -116,7 +116,7 @@ def test_draws_depend_on_their_names_alone(lively):
 def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     seen = Joints3D(lively.mean, noise=0.1)
     with pytest.raises(
-        UnsupportedPosterior, match="no place for evidence; mas, mvpc would do"
+        UnsupportedPosterior, match=r"place for evidence; .*mas, .*mvpc.* would do"
     ) as no:
         ScoreDistillation().sample(MotionPosterior(lively, seen), progress=False)
     assert no.value.word == "evidence"
