@@ -149,15 +149,21 @@ def suited(posterior: MotionPosterior) -> list[str]:
 
 
 def importable_samplers() -> dict[str, type[Any]]:
-    """Return the classes of all registered samplers, by name.
+    """Return the classes of all registered samplers that have defaults, by name.
 
-    One that cannot be imported, as of a package that is half removed, is left out, and a warning
-    says so: whoever asks for all is not stopped by one.
+    One that cannot be imported, as of a package that is half removed, or not be made without
+    settings, is left out, and a warning says so: whoever asks for all is not stopped by one.
     """
     refused: dict[str, ValueError] = {}
-    found = _imported(refused)
-    for error in refused.values():
-        warnings.warn(f"{error}; it is left out", stacklevel=2)
+    found = {}
+    for name, kind in _imported(refused).items():
+        try:
+            default_sampler(name)
+            found[name] = kind
+        except ValueError as error:
+            refused[name] = error
+    for reason in refused.values():
+        warnings.warn(f"{reason}; it is left out", stacklevel=2)
     return found
 
 
@@ -173,8 +179,22 @@ def _imported(refused: dict[str, ValueError]) -> dict[str, type[Any]]:
 
 @cache
 def _registered() -> dict[str, EntryPoint]:
-    found = entry_points(group="probmotion.samplers")
-    return {point.name: point for point in found}
+    kept: dict[str, EntryPoint] = {}
+    # The library's own first: nobody else's takes the place of one.
+    points = entry_points(group="probmotion.samplers")
+    for point in sorted(points, key=lambda point: _package_of(point) != "the package probmotion"):
+        first = kept.setdefault(point.name, point)
+        if first.value != point.value:
+            warnings.warn(
+                f"sampler {point.name!r} of {_package_of(point)} is left out: "
+                f"{_package_of(first)} has one of that name",
+                stacklevel=3,
+            )
+    return kept
+
+
+def _package_of(point: EntryPoint) -> str:
+    return f"the package {point.dist.name}" if point.dist else "a package without a name"
 
 
 def sampler_names() -> list[str]:
@@ -202,12 +222,32 @@ def load_sampler(name: str) -> type[Any]:
         return point.load()
     # A package of somebody else's may fail in any way as it is imported.
     except Exception as error:
-        package = f"the package {point.dist.name}" if point.dist else "a package without a name"
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(
-            f"sampler is {name!r}, which {package} registers as {point.value!r}, expected one "
-            f"that can be imported ({reason})"
+            f"sampler is {name!r}, which {_package_of(point)} registers as {point.value!r}, "
+            f"expected one that can be imported ({_in_a_line(error)})"
         ) from error
+
+
+def default_sampler(name: str) -> Any:
+    """Return a registered sampler with its default settings.
+
+    Raises
+    ------
+    ValueError
+        As :func:`load_sampler`, or if it cannot be made without settings.
+    """
+    kind = load_sampler(name)
+    try:
+        return kind()
+    except Exception as error:
+        raise ValueError(
+            f"sampler is {name!r}, which cannot be made without settings ({_in_a_line(error)}), "
+            "expected an object with its settings"
+        ) from error
+
+
+def _in_a_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 class _Silent:

@@ -7,15 +7,17 @@ proposal) is written as in Python: ``DPS`` or ``DPS(strength=0.5)``.
 from __future__ import annotations
 
 import ast
+import re
 import sys
 import types
 from collections.abc import Iterable
 from dataclasses import field, fields, is_dataclass, make_dataclass
 from functools import partial
 from inspect import Parameter, signature
+from keyword import iskeyword
 from typing import TYPE_CHECKING, Any, Union, get_args
 
-from probmotion.sampling import importable_samplers, load_sampler
+from probmotion.sampling import default_sampler, importable_samplers, load_sampler, sampler_names
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -33,7 +35,8 @@ __all__ = [
 
 def option_name(sampler: str) -> str:
     """Return the field of a sampler's settings: its name as an identifier."""
-    return sampler.replace("-", "_")
+    name = re.sub(r"\W", "_", sampler)
+    return name if name.isidentifier() and not iskeyword(name) else f"sampler_{name}"
 
 
 def settings_of_samplers(quick: bool = False) -> type[Any]:
@@ -49,11 +52,14 @@ def settings_of_samplers(quick: bool = False) -> type[Any]:
         from probmotion.comparison import quick_samplers
 
         begin = quick_samplers()
-    entries = []
+    entries: dict[str, tuple[type, Any]] = {}
     for name, kind in importable_samplers().items():
         default = partial(_same, begin[name]) if quick else kind
-        entries.append((option_name(name), kind, field(default_factory=default)))
-    settings = make_dataclass("Settings", entries, frozen=True)
+        # Of two that other packages call nearly alike, the first has options.
+        entries.setdefault(option_name(name), (kind, field(default_factory=default)))
+    settings = make_dataclass(
+        "Settings", [(name, *entry) for name, entry in entries.items()], frozen=True
+    )
     settings.__doc__ = "Settings of the samplers."
     return settings
 
@@ -89,12 +95,14 @@ def sampler_called(name: str, settings: Any) -> Any:
     Raises
     ------
     ValueError
-        If there is no such sampler or preset; the message lists the known ones.
+        If there is no such sampler or preset, with the known ones, or it has no defaults.
     """
-    base, _, preset = name.partition(".")
+    # Others may have a point in their names.
+    base, _, preset = (name, "", "") if name in sampler_names() else name.partition(".")
     kind = load_sampler(base)
     if not preset:
-        return getattr(settings, option_name(base))
+        given = getattr(settings, option_name(base), None)
+        return given if type(given) is kind else default_sampler(base)
     known = presets_of(kind)
     if preset not in known:
         names = ", ".join(f"{base}.{one}" for one in known) or f"{base} alone, which has no presets"

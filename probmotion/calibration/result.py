@@ -113,9 +113,10 @@ class Calibration:
     def _of_some(self, problem: str, sampler: str) -> list[str]:
         """Return the quantities that some simulations have and others have not."""
         cells = self.cells(problem, sampler)
-        worked = [set(cell.metrics) for cell in cells if cell.failure is None]
-        some = set().union(*worked).difference(set.intersection(*worked)) if worked else set()
-        return sorted(name.removeprefix("rank ") for name in some if name.startswith("rank "))
+        worked = [cell.metrics for cell in cells if cell.failure is None]
+        names = {name for metrics in worked for name in metrics if name.startswith("rank ")}
+        some = [name for name in names if not all(name in metrics for metrics in worked)]
+        return sorted(name.removeprefix("rank ") for name in some)
 
     @property
     def ranked(self) -> bool:

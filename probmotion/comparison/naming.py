@@ -8,7 +8,7 @@ from typing import Any
 
 from probmotion.posterior import MotionPosterior
 from probmotion.problems import Problem, load_problem, problem_names
-from probmotion.sampling import Sampler, importable_samplers, load_sampler
+from probmotion.sampling import Sampler, default_sampler, importable_samplers
 
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
 
@@ -60,7 +60,7 @@ def named_samplers(samplers: Any) -> dict[str, Sampler]:
         list(importable_samplers()) if samplers is None else samplers, AnySampler
     ):
         if isinstance(given, str):
-            _add("samplers", found, label or given, load_sampler(given)())
+            _add("samplers", found, label or given, default_sampler(given))
         elif isinstance(given, Sampler) and not isinstance(given, type):
             _add("samplers", found, label or given.name, given)
         else:

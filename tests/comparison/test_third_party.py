@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -165,6 +166,50 @@ def test_its_sampler_runs_beside_ours_on_a_posterior_of_one_s_own(package, tmp_p
     # Its effort is spent like that of our own samplers.
     assert found["settings"] == {"importance": {"candidates": 1500}, "exact": {}}
     assert "importance" in found["suited"]
+
+
+NEEDY = """
+
+class Needy(Importance):
+    def __init__(self, model):
+        self.model = model
+"""
+
+
+def test_whatever_they_are_called_and_whatever_they_need_they_stop_no_others(package, tmp_path):
+    (package / "walkers_of_ours" / "__init__.py").write_text(SAMPLER + NEEDY)
+    names = ["my.good", "1st", "lambda", "my good", "my-good", "plain"]
+    entries = [*(f"{name} = walkers_of_ours:Importance" for name in names)]
+    entries += ["needy = walkers_of_ours:Needy", "mh = walkers_of_ours:Importance"]
+    (package / "walkers_of_ours-0.3.dist-info" / "entry_points.txt").write_text(
+        "\n".join(["[probmotion.samplers]", *entries])
+    )
+    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
+
+    def said(*samplers):
+        words = ["compare", "gait-monocular(frames=4)", "--samplers", *samplers, "--draws", "10"]
+        words += ["--workers", "0", "--out", str(tmp_path / "out")]
+        command = "import sys; from probmotion.cli import main; sys.exit(main())"
+        run = subprocess.run(
+            [sys.executable, "-c", command, *words],
+            env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True,
+            text=True,
+            timeout=200,
+        )
+        return run.returncode, run.stdout, run.stderr
+
+    status, table, notes = said("exact", "my.good", "1st", "lambda", "my good")
+    assert status == 0, notes
+    for name in ("exact", "my.good", "1st", "lambda", "my good"):
+        assert re.search(rf"^{re.escape(name)} .* [0-9.]+", table, re.MULTILINE)
+    assert "sampler 'mh' of the package walkers-of-ours is left out" in notes
+    assert "'needy', which cannot be made without settings (TypeError" in notes
+    assert "it is left out" in notes
+    status, _, notes = said("needy")
+    assert status == 2
+    assert notes.splitlines()[-1].startswith("probmotion: sampler is 'needy', which cannot be made")
+    assert "Traceback" not in notes
 
 
 def test_those_that_cannot_be_imported_are_named_and_stop_no_others(package, tmp_path):
