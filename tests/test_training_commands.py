@@ -347,7 +347,8 @@ def test_wrong_words_are_one_sentence(
         (*made, "--clips", walks, "--test", "walk1"): "test is given without validation, "
         "expected clips for both or neither",
         (*made, "--clips", walks, "--validation", "walk1", "--test", "walk9"): "clips has "
-        "'walk9', which names no clip of the 5 tracks, expected only clips that have tracks",
+        "'walk9', which names no clip of the 5 tracks, expected only clips that have tracks, of "
+        "those that preparation has kept",
         (*made, "--clips", walks, "--views", "0"): "views is 0, expected an integer of at least 1",
         (*made, "--clips", walks, "--fps", "0"): "fps is 0.0, expected a finite number above 0",
         (*made, "--device", "cuda"): "device is 'cuda', but this machine has no CUDA; expected "

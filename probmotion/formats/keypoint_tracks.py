@@ -180,13 +180,10 @@ def tracks_of(
             values[span.index(frame)] = detection.values
         confidence = values[..., 2]
         words = [file.stem, video if len(seen) > 1 else "", person]
-        tracks.append(
-            KeypointTrack(
-                np.where(confidence[..., np.newaxis] > 0, values[..., :2], np.nan),
-                confidence,
-                skeleton,
-                fps,
-                name=" ".join(word for word in words if word),
-            )
-        )
+        name = " ".join(word for word in words if word)
+        keypoints = np.where(confidence[..., np.newaxis] > 0, values[..., :2], np.nan)
+        try:
+            tracks.append(KeypointTrack(keypoints, confidence, skeleton, fps, name))
+        except ValueError as error:
+            raise MotionFileError(f"{file}: {error}") from error
     return tracks

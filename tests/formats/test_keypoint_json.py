@@ -250,6 +250,7 @@ def changed(key: str, value: Any) -> dict[str, Any]:
         ([ONE | {"keypoints": ["1", 2, 3]}], "holds '1', expected numbers"),
         ([ONE | {"keypoints": [True, 2, 3]}], "holds True, expected numbers"),
         ([ONE | {"keypoints": [1, 2, -1]}], "holds the confidence -1, expected 0 or more"),
+        ([ONE | {"keypoints": [1, 2, 95] * 17}], "confidence is 95 at its most, expected 0"),
         ([ONE | {"keypoints": [float("nan"), 2, 1]}], "holds NaN where confidence is above 0"),
         ([ONE | {"keypoints": [1e300, 2, 1]}], r"holds 1e\+300"),
         ([ONE | {"keypoints": [1, 2, 1] * 5}], "5 keypoints of unknown names"),
