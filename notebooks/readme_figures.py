@@ -33,7 +33,7 @@ def replace_block(text: str, name: str, block: str) -> str:
 def save_small(path: Path) -> None:
     """Write a picture again with few colours, so that the repository stays small."""
     picture = Image.open(path).convert("RGB")
-    picture.quantize(32, dither=Image.Dither.NONE).save(path, optimize=True)
+    picture.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
