@@ -6,7 +6,7 @@ value that makes sense. Pilot runs, each of 2 to 8 times the effort of the one b
 unit of it costs; the cost is a straight line in all of ours but NUTS, whose trajectories adapt. Of
 seconds the first pilot is run twice: libraries compile at the first. And what else a machine does
 adds to some: where the last three are not on a line they are run again, the cheapest first, until
-they are.
+they are, or the pilots have cost as much as the budget.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def affordable(
         costs.append((effort, pilot(_with(sampler, effort))))
     if budget.seconds is not None:
         for place in range(-3, 0):
-            if _bends(costs):
+            if _bends(costs) and sum(seconds for _, seconds in costs) < budget.amount:
                 effort, seconds = costs[place]
                 costs[place] = effort, min(seconds, pilot(_with(sampler, effort)))
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))

@@ -214,12 +214,12 @@ def test_what_is_compiled_at_the_first_run_is_no_cost_of_a_cell():
 
 @pytest.mark.parametrize("slowed", range(7))
 def test_a_pilot_that_something_slowed_down_is_no_measure(slowed):
-    """Of 6 seconds, at 1/100 for a unit of effort; one pilot takes twice as long."""
+    """Of 6 seconds, at 1/100 for a unit of effort; one pilot takes half as long again."""
     asked = []
 
     def pilot(sampler):
         asked.append(sampler.stride)
-        return (0.05 + 0.01 * sampler.stride) * (2 if len(asked) == 1 + slowed else 1)
+        return (0.05 + 0.01 * sampler.stride) * (1.5 if len(asked) == 1 + slowed else 1)
 
     found = affordable(Budget(seconds=6.0), Walking(stride=100), pilot)
     assert found["stride"] == pytest.approx(595, rel=0.01)
@@ -239,6 +239,14 @@ def test_a_cost_that_is_no_line_is_asked_again_once():
     found = affordable(Budget(seconds=6.0), Walking(stride=100), pilot)["stride"]
     assert 0.5 * 6 < 1e-3 * found**1.5 < 1.5 * 6
     assert all(asked.count(stride) <= 2 for stride in asked)
+    # Not where pilots have cost as much as a cell already.
+    asked.clear()
+    steep = affordable(
+        Budget(seconds=5.0), Walking(stride=100), lambda each: 0.4 * pilot(each) ** (4 / 3) / 0.01
+    )
+    assert steep
+    assert asked.count(2) == 2
+    assert len(asked) == 1 + len(set(asked))
     asked.clear()
     affordable(Budget(evaluations=6), Walking(stride=100), pilot)
     assert len(asked) == len(set(asked))
