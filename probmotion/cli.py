@@ -93,7 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _note
         try:
-            _parse(words[0], words[1:]).run()
+            try:
+                _parse(words[0], words[1:]).run()
+            finally:
+                # Here, where a reader that is gone is no error; not as Python ends.
+                sys.stdout.flush()
         except KeyboardInterrupt as error:
             return _complain(str(error) or "interrupted; nothing was written", 130)
         except BrokenPipeError:

@@ -83,8 +83,11 @@ def test_list_names_everything(capsys):
         assert f"\n  {name} " in listed
 
 
-def test_a_reader_that_stops_early_is_no_error():
-    code = f"{sys.executable} -c '{PROGRAM[2]}' compare --help | head -1; exit ${{PIPESTATUS[0]}}"
+@pytest.mark.parametrize(("words", "lines"), [("compare --help", 1), ("which gait", 0)])
+def test_a_reader_that_stops_early_is_no_error(words, lines):
+    """While it is written to, and as the last lines leave a buffer that held all of them."""
+    program = f"{sys.executable} -c '{PROGRAM[2]}' {words}"
+    code = f"unset PYTHONUNBUFFERED; {program} | head -n {lines}; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stderr == ""
