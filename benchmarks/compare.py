@@ -27,9 +27,9 @@ from probmotion.samplers import MetropolisHastings
 _START = """
 import time
 start = time.perf_counter()
-import probmotion.comparison.processes, probmotion.comparison.cells, probmotion.metrics
+import probmotion.comparison.run.processes, probmotion.comparison.run.cells, probmotion.metrics
 from probmotion.problems import load_problem
-import probmotion.samplers.metropolis
+import probmotion.samplers.mcmc.metropolis
 imported = time.perf_counter()
 load_problem("gait")
 print(imported - start, time.perf_counter() - imported)

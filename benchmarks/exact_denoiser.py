@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 from probmotion import Cameras
-from probmotion.data.gaits import make_gaits
+from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.models import GaussianMixtureMotion
 
 

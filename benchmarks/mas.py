@@ -30,12 +30,12 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from probmotion import MotionPosterior
-from probmotion.models.diffusion_settings import DiffusionSettings
-from probmotion.models.motion_diffusion import MotionDiffusion
-from probmotion.models.standards import Standards
+from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+from probmotion.models.diffusion.settings import DiffusionSettings
+from probmotion.models.training.standardisation import Standards
+from probmotion.motion.skeleton import Skeleton
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral
-from probmotion.skeleton import Skeleton
 
 FRAMES, JOINTS, VIEWS = 180, 16, 5
 

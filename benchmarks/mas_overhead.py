@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 from probmotion import Cameras, MotionPosterior
-from probmotion.data.gaits import make_gaits
+from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.models import GaussianMixtureMotion
 from probmotion.samplers import MultiViewAncestral
 

@@ -13,18 +13,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from probmotion.data.walks import made_walks
-from probmotion.likelihoods import Joints3D
-from probmotion.models.body_states import BodyStates, rest_pose
-from probmotion.models.dvae_inference import DenoisingNetworks
-from probmotion.models.dvae_settings import DVAESettings
-from probmotion.models.dvae_training import DVAETrainee
-from probmotion.models.motion_denoiser import MotionDenoiser, NoisyMotion
-from probmotion.models.motion_dvae import MotionDVAE
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
+from probmotion.data.synthetic.walks import made_walks
+from probmotion.models.bodies.body_states import BodyStates, rest_pose
+from probmotion.models.dvae.inference import DenoisingNetworks
+from probmotion.models.dvae.motion_denoiser import MotionDenoiser, NoisyMotion
+from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.settings import DVAESettings
+from probmotion.models.dvae.training import DVAETrainee
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.samplers import DVAEInference
-from probmotion.skeleton import Skeleton
 
 FRAMES, WINDOW, ITERATIONS, SEQUENCES = 300, 30, 50, 64
 

@@ -25,14 +25,14 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from probmotion.models.articulated_body import ArticulatedBody
-from probmotion.models.motion_vae_network import MotionVAENetwork
-from probmotion.models.motion_vae_settings import MotionVAESettings
-from probmotion.models.motion_vae_training import MotionVAETrainee
-from probmotion.models.pose_network import PoseNetwork
-from probmotion.models.taught_poses import TaughtPoses
-from probmotion.motion import KeypointTrack
-from probmotion.skeleton import Skeleton
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.vae.network import MotionVAENetwork
+from probmotion.models.vae.pose_network import PoseNetwork
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.models.vae.teacher_forcing import TaughtPoses
+from probmotion.models.vae.training import MotionVAETrainee
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.skeleton import Skeleton
 
 BONES, SEQUENCES, BATCH = 20, 1_400, 64
 

@@ -55,15 +55,15 @@ def digests() -> dict[str, str]:
 
 
 def _short(sampler: Any) -> Any:
-    settings = {field.name: _EFFORT[field.name] for field in fields(sampler) if field.name in _EFFORT}
+    settings = {
+        field.name: _EFFORT[field.name] for field in fields(sampler) if field.name in _EFFORT
+    }
     return replace(sampler, **settings)
 
 
 def _digest(sampler: Any, posterior: Any) -> str:
     try:
-        drawn = sampler.sample(
-            posterior, draws=_DRAWS, chains=_CHAINS, seed=_SEED, progress=False
-        )
+        drawn = sampler.sample(posterior, draws=_DRAWS, chains=_CHAINS, seed=_SEED, progress=False)
     except Exception as error:
         return type(error).__name__
     return hashlib.sha256(np.asarray(drawn.positions).tobytes()).hexdigest()

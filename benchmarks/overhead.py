@@ -29,7 +29,7 @@ from numpyro.infer import NUTS as Kernel  # noqa: N811
 from probmotion import MotionPosterior, seeds
 from probmotion.problems import load_problem
 from probmotion.samplers import NUTS, Ensemble
-from probmotion.samplers.nuts_kernel import compiled
+from probmotion.samplers.mcmc.nuts_kernel import compiled
 
 SEED = 0
 

@@ -22,16 +22,17 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from probmotion.data.dances import make_dances
 from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import SALSA_HELD_OUT
-from probmotion.interaction.delaunay import delaunay_into, most_edges
-from probmotion.interaction.graphs import joggle_offsets
-from probmotion.interaction.views import project_to_views
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.delaunay import delaunay_into, most_edges
+from probmotion.interaction.geometry.graphs import joggle_offsets
 from probmotion.metrics.chains import chain_diagnostics
-from probmotion.problems import Problem, pairs_problem
+from probmotion.posteriors.problem import Problem
+from probmotion.problems import pairs_problem
 from probmotion.samplers import MetropolisHastings
-from probmotion.samplers.proposals import Isotropic
+from probmotion.samplers.mcmc.proposals import Isotropic
 
 CHAINS, WARMUP, DRAWS = 32, 300, 400
 

@@ -28,9 +28,10 @@ import numpy as np
 from IPython.display import Image
 
 import probmotion as pm
-from probmotion.data.gaits import make_gaits
+from probmotion.data.synthetic.gaits import make_gaits
+from probmotion.io.files import save_motion
 from probmotion.models import GaussianMixtureMotion
-from probmotion.pictures import draw_skeletons
+from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector
 
 # %% [markdown]
@@ -44,7 +45,7 @@ folder = Path("walks")
 if not list(folder.glob("*.bvh")):
     folder.mkdir(exist_ok=True)
     for clip in make_gaits(120, frames=32):
-        clip.save(folder / f"{clip.name}.bvh")
+        save_motion(clip, folder / f"{clip.name}.bvh")
 
 clips = pm.load_motions(f"{folder}/*.bvh", fps=30)
 print(f"{len(clips)} clips, the first: {clips[0]}")
@@ -126,7 +127,7 @@ Image("posterior.png")
 # %%
 draws = MultiViewAncestral(steps=50).sample(posterior, draws=20, seed=0, progress=False)
 print(draws.positions.sizes)
-draws.motion(draw=3).save("take3.bvh")
+save_motion(draws.motion(draw=3), "take3.bvh")
 
 # %% [markdown]
 # `compare` runs them all under the same clock, with the same measures, and keeps every finished run

@@ -26,33 +26,34 @@ from pathlib import Path
 import numpy as np
 from IPython.display import Image
 
-from probmotion.data.dances import make_dances
 from probmotion.data.pair_sets import choose_seed, dance_frames, describe_dance_frames, ground_truth
 from probmotion.data.pairs import load_pairs
-from probmotion.interaction.annotation_sources import draw_annotations
-from probmotion.interaction.coordinates import align_rigidly
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.interaction.annotations.sources import draw_annotations
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.retrieval import retrieve
-from probmotion.interaction.views import project_to_views
+from probmotion.io.files import save_motion
 from probmotion.metrics.coverage import coverage
-from probmotion.models.pair_posterior import PairSettings, pair_posterior
-from probmotion.pictures.calibration import draw_calibration
-from probmotion.pictures.pairs import draw_pairs
+from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
+from probmotion.plots.calibration_curves import draw_calibration
+from probmotion.plots.pairs import draw_pairs
 from probmotion.samplers import MetropolisHastings
-from probmotion.samplers.proposals import Isotropic
+from probmotion.samplers.mcmc.proposals import Isotropic
 
 # %% [markdown]
 # ## 1. A dance
 #
 # Put `.npz` clips of two people into the folder `dances` (for two BVH files with a common frame
 # there is `probmotion.data.pairs.pair_motion`, for keypoint JSON of a video
-# `Annotations.from_tracks`). If there is none, a few dances are made and written there.
+# `annotations_of_tracks`). If there is none, a few dances are made and written there.
 
 # %%
 folder = Path("dances")
 if not list(folder.glob("*.npz")):
     folder.mkdir(exist_ok=True)
     for clip in make_dances(6):
-        clip.save(folder / f"{clip.name}.npz")
+        save_motion(clip, folder / f"{clip.name}.npz")
 
 *shown, hidden = load_pairs(sorted(folder.glob("*.npz")))
 print(describe_dance_frames(shown[0]))
@@ -174,7 +175,7 @@ print(f"coverage: {coverage(truth, drawn_poses):.3f} m, by the seed alone "
 # another run starts.
 
 # %%
-draws.playback(chain=0).save("walk.bvh")
+save_motion(draws.playback(chain=0), "walk.bvh")
 liked = draws.dataset["theta"].values[:1, 120]
 again = sampler.sample(posterior, draws=5, chains=1, seed=1, initial=liked, progress=False)
 print(again.positions.sizes)

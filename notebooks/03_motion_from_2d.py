@@ -29,22 +29,22 @@ import pandas as pd
 from IPython.display import Image
 
 import probmotion as pm
-from probmotion.data.learning import film_clips, film_windows, read_tracks, split_tracks
 from probmotion.data.projections import DetectorNoise, centre_motion, project_clips
-from probmotion.data.walks import made_walks
+from probmotion.data.synthetic.walks import made_walks
+from probmotion.data.tracks.learning import film_clips, film_windows, read_tracks, split_tracks
 from probmotion.metrics.generation import GenerationReference
-from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
-from probmotion.models.diffusion_training import DiffusionTrainee
-from probmotion.models.evaluator import TrackEvaluator
-from probmotion.models.evaluator_training import EvaluatorTrainee
-from probmotion.models.motion_diffusion import DiffusionSettings, MotionDiffusion
-from probmotion.models.track_autoencoder import EvaluatorSettings
-from probmotion.models.track_denoising import denoise_track
-from probmotion.models.training import TrainingSettings, train
-from probmotion.pictures import draw_skeletons
-from probmotion.pictures.playing import play_skeletons
+from probmotion.models.diffusion.motion_diffusion import DiffusionSettings, MotionDiffusion
+from probmotion.models.diffusion.track_denoising import denoise_track
+from probmotion.models.diffusion.training import DiffusionTrainee
+from probmotion.models.evaluation.evaluator import TrackEvaluator
+from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
+from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
+from probmotion.models.training.trainer import TrainingSettings, train
+from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.plots.animation import play_skeletons
+from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import MultiViewAncestral
-from probmotion.samplers.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 
 # %% [markdown]
 # ## 1. Tracks

@@ -33,11 +33,11 @@ from IPython.display import Image
 import probmotion as pm
 from probmotion.data.cmu_clips import cmu_clip
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
-from probmotion.data.walks import made_walks
+from probmotion.data.synthetic.walks import made_walks
 from probmotion.metrics import accuracy
-from probmotion.noisy_joints import noisy_joints
-from probmotion.pictures import draw_skeletons
-from probmotion.pictures.playing import play_skeletons
+from probmotion.plots.animation import play_skeletons
+from probmotion.plots.skeletons import draw_skeletons
+from probmotion.posteriors.noisy_joints import noisy_joints
 from probmotion.problems.denoising import body_of, body_prior, limbs_hidden
 from probmotion.samplers import DVAEInference
 

@@ -27,20 +27,20 @@ import pandas as pd
 from IPython.display import Image
 
 import probmotion as pm
-from probmotion.data.animals import made_animals
-from probmotion.data.learning import film_clips
+from probmotion.data.synthetic.animals import made_animals
+from probmotion.data.tracks.learning import film_clips
 from probmotion.metrics import accuracy
 from probmotion.models import MotionVAE
-from probmotion.models.articulated_body import ArticulatedBody
-from probmotion.models.motion_vae_settings import MotionVAESettings
-from probmotion.models.motion_vae_training import MotionVAETrainee, PoseTrainee
-from probmotion.models.training import train
-from probmotion.models.training_settings import TrainingSettings
-from probmotion.models.transition_latents import greatest_acceleration, long_motion
-from probmotion.models.view_hypotheses import judge_hypotheses
-from probmotion.pictures import draw_skeletons
-from probmotion.pictures.playing import play_skeletons
-from probmotion.rest_poses import estimate_rest_pose
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.models.training.trainer import train
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee
+from probmotion.models.vae.transition_latents import greatest_acceleration, long_motion
+from probmotion.models.vae.view_hypotheses import judge_hypotheses
+from probmotion.motion.rest_poses import estimate_rest_pose
+from probmotion.plots.animation import play_skeletons
+from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import DVAEInference
 
 prior = MotionVAE.load("animal-vae")
@@ -51,7 +51,7 @@ print(skeleton.n_joints, "joints,", prior.frames, "frames at", prior.fps, "a sec
 # ## 1. What one has: tracks
 #
 # Eight animals that the prior has not seen are filmed from all sides. Of your own videos,
-# `probmotion.formats.read_keypoints` reads what DeepLabCut and other detectors write.
+# `probmotion.io.read_keypoints` reads what DeepLabCut and other detectors write.
 
 # %%
 animals = made_animals(8, seed=3)

@@ -24,10 +24,9 @@ import pandas as pd
 from IPython.display import Image
 
 import probmotion as pm
-from probmotion.advice import advise
-from probmotion.bias import bias_budget
 from probmotion.calibration import Overconfident, calibrate
-from probmotion.comparison import Budget
+from probmotion.calibration.error_decomposition import bias_budget
+from probmotion.comparison import Budget, advise
 from probmotion.problems import load_problem
 from probmotion.samplers import ExactSampler, MetropolisHastings, MultiViewAncestral
 

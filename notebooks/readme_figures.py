@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from probmotion import Comparison
-from probmotion.pictures import draw_skeletons
+from probmotion.plots.skeletons import draw_skeletons
 from probmotion.problems import load_problem
 
 ROOT = Path(__file__).parents[1]

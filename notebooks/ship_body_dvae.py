@@ -18,15 +18,15 @@ import pandas as pd
 
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.files import written_whole
-from probmotion.models.body_states import BodyStates, rest_pose
-from probmotion.models.checkpoints import WEIGHTS
-from probmotion.models.denoiser_training import DenoiserTrainee, usual_denoiser_training
-from probmotion.models.dvae_settings import DVAESettings
-from probmotion.models.dvae_training import DVAETrainee, refit_joint_scale, usual_dvae_training
-from probmotion.models.motion_denoiser import MotionDenoiser
-from probmotion.models.motion_dvae import MotionDVAE
-from probmotion.models.training import train
-from probmotion.motion import Motion
+from probmotion.models.bodies.body_states import BodyStates, rest_pose
+from probmotion.models.dvae.denoiser_training import DenoiserTrainee, usual_denoiser_training
+from probmotion.models.dvae.motion_denoiser import MotionDenoiser
+from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.settings import DVAESettings
+from probmotion.models.dvae.training import DVAETrainee, refit_joint_scale, usual_dvae_training
+from probmotion.models.training.checkpoints import WEIGHTS
+from probmotion.models.training.trainer import train
+from probmotion.motion.motion import Motion
 
 ROOT = Path(__file__).parents[1]
 NAME = "body-dvae"

@@ -22,30 +22,26 @@ from pathlib import Path
 import numpy as np
 from ship_walk2d import write_features
 
-from probmotion.data.animals import ANIMAL_SKELETON, animal_clips
-from probmotion.data.learning import certain, film_clips
 from probmotion.data.projections import Filming, centre_motion
-from probmotion.data.walks import walk_clips
+from probmotion.data.synthetic.animals import ANIMAL_SKELETON, animal_clips
+from probmotion.data.synthetic.walks import walk_clips
+from probmotion.data.tracks.learning import certain, film_clips
 from probmotion.files import written_whole
-from probmotion.metrics.motion_distances import windows
-from probmotion.models.articulated_body import ArticulatedBody
-from probmotion.models.checkpoints import WEIGHTS, load_checkpoint
-from probmotion.models.evaluator import TrackEvaluator
-from probmotion.models.evaluator_training import EvaluatorTrainee
-from probmotion.models.motion_vae import MotionVAE
-from probmotion.models.motion_vae_settings import MotionVAESettings
-from probmotion.models.motion_vae_training import (
-    MotionVAETrainee,
-    PoseTrainee,
-    usual_motion_vae_training,
-)
-from probmotion.models.track_autoencoder import EvaluatorSettings
-from probmotion.models.training import train
-from probmotion.models.training_settings import TrainingSettings
-from probmotion.models.view_hypotheses import JudgedHypotheses, judge_hypotheses
-from probmotion.motion import KeypointTrack, Motion
-from probmotion.rest_poses import estimate_rest_pose
-from probmotion.skeleton import Skeleton
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.evaluation.evaluator import TrackEvaluator
+from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
+from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
+from probmotion.models.training.checkpoints import WEIGHTS, load_checkpoint
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.models.training.trainer import train
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
+from probmotion.models.vae.view_hypotheses import JudgedHypotheses, judge_hypotheses
+from probmotion.motion.distances import windows
+from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.rest_poses import estimate_rest_pose
+from probmotion.motion.skeleton import Skeleton
 
 ROOT = Path(__file__).parents[1]
 FPS = 10.0

@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from probmotion.data.learning import film_windows
 from probmotion.data.projections import Filming
-from probmotion.data.walks import WALK_CLIPS, walk_clips
+from probmotion.data.synthetic.walks import WALK_CLIPS, walk_clips
+from probmotion.data.tracks.learning import film_windows
 from probmotion.files import written_whole
-from probmotion.models.checkpoints import WEIGHTS
-from probmotion.models.evaluator import TrackEvaluator
-from probmotion.models.motion_diffusion import MotionDiffusion
-from probmotion.models.motion_vae import MotionVAE
-from probmotion.motion import Motion
+from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+from probmotion.models.evaluation.evaluator import TrackEvaluator
+from probmotion.models.training.checkpoints import WEIGHTS
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.motion.motion import Motion
 
 ROOT = Path(__file__).parents[1]
 WINDOWS = 1000

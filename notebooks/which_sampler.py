@@ -16,7 +16,9 @@ from pathlib import Path
 from readme_figures import replace_block
 
 from probmotion import Comparison
-from probmotion.advice import Advice, Standing, advise, keep_measured
+from probmotion.comparison import advise
+from probmotion.comparison.advice import Advice, Standing
+from probmotion.comparison.measurements import keep_measured
 
 ROOT = Path(__file__).parents[1]
 SHOWN = ("gait", "gait-monocular", "gait-sparse", "cmu-monocular")

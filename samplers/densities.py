@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from probmotion import seeds
-from probmotion.checks import check_count, check_finite, check_shape
-from probmotion.draws import MotionDraws, settings_of
-from probmotion.posterior import MotionPosterior
-from probmotion.priors import HasSeeds, NotConjugate
-from probmotion.sampling import Sampler, UnsupportedPosterior, batches, require
+from probmotion.posteriors.draws import MotionDraws, settings_of
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.protocols import HasSeeds, NotConjugate
+from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, batches, require
 from probmotion.seeds import NormalStreams
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Density", "continued", "motions", "not_conjugate", "starting_points"]
 

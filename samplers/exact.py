@@ -9,17 +9,22 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probmotion import seeds
-from probmotion.checks import check_count
-from probmotion.draws import MotionDraws
-from probmotion.posterior import MotionPosterior
-from probmotion.priors import ExactPosterior, HasExactPosterior, NotConjugate, Samplable
-from probmotion.sampling import (
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.protocols import (
+    ExactPosterior,
+    HasExactPosterior,
+    NotConjugate,
+    Samplable,
+)
+from probmotion.posteriors.sampling import (
     Interrupted,
     UnsupportedPosterior,
     progress_bar,
     require,
     suited,
 )
+from probmotion.validation import check_count
 
 __all__ = ["ExactSampler"]
 

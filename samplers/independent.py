@@ -11,12 +11,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from probmotion.arrays import to_numpy
-from probmotion.checks import check_count
-from probmotion.draws import MotionDraws
-from probmotion.posterior import MotionPosterior
-from probmotion.sampling import Interrupted, Sampler, batches, progress_bar
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.sampling import Interrupted, Sampler, batches, progress_bar
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
+from probmotion.validation import check_count
 
 __all__ = ["DrawBatch", "draw_independently", "refuse_initial", "with_coordinates"]
 
@@ -47,7 +47,7 @@ def draw_independently(
     draw_batch : callable
         Draws one batch.
     draws, chains, seed, progress
-        As in :class:`~probmotion.sampling.Sampler`.
+        As in :class:`~probmotion.posteriors.sampling.Sampler`.
     batch : int
         Draws at a time; draw i of chain k uses its own random numbers whatever its batch.
     steps : int

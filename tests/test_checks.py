@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 
 @pytest.mark.parametrize(

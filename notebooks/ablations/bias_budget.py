@@ -18,14 +18,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from probmotion.bias.budget import bias_budget
-from probmotion.bias.result import BiasBudget
+from probmotion.calibration.error_decomposition import bias_budget
+from probmotion.calibration.error_result import BiasBudget
 from probmotion.data.projections import Filming
 from probmotion.files import written_whole
-from probmotion.models.motion_diffusion import MotionDiffusion
-from probmotion.models.projected_denoiser import denoiser_of
-from probmotion.models.training_settings import TrainingSettings
-from probmotion.problems import Problem, load_problem
+from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+from probmotion.models.diffusion.projected_denoiser import denoiser_of
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.posteriors.problem import Problem
+from probmotion.problems import load_problem
 
 
 @dataclass(frozen=True)

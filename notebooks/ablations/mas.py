@@ -24,54 +24,41 @@ import numpy as np
 import pandas as pd
 
 from probmotion import seeds
-from probmotion.cameras import Cameras
 from probmotion.comparison import Comparison, compare
-from probmotion.comparison.cells import CellResult
-from probmotion.comparison.fingerprint import fingerprint
-from probmotion.data.learning import (
-    LearningTracks,
-    film_clips,
-    film_windows,
-    split_tracks,
-)
-from probmotion.data.projections import (
-    DetectorNoise,
-    Filming,
-    centre_motion,
-    project_clips,
-)
-from probmotion.data.walks import made_walks, walk_clips
+from probmotion.comparison.results.cell_results import CellResult
+from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
+from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.data.tracks.learning import LearningTracks, film_clips, film_windows, split_tracks
 from probmotion.files import written_whole
-from probmotion.formats.predictions import read_predictions
-from probmotion.metrics import measure
+from probmotion.geometry.cameras import Cameras
+from probmotion.io.predictions import read_predictions
 from probmotion.metrics.generation import COLLAPSED_BELOW, GenerationReference
-from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
-from probmotion.models.diffusion_settings import DiffusionSettings
-from probmotion.models.diffusion_training import DiffusionTrainee
-from probmotion.models.evaluator import TrackEvaluator
-from probmotion.models.evaluator_training import EvaluatorTrainee
-from probmotion.models.lifter import LifterSettings, PoseLifter
-from probmotion.models.lifter_training import LifterTrainee
-from probmotion.models.motion_diffusion import MotionDiffusion
-from probmotion.models.pose_flow import FlowSettings, PoseFlow
-from probmotion.models.pose_flow_training import PoseFlowTrainee
-from probmotion.models.track_autoencoder import EvaluatorSettings
-from probmotion.models.track_batches import Augmentation
-from probmotion.models.training import train
-from probmotion.models.training_settings import TrainingSettings
-from probmotion.motion import Motion
-from probmotion.pictures import draw_skeletons
-from probmotion.pictures.generation import draw_generation
-from probmotion.posterior import MotionPosterior
-from probmotion.problems import Problem, load_problem
-from probmotion.samplers import (
-    MultiViewAncestral,
-    MultiViewPredictorCorrector,
-    ScoreDistillation,
-)
-from probmotion.samplers.ancestral2d import Ancestral2D
-from probmotion.sampling import Sampler
-from probmotion.skeleton import Skeleton
+from probmotion.metrics.measures import measure
+from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+from probmotion.models.diffusion.settings import DiffusionSettings
+from probmotion.models.diffusion.training import DiffusionTrainee
+from probmotion.models.evaluation.evaluator import TrackEvaluator
+from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
+from probmotion.models.evaluation.lifter import LifterSettings, PoseLifter
+from probmotion.models.evaluation.lifter_training import LifterTrainee
+from probmotion.models.evaluation.pose_flow import FlowSettings, PoseFlow
+from probmotion.models.evaluation.pose_flow_training import PoseFlowTrainee
+from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.models.training.track_batches import Augmentation
+from probmotion.models.training.trainer import train
+from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.plots.generation import draw_generation
+from probmotion.plots.skeletons import draw_skeletons
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import Sampler
+from probmotion.problems import load_problem
+from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector, ScoreDistillation
+from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 
 SEED = 0
 FPS = 20.0

@@ -31,28 +31,28 @@ from probmotion import seeds
 from probmotion.comparison import compare
 from probmotion.data.denoising_clips import denoising_clips, made_denoising_clips
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
-from probmotion.data.recordings import read_recording
-from probmotion.draws import MotionDraws
 from probmotion.files import written_whole
-from probmotion.likelihoods import Joints3D
+from probmotion.io.recordings import read_recording
 from probmotion.metrics import accuracy
 from probmotion.models import GaussianMixtureMotion
-from probmotion.models.body_states import BodyStates, rest_pose
-from probmotion.models.checkpoints import weights_digest
-from probmotion.models.denoiser_training import DenoiserTrainee, usual_denoiser_training
-from probmotion.models.dvae_settings import DVAESettings
-from probmotion.models.dvae_training import DVAETrainee, usual_dvae_training
-from probmotion.models.joint_noise import JointNoise
-from probmotion.models.motion_denoiser import MotionDenoiser
-from probmotion.models.motion_dvae import MotionDVAE
-from probmotion.models.noisy_windows import Stitching
-from probmotion.models.training import train
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.problems import Problem
+from probmotion.models.bodies.body_states import BodyStates, rest_pose
+from probmotion.models.dvae.denoiser_training import DenoiserTrainee, usual_denoiser_training
+from probmotion.models.dvae.joint_noise import JointNoise
+from probmotion.models.dvae.motion_denoiser import MotionDenoiser
+from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.noisy_windows import Stitching
+from probmotion.models.dvae.settings import DVAESettings
+from probmotion.models.dvae.training import DVAETrainee, usual_dvae_training
+from probmotion.models.training.checkpoints import weights_digest
+from probmotion.models.training.trainer import train
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.denoising import body_of, body_prior, gaussian_noise, limbs_hidden
 from probmotion.samplers import NUTS, DVAEInference
-from probmotion.sampling import Sampler
 
 FRAMES = 60
 BALANCING = "S00_P00_T01_BalancingTrial_multiview.npz"

@@ -29,10 +29,9 @@ import torch
 
 from probmotion import seeds
 from probmotion.comparison import compare
-from probmotion.data.learning import certain, film_clips
 from probmotion.data.projections import Filming, centre_motion
-from probmotion.data.walks import made_walks, walk_clips
-from probmotion.draws import MotionDraws
+from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.data.tracks.learning import certain, film_clips
 from probmotion.files import written_whole
 from probmotion.metrics.filming import film_motions
 from probmotion.metrics.keypoints import (
@@ -41,26 +40,24 @@ from probmotion.metrics.keypoints import (
     velocity_error,
 )
 from probmotion.metrics.motion_chamfer import motion_chamfer_distance
-from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
-from probmotion.models.articulated_body import ArticulatedBody
-from probmotion.models.motion_vae import MotionVAE
-from probmotion.models.motion_vae_losses import best_guess, guess_terms, pictured, weighted_sum
-from probmotion.models.motion_vae_settings import MotionVAESettings
-from probmotion.models.motion_vae_training import (
-    MotionVAETrainee,
-    PoseTrainee,
-    usual_motion_vae_training,
-)
-from probmotion.models.pose_network import PoseNetwork
-from probmotion.models.training import train
-from probmotion.models.view_hypotheses import judge_hypotheses
-from probmotion.motion import KeypointTrack, Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.problems import Problem, load_problem
-from probmotion.rest_poses import estimate_rest_pose
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.training.trainer import train
+from probmotion.models.vae.losses import best_guess, guess_terms, pictured, weighted_sum
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.pose_network import PoseNetwork
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
+from probmotion.models.vae.view_hypotheses import judge_hypotheses
+from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.rest_poses import estimate_rest_pose
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import Sampler
+from probmotion.problems import load_problem
 from probmotion.samplers import ExactSampler, MultiViewAncestral, ScoreDistillation
-from probmotion.sampling import Sampler
-from probmotion.skeleton import Skeleton
 
 FPS = 10.0
 FRAMES = 10

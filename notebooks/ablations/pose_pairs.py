@@ -25,7 +25,6 @@ import pandas as pd
 
 from probmotion import seeds
 from probmotion.comparison import Comparison, compare
-from probmotion.data.dances import make_dances
 from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import (
     SALSA_HELD_OUT,
@@ -34,30 +33,31 @@ from probmotion.data.pair_sets import (
     ground_truth,
     hold_out,
 )
-from probmotion.draws import MotionDraws
+from probmotion.data.synthetic.dances import make_dances
 from probmotion.files import written_whole
-from probmotion.interaction.annotation_sources import DrawnAnnotations, draw_annotations
-from probmotion.interaction.backbones import annotation_views
+from probmotion.interaction.annotations.backbones import annotation_views
+from probmotion.interaction.annotations.sources import DrawnAnnotations, draw_annotations
+from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.completion import (
     complete_keypoints,
     hidden_joint_error,
     nearest_annotation_completion,
 )
-from probmotion.interaction.coordinates import align_rigidly
-from probmotion.interaction.pose_distances import MEASURES, pose_distances
+from probmotion.interaction.geometry.coordinates import align_rigidly
+from probmotion.interaction.geometry.pose_distances import MEASURES, pose_distances
 from probmotion.interaction.retrieval import views_around
-from probmotion.interaction.views import project_to_views
 from probmotion.metrics.coverage import coverage
-from probmotion.models.pair_posterior import PairSettings, pair_posterior
-from probmotion.models.single_pose_lifting import lift_people
-from probmotion.pictures.calibration import draw_calibration
-from probmotion.pictures.coverage import classical_scaling, draw_coverage, draw_embedding
-from probmotion.pictures.pairs import draw_pairs
-from probmotion.problems import Problem
+from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
+from probmotion.models.pose_pairs.single_pose_lifting import lift_people
+from probmotion.motion.skeleton import Skeleton
+from probmotion.plots.calibration_curves import draw_calibration
+from probmotion.plots.coverage import classical_scaling, draw_coverage, draw_embedding
+from probmotion.plots.pairs import draw_pairs
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.truncation import TruncatedPosterior, limit_for_dimension
 from probmotion.samplers import MetropolisHastings
-from probmotion.samplers.proposals import Isotropic, Proposal, VelocityBiased
-from probmotion.skeleton import Skeleton
-from probmotion.truncation import TruncatedPosterior, limit_for_dimension
+from probmotion.samplers.mcmc.proposals import Isotropic, Proposal, VelocityBiased
 
 SEED = 0
 # σ_l of the part "coverage", from the part "noise" on the validation clips: for the others where

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from probmotion.comparison import compare
+from probmotion.posteriors.sampling import Sampler
 from probmotion.samplers import (
     NUTS,
     Ensemble,
@@ -22,7 +23,6 @@ from probmotion.samplers import (
     MultiViewAncestral,
     MultiViewPredictorCorrector,
 )
-from probmotion.sampling import Sampler
 
 
 @dataclass(frozen=True)

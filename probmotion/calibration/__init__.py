@@ -1,9 +1,5 @@
-"""Is a sampler right about its own uncertainty? Simulated evidence, of which the truth is known."""
+"""Simulation-based calibration of samplers, and the decomposition of their error."""
 
-from __future__ import annotations
+import lazy_loader
 
-from probmotion.calibration.grid import FEWEST_SIMULATIONS, calibrate
-from probmotion.calibration.negative_control import Overconfident
-from probmotion.calibration.result import Calibration
-
-__all__ = ["FEWEST_SIMULATIONS", "Calibration", "Overconfident", "calibrate"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,16 +16,22 @@ from typing import ClassVar
 from probmotion import seeds
 from probmotion.calibration.ranks import ranks_of_truth
 from probmotion.calibration.result import Calibration
-from probmotion.checks import check_count, check_positive
-from probmotion.comparison.budgets import Budget, check_budget
-from probmotion.comparison.cells import Cell
-from probmotion.comparison.locks import locked
-from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
-from probmotion.comparison.plan import Plan
-from probmotion.comparison.tasks import Grid, refuse_taken, run_grid
-from probmotion.draws import MotionDraws
+from probmotion.comparison.results.budgets import Budget, check_budget
+from probmotion.comparison.results.naming import (
+    AnyProblem,
+    AnySampler,
+    named_problems,
+    named_samplers,
+)
+from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.run.cells import Cell
+from probmotion.comparison.run.locks import locked
+from probmotion.comparison.run.tasks import Grid, refuse_taken, run_grid
 from probmotion.files import writable_folder
-from probmotion.problems import Problem, load_problem
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.problem import Problem
+from probmotion.problems.catalogue import load_problem
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["calibrate"]
 

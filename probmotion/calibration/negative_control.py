@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from probmotion.checks import check_positive
-from probmotion.draws import MotionDraws
-from probmotion.posterior import MotionPosterior
-from probmotion.sampling import Interrupted, Sampler
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.sampling import Interrupted, Sampler
+from probmotion.validation import check_positive
 
 __all__ = ["Overconfident"]
 

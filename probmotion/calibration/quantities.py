@@ -11,13 +11,11 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import to_numpy
-from probmotion.posterior import MotionPosterior
-from probmotion.problems import Problem
+from probmotion.metrics.credible_sets import DENSITY
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
 
-__all__ = ["DENSITY", "DISTANCE", "Quantity", "credible_level", "log_densities", "quantities"]
-
-DENSITY, DISTANCE = "log density", "distance"
-"""Quantities whose credible sets are not central intervals."""
+__all__ = ["Quantity", "log_densities", "quantities"]
 
 _DIRECTIONS = 3
 
@@ -93,19 +91,6 @@ def log_densities(simulation: Problem, positions: np.ndarray) -> dict[str, np.nd
     if density is not None:
         found[DENSITY] = density
     return found
-
-
-def credible_level(quantity: str, ranks: np.ndarray) -> np.ndarray:
-    """Return the level of the smallest credible set that holds the truth, by its rank in [0, 1].
-
-    Of :data:`DENSITY` the set of highest density (Hermans et al. 2022, "A crisis in
-    simulation-based inference?"); of :data:`DISTANCE` the ball about a random point (Lemos et al.
-    2023, "Sampling-based accuracy testing of posterior estimators"); of any other quantity the
-    central interval.
-    """
-    if quantity == DENSITY:
-        return 1 - ranks
-    return ranks if quantity == DISTANCE else np.abs(2 * ranks - 1)
 
 
 def _along(direction: np.ndarray, root: int, positions: np.ndarray) -> np.ndarray:

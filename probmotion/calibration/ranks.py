@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion import seeds
-from probmotion.calibration.quantities import DISTANCE, log_densities, quantities
-from probmotion.draws import MotionDraws
-from probmotion.problems import Problem
+from probmotion.calibration.quantities import log_densities, quantities
+from probmotion.metrics.credible_sets import DISTANCE
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.problem import Problem
 
 __all__ = ["Rank", "independent_draws", "rank", "ranks_of_truth"]
 

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.cells import CellResult, read_result, used_of_budget
-from probmotion.comparison.plan import Plan
+from probmotion.comparison.results.cell_results import CellResult, read_result, used_of_budget
+from probmotion.comparison.results.plan import Plan
 from probmotion.files import written_whole
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probmotion.calibration.table import CalibrationTable
+    from probmotion.calibration.table import CalibrationTable, Ranked
 
 __all__ = ["Calibration"]
 
@@ -180,7 +180,8 @@ class Calibration:
         """
         from probmotion.calibration.table import CalibrationTable
 
-        return CalibrationTable.of(self)
+        places = product(self.plan.problems, self.plan.samplers)
+        return CalibrationTable.of([self._ranked(*place) for place in places], self.notes)
 
     def coverage(self, problem: str, sampler: str) -> pd.DataFrame:
         """Return by quantity and level the share of truths that credible sets hold.
@@ -193,11 +194,19 @@ class Calibration:
 
         return coverage_frame(self.ranks(problem, sampler))
 
+    def _ranked(self, problem: str, sampler: str) -> Ranked:
+        from probmotion.calibration.table import Ranked
+
+        cells = self.cells(problem, sampler)
+        failures = [cell.failure for cell in cells if cell.failure is not None]
+        ranks = self.ranks(problem, sampler)
+        return Ranked(problem, sampler, ranks, failures, len(cells), self.plan.seeds)
+
     def verdict(self, problem: str, sampler: str) -> str:
         """Return in one sentence whether a sampler is calibrated, and how it is not."""
         from probmotion.calibration.table import verdict
 
-        return verdict(self, problem, sampler)
+        return verdict(self._ranked(problem, sampler))
 
     def plot(self, path: str | Path | None = None, problem: str | None = None) -> Path:
         """Draw ranks and coverage and return where; beside the cells by default.
@@ -209,7 +218,7 @@ class Calibration:
         ValueError
             If the problem is unknown, or nothing was ranked.
         """
-        from probmotion.pictures.rank_plots import draw_ranks
+        from probmotion.plots.ranks import draw_ranks
 
         target = self.folder / _PICTURE if path is None else Path(path)
         draw_ranks(self._blocks(self.plan.problems if problem is None else [problem]), target)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from probmotion.calibration.quantities import DENSITY, DISTANCE, credible_level
+from probmotion.comparison.results.failures import Failure
+from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
 from probmotion.metrics.uniformity import adjusted_p_values, uniformity_p_value
 
-if TYPE_CHECKING:
-    from probmotion.calibration.result import Calibration
-
-__all__ = ["LEVELS", "CalibrationTable", "coverage_curve", "coverage_frame", "verdict"]
+__all__ = ["LEVELS", "CalibrationTable", "Ranked", "coverage_curve", "coverage_frame", "verdict"]
 
 LEVELS = np.arange(1, 20) / 20
 """Of credible sets: 0.05, 0.1, …, 0.95."""
@@ -35,6 +33,30 @@ density, distance: the same of the sets of highest density and of balls about ra
 error: mean |coverage − level|, mean over quantities; exact draws have about 0.3/√simulations."""
 
 
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """The ranks of one sampler on one problem.
+
+    Parameters
+    ----------
+    problem, sampler : str
+        Their names.
+    ranks : mapping of str to ndarray, (n,)
+        The truth's ranks in [0, 1] by quantity, of the simulations that worked.
+    failures : sequence of Failure
+        Of the simulations that did not work.
+    simulations, planned : int
+        How many are finished, and how many were asked for.
+    """
+
+    problem: str
+    sampler: str
+    ranks: Mapping[str, np.ndarray]
+    failures: Sequence[Failure]
+    simulations: int
+    planned: int
+
+
 class CalibrationTable(pd.DataFrame):
     """A row per problem, sampler and quantity, as :meth:`Calibration.table` says.
 
@@ -43,21 +65,15 @@ class CalibrationTable(pd.DataFrame):
     """
 
     @classmethod
-    def of(cls, calibration: Calibration) -> CalibrationTable:
-        """Return the table of a calibration."""
+    def of(cls, ranked: Sequence[Ranked], notes: Sequence[str]) -> CalibrationTable:
+        """Return the table of every sampler's ranks on every problem."""
         rows: list[tuple] = []
-        verdicts = []
-        for problem in calibration.plan.problems:
-            for sampler in calibration.plan.samplers:
-                ranks = calibration.ranks(problem, sampler)
-                cells = calibration.cells(problem, sampler)
-                failed = sum(cell.failure is not None for cell in cells)
-                counts = (len(cells) - failed, failed)
-                scores = _scores(ranks)
-                rows += [(problem, sampler, *score, *counts) for score in scores]
-                verdicts.append(verdict(calibration, problem, sampler))
+        for one in ranked:
+            worked = one.simulations - len(one.failures)
+            counts = (worked, len(one.failures))
+            rows += [(one.problem, one.sampler, *score, *counts) for score in _scores(one.ranks)]
         table = cls(rows, columns=_COLUMNS)
-        table.attrs = {"verdicts": verdicts, "notes": calibration.notes}
+        table.attrs = {"verdicts": [verdict(one) for one in ranked], "notes": list(notes)}
         return table
 
     @property
@@ -103,22 +119,20 @@ def coverage_frame(ranks: Mapping[str, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["quantity", "level", "coverage", "lower", "upper"])
 
 
-def verdict(calibration: Calibration, problem: str, sampler: str) -> str:
+def verdict(ranked: Ranked) -> str:
     """Return in one sentence whether a sampler is calibrated on a problem, and how it is not."""
-    cells = calibration.cells(problem, sampler)
-    failed = [cell.failure for cell in cells if cell.failure is not None]
-    ranks = calibration.ranks(problem, sampler)
-    worked = len(cells) - len(failed)
-    where = f"{sampler} on {problem}"
+    failed, ranks, finished = ranked.failures, ranked.ranks, ranked.simulations
+    worked = finished - len(failed)
+    where = f"{ranked.sampler} on {ranked.problem}"
     but = ""
     if failed:
         said = failed[0].message
         if not worked and all(failure.unsupported for failure in failed):
             return f"{where}: not supported, {said}"
-        more = f"{len(failed)} of {len(cells)} simulations failed, the first: {said}"
+        more = f"{len(failed)} of {finished} simulations failed, the first: {said}"
         but = f"; {more}"
     if worked < _FEWEST:
-        return f"{where}: nothing to judge by, {worked} of {calibration.plan.seeds} worked{but}"
+        return f"{where}: nothing to judge by, {worked} of {ranked.planned} worked{but}"
     p_values = {name: uniformity_p_value(values) for name, values in ranks.items()}
     p = float(adjusted_p_values(np.array(list(p_values.values()))).min())
     if p >= _SIGNIFICANT:

@@ -1,25 +1,5 @@
-"""Which sampler, and how wrong is it? The grid problem × sampler × seed, and its table."""
+"""Comparison of samplers on problems, and advice from the measured results."""
 
-from __future__ import annotations
+import lazy_loader
 
-from probmotion.comparison.budgets import Budget
-from probmotion.comparison.grid import compare
-from probmotion.comparison.quick import (
-    QUICK,
-    QUICK_BUDGET,
-    QUICK_DRAWS,
-    QUICK_LIMIT,
-    quick_samplers,
-)
-from probmotion.comparison.result import Comparison
-
-__all__ = [
-    "QUICK",
-    "QUICK_BUDGET",
-    "QUICK_DRAWS",
-    "QUICK_LIMIT",
-    "Budget",
-    "Comparison",
-    "compare",
-    "quick_samplers",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

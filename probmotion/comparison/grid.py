@@ -8,16 +8,21 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from probmotion import seeds as addressed
-from probmotion.checks import check_count, check_positive
-from probmotion.comparison.budgets import Budget, check_budget
-from probmotion.comparison.kept_problems import keep_problem
-from probmotion.comparison.locks import locked
-from probmotion.comparison.naming import AnyProblem, AnySampler, named_problems, named_samplers
-from probmotion.comparison.plan import Plan
-from probmotion.comparison.result import Comparison
-from probmotion.comparison.tasks import Grid, refuse_taken, run_grid
+from probmotion.comparison.comparison import Comparison
+from probmotion.comparison.results.budgets import Budget, check_budget
+from probmotion.comparison.results.naming import (
+    AnyProblem,
+    AnySampler,
+    named_problems,
+    named_samplers,
+)
+from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.results.stored_problems import keep_problem
+from probmotion.comparison.run.locks import locked
+from probmotion.comparison.run.tasks import Grid, refuse_taken, run_grid
 from probmotion.files import writable_folder
-from probmotion.problems import load_problem
+from probmotion.problems.catalogue import load_problem
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["compare"]
 

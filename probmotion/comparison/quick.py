@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from probmotion.comparison.budgets import Budget
-from probmotion.sampling import Sampler, importable_samplers, load_sampler
+from probmotion.comparison.results.budgets import Budget
+from probmotion.posteriors.sampling import Sampler, importable_samplers, load_sampler
 
 __all__ = ["QUICK", "QUICK_BUDGET", "QUICK_DRAWS", "QUICK_LIMIT", "quick_samplers"]
 

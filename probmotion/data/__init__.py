@@ -1,1 +1,5 @@
-"""Motions made by the project, clips that a user points at, and public ones fetched by name."""
+"""Clips by name, downloads, and projections of motions to 2D."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.data.downloads import data_places
-from probmotion.formats import MotionFileError, read_amc
-from probmotion.motion import Motion, load_motion
+from probmotion.io.amc import read_amc
+from probmotion.io.errors import MotionFileError
+from probmotion.io.files import load_motion
+from probmotion.motion.motion import Motion
 
 __all__ = ["cmu_clip"]
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.checks import check_count, check_positive
-from probmotion.data.gaits import GAITS, make_gait
-from probmotion.motion import Motion, load_motion
-from probmotion.skeleton import Skeleton
+from probmotion.data.synthetic.gaits import GAITS, make_gait
+from probmotion.io.files import load_motion
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["DENOISING_CLIPS", "denoising_clips", "made_denoising_clips"]
 

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 
 from probmotion.data.pairs import load_pairs, read_salsa_bvh
-from probmotion.motion import Motion
+from probmotion.motion.motion import Motion
 
 __all__ = [
     "CMU_ACKNOWLEDGEMENT",

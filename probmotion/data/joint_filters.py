@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = ["filled_between", "fit_acceleration", "kalman_smooth", "log_evidence", "savitzky_golay"]
 

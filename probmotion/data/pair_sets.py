@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
-from probmotion.motion import Motion
-from probmotion.skeleton import Skeleton
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
     "SALSA_HELD_OUT",

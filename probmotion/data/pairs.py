@@ -22,9 +22,10 @@ from probmotion.data.pair_sets import (
     person_height,
     scaled_to_height,
 )
-from probmotion.formats.bvh import read_bvh
-from probmotion.motion import Motion, load_motions
-from probmotion.skeleton import Skeleton
+from probmotion.io.bvh import read_bvh
+from probmotion.io.files import load_motions
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
     "SALSA_HELD_OUT",

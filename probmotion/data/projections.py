@@ -13,9 +13,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from probmotion import seeds
-from probmotion.cameras import Cameras
-from probmotion.checks import check_count, check_positive
-from probmotion.motion import KeypointTrack, Motion
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["Centre", "DetectorNoise", "Filming", "centre_motion", "project_clips"]
 

@@ -1,1 +1,5 @@
-"""Interaction of characters: coordinates, views, annotations and the likelihood they make."""
+"""The likelihood of 2D annotations of people together, their retrieval and completion."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,12 +10,12 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import Array, logsumexp
-from probmotion.checks import check_count, check_positive, check_shape
-from probmotion.interaction.annotations import Annotations
-from probmotion.interaction.backbones import annotation_views
-from probmotion.interaction.nearest import PairComparer
-from probmotion.interaction.views import ViewDistribution, project_to_views
-from probmotion.skeleton import Skeleton
+from probmotion.interaction.annotations.annotations import Annotations
+from probmotion.interaction.annotations.backbones import annotation_views
+from probmotion.interaction.annotations.views import ViewDistribution, project_to_views
+from probmotion.interaction.geometry.nearest import PairComparer
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["AnnotatedPairs"]
 
@@ -44,7 +44,7 @@ class AnnotatedPairs:
         ``"interaction"``: interaction coordinates; ``"cartesian"`` or ``"shape-context"``.
     graph : str
         Whose edges interaction coordinates are taken along; see
-        :data:`probmotion.interaction.graphs.GRAPHS`.
+        :data:`probmotion.interaction.geometry.graphs.GRAPHS`.
     shortest_edge : float
         ε of eq. 8, metres.
     seed : int

@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
-from probmotion.interaction.coordinates import align_rigidly
-from probmotion.interaction.nearest import PairComparer
-from probmotion.interaction.pose_distances import pose_distances
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.coordinates import align_rigidly
+from probmotion.interaction.geometry.nearest import PairComparer
+from probmotion.interaction.geometry.pose_distances import pose_distances
 from probmotion.interaction.retrieval import retrieve
-from probmotion.interaction.views import project_to_views
-from probmotion.skeleton import Skeleton
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
     "BANDWIDTH",
@@ -79,7 +79,7 @@ def complete(
     bandwidth : float
         How far a visible joint's displacement reaches, metres.
     measure : str
-        One of :data:`probmotion.interaction.pose_distances.MEASURES`.
+        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
 
     Raises
     ------

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.checks import check_count, check_finite, check_shape
-from probmotion.interaction.nearest import PairComparer
-from probmotion.interaction.views import project_to_views
-from probmotion.skeleton import Skeleton
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.nearest import PairComparer
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Retrieved", "retrieve", "view_grid", "views_around"]
 
@@ -87,7 +87,7 @@ def retrieve(
     n : int
         How many draws.
     measure : str
-        As in :class:`probmotion.interaction.nearest.PairComparer`.
+        As in :class:`probmotion.interaction.geometry.nearest.PairComparer`.
 
     Returns
     -------

@@ -6,7 +6,7 @@ Errors are distances per joint and frame, metres, averaged over those that ``mas
 from __future__ import annotations
 
 from probmotion.arrays import Array, array_namespace, constant
-from probmotion.checks import check_positive, check_shape
+from probmotion.validation import check_positive, check_shape
 
 __all__ = [
     "acceleration_error",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probmotion import seeds
-from probmotion.draws import MotionDraws
+from probmotion.posteriors.draws import MotionDraws
 
 __all__ = [
     "chain_diagnostics",

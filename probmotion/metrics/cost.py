@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from probmotion.draws import MotionDraws
+from probmotion.posteriors.draws import MotionDraws
 
 __all__ = ["costs"]
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probmotion.checks import check_count, check_finite, check_shape
-from probmotion.interaction.pose_distances import MEASURES, check_measure, pose_distances
+from probmotion.interaction.geometry.pose_distances import MEASURES, check_measure, pose_distances
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["coverage", "nearest_draw_distances", "pose_distances"]
 
@@ -32,8 +32,8 @@ def coverage(
         Draws, metres; a memory map will do, as a few hundred are looked at together. A pose that
         a chain repeats is measured once.
     measure : str
-        One of :data:`probmotion.interaction.pose_distances.MEASURES`; every one is taken after
-        the best rigid alignment of the two poses.
+        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`; every one is taken
+        after the best rigid alignment of the two poses.
     counts : sequence of int, optional
         Numbers of draws, in any order: coverage by the first so many draws, from one pass.
 

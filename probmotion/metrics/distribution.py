@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant
-from probmotion.checks import check_count, check_shape
+from probmotion.validation import check_count, check_shape
 
 __all__ = [
     "mean_error",

@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from probmotion.cameras import Cameras
-from probmotion.checks import check_count, check_finite, check_shape
+from probmotion.geometry.cameras import Cameras
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Angles", "film_motions", "random_azimuths"]
 

@@ -13,11 +13,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from probmotion import seeds
-from probmotion.checks import check_count, check_finite, check_shape
 from probmotion.metrics.distribution import precision_recall
 from probmotion.metrics.filming import Angles, film_motions
 from probmotion.metrics.motion_chamfer import MotionChamfer, motion_chamfer_distance
-from probmotion.skeleton import Skeleton
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = [
     "COLLAPSED_BELOW",

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probmotion.checks import check_shape
+from probmotion.validation import check_shape
 
 __all__ = ["best_and_tied", "t_interval"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probmotion.checks import check_finite, check_positive, check_shape
+from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = [
     "fit_linear_map",

@@ -5,27 +5,36 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probmotion import seeds
-from probmotion.draws import MotionDraws
-from probmotion.interaction.coordinates import align_motions
-from probmotion.likelihoods import Keypoints2D
+from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.cost import costs
-from probmotion.metrics.generation import GenerationReference, diversity
+from probmotion.metrics.generation import diversity
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
 from probmotion.metrics.structure import HasManifold, HasStyles
 from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.likelihoods import Keypoints2D
 
 if TYPE_CHECKING:
-    from probmotion.posterior import MotionPosterior
-    from probmotion.problems import Problem
+    from probmotion.posteriors.posterior import MotionPosterior
+    from probmotion.posteriors.problem import Problem, ScoresGeneration
 
-__all__ = ["measure"]
+__all__ = ["accuracy_of", "load_libraries", "measure"]
+
+_LATE = (
+    "arviz_stats.base",
+    "scipy.spatial.distance",
+    "sklearn.decomposition",
+    "sklearn.model_selection",
+    "sklearn.svm",
+)
 
 _DIRECTIONS = 256
 # Exact draws to compare with: sets as large as the run's, as many as make about 4000.
@@ -190,7 +199,7 @@ def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:
 
 
 def _against_real_views(
-    reference: GenerationReference, positions: np.ndarray, seed: int
+    reference: ScoresGeneration, positions: np.ndarray, seed: int
 ) -> dict[str, float]:
     samples = len(positions)
     around = reference.score_motions(positions, seed=seed, samples=samples)
@@ -233,7 +242,7 @@ def _shares(prior: object, positions: np.ndarray) -> dict[str, float]:
 
 
 def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float]:
-    from probmotion.interaction.pose_distances import MEASURES
+    from probmotion.interaction.geometry.pose_distances import MEASURES
     from probmotion.metrics.coverage import coverage
 
     # Poses are compared one by one, whatever motion they are a frame of.
@@ -323,3 +332,9 @@ def _visible(posterior: MotionPosterior) -> np.ndarray | None:
         return None
     shape = (math.prod(entries.visible.shape[:-2]), *entries.visible.shape[-2:])
     return entries.visible.reshape(shape).any(axis=0)
+
+
+def load_libraries() -> None:
+    """Import what measures import when they are first asked, so that no cell's clock counts it."""
+    for name in _LATE:
+        import_module(name)

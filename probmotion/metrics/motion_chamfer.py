@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.checks import check_count, check_finite, check_shape
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["MotionChamfer", "motion_chamfer_distance"]
 

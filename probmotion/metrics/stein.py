@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from probmotion.arrays import to_numpy
-from probmotion.checks import check_finite, check_positive, check_shape
 from probmotion.metrics.two_sample import median_distance, squared_distances
-from probmotion.posterior import MotionPosterior
-from probmotion.priors import HasLogDensity, NotConjugate
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.protocols import HasLogDensity, NotConjugate
+from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = ["NoGradient", "kernel_stein_discrepancy", "score_of"]
 

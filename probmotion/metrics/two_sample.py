@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from probmotion import seeds
-from probmotion.checks import check_count, check_finite, check_positive, check_shape
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
     "classifier_two_sample",

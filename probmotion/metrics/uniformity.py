@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import bdtr, bdtrc
 from scipy.stats import poisson
 
-from probmotion.checks import check_count, check_finite, check_shape
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["adjusted_p_values", "ecdf_band", "evaluation_points", "uniformity_p_value"]
 

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from probmotion.checks import check_count, check_positive
 from probmotion.data.cmu_clips import cmu_clip
-from probmotion.models import GaussianMixtureMotion
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.problems.evidence import OBSERVATIONS, observe
-from probmotion.problems.problem import Problem, simulated
+from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem, simulated
+from probmotion.problems.observations import OBSERVATIONS, observe
 from probmotion.threads import one_thread
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["CLIP_PROBLEMS", "clips_problem"]
 
@@ -55,7 +55,7 @@ def clips_problem(
         Number of styles, found by clustering.
     observe : str
         What is seen of the held-out window: a name of
-        :data:`~probmotion.problems.evidence.OBSERVATIONS`; ``"none"`` for generation.
+        :data:`~probmotion.problems.observations.OBSERVATIONS`; ``"none"`` for generation.
     noise : float
         Standard deviation of a keypoint, metres.
     held_out : int or str
@@ -148,7 +148,7 @@ def _index(motions: Sequence[Motion], held_out: int | str) -> int:
 
 def _on_common_ground(motions: Sequence[Motion], fps: float | None) -> list[Motion]:
     """The clips at one frame rate and with one skeleton."""
-    from probmotion.retargeting import common_skeleton
+    from probmotion.motion.retargeting import common_skeleton
 
     rates = sorted({motion.fps for motion in motions})
     if fps is not None:
@@ -159,7 +159,7 @@ def _on_common_ground(motions: Sequence[Motion], fps: float | None) -> list[Moti
             f"motions has clips of {listed} frames per second, expected one rate; give fps= to "
             "resample them"
         )
-    skeleton = common_skeleton(motions)
+    skeleton = common_skeleton([motion.skeleton for motion in motions])
     return [motion.retarget(skeleton) for motion in motions]
 
 

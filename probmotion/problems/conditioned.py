@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-from probmotion.likelihoods import Likelihood
-from probmotion.models.conditioned_mixture import ConditionedMixture
-from probmotion.models.gaussian_mixture import GaussianMixtureMotion
-from probmotion.posterior import MotionPosterior
-from probmotion.priors import MotionPrior
+from probmotion.models.mixture.conditioned_mixture import ConditionedMixture
+from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.protocols import Likelihood, MotionPrior
 
 __all__ = ["Conditions", "conditioned"]
 

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.bone_lengths import bone_lengths
 from probmotion.data.cmu_clips import cmu_clip
-from probmotion.likelihoods import Joints3D
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.problems.problem import Problem, simulated
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.bone_lengths import bone_lengths
+from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem, simulated
 
 if TYPE_CHECKING:
-    from probmotion.models import MotionDVAE
+    from probmotion.models.dvae.motion_dvae import MotionDVAE
 
 __all__ = [
     "DENOISING_PROBLEMS",
@@ -44,8 +44,8 @@ def body_prior(name: str = "body-dvae") -> MotionDVAE:
     FileNotFoundError
         If the package has no such prior.
     """
-    from probmotion.models import MotionDVAE
-    from probmotion.models.motion_denoiser import MotionDenoiser
+    from probmotion.models.dvae.motion_denoiser import MotionDenoiser
+    from probmotion.models.dvae.motion_dvae import MotionDVAE
 
     prior = MotionDVAE.load(name)
     return prior.of(inference_network=MotionDenoiser.load(f"{name}-denoiser", prior))

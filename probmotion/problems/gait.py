@@ -23,14 +23,14 @@ from typing import Any, Literal
 import numpy as np
 
 from probmotion import seeds
-from probmotion.checks import check_count, check_positive
-from probmotion.data.gaits import make_gaits
-from probmotion.likelihoods import Joints3D, Keypoints2D
-from probmotion.models import GaussianMixtureMotion
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.problems.evidence import in_one_camera, limb_hidden, nearest_joints, one_frame
-from probmotion.problems.problem import Problem, simulated
+from probmotion.data.synthetic.gaits import make_gaits
+from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem, simulated
+from probmotion.problems.observations import in_one_camera, limb_hidden, nearest_joints, one_frame
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["GAIT_OUTLIER_PROBLEMS", "GAIT_PROBLEMS", "GaitProblem"]
 

@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion import models, seeds
-from probmotion.likelihoods import Keypoints2D
 from probmotion.metrics.generation import GenerationReference
-from probmotion.motion import Motion
-from probmotion.posterior import MotionPosterior
-from probmotion.priors import Samplable
-from probmotion.problems.evidence import observe
-from probmotion.problems.problem import Problem, simulated
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.likelihoods import Keypoints2D
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem, simulated
+from probmotion.posteriors.protocols import Samplable
+from probmotion.problems.observations import observe
 
 if TYPE_CHECKING:
-    from probmotion.models import MotionDiffusion, MotionVAE
+    from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+    from probmotion.models.vae.motion_vae import MotionVAE
 
 __all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
 
@@ -39,7 +40,7 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
     FileNotFoundError
         If the package has no such prior.
     """
-    from probmotion.models.evaluator import TrackEvaluator
+    from probmotion.models.evaluation.evaluator import TrackEvaluator
 
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
@@ -68,7 +69,7 @@ def seen_draw_problem(
     prior : str
         A motion VAE that comes with the package.
     how : str
-        What is seen; see :func:`~probmotion.problems.evidence.observe`.
+        What is seen; see :func:`~probmotion.problems.observations.observe`.
     seed : int
         Of the draw and its noise.
     """

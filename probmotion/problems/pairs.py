@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probmotion.motion import Motion
-from probmotion.problems.problem import Problem
+from probmotion.motion.motion import Motion
+from probmotion.posteriors.problem import Problem
 
 if TYPE_CHECKING:
-    from probmotion.models.pair_posterior import PairSettings
+    from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
 __all__ = ["PAIR_PROBLEMS", "pairs_problem"]
 
@@ -59,8 +59,8 @@ def pairs_problem(
     """
     # Compiled code is imported by those who use it.
     from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth, hold_out
-    from probmotion.interaction.annotation_sources import draw_annotations
-    from probmotion.models.pair_posterior import pair_posterior
+    from probmotion.interaction.annotations.sources import draw_annotations
+    from probmotion.models.pose_pairs.pair_posterior import pair_posterior
 
     shown, hidden = hold_out(motions, held_out)
     chosen = [dance_frames(motion) for motion in shown]
@@ -79,8 +79,8 @@ _SALSA = "salsa (CMU 60 and 61), 5599 annotated 2D pairs of 7 clips and one 3D s
 
 
 def _made() -> Problem:
-    from probmotion.data.dances import make_dances
-    from probmotion.models.pair_posterior import PairSettings
+    from probmotion.data.synthetic.dances import make_dances
+    from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
     return pairs_problem(
         make_dances(8, seed=0),
@@ -96,7 +96,7 @@ def _made() -> Problem:
 def _salsa(name: str, description: str, paper: bool) -> Problem:
     from probmotion.data.downloads import salsa_pairs
     from probmotion.data.pair_sets import SALSA_HELD_OUT
-    from probmotion.models.pair_posterior import PairSettings
+    from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
     return pairs_problem(
         salsa_pairs(),

@@ -1,7 +1,5 @@
-"""One page that shows a comparison: its tables, its plots, and draws that move."""
+"""The report: one HTML page with tables, figures and animated draws."""
 
-from __future__ import annotations
+import lazy_loader
 
-from probmotion.report.page import write_report
-
-__all__ = ["write_report"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.comparison.kept_problems import KeptProblem
-from probmotion.interaction.coordinates import align_motions
-from probmotion.pictures.skeletons import _facing, _sides
+from probmotion.comparison.results.stored_problems import KeptProblem
+from probmotion.interaction.geometry.coordinates import align_motions
+from probmotion.plots.skeletons import _facing, _sides
 
 __all__ = ["Shown", "choose_draws", "motion_numbers"]
 

@@ -8,25 +8,25 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from probmotion.comparison.qualities import QUALITIES, best_of, first_quality
-from probmotion.comparison.table import ComparisonTable
+from probmotion.comparison.results.qualities import QUALITIES, best_of, first_quality
+from probmotion.comparison.results.table import ComparisonTable
 from probmotion.report.plots import marker
 from probmotion.report.tables import Outcome, value_cell
 
 if TYPE_CHECKING:
-    from probmotion.comparison import Comparison
+    from probmotion.comparison.results.grid_results import GridResults
 
 __all__ = ["overview"]
 
 
 def overview(
-    comparison: Comparison, table: ComparisonTable, outcomes: Mapping[str, Mapping[str, Outcome]]
+    comparison: GridResults, table: ComparisonTable, outcomes: Mapping[str, Mapping[str, Outcome]]
 ) -> str:
     """Return a table in HTML, problems down and samplers across; empty of a single problem.
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : GridResults
         What was drawn.
     table : ComparisonTable
         Its table.

@@ -14,19 +14,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probmotion.comparison.table import ComparisonTable
+from probmotion.comparison.results.table import ComparisonTable
 from probmotion.files import written_whole
-from probmotion.pictures.colours import CYCLE, LEFT, RIGHT
-from probmotion.report.heads import contents, facts, note_ids, notes, reading
+from probmotion.plots.colours import CYCLE, LEFT, RIGHT
+from probmotion.report.animations import BUDGET, players, shown_problems
+from probmotion.report.header import contents, facts, note_ids, notes, reading
 from probmotion.report.motions import Shown
 from probmotion.report.overview import overview
-from probmotion.report.players import BUDGET, players, shown_problems
 from probmotion.report.plots import quality_against_cost
 from probmotion.report.tables import Outcome, problem_tables
 
 if TYPE_CHECKING:
     from probmotion.calibration.result import Calibration
-    from probmotion.comparison import Comparison
+    from probmotion.comparison.results.grid_results import GridResults
 
 __all__ = ["write_report"]
 
@@ -41,13 +41,13 @@ _LEAST = BUDGET // 9
 
 
 def write_report(
-    comparison: Comparison, path: str | Path, calibration: Calibration | None = None
+    comparison: GridResults, path: str | Path, calibration: Calibration | None = None
 ) -> Path:
     """Write a comparison as one HTML page and return where.
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : GridResults
         What was drawn; what is not finished is left out.
     path : str or Path
         Where to write, ``.html``.
@@ -70,7 +70,7 @@ def write_report(
     return path
 
 
-def _page(comparison: Comparison, calibration: Calibration | None) -> str:
+def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     plan, table = comparison.plan, comparison.table()
     picture = b"" if calibration is None or not calibration.ranked else _picture(calibration)
     shown = shown_problems(comparison, max(_LEAST, BUDGET - len(picture)))
@@ -115,7 +115,7 @@ def _page(comparison: Comparison, calibration: Calibration | None) -> str:
 </main>
 <script>
 document.querySelectorAll("table").forEach({_text("tables.js")});
-document.querySelectorAll(".player").forEach({_text("players.js")});
+document.querySelectorAll(".player").forEach({_text("animations.js")});
 </script>
 </body>
 </html>
@@ -123,7 +123,7 @@ document.querySelectorAll(".player").forEach({_text("players.js")});
 
 
 def _section(
-    comparison: Comparison,
+    comparison: GridResults,
     table: ComparisonTable,
     name: str,
     place: int,
@@ -152,7 +152,7 @@ def _section(
 
 
 def _outcome(
-    comparison: Comparison, problem: str, sampler: str, ids: Mapping[tuple[str, str], str]
+    comparison: GridResults, problem: str, sampler: str, ids: Mapping[tuple[str, str], str]
 ) -> Outcome:
     """How a sampler fared: a cell that is not there was not run."""
     seeds = comparison.plan.seeds

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.qualities import QUALITIES, first_quality
-from probmotion.pictures.colours import style_of
-from probmotion.report.label_places import Box, place_labels
+from probmotion.comparison.results.qualities import QUALITIES, first_quality
+from probmotion.plots.colours import style_of
+from probmotion.plots.label_placement import Box, place_labels
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,7 +35,7 @@ _MARKERS = {
     "<": "M-6 0L4.5-5.5v11z",
     ">": "M6 0L-4.5-5.5v11z",
 }
-"""The shapes of :func:`~probmotion.pictures.colours.style_of` as paths, about the origin."""
+"""The shapes of :func:`~probmotion.plots.colours.style_of` as paths, about the origin."""
 
 
 def marker(place: int) -> str:

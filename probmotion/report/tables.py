@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
-from probmotion.comparison.qualities import best_of
-from probmotion.comparison.table import _BLOCKS, _mean_and_sd
+from probmotion.comparison.results.qualities import best_of
+from probmotion.comparison.results.table import _BLOCKS, _mean_and_sd
 from probmotion.report.plots import marker
 
 if TYPE_CHECKING:

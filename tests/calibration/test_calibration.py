@@ -18,16 +18,16 @@ from toy_samplers import small_prior
 from probmotion import Motion, MotionDraws, MotionPosterior, UnsupportedPosterior, seeds
 from probmotion.calibration.grid import calibrate
 from probmotion.calibration.negative_control import Overconfident
-from probmotion.calibration.quantities import DENSITY, DISTANCE, credible_level, quantities
+from probmotion.calibration.quantities import quantities
 from probmotion.calibration.ranks import independent_draws, rank
 from probmotion.calibration.result import Calibration
 from probmotion.calibration.table import LEVELS, coverage_curve
 from probmotion.comparison import Budget
+from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
 from probmotion.metrics.uniformity import uniformity_p_value
-from probmotion.problems import Problem
-from probmotion.problems.evidence import observe
-from probmotion.problems.problem import simulated
-from probmotion.sampling import Interrupted
+from probmotion.posteriors.problem import Problem, simulated
+from probmotion.posteriors.sampling import Interrupted
+from probmotion.problems.observations import observe
 
 prior = cache(small_prior)
 
@@ -317,7 +317,7 @@ def test_it_is_read_again_and_plotted(calibration, monkeypatch, tmp_path):
     assert again.table().equals(calibration.table())
     drawn = {}
     monkeypatch.setattr(
-        "probmotion.pictures.rank_plots.draw_ranks",
+        "probmotion.plots.ranks.draw_ranks",
         lambda blocks, path: drawn.update({path: blocks}),
     )
     assert again.plot() == calibration.folder / "ranks.png"

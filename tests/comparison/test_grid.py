@@ -24,8 +24,8 @@ from toy_samplers import (
 
 from probmotion import MotionPosterior
 from probmotion.comparison import Comparison, compare
-from probmotion.comparison.plan import Plan
-from probmotion.problems import Problem
+from probmotion.comparison.results.plan import Plan
+from probmotion.posteriors.problem import Problem
 from probmotion.samplers import ExactSampler
 
 SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}

@@ -13,9 +13,9 @@ import numpy as np
 
 from probmotion import Motion, MotionDraws, MotionPosterior, Skeleton, UnsupportedPosterior, seeds
 from probmotion.models import GaussianMixtureMotion
-from probmotion.priors import Samplable
-from probmotion.problems import Problem
-from probmotion.problems.evidence import observe
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.protocols import Samplable
+from probmotion.problems.observations import observe
 
 
 @dataclass(frozen=True)

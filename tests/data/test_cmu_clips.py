@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from probmotion.data.cmu_clips import cmu_clip
-from probmotion.formats import MotionFileError
-from probmotion.motion import Motion
-from probmotion.skeleton import Skeleton
+from probmotion.io.errors import MotionFileError
+from probmotion.io.files import save_motion
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
 
 ASF = """:units
 length 0.254
@@ -44,7 +45,9 @@ def put_originals(folder: Path, frames: int = 9, name: str = "02_02") -> None:
 def put_archive(folder: Path, frames: int, fps: float = 30.0, name: str = "cmu_02_02") -> None:
     folder.mkdir(parents=True, exist_ok=True)
     skeleton = Skeleton(["root", "head"], [-1, 0])
-    Motion(np.zeros((frames, 2, 3)), skeleton, fps, name="other").save(folder / f"{name}.npz")
+    save_motion(
+        Motion(np.zeros((frames, 2, 3)), skeleton, fps, name="other"), folder / f"{name}.npz"
+    )
 
 
 @pytest.fixture

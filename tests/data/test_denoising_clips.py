@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probmotion import Motion, Skeleton, load_motion
-from probmotion.data.denoising_clips import (
-    DENOISING_CLIPS,
-    denoising_clips,
-    made_denoising_clips,
-)
-from probmotion.metrics.motion_distances import windows, yaw_aligned_distances
+from probmotion import Motion, Skeleton
+from probmotion.data.denoising_clips import DENOISING_CLIPS, denoising_clips, made_denoising_clips
+from probmotion.io.files import load_motion
+from probmotion.motion.distances import windows, yaw_aligned_distances
 
 PERSON = Skeleton.preset("person14")
 

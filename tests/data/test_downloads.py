@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from probmotion.data import downloads
-from probmotion.data.dances import make_dances
 from probmotion.data.downloads import DownloadError, download, salsa_pairs
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.io.files import save_motion
 
 COMMIT = "0" * 40
 
@@ -211,7 +212,7 @@ def put_archives(folder, frames=3):
     folder.mkdir(parents=True)
     for trial, dance in zip(downloads.SALSA_TRIALS, make_dances(10, frames=frames), strict=True):
         dance = type(dance)(dance.positions, dance.skeleton, 30.0)
-        dance.save(folder / f"cmu_60_61_{trial}.npz")
+        save_motion(dance, folder / f"cmu_60_61_{trial}.npz")
 
 
 @pytest.mark.parametrize("place", ["cache/cmu_salsa_pairs", "cache", "shared/data/cmu_salsa_pairs"])

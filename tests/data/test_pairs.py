@@ -7,7 +7,6 @@ import warnings
 import numpy as np
 import pytest
 
-from probmotion.data.dances import make_dances
 from probmotion.data.pairs import (
     SALSA_HELD_OUT,
     choose_seed,
@@ -22,9 +21,11 @@ from probmotion.data.pairs import (
     read_salsa_bvh,
     scaled_to_height,
 )
-from probmotion.motion import Motion, load_motion
-from probmotion.rotations import vector_to_matrix
-from probmotion.skeleton import Skeleton
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.io.files import load_motion, save_motion
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
 
 PAIR = Skeleton.preset("pair17")
 ONE = Skeleton.preset("person17")
@@ -296,12 +297,12 @@ def test_clips_that_do_not_fit_are_refused_in_one_sentence(dances):
 
 def test_folders_files_and_patterns(dances, tmp_path):
     for dance in dances:
-        dance.save(tmp_path / f"{dance.name}.npz")
+        save_motion(dance, tmp_path / f"{dance.name}.npz")
     for given in (tmp_path, str(tmp_path / "*.npz"), [tmp_path / f"{d.name}.npz" for d in dances]):
         read = load_pairs(given)
         assert [m.name for m in read] == [d.name for d in dances]
         np.testing.assert_array_equal(read[3].positions, dances[3].positions)
-    alone(dances[0], 0).save(tmp_path / "one.npz")
+    save_motion(alone(dances[0], 0), tmp_path / "one.npz")
     with pytest.raises(ValueError, match=r"Motion\(p0: 45 frames.*1 root, expected 2"):
         load_pairs(tmp_path)
     (tmp_path / "empty").mkdir()
@@ -313,7 +314,7 @@ def test_folders_files_and_patterns(dances, tmp_path):
 
 def test_two_bvh_files_written_by_us(dances, tmp_path):
     for person in range(2):
-        alone(dances[0], person).save(tmp_path / f"{person}.bvh")
+        save_motion(alone(dances[0], person), tmp_path / f"{person}.bvh")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         pair = pair_motion(*[load_motion(tmp_path / f"{person}.bvh") for person in range(2)])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, seeds
-from probmotion.data.gaits import make_gaits
 from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
-from probmotion.data.splits import clip_of
+from probmotion.data.synthetic.gaits import make_gaits
+from probmotion.motion.splits import clip_of
 
 NO_NOISE = DetectorNoise.none()
 

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
 from probmotion import MotionPosterior
-from probmotion.data.dances import make_dances
+from probmotion.data.synthetic.dances import make_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
-from probmotion.interaction.annotation_sources import draw_annotations
-from probmotion.interaction.coordinates import align_rigidly, dissimilarity
-from probmotion.interaction.graphs import graph_edges
-from probmotion.interaction.views import project_to_views
-from probmotion.likelihoods import ComparesViews, Likelihood
+from probmotion.interaction.annotations.sources import draw_annotations
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.coordinates import align_rigidly, dissimilarity
+from probmotion.interaction.geometry.graphs import graph_edges
+from probmotion.posteriors.protocols import ComparesViews, Likelihood
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def test_the_shortest_edge_is_the_densitys(drawn, poses):
 
 
 def test_views_are_estimated_from_the_first_seed(drawn):
-    from probmotion.models.pair_posterior import PairSettings, pair_posterior
+    from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
 
     unknown = draw_annotations(make_dances(4), 60, seed=0).annotations
     seeds = drawn.positions[[0, 30]]

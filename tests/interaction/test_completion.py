@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from probmotion import Skeleton
-from probmotion.data.dances import make_dances
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.completion import (
     blend,
     complete,
@@ -16,7 +17,6 @@ from probmotion.interaction.completion import (
     nearest_annotation_completion,
 )
 from probmotion.interaction.retrieval import view_grid
-from probmotion.interaction.views import project_to_views
 
 PAIR = Skeleton.preset("pair17")
 DRAWS = np.concatenate([dance.positions[::5] for dance in make_dances(8)])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from probmotion import Skeleton
-from probmotion.data.dances import make_dances
-from probmotion.interaction.coordinates import interaction_distance
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.interaction.annotations.views import project_to_views
+from probmotion.interaction.geometry.coordinates import interaction_distance
 from probmotion.interaction.retrieval import retrieve, view_grid, views_around
-from probmotion.interaction.views import project_to_views
 
 PAIR = Skeleton.preset("pair17")
 DRAWS = np.concatenate([dance.positions[::9] for dance in make_dances(4)])

@@ -11,11 +11,7 @@ import numpy as np
 import pytest
 
 from probmotion import MotionDraws, Skeleton, seeds
-from probmotion.metrics.chains import (
-    chain_diagnostics,
-    rhat_of_independent,
-    watched_coordinates,
-)
+from probmotion.metrics.chains import chain_diagnostics, rhat_of_independent, watched_coordinates
 from probmotion.metrics.cost import costs
 
 CHAINS, DRAWS = 4, 500

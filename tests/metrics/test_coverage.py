@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from probmotion.data.dances import make_dances
-from probmotion.interaction.coordinates import align_rigidly
-from probmotion.interaction.pose_distances import MEASURES
-from probmotion.interaction.rigid_kernels import align, residual
-from probmotion.interaction.shape_context import shape_context_distance, shape_contexts
+from probmotion.data.synthetic.dances import make_dances
+from probmotion.interaction.geometry.coordinates import align_rigidly
+from probmotion.interaction.geometry.pose_distances import MEASURES
+from probmotion.interaction.geometry.rigid_kernels import align, residual
+from probmotion.interaction.geometry.shape_context import shape_context_distance, shape_contexts
 from probmotion.metrics.coverage import coverage, nearest_draw_distances, pose_distances
 
 PAIRS = np.concatenate([dance.positions[::9] for dance in make_dances(6)])
@@ -177,7 +177,7 @@ def test_blocks_and_repeats_change_nothing():
 
 
 def test_a_repeated_pose_is_triangulated_once(monkeypatch):
-    from probmotion.interaction import pose_distances as module
+    from probmotion.interaction.geometry import pose_distances as module
 
     measured = []
     plain = module.graph_edges

@@ -6,8 +6,8 @@ import pytest
 import scipy.linalg
 
 from probmotion import seeds
-from probmotion.cameras import Cameras
-from probmotion.data.gaits import make_gait
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.geometry.cameras import Cameras
 from probmotion.metrics.distribution import precision_recall
 from probmotion.metrics.filming import film_motions, random_azimuths
 from probmotion.metrics.generation import (
@@ -18,7 +18,7 @@ from probmotion.metrics.generation import (
     frechet_distance,
     score_generation,
 )
-from probmotion.skeleton import Skeleton
+from probmotion.motion.skeleton import Skeleton
 
 
 @pytest.fixture

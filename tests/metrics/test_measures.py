@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, Motion, MotionDraws, MotionPosterior, Skeleton
-from probmotion.metrics import accuracy_of, measure
-from probmotion.metrics.measures import _exact_draws
+from probmotion.metrics.measures import _exact_draws, accuracy_of, measure
 from probmotion.metrics.stein import kernel_stein_discrepancy, score_of
 from probmotion.models import GaussianMixtureMotion
-from probmotion.problems import Problem
-from probmotion.problems.evidence import observe
+from probmotion.posteriors.problem import Problem
+from probmotion.problems.observations import observe
 
 K, R, L, J, A = 2, 2, 4, 5, 6
 N = 400

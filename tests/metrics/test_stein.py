@@ -13,7 +13,7 @@ import torch
 import probmotion as pm
 from probmotion.arrays import array_namespace, constant
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
-from probmotion.priors import NotConjugate
+from probmotion.posteriors.protocols import NotConjugate
 from probmotion.problems import load_problem
 
 

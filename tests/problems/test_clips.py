@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probmotion import Motion, load_motions
-from probmotion.data.gaits import make_gait
+from probmotion import Motion
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.io.files import load_motions
 from probmotion.problems import clips_problem, load_problem
 from probmotion.problems.clips import CLIP_PROBLEMS
 

@@ -12,23 +12,19 @@ import torch
 from probmotion import models, seeds
 from probmotion.calibration import calibrate
 from probmotion.data.cmu_clips import cmu_clip
-from probmotion.data.walks import made_walks
-from probmotion.likelihoods import Joints3D
-from probmotion.metrics import measure
-from probmotion.models.body_states import BodyStates, rest_pose
-from probmotion.models.checkpoints import weights_digest
-from probmotion.models.denoiser_training import DenoiserTrainee
-from probmotion.models.dvae_network import DVAESettings
-from probmotion.models.dvae_training import DVAETrainee
-from probmotion.models.motion_denoiser import MotionDenoiser
-from probmotion.models.motion_dvae import MotionDVAE
-from probmotion.problems import (
-    Problem,
-    denoising,
-    load_problem,
-    problem_descriptions,
-    problem_names,
-)
+from probmotion.data.synthetic.walks import made_walks
+from probmotion.metrics.measures import measure
+from probmotion.models.bodies.body_states import BodyStates, rest_pose
+from probmotion.models.dvae.denoiser_training import DenoiserTrainee
+from probmotion.models.dvae.motion_denoiser import MotionDenoiser
+from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.network import DVAESettings
+from probmotion.models.dvae.training import DVAETrainee
+from probmotion.models.training.checkpoints import weights_digest
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.problem import Problem
+from probmotion.problems import denoising, load_problem, problem_descriptions, problem_names
 from probmotion.problems.denoising import (
     DENOISING_PROBLEMS,
     body_of,
@@ -36,14 +32,7 @@ from probmotion.problems.denoising import (
     denoising_problem,
     limbs_hidden,
 )
-from probmotion.samplers import (
-    NUTS,
-    DVAEInference,
-    Ensemble,
-    MetropolisHastings,
-    ScoreDistillation,
-)
-from probmotion.skeleton import Skeleton
+from probmotion.samplers import NUTS, DVAEInference, Ensemble, MetropolisHastings, ScoreDistillation
 from probmotion.threads import one_thread
 
 BODY = Skeleton.preset("person14")

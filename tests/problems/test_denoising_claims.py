@@ -9,9 +9,9 @@ import pytest
 
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.data.joint_filters import kalman_smooth, savitzky_golay
-from probmotion.likelihoods import Joints3D
 from probmotion.metrics import accuracy
-from probmotion.posterior import MotionPosterior
+from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.problems.denoising import body_of, body_prior, limbs_hidden
 from probmotion.samplers import DVAEInference
 

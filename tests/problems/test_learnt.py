@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, MotionPosterior, compare, models
-from probmotion.comparison.fingerprint import fingerprint
+from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.data.projections import centre_motion
-from probmotion.data.walks import made_walks, walk_clips
-from probmotion.metrics import measure
-from probmotion.metrics.motion_distances import mirror_share, nearest_distances, windows
+from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.metrics.measures import measure
+from probmotion.motion.distances import mirror_share, nearest_distances, windows
 from probmotion.problems import load_problem
 from probmotion.samplers import NUTS, MultiViewAncestral, ScoreDistillation
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from probmotion import MotionPosterior, compare, models
-from probmotion.data.animals import animal_clips, made_animals
-from probmotion.data.gaits import make_gaits
-from probmotion.data.learning import film_windows
 from probmotion.data.projections import centre_motion
-from probmotion.data.walks import walk_clips
-from probmotion.metrics import measure
-from probmotion.metrics.motion_distances import nearest_distances, windows
+from probmotion.data.synthetic.animals import animal_clips, made_animals
+from probmotion.data.synthetic.gaits import make_gaits
+from probmotion.data.synthetic.walks import walk_clips
+from probmotion.data.tracks.learning import film_windows
+from probmotion.metrics.measures import measure
 from probmotion.models import MotionVAE
-from probmotion.models.view_hypotheses import judge_hypotheses
+from probmotion.models.vae.view_hypotheses import judge_hypotheses
+from probmotion.motion.distances import nearest_distances, windows
+from probmotion.posteriors.sampling import UnsupportedPosterior, load_sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral
-from probmotion.sampling import UnsupportedPosterior, load_sampler
 
 WEIGHTS = Path(models.__file__).parent / "weights"
 NAMES = ("walk-vae", "animal-vae")

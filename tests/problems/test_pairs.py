@@ -7,21 +7,16 @@ import pytest
 
 import probmotion as pm
 from probmotion import MotionDraws
-from probmotion.data.dances import make_dances
 from probmotion.data.pair_sets import SALSA_HELD_OUT
-from probmotion.metrics import measure
+from probmotion.data.synthetic.dances import make_dances
 from probmotion.metrics.coverage import coverage
-from probmotion.models.pair_posterior import PairSettings
-from probmotion.problems import (
-    Problem,
-    load_problem,
-    pairs_problem,
-    problem_descriptions,
-    problem_names,
-)
+from probmotion.metrics.measures import measure
+from probmotion.models.pose_pairs.pair_posterior import PairSettings
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.truncation import TruncatedPosterior
+from probmotion.problems import load_problem, pairs_problem, problem_descriptions, problem_names
 from probmotion.samplers import MetropolisHastings
-from probmotion.samplers.proposals import Isotropic
-from probmotion.truncation import TruncatedPosterior
+from probmotion.samplers.mcmc.proposals import Isotropic
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from probmotion import MotionPosterior
-from probmotion.problems import Problem, load_problem
+from probmotion.posteriors.problem import Problem
+from probmotion.problems import load_problem
 from probmotion.problems.gait import GAIT_PROBLEMS
 
 WITH_EVIDENCE = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]

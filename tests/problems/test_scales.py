@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from probmotion.comparison.fingerprint import fingerprint
-from probmotion.comparison.naming import _NAME
+from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.comparison.results.naming import _NAME
 from probmotion.problems import load_problem, problem_names
 
 

@@ -16,19 +16,20 @@ from PIL import Image
 
 from probmotion import Cameras, MotionDraws, MotionPosterior, seeds
 from probmotion.calibration import calibrate
-from probmotion.comparison.cells import CellResult, Failure
-from probmotion.comparison.kept_problems import KeptProblem, keep_problem, read_kept
-from probmotion.comparison.result import Comparison
-from probmotion.comparison.table import ComparisonTable
-from probmotion.data.gaits import make_gait
-from probmotion.likelihoods import Joints3D, Keypoints2D
+from probmotion.comparison.comparison import Comparison
+from probmotion.comparison.results.cell_results import CellResult
+from probmotion.comparison.results.failures import Failure
+from probmotion.comparison.results.stored_problems import KeptProblem, keep_problem, read_kept
+from probmotion.comparison.results.table import ComparisonTable
+from probmotion.data.synthetic.gaits import make_gait
 from probmotion.models import GaussianMixtureMotion
-from probmotion.pictures.rank_plots import draw_ranks
-from probmotion.problems import Problem
-from probmotion.report.label_places import place_labels
+from probmotion.plots.label_placement import place_labels
+from probmotion.plots.ranks import draw_ranks
+from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
+from probmotion.posteriors.problem import Problem
+from probmotion.report.animations import BUDGET, shown_problems
 from probmotion.report.motions import Shown, motion_numbers
 from probmotion.report.page import write_report
-from probmotion.report.players import BUDGET, shown_problems
 from probmotion.samplers import ScoreDistillation
 
 SCRIPT = "</script><script>alert(1)</script><b onclick='x'>&\"'"
@@ -73,7 +74,7 @@ class Made(Comparison):
             keep_problem(p, folder / "problems" / p.name, draws=2)
 
     def _plan(self, numbers: int):
-        from probmotion.comparison.result import Plan
+        from probmotion.comparison.results.plan import Plan
 
         samplers: dict[str, dict[str, str]] = {"good": {}, "b<i>ad": {"path": SCRIPT}, "none": {}}
         told = {name: p.description for name, p in self.problems.items()}

@@ -13,16 +13,17 @@ import pytest
 from live_browser import browser_command
 
 from probmotion import Cameras, Keypoints2D, MotionDraws, MotionPosterior, seeds
-from probmotion.comparison.cells import CellResult, Failure
-from probmotion.comparison.kept_problems import KeptProblem, keep_problem
-from probmotion.comparison.plan import Plan
-from probmotion.comparison.result import Comparison
-from probmotion.data.gaits import make_gait
+from probmotion.comparison.comparison import Comparison
+from probmotion.comparison.results.cell_results import CellResult
+from probmotion.comparison.results.failures import Failure
+from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.results.stored_problems import KeptProblem, keep_problem
+from probmotion.data.synthetic.gaits import make_gait
 from probmotion.models import GaussianMixtureMotion
-from probmotion.problems import Problem
+from probmotion.posteriors.problem import Problem
+from probmotion.report.animations import shown_problems
 from probmotion.report.motions import motion_numbers
 from probmotion.report.page import write_report
-from probmotion.report.players import shown_problems
 
 WALK = make_gait("walk", frames=8)
 SEEN = 3

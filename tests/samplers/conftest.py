@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from probmotion.arrays import array_namespace, constant, dot, logsumexp
-from probmotion.cameras import Cameras
-from probmotion.likelihoods import Likelihood
-from probmotion.skeleton import Skeleton
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.protocols import Likelihood
 
 
 @dataclass(frozen=True, eq=False)

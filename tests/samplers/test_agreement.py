@@ -19,9 +19,9 @@ from scipy.stats import multivariate_normal, norm
 
 from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
 from probmotion.models import GaussianMixtureMotion
+from probmotion.motion.skeleton import Skeleton
 from probmotion.samplers import NUTS, Ensemble, ExactSampler, MetropolisHastings
-from probmotion.samplers.nuts_kernel import compiled
-from probmotion.skeleton import Skeleton
+from probmotion.samplers.mcmc.nuts_kernel import compiled
 
 L, J, K, RANK, AZIMUTHS = 3, 4, 2, 2, 4
 PROBLEMS = ("prior", "monocular", "sparse")

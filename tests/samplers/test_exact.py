@@ -7,11 +7,11 @@ import pytest
 
 from probmotion import Joints3D, MotionPosterior
 from probmotion.models import GaussianMixtureMotion
-from probmotion.problems import Problem
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import UnsupportedPosterior, suited
+from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.samplers import ExactSampler
-from probmotion.sampling import UnsupportedPosterior, suited
-from probmotion.skeleton import Skeleton
-from probmotion.truncation import TruncatedPosterior
 
 
 @pytest.fixture(scope="module")

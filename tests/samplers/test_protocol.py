@@ -11,18 +11,18 @@ import pytest
 
 import probmotion.samplers
 from probmotion import Cameras, Keypoints2D, Motion, MotionDraws, MotionPosterior
+from probmotion.cli.settings_options import object_from_text, text_of_object
 from probmotion.models import GaussianMixtureMotion
-from probmotion.problems import load_problem
-from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
-from probmotion.sampling import (
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.sampling import (
     Sampler,
     UnsupportedPosterior,
     load_sampler,
     sampler_names,
     suited,
 )
-from probmotion.settings_options import object_from_text, text_of_object
-from probmotion.skeleton import Skeleton
+from probmotion.problems import load_problem
+from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 
 NAMES = ("exact", "ancestral3d", "mas", "mvpc", "sds", "mh", "nuts", "ensemble", "dvae")
 QUICK = {

@@ -1,0 +1,4 @@
+from .diffusion.motion_diffusion import MotionDiffusion as MotionDiffusion
+from .dvae.motion_dvae import MotionDVAE as MotionDVAE
+from .mixture.gaussian_mixture import GaussianMixtureMotion as GaussianMixtureMotion
+from .vae.motion_vae import MotionVAE as MotionVAE

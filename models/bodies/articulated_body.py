@@ -1,0 +1,218 @@
+"""A body of bones that turn: from rotation vectors and a rigid pose to where the joints are.
+
+It is the ξ of a motion VAE learnt from 2D (*Ponymation*, section 3.1): ξ₁ ∈ SE(3), the rigid pose,
+and ξ_b ∈ SO(3), one rotation for each bone from its rest pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant
+from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.models.bodies.body_states import check_bones, trunk_joints
+from probmotion.models.bodies.joint_ranges import range_of
+from probmotion.motion.kinematics import forward_kinematics
+from probmotion.motion.rest_poses import is_four_legged
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_shape
+
+__all__ = ["ArticulatedBody"]
+
+
+@dataclass(frozen=True, eq=False)
+class ArticulatedBody:
+    """Bones that turn from a rest pose.
+
+    Where a trunk leaves a joint that limbs hang on, as at the pelvis, it turns on its own, as in
+    :class:`~probmotion.models.bodies.body_states.BodyStates`.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+        J joints, one root.
+    rest : ndarray, (J, 3)
+        Each joint's offset from its parent in the rest pose, metres; the root's is not used. The
+        body looks along +Z, up is +Y and its left is at +X. Ranges of joints are meant for a rest
+        pose that is the mean pose, as of :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
+
+    Raises
+    ------
+    ValueError
+        If the skeleton has several roots, a shape does not fit, or a bone has no length or one
+        that no bone has in metres.
+    """
+
+    skeleton: Skeleton
+    rest: np.ndarray
+
+    def __post_init__(self) -> None:
+        if len(self.skeleton.roots) != 1:
+            raise ValueError(
+                f"skeleton has {len(self.skeleton.roots)} roots, expected one: it is one body"
+            )
+        rest = np.array(self.rest, dtype=np.float64)
+        check_bones("rest", rest, self.skeleton)
+        rest[self.skeleton.roots[0]] = 0.0
+        object.__setattr__(self, "rest", rest)
+
+    @cached_property
+    def _rig(self) -> Skeleton:
+        """The skeleton with a joint more for every trunk, at its lower end, that turns it."""
+        names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
+        for joint in trunk_joints(self.skeleton):
+            names.append(f"{names[joint]} trunk")
+            parents.append(parents[joint])
+            parents[joint] = len(names) - 1
+        return Skeleton(names, parents)
+
+    @cached_property
+    def _turning(self) -> tuple[int, ...]:
+        """The rig's joints that have children, other than the root."""
+        below = set(self._rig.parents) - {self.skeleton.roots[0], -1}
+        return tuple(joint for joint in range(self._rig.n_joints) if joint in below)
+
+    @property
+    def bones(self) -> tuple[str, ...]:
+        """Names of the B bones that turn, by the joint they turn at; trunks are at the end."""
+        return tuple(self._rig.joint_names[joint] for joint in self._turning)
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether the skeleton has left-right pairs and is its own mirror image."""
+        order, parents = self.skeleton.mirrored_order, self.skeleton.parents
+        return bool(self.skeleton.mirrored_pairs) and all(
+            parents[order[joint]] == order[parent] for joint, parent in self.skeleton.bones
+        )
+
+    @cached_property
+    def length_groups(self) -> tuple[int, ...]:
+        """For every joint the group whose length its bone shares with its mirror image, 0 to G−1.
+
+        Bones of a body that is not :attr:`symmetric` have a group each; so has the root, which
+        has no bone, and the number for it changes nothing.
+        """
+        order = self.skeleton.mirrored_order
+        n_joints = self.skeleton.n_joints
+        first = [min(j, order[j]) if self.symmetric else j for j in range(n_joints)]
+        return tuple(sorted(set(first)).index(joint) for joint in first)
+
+    @property
+    def n_groups(self) -> int:
+        """Number of lengths G."""
+        return max(self.length_groups) + 1
+
+    @property
+    def rest_positions(self) -> np.ndarray:
+        """Joints of the rest pose relative to the root, (J, 3) metres."""
+        found = np.zeros_like(self.rest)
+        for joint in self.skeleton.topological_order:
+            parent = self.skeleton.parents[joint]
+            if parent >= 0:
+                found[joint] = found[parent] + self.rest[joint]
+        return found
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Least rotation vectors in range, (B, 3) radians; the numbers are ours."""
+        return self._ranges[0]
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Greatest rotation vectors in range, (B, 3) radians; the numbers are ours."""
+        return self._ranges[1]
+
+    @cached_property
+    def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        names, parents = self.skeleton.canonical_names, self.skeleton.parents
+        animal, n_joints = is_four_legged(self.skeleton), self.skeleton.n_joints
+        found = []
+        for joint in self._turning:
+            if joint < n_joints:
+                children = [child for child, parent in self.skeleton.bones if parent == joint]
+                below = self.rest[children].mean(axis=0)
+                found.append(range_of(names[joint], animal, self.rest[joint], below))
+            else:
+                (end,) = (j for j, parent in enumerate(self._rig.parents) if parent == joint)
+                at_root = parents[end] in self.skeleton.roots
+                name = "trunk" if at_root and names[end] != "tail" else names[end]
+                found.append(range_of(name, animal, self.rest[end], self.rest[end]))
+        lower, upper = np.array(found).reshape(-1, 2, 3).swapaxes(0, 1)
+        return lower, upper
+
+    def range_excess(self, turns: Array) -> Array:
+        """Return how far turns are out of range: ``(…, B, 3) → (…)``, squared radians, summed."""
+        check_shape("turns", turns, ("…", len(self.bones), 3))
+        xp = array_namespace(turns)
+        lower, upper = constant(self.lower, turns), constant(self.upper, turns)
+        none = xp.zeros_like(turns)
+        excess = xp.where(turns > upper, turns - upper, none)
+        excess = xp.where(turns < lower, lower - turns, excess)
+        return xp.sum(excess**2, axis=(-2, -1))
+
+    def positions(
+        self,
+        turns: Array,
+        root_rotation: Array,
+        root_translation: Array,
+        log_lengths: Array | None = None,
+    ) -> Array:
+        """Return where the joints are, (…, L, J, 3), metres.
+
+        NumPy or torch arrays of one library, differentiable; batch axes broadcast.
+
+        Parameters
+        ----------
+        turns : Array, (…, L, B, 3)
+            Rotation vectors of :attr:`bones` in the parents' frames, radians; 0 is the rest pose.
+        root_rotation : Array, (…, L, 3, 3)
+            Of the whole body.
+        root_translation : Array, (…, L, 3)
+            Where the root is, metres.
+        log_lengths : Array, (…, G), optional
+            Logarithm of what each group's bones are longer by than in the rest pose.
+
+        Raises
+        ------
+        ValueError
+            If a shape does not fit.
+        """
+        check_shape("turns", turns, ("…", "L", len(self.bones), 3))
+        check_shape("root_rotation", root_rotation, ("…", "L", 3, 3))
+        check_shape("root_translation", root_translation, ("…", "L", 3))
+        xp = array_namespace(turns, root_rotation, root_translation)
+        offsets = constant(self.rest, turns)
+        batch = [turns.shape[:-2], root_rotation.shape[:-2], root_translation.shape[:-1]]
+        if log_lengths is not None:
+            check_shape("log_lengths", log_lengths, ("…", self.n_groups))
+            longer = [xp.exp(log_lengths[..., group]) for group in self.length_groups]
+            offsets = offsets * xp.stack(longer, axis=-1)[..., None]
+            batch.append((*log_lengths.shape[:-1], 1))
+        shape = np.broadcast_shapes(*(tuple(axes) for axes in batch))
+        more = xp.zeros_like(offsets[..., :1, :])
+        n_more = self._rig.n_joints - self.skeleton.n_joints
+        rotations = self._rotations(xp, vector_to_matrix(turns), root_rotation, shape)
+        found, _ = forward_kinematics(
+            self._rig,
+            rotations,
+            xp.broadcast_to(root_translation, (*shape, 3))[..., None, :],
+            xp.concat([offsets, *[more] * n_more], axis=-2),
+        )
+        return found[..., : self.skeleton.n_joints, :]
+
+    def _rotations(
+        self, xp: Any, turned: Array, root_rotation: Array, shape: tuple[int, ...]
+    ) -> Array:
+        """Return the rotations of the rig's joints, (…, L, J', 3, 3)."""
+        still = xp.broadcast_to(constant(np.eye(3), turned), (*shape, 3, 3))
+        which = {joint: turned[..., at, :, :] for at, joint in enumerate(self._turning)}
+        which[self.skeleton.roots[0]] = root_rotation
+        each = [
+            xp.broadcast_to(which[joint], (*shape, 3, 3)) if joint in which else still
+            for joint in range(self._rig.n_joints)
+        ]
+        return xp.stack(each, axis=-3)

@@ -1,0 +1,98 @@
+"""What happens to joints on the way to a recording: noise, outliers, and joints that hide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_positive
+
+__all__ = ["JointNoise", "Noisy"]
+
+
+class Noisy(NamedTuple):
+    """Noisy windows: joints (B, L, J, 3), noise (B, L, J), seen (B, L, J), tails (B,)."""
+
+    joints: np.ndarray
+    noise: np.ndarray
+    seen: np.ndarray
+    tails: np.ndarray
+
+
+@dataclass(frozen=True)
+class JointNoise:
+    """What recordings are like that a denoiser is to learn from.
+
+    Parameters
+    ----------
+    least, most : float
+        Range of the noise's standard deviation (Student-t: scale), metres; even in its logarithm,
+        one per window.
+    outliers : float
+        Share of windows whose noise is Student-t, with 2 to 8 degrees of freedom; in the others it
+        is Gaussian.
+    hidden : float
+        Share of windows in which limbs hide for a while, and single joints here and there.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    """
+
+    least: float = 0.01
+    most: float = 0.08
+    outliers: float = 0.4
+    hidden: float = 0.6
+
+    def __post_init__(self) -> None:
+        check_positive("least", self.least)
+        check_positive("most", self.most)
+        if not self.least <= self.most:
+            raise ValueError(f"most is {self.most}, expected at least least={self.least}")
+        for name in ("outliers", "hidden"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a share, 0 to 1")
+
+    @classmethod
+    def hardly_any(cls) -> JointNoise:
+        """Return half a centimetre of noise and nothing hidden: all but clean motion."""
+        return cls(least=5e-3, most=5e-3, outliers=0.0, hidden=0.0)
+
+    def apply(self, rng: np.random.Generator, joints: np.ndarray, skeleton: Skeleton) -> Noisy:
+        """Return noisy windows of clean ones, (B, L, J, 3)."""
+        n, frames, count, _ = joints.shape
+        scale = np.exp(rng.uniform(np.log(self.least), np.log(self.most), n))
+        heavy = np.less(rng.random(n), self.outliers)
+        freedom = np.exp(rng.uniform(np.log(2.0), np.log(8.0), n))
+        error = rng.standard_normal(joints.shape)
+        # Student-t is Gaussian over the root of a mean square.
+        square = (
+            rng.chisquare(freedom[:, None, None, None], joints.shape) / freedom[:, None, None, None]
+        )
+        error = np.where(heavy[:, None, None, None], error / np.sqrt(square), error)
+        seen = np.stack([self._seen(rng, frames, skeleton) for _ in range(n)])
+        noise = np.broadcast_to(scale[:, None, None], (n, frames, count))
+        tails = np.where(heavy, 1 / freedom, 0.0)
+        return Noisy(joints + scale[:, None, None, None] * error, noise, seen, tails)
+
+    def _seen(self, rng: np.random.Generator, frames: int, skeleton: Skeleton) -> np.ndarray:
+        """Return what one window shows, (L, J)."""
+        seen = np.ones((frames, skeleton.n_joints), dtype=bool)
+        if rng.random() >= self.hidden:
+            return seen
+        for _ in range(rng.integers(1, 4)):
+            top = int(rng.integers(skeleton.n_joints))
+            limb = [j for j in range(skeleton.n_joints) if j == top or top in skeleton.ancestors(j)]
+            # All of the body hides for a moment only: what it did then cannot be known.
+            most = frames // 4 if len(limb) > skeleton.n_joints // 2 else frames
+            length = int(rng.integers(1, most + 1))
+            start = int(rng.integers(0, frames - length + 1))
+            seen[start : start + length, limb] = False
+        seen &= rng.random(seen.shape) >= rng.choice([0.0, 0.0, 0.1, 0.3])
+        if not seen.any():
+            seen[0] = True
+        return seen

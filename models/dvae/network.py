@@ -1,0 +1,172 @@
+"""The networks of Motion-DVAE: what a body does next, and all that is learnt beside it (A.1)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from probmotion import seeds
+from probmotion.models.bodies.body_states import BodyStates
+from probmotion.models.dvae.encoders import Evidence, JointEncoder, TrackingEncoder
+from probmotion.models.dvae.latent_rollouts import Rollout
+from probmotion.models.dvae.layers import State, mean_and_log_scale, perceptron
+from probmotion.models.dvae.settings import DVAESettings
+
+__all__ = ["PARTS", "DVAEModel", "DVAENetwork"]
+
+PARTS = 4
+"""What has a decoder scale: root's translation, its rotation, other rotations, joints."""
+
+
+class DVAENetwork(nn.Module):
+    """p(x_{1:T}, z_{1:T} | x₀): what a body does next, in standardised states.
+
+    Parameters
+    ----------
+    size : DVAESettings
+        Its size.
+    dim : int
+        Numbers of a state.
+    parts : int
+        Parts of a state that have a decoder scale of their own, and one more: joints.
+    """
+
+    def __init__(self, size: DVAESettings, dim: int, parts: int) -> None:
+        super().__init__()
+        width, groups = size.hidden, size.groups
+        self.starts = perceptron(dim, 2 * width, width, groups)
+        self.recurrent = nn.LSTMCell(size.latent, width)
+        self.decoder = perceptron(width, dim, width, groups)
+        self.latent_prior = perceptron(width, 2 * size.latent, width, groups)
+        self.cumulative = size.decoder == "cumulative"
+        if self.cumulative:
+            self.straight = nn.Linear(size.latent, dim, bias=False)
+            _quiet(self.decoder)
+        self.log_scales = nn.Parameter(torch.full((parts,), math.log(0.1)))
+
+    def start(self, initial: torch.Tensor) -> State:
+        """Return h₀ = d_ini(x₀): ``(B, D)``, standardised."""
+        hidden, cell = self.starts(initial).chunk(2, dim=-1)
+        return State(torch.tanh(hidden), cell, initial)
+
+    def priors(self, states: list[State]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and log scale of p(z_t | z_{1:t−1}, x₀) from each h_{t−1}, (B, T, Z)."""
+        return mean_and_log_scale(_over_frames(self.latent_prior, states))
+
+    def step(self, state: State, latent: torch.Tensor) -> State:
+        """Return h_t = LSTM(h_{t−1}, z_t)."""
+        hidden, cell = self.recurrent(latent, (state.hidden, state.cell))
+        # A direct decoder's motion is decoded at once, when all frames are there.
+        if not self.cumulative:
+            return State(hidden, cell, state.motion)
+        moved = state.motion + self.decoder(hidden) + self.straight(latent)
+        return State(hidden, cell, moved)
+
+    def decode(self, states: list[State]) -> torch.Tensor:
+        """Return μ_x of every frame, ``T × (B, H) → (B, T, D)``, standardised."""
+        if self.cumulative:
+            return torch.stack([state.motion for state in states], dim=1)
+        return _over_frames(self.decoder, states)
+
+
+class DVAEModel(nn.Module):
+    """All that a Motion-DVAE learns: two networks, what they are standardised by, and p(x₀).
+
+    Parameters
+    ----------
+    size : DVAESettings
+        Its size.
+    dim : int
+        Numbers D of a state.
+    joints : int
+        J.
+    rank : int
+        Directions r in which the first state varies.
+    seed : int
+        Of the first weights.
+    """
+
+    state_mean: torch.Tensor
+    state_deviation: torch.Tensor
+    joint_mean: torch.Tensor
+    joint_deviation: torch.Tensor
+    initial_mean: torch.Tensor
+    initial_factor: torch.Tensor
+
+    def __init__(self, size: DVAESettings, dim: int, joints: int, rank: int, seed: int = 0) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seeds.integer(seed, "weights"))
+            self.generative = DVAENetwork(size, dim, PARTS)
+            kind = TrackingEncoder if size.decoder == "cumulative" else JointEncoder
+            self.encoder = kind(size, dim, joints)
+        for name, shape in (
+            ("state_mean", (dim,)),
+            ("state_deviation", (dim,)),
+            ("joint_mean", (joints, 3)),
+            ("joint_deviation", (joints, 3)),
+            ("initial_mean", (dim,)),
+            ("initial_factor", (dim, rank)),
+        ):
+            self.register_buffer(name, torch.zeros(shape))
+
+    def standardised(self, states: torch.Tensor) -> torch.Tensor:
+        """Return states as the networks read them, ``(…, D) → (…, D)``."""
+        return (states - self.state_mean) / self.state_deviation
+
+    def decoded(self, rolled: Rollout) -> torch.Tensor:
+        """Return μ_x of frames 1 to T, (B, T, D), in the states' own units."""
+        return self.state_mean + self.state_deviation * self.generative.decode(rolled.states)
+
+    def first_states(self, coordinates: torch.Tensor) -> torch.Tensor:
+        """Return x₀ at its coordinates, ``(…, r) → (…, D)``: N(0, I) there is p(x₀)."""
+        return self.initial_mean + coordinates @ self.initial_factor.T
+
+    def observed(
+        self, joints: torch.Tensor, trust: torch.Tensor, tails: torch.Tensor
+    ) -> torch.Tensor:
+        """Return what inference reads of frames, (…, L, 4 J + 1).
+
+        Parameters
+        ----------
+        joints : Tensor, (…, L, J, 3)
+            In the canonical frame, metres; not read where hidden.
+        trust : Tensor, (…, L, J)
+            How far each is trusted, :func:`trust_in`; 0 where hidden.
+        tails : Tensor, (…)
+            One over the degrees of freedom of the noise; 0 where it is Gaussian.
+        """
+        shown = (joints - self.joint_mean) / self.joint_deviation
+        shown = torch.where(trust[..., None] > 0, shown, torch.zeros_like(shown))
+        tail = tails[..., None, None].expand(*trust.shape[:-1], 1)
+        return torch.cat([shown.flatten(-2), trust, tail], dim=-1)
+
+    def evidence(
+        self,
+        joints: torch.Tensor,
+        trust: torch.Tensor,
+        tails: torch.Tensor,
+        states: BodyStates,
+        bodies: torch.Tensor,
+    ) -> Evidence:
+        """Return what an encoder reads of B windows; ``bodies`` (B, J, 3) are who moves."""
+
+        def pose(motion: torch.Tensor) -> torch.Tensor:
+            own = self.state_mean + self.state_deviation * motion
+            return states.positions(own[:, None], bodies)[:, 0]
+
+        return Evidence(self.observed(joints, trust, tails), joints, trust, pose)
+
+
+def _quiet(network: nn.Sequential) -> None:
+    """Let a network begin near 0: frames hardly differ."""
+    with torch.no_grad():
+        network[-1].weight.mul_(0.1)
+        network[-1].bias.zero_()
+
+
+def _over_frames(network: nn.Module, states: list[State]) -> torch.Tensor:
+    hidden = torch.stack([state.hidden for state in states], dim=1)
+    return network(hidden.flatten(0, 1)).unflatten(0, hidden.shape[:2])

@@ -1,0 +1,292 @@
+"""`PoseLifter`: 3D poses from 2D poses, frame by frame, learnt from 2D poses alone.
+
+The network says how deep each joint is and how far above the horizon the camera stands (Wandt,
+Little and Rhodin, "ElePose", CVPR 2022); :mod:`probmotion.models.evaluation.lifter_training` is how
+it learns. A point at p in the picture and z metres behind the root is at (p (1 + z/d), z) in the
+camera, d being the camera's distance and focal length, so that a lifted pose projects onto what was
+lifted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from probmotion import seeds
+from probmotion.models.training.checkpoints import load_checkpoint, load_weights
+from probmotion.models.training.trainer import check_device
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
+
+__all__ = [
+    "KIND",
+    "LifterNetwork",
+    "LifterSettings",
+    "PoseLifter",
+    "project_points",
+    "raise_points",
+]
+
+KIND = "pose-lifter"
+# Poses of a chunk, always as many: the bits of a row depend on the shape it is computed in.
+_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class LifterSettings:
+    """Size of the network, and the cameras that it supposes.
+
+    Parameters
+    ----------
+    width : int
+        Of every layer.
+    blocks : int
+        Residual blocks of each of the two branches.
+    deepest : float
+        Metres that a joint may be before or behind the root at most, below ``distance``.
+    steepest : float
+        Highest elevation of a camera, radians. The lowest is 0: cameras stand above the horizon.
+        Without that, a motion and its reflection seen from below make nearly the same pictures.
+    distance : float
+        Metres from the camera to the root.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    """
+
+    width: int = 256
+    blocks: int = 2
+    deepest: float = 2.0
+    steepest: float = math.pi / 4
+    distance: float = 7.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "blocks"):
+            check_count(name, getattr(self, name))
+        for name in ("deepest", "steepest", "distance"):
+            check_positive(name, getattr(self, name))
+        if not self.deepest < self.distance:
+            raise ValueError(f"deepest is {self.deepest}, expected below distance, {self.distance}")
+        if not self.steepest < math.pi / 2:
+            raise ValueError(f"steepest is {self.steepest}, expected below pi/2")
+
+    @classmethod
+    def tiny(cls) -> LifterSettings:
+        """Return the size for tests."""
+        return cls(width=64, blocks=1)
+
+    @classmethod
+    def small(cls) -> LifterSettings:
+        """Return the size that one core trains in minutes."""
+        return cls()
+
+
+class LifterNetwork(nn.Module):
+    """Depths of the joints and elevation of the camera, from one root-centred 2D pose.
+
+    Parameters
+    ----------
+    settings : LifterSettings
+        Its size.
+    n_joints, root : int
+        Number of joints J, and which is the root, at depth 0.
+    seed : int
+        Of the first weights.
+    """
+
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
+    def __init__(self, settings: LifterSettings, n_joints: int, root: int, seed: int = 0) -> None:
+        super().__init__()
+        self.settings = settings
+        self.joints = [joint for joint in range(n_joints) if joint != root]
+        self.n_joints = n_joints
+        D = 2 * len(self.joints)
+        self.register_buffer("mean", torch.zeros(D))
+        self.register_buffer("deviation", torch.ones(D))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seeds.integer(seed, "weights"))
+            self.entry = nn.Linear(D, settings.width)
+            self.depth = _branch(settings, len(self.joints))
+            self.elevation = _branch(settings, 1)
+
+    def forward(self, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return depths, metres, and elevations, radians: ``(N, J, 2) → (N, J), (N,)``."""
+        flat = (poses[:, self.joints].flatten(1) - self.mean) / self.deviation
+        entered = self.entry(flat)
+        most = self.settings.deepest
+        depth = poses.new_zeros(poses.shape[:2])
+        depth[:, self.joints] = most * torch.tanh(self.depth(entered) / most)
+        # It begins in the middle, between a camera on the horizon and the steepest one.
+        elevation = self.settings.steepest * torch.sigmoid(self.elevation(entered)[:, 0])
+        return depth, elevation
+
+
+class _Block(nn.Module):
+    """Two layers beside a way around them."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x + self.layers(x)
+
+
+def _branch(settings: LifterSettings, outputs: int) -> nn.Sequential:
+    blocks = [_Block(settings.width) for _ in range(settings.blocks)]
+    last = nn.Linear(settings.width, outputs)  # near 0 at first: flat poses
+    nn.init.normal_(last.weight, std=0.01)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(*blocks, nn.SiLU(), last)
+
+
+def raise_points(
+    poses: torch.Tensor,
+    depth: torch.Tensor,
+    azimuth: torch.Tensor,
+    elevation: torch.Tensor,
+    distance: float,
+) -> torch.Tensor:
+    """Return where the joints of 2D poses are in the world, root at the origin: (N, J, 3), metres.
+
+    Parameters
+    ----------
+    poses : Tensor, (N, J, 2)
+        Pictures centred on the root, metres.
+    depth : Tensor, (N, J)
+        Metres behind the root, as the camera sees it.
+    azimuth, elevation : Tensor, (N,)
+        Of each pose's camera, radians, as in :meth:`probmotion.geometry.cameras.Cameras.around`.
+    distance : float
+        Metres from the camera to the root.
+    """
+    plane = poses * (1 + depth[..., None] / distance)
+    return torch.cat([plane, depth[..., None]], dim=-1) @ _turn(azimuth, elevation)
+
+
+def project_points(
+    points: torch.Tensor, azimuth: torch.Tensor, elevation: torch.Tensor, distance: float
+) -> torch.Tensor:
+    """Return the pictures of points (N, J, 3), each seen by its camera: (N, J, 2), metres."""
+    seen = points @ _turn(azimuth, elevation).mT
+    return seen[..., :2] / (1 + seen[..., 2:] / distance)
+
+
+def _turn(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Tensor:
+    """Rotations from the world to cameras around it, (N, 3, 3)."""
+    ca, sa, ce, se = azimuth.cos(), azimuth.sin(), elevation.cos(), elevation.sin()
+    zero = torch.zeros_like(ca)
+    rows = [ca, zero, -sa, se * sa, -ce, se * ca, -ce * sa, -se, -ce * ca]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+class PoseLifter:
+    """A trained lifter.
+
+    Parameters
+    ----------
+    network : LifterNetwork
+        What says depths and elevation.
+    skeleton : Skeleton
+        The J joints.
+    device : str
+        ``cpu`` or ``cuda``.
+    """
+
+    def __init__(self, network: LifterNetwork, skeleton: Skeleton, *, device: str = "cpu") -> None:
+        self.skeleton = skeleton
+        self.settings = network.settings
+        self._device = check_device(device).type
+        self._network = network.to(self._device).eval().requires_grad_(False)
+
+    @classmethod
+    def load(cls, source: str | Path, *, device: str = "cpu") -> PoseLifter:
+        """Return a trained lifter from a checkpoint's file or the folder of a training run.
+
+        Raises
+        ------
+        CheckpointError
+            If the file is damaged, of another version or no lifter.
+        FileNotFoundError
+            If there is no such file.
+        """
+        checkpoint = load_checkpoint(source, KIND)
+        kept = checkpoint.settings["network"]
+        skeleton = Skeleton(kept["joint_names"], kept["parents"])
+        settings = LifterSettings(**kept["size"])
+        network = LifterNetwork(settings, skeleton.n_joints, skeleton.roots[0])
+        load_weights(network, checkpoint.tensors)
+        return cls(network, skeleton, device=device)
+
+    def lift(self, views: np.ndarray) -> np.ndarray:
+        """Return the 3D motion of each 2D motion: ``(N, L, J, 2) → (N, L, J, 3)``.
+
+        Parameters
+        ----------
+        views : ndarray, (N, L, J, 2)
+            Metres at the root's distance, x right and y down. Every frame is centred on the root,
+            as in pictures that follow the subject.
+
+        Returns
+        -------
+        ndarray, (N, L, J, 3)
+            Metres, Y up, root at the origin. The camera
+            ``Cameras.around([0], [elevation], distance=settings.distance, perspective=True)``, with
+            the :meth:`elevations` of the views, sees the centred views exactly.
+
+        Raises
+        ------
+        ValueError
+            If the shape is another or a number is not finite.
+        """
+        poses, depth, elevation = self._seen(views)
+        L, J = views.shape[1:3]
+        heights = torch.as_tensor(np.repeat(elevation, L))
+        points = raise_points(
+            torch.from_numpy(poses),
+            torch.from_numpy(depth),
+            torch.zeros_like(heights),
+            heights,
+            self.settings.distance,
+        )
+        return points.numpy().reshape(len(views), L, J, 3)
+
+    def elevations(self, views: np.ndarray) -> np.ndarray:
+        """Return the elevation of each motion's camera, radians: ``(N, L, J, 2) → (N,)``.
+
+        It is the mean over the frames: a track is filmed by one camera, so that what differs from
+        frame to frame is error, and motions that nodded with it would look alive where they rest.
+        """
+        return self._seen(views)[2]
+
+    def _seen(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return centred poses (N L, J, 2), depths (N L, J) and elevations (N,), float64."""
+        J = self.skeleton.n_joints
+        check_shape("views", views, ("N", "L", J, 2))
+        check_finite("views", views)
+        if 0 in views.shape:
+            raise ValueError(f"views has shape {views.shape}, expected a motion and a frame")
+        root = self.skeleton.roots[0]
+        poses = np.asarray(views, np.float64).reshape(-1, J, 2)
+        poses = poses - poses[:, root : root + 1]
+        depth, elevation = np.empty(poses.shape[:2]), np.empty(len(poses))
+        for start in range(0, len(poses), _CHUNK):
+            some = poses[start : start + _CHUNK]
+            full = np.zeros((_CHUNK, J, 2), np.float32)
+            full[: len(some)] = some
+            with torch.inference_mode():
+                found = self._network(torch.from_numpy(full).to(self._device))
+            rows = slice(start, start + len(some))
+            depth[rows], elevation[rows] = (part.cpu().numpy()[: len(some)] for part in found)
+        return poses, depth, elevation.reshape(views.shape[:2]).mean(axis=1)

@@ -1,0 +1,5 @@
+"""The Gaussian mixture prior, exact in density, denoising and posterior."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

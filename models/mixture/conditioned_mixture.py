@@ -1,0 +1,169 @@
+"""`ConditionedMixture`: a Gaussian-mixture prior given evidence, with its exact denoisers.
+
+Evidence y about X is exp(−½ xᵀΛx + ηᵀx) at each joint and frame, and so is a noisy view of X:
+x_t = √ᾱ P X + √(1−ᾱ) ε adds ᾱ/(1−ᾱ) PᵀP to Λ and √ᾱ/(1−ᾱ) Pᵀ x_t to η. Hence E[X₀ | x_t, y] is
+a mixture's posterior mean (:mod:`~probmotion.models.mixture.posterior` has the algebra), and Λ is
+the same for all draws of a noise level: what depends on it is computed once per batch.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from probmotion.arrays import Array
+from probmotion.geometry.cameras import Cameras
+from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
+from probmotion.models.mixture.posterior import MixturePosterior
+from probmotion.models.mixture.turned_mixture import turning_coefficients
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.protocols import Likelihood, NotConjugate
+from probmotion.validation import check_shape
+
+__all__ = ["ConditionedMixture"]
+
+
+class ConditionedMixture:
+    """p(X | y) as a prior of its own: E[X₀ | X_t, y] and E[x₀ | x_t, y] of any view are exact.
+
+    Parameters
+    ----------
+    prior : GaussianMixtureMotion
+        The belief before the evidence.
+    likelihood : Likelihood
+        The evidence.
+
+    Raises
+    ------
+    NotConjugate
+        If the likelihood is not linear in the positions with Gaussian noise.
+    """
+
+    def __init__(self, prior: GaussianMixtureMotion, likelihood: Likelihood) -> None:
+        self.prior = prior
+        self.likelihood = likelihood
+        self._posterior = prior.exact_posterior(likelihood)
+        linear = getattr(likelihood, "linear", None)
+        if linear is None:
+            raise NotConjugate(f"the likelihood {type(likelihood).__name__} has no linear()")
+        axes, target, precision = linear()
+        F = prior.means[0].size // 3
+        precision = precision.reshape(len(axes), F)
+        target = target.reshape(len(axes), F, -1)
+        self._information = np.einsum("vf,vmi,vmj->fij", precision, axes, axes)
+        self._shift = np.einsum("vf,vmi,vfm->fi", precision, axes, target)
+        self._turns = turning_coefficients(prior.yaws)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The prior's skeleton."""
+        return self.prior.skeleton
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return self.prior.frames
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.prior.fps
+
+    @property
+    def dim(self) -> int:
+        """Length of θ, which is all positions."""
+        return self.prior.means[0].size
+
+    @property
+    def scale(self) -> float:
+        """Metres per normalised unit, the prior's."""
+        return self.prior.scale
+
+    def motion(self, theta: Array) -> Array:
+        """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
+        return theta.reshape(*theta.shape[:-1], *self.prior.means.shape[1:])
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n independent motions, (n, L, J, 3), metres."""
+        return self._posterior.sample(rng, n)
+
+    def exact_posterior(self, likelihood: Likelihood | None) -> MixturePosterior:
+        """Return p(X | y).
+
+        Raises
+        ------
+        NotConjugate
+            If there is more evidence: it belongs with the first.
+        """
+        if likelihood is not None:
+            raise NotConjugate("there is evidence already; give the prior all of it at once")
+        return self._posterior
+
+    def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return E[X₀ | X_t, y]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
+        check_shape("x_t", x_t, ("B", *self.prior.means.shape[1:]))
+        seen = x_t.reshape(len(x_t), -1, 3)
+        return self._mean(seen, alpha_bar, np.eye(3)).reshape(x_t.shape)
+
+    def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
+        """Return E[x₀ | x_t, y] view by view, all arrays (B, V, L, J, 2), normalised units.
+
+        Raises
+        ------
+        ValueError
+            If a camera is perspective.
+        """
+        if not cameras.orthographic:
+            raise ValueError("cameras is perspective, expected orthographic cameras")
+        check_shape("x_t", x_t, ("B", cameras.n_views, *self.prior.means.shape[1:3], 2))
+        out = np.empty_like(x_t)
+        for view, axes in enumerate(cameras.image_axes):
+            seen = x_t[:, view].reshape(len(x_t), -1, 2)
+            out[:, view] = (self._mean(seen, alpha_bar, axes) @ axes.T).reshape(out[:, view].shape)
+        return out
+
+    def _mean(self, seen: np.ndarray, alpha_bar: float, axes: np.ndarray) -> np.ndarray:
+        """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``; P is ``axes``, (M, 3)."""
+        prior, scale, variance = self.prior, self.prior.scale, self.prior.noise**2
+        if not 0 < alpha_bar < 1:
+            raise ValueError(f"alpha_bar is {alpha_bar!r}, expected a number between 0 and 1")
+        precision = alpha_bar / ((1 - alpha_bar) * scale**2)
+        information = self._information + precision * axes.T @ axes
+        shrink = np.linalg.inv(np.eye(3) + variance * information)
+        fields = prior.base_fields
+        K, width, _, F, _ = fields.shape
+        turns = self._turns
+        flat = fields.reshape(K, width * 3, F * 3)
+        moved = np.einsum("fij,knefj->knefi", shrink @ information, fields, optimize=True)
+        gram = (flat @ moved.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
+        gram = np.einsum("kicjd,ac,ad->kaij", gram, turns, turns, optimize=True)
+        # From here on one row per draw.
+        shift = self._shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (seen @ axes)
+        pull = np.einsum("fij,bfj->bfi", shrink, shift)
+        products = pull.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T
+        linear = products.reshape(len(seen), K, width, 3) @ turns.T
+        return self._recombine(linear.swapaxes(2, 3), gram, shrink, shift)
+
+    def _recombine(
+        self, linear: np.ndarray, gram: np.ndarray, shrink: np.ndarray, shift: np.ndarray
+    ) -> np.ndarray:
+        """Return S (E[m + W z] + δ² η), the mean over components and latents, (B, F, 3).
+
+        ``linear`` is (B, K, A, 1 + r), ``gram`` (K, A, 1 + r, 1 + r).
+        """
+        prior = self.prior
+        latent_precision = np.eye(prior.rank) + gram[..., 1:, 1:]
+        slope = linear[..., 1:] - gram[..., 0, 1:]
+        latent = (np.linalg.inv(latent_precision) @ slope[..., None])[..., 0]
+        logits = np.log(prior.weights)[:, None] - 0.5 * gram[..., 0, 0]
+        logits = logits - 0.5 * np.linalg.slogdet(latent_precision)[1]
+        logits = logits + linear[..., 0] + 0.5 * (slope * latent).sum(axis=-1)
+        weights = np.exp(logits - logits.max(axis=(1, 2), keepdims=True))
+        weights /= weights.sum(axis=(1, 2), keepdims=True)
+        whole = np.concatenate([np.ones((*latent.shape[:-1], 1)), latent], axis=-1)
+        base = (whole * weights[..., None]).swapaxes(2, 3) @ self._turns
+        fields = prior.base_fields
+        clean = base.reshape(len(base), -1) @ fields.reshape(-1, fields[0, 0, 0].size)
+        clean = clean.reshape(shift.shape) + prior.noise**2 * shift
+        return np.einsum("fij,bfj->bfi", shrink, clean) / prior.scale

@@ -1,0 +1,395 @@
+"""`GaussianMixtureMotion`: a prior for which everything is known exactly.
+
+K gait styles, each a probabilistic PCA, turned about the vertical by a yaw that is uniform on a
+grid of A azimuths: K·A Gaussian components with covariance W Wᵀ + δ² I.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace
+from probmotion.geometry.cameras import Cameras
+from probmotion.models.mixture.fit import fit_styles
+from probmotion.models.mixture.posterior import MixturePosterior
+from probmotion.models.mixture.turned_mixture import TurnedMixture, turning_fields
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.protocols import Likelihood
+from probmotion.seeds import RandomNumbers
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
+
+__all__ = ["GaussianMixtureMotion"]
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixtureMotion:
+    """A mixture of K·A Gaussians over motions of one skeleton, centred on the root.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+        The J joints.
+    fps : float
+        Frames per second.
+    means : ndarray, (K, L, J, 3)
+        Mean motion of each style, metres.
+    factors : ndarray, (K, r, L, J, 3)
+        W: what one standard deviation of each latent coordinate adds, metres.
+    weights : ndarray, (K,)
+        Probabilities of the styles, summing to 1.
+    noise : float
+        δ: standard deviation of every coordinate around the subspaces, metres.
+    azimuths : int
+        A: number of yaws ψ_a = 2π a / A.
+    styles : sequence of str, optional
+        Names of the styles.
+    coordinates : {"latent", "positions"}
+        What θ is: the latent z of r numbers, style, yaw and small noise integrated out; or all
+        3·L·J positions.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree or a number is out of range.
+    """
+
+    skeleton: Skeleton
+    fps: float
+    means: np.ndarray
+    factors: np.ndarray
+    weights: np.ndarray
+    noise: float
+    azimuths: int = 36
+    styles: Sequence[str] = ()
+    coordinates: Literal["latent", "positions"] = "latent"
+    _posteriors: WeakKeyDictionary = field(
+        init=False, repr=False, default_factory=WeakKeyDictionary
+    )
+    _views: dict[bytes, TurnedMixture] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        J = self.skeleton.n_joints
+        check_shape("means", self.means, ("K", "L", J, 3))
+        K, L = self.means.shape[:2]
+        check_shape("factors", self.factors, (K, "r", L, J, 3))
+        check_shape("weights", self.weights, (K,))
+        for name in ("means", "factors", "weights"):
+            check_finite(name, getattr(self, name))
+        check_positive("noise", self.noise)
+        check_positive("fps", self.fps)
+        check_count("azimuths", self.azimuths)
+        if self.weights.min() <= 0 or abs(self.weights.sum() - 1) > 1e-9:
+            raise ValueError(f"weights is {self.weights}, expected numbers above 0 that sum to 1")
+        names = tuple(self.styles) or tuple(f"style-{k}" for k in range(K))
+        if len(names) != K:
+            raise ValueError(f"styles has {len(names)} names, expected {K}, one per mean")
+        if self.coordinates not in ("latent", "positions"):
+            raise ValueError(
+                f"coordinates is {self.coordinates!r}, expected 'latent' or 'positions'"
+            )
+        object.__setattr__(self, "styles", names)
+
+    def __getstate__(self) -> dict:
+        # Caches are rebuilt where they are used; weak references cannot travel.
+        return self.__dict__ | {"_posteriors": None, "_views": None}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state | {"_posteriors": WeakKeyDictionary(), "_views": {}})
+
+    @classmethod
+    def fit(
+        cls,
+        motions: Sequence[Motion],
+        frames: int,
+        *,
+        rank: int = 10,
+        styles: int | Sequence[str] = 3,
+        weights: Sequence[float] | None = None,
+        azimuths: int = 36,
+        stride: int | None = None,
+        coordinates: Literal["latent", "positions"] = "latent",
+        seed: int = 0,
+    ) -> GaussianMixtureMotion:
+        """Fit the mixture to clips: windows, a common heading, then one PCA per style.
+
+        Parameters
+        ----------
+        motions : sequence of Motion
+            Clips of one skeleton and frame rate.
+        frames : int
+            Length L of the motions the prior is over.
+        rank : int
+            r: latent dimensions per style.
+        styles : int or sequence of str
+            Number of styles to find by k-means, or one label per clip.
+        weights : sequence of float, optional
+            Probabilities of the styles, in the order of their sorted names; their shares of the
+            windows by default.
+        azimuths : int
+            A: number of yaws.
+        stride : int, optional
+            Frames from one window's start to the next; a quarter of ``frames`` by default.
+        coordinates : {"latent", "positions"}
+            What θ is.
+        seed : int
+            Seed of the k-means.
+
+        Raises
+        ------
+        ValueError
+            If the clips do not share a skeleton and frame rate, all are shorter than ``frames``,
+            or a style has too few windows for ``rank``.
+        """
+        fitted = fit_styles(motions, frames, rank, styles, stride, seed)
+        shares = fitted.shares if weights is None else np.asarray(weights, dtype=np.float64)
+        return cls(
+            skeleton=motions[0].skeleton,
+            fps=motions[0].fps,
+            means=fitted.means,
+            factors=fitted.factors,
+            weights=shares,
+            noise=fitted.noise,
+            azimuths=azimuths,
+            styles=fitted.names,
+            coordinates=coordinates,
+        )
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return self.means.shape[1]
+
+    @property
+    def rank(self) -> int:
+        """Latent dimensions r."""
+        return self.factors.shape[1]
+
+    @property
+    def dim(self) -> int:
+        """Length of θ."""
+        return self.rank if self.coordinates == "latent" else self.means[0].size
+
+    @property
+    def yaws(self) -> np.ndarray:
+        """The azimuths ψ_a, radians, (A,)."""
+        return 2 * np.pi * np.arange(self.azimuths) / self.azimuths
+
+    @cached_property
+    def scale(self) -> float:
+        """Metres per normalised unit: the root mean square of all coordinates."""
+        square = (self.means**2).mean(axis=(1, 2, 3))
+        square = square + (self.factors**2).sum(axis=1).mean(axis=(1, 2, 3))
+        return float(np.sqrt(self.weights @ square + self.noise**2))
+
+    @cached_property
+    def base_fields(self) -> np.ndarray:
+        """The three base fields of each mean and factor, metres, (K, 1 + r, 3, L·J, 3)."""
+        fields = np.concatenate([self.means[:, None], self.factors], axis=1)
+        return turning_fields(fields.reshape(*fields.shape[:2], -1, 3))
+
+    # What the prior can do. Each method is one protocol of probmotion.posteriors.protocols.
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n independent motions, (n, L, J, 3), metres."""
+        return self.exact_posterior(None).sample(rng, n)
+
+    def motion(self, theta: Array) -> Array:
+        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; only in ``positions``."""
+        if self.coordinates == "latent":
+            raise ValueError(
+                "coordinates is 'latent', where a motion at θ is a draw; expected 'positions', or "
+                "use complete(rng, theta, likelihood)"
+            )
+        xp = array_namespace(theta)
+        return xp.reshape(theta, (*theta.shape[:-1], *self.means.shape[1:]))
+
+    def log_density(self, theta: Array) -> Array:
+        """Return log p(θ), normalised: ``(…, dim) → (…)``."""
+        xp = array_namespace(theta)
+        if self.coordinates == "latent":
+            constant = -0.5 * self.rank * math.log(2 * math.pi)
+            return constant - 0.5 * xp.sum(theta**2, axis=-1)
+        return self._metres.log_density(theta)
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n draws of θ, (n, dim)."""
+        if self.coordinates == "latent":
+            return rng.standard_normal((n, self.rank))
+        return self.sample(rng, n).reshape(n, -1)
+
+    def log_likelihood(self, theta: Array, likelihood: Likelihood) -> Array:
+        """Return log p(y | θ): ``(…, dim) → (…)``.
+
+        Raises
+        ------
+        NotConjugate
+            In latent coordinates, if the likelihood is not linear with Gaussian noise.
+        """
+        if self.coordinates == "latent":
+            return self.exact_posterior(likelihood).log_likelihood(theta)
+        return likelihood.log_density(self.motion(theta))
+
+    def complete(
+        self, rng: RandomNumbers, theta: np.ndarray, likelihood: Likelihood | None
+    ) -> np.ndarray:
+        """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres."""
+        if self.coordinates == "latent":
+            return self.exact_posterior(likelihood).complete(rng, theta)
+        return np.asarray(self.motion(theta))
+
+    def exact_posterior(self, likelihood: Likelihood | None) -> MixturePosterior:
+        """Return p(X | y), again a Gaussian mixture.
+
+        Raises
+        ------
+        NotConjugate
+            If the likelihood is not linear in the positions with Gaussian noise.
+        """
+        key = self if likelihood is None else likelihood
+        if key not in self._posteriors:
+            self._posteriors[key] = MixturePosterior(
+                self.base_fields,
+                self.yaws,
+                self.weights,
+                self.noise,
+                self.means.shape[1:],
+                likelihood,
+            )
+        return self._posteriors[key]
+
+    def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
+        """Return E[x₀ | x_t] view by view, all arrays (B, V, L, J, 2), normalised units.
+
+        Raises
+        ------
+        ValueError
+            If a camera is perspective: its marginals are no Gaussian mixtures.
+        """
+        out = np.empty_like(x_t)
+        for view, mixture in enumerate(self._seen_by(cameras, x_t)):
+            flat = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
+            out[:, view] = mixture.denoise(flat, alpha_bar).reshape(out[:, view].shape)
+        return out
+
+    def view_covariance_product(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
+    ) -> np.ndarray:
+        """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
+        out = np.empty_like(vectors)
+        for view, mixture in enumerate(self._seen_by(cameras, x_t)):
+            noisy = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
+            flat = np.ascontiguousarray(vectors[:, view]).reshape(len(x_t), mixture.dim)
+            product = mixture.covariance_product(noisy, alpha_bar, flat)
+            out[:, view] = product.reshape(out[:, view].shape)
+        return out
+
+    def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return E[X₀ | X_t]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
+        check_shape("x_t", x_t, ("B", *self.means.shape[1:]))
+        flat = x_t.reshape(len(x_t), self._normalised.dim)
+        return self._normalised.denoise(flat, alpha_bar).reshape(x_t.shape)
+
+    def motion_covariance_product(
+        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
+    ) -> np.ndarray:
+        """Return Cov[X₀ | X_t] v, all arrays (B, L, J, 3), normalised units."""
+        check_shape("x_t", x_t, ("B", *self.means.shape[1:]))
+        check_shape("vectors", vectors, x_t.shape)
+        rows = (len(x_t), self._normalised.dim)
+        product = self._normalised.covariance_product(
+            x_t.reshape(rows), alpha_bar, vectors.reshape(rows)
+        )
+        return product.reshape(x_t.shape)
+
+    # What is known of a motion because the prior is a mixture.
+
+    def style_responsibilities(self, positions: np.ndarray) -> np.ndarray:
+        """Return the probability of each style given a motion: ``(n, L, J, 3) → (n, K)``."""
+        flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
+        return self._metres.responsibilities(flat).sum(axis=2)
+
+    def off_manifold(self, positions: np.ndarray) -> np.ndarray:
+        """Return the variance outside the likeliest component's subspace over δ², (n,).
+
+        1 in expectation for draws from the prior.
+        """
+        flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
+        return self._metres.residual_variance(flat) / self.noise**2
+
+    def log_prior(self, positions: Array) -> Array:
+        """Return the normalised log density of positions: ``(…, L, J, 3) → (…)``."""
+        xp = array_namespace(positions)
+        check_shape("positions", positions, ("…", *self.means.shape[1:]))
+        return self._metres.log_density(
+            xp.reshape(positions, (*positions.shape[:-3], self._metres.dim))
+        )
+
+    def reduced(self) -> tuple[GaussianMixtureMotion, np.ndarray]:
+        """Return the same prior on the span of its scalar fields, and that span's basis.
+
+        Frames and joints enter only through the x, y and z fields of the means and factors; on
+        their span everything that is linear and treats all entries alike (turning, orthographic
+        projection, triangulation, isotropic noise) is unchanged.
+
+        Returns
+        -------
+        prior : GaussianMixtureMotion
+            One frame of M anonymous "joints", M the span's dimension.
+        basis : ndarray, (L·J, M)
+            Orthonormal; a motion's coordinates are ``basis.T @ motion.reshape(-1, 3)``.
+        """
+        K, L, J, _ = self.means.shape
+        fields = np.concatenate([self.means[:, None], self.factors], axis=1)
+        scalars = fields.reshape(K, 1 + self.rank, L * J, 3).transpose(2, 0, 1, 3)
+        basis, size, _ = np.linalg.svd(scalars.reshape(L * J, -1), full_matrices=False)
+        basis = basis[:, size > 1e-12 * size[0]]
+        M = basis.shape[1]
+        small = np.einsum("fm,kifc->kimc", basis, fields.reshape(K, 1 + self.rank, L * J, 3))
+        prior = GaussianMixtureMotion(
+            skeleton=Skeleton([f"field-{m}" for m in range(M)], [-1] * M),
+            fps=self.fps,
+            means=small[:, :1],
+            factors=small[:, 1:, None],
+            weights=self.weights,
+            noise=self.noise,
+            azimuths=self.azimuths,
+            styles=self.styles,
+            coordinates=self.coordinates,
+        )
+        # The unit is part of the denoiser's contract and must be the full prior's.
+        prior.__dict__["scale"] = self.scale
+        return prior, basis
+
+    @cached_property
+    def _metres(self) -> TurnedMixture:
+        fields = self.base_fields.reshape(*self.base_fields.shape[:3], -1)
+        return TurnedMixture(fields, self.yaws, self.weights, self.noise**2)
+
+    @cached_property
+    def _normalised(self) -> TurnedMixture:
+        fields = self.base_fields.reshape(*self.base_fields.shape[:3], -1) / self.scale
+        return TurnedMixture(fields, self.yaws, self.weights, (self.noise / self.scale) ** 2)
+
+    def _seen_by(self, cameras: Cameras, x_t: np.ndarray) -> list[TurnedMixture]:
+        """The 2D marginals of the V views, which are mixtures with the same weights."""
+        if not cameras.orthographic:
+            raise ValueError("cameras is perspective, expected orthographic cameras")
+        check_shape("x_t", x_t, ("B", cameras.n_views, *self.means.shape[1:3], 2))
+        return [self._view(axes) for axes in cameras.image_axes]
+
+    def _view(self, axes: np.ndarray) -> TurnedMixture:
+        key = axes.tobytes()
+        if key not in self._views:
+            image = (self.base_fields @ axes.T) / self.scale
+            fields = image.reshape(*image.shape[:3], -1)
+            variance = (self.noise / self.scale) ** 2
+            self._views[key] = TurnedMixture(fields, self.yaws, self.weights, variance)
+        return self._views[key]

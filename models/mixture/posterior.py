@@ -1,0 +1,247 @@
+"""The Gaussian-mixture prior after linear evidence with Gaussian noise: again a mixture.
+
+At one joint and frame the evidence about a position x is exp(−½ xᵀΛx + ηᵀx). With the small noise
+δ ε integrated out it is the same in m_k + W_k z with Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Turning
+enters through the three base fields of each mean and factor (``turned_mixture``), so that the Gram
+matrices of all K·A components come from K small ones.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant, logsumexp
+from probmotion.models.mixture.turned_mixture import turning_coefficients
+from probmotion.posteriors.protocols import Likelihood, NotConjugate
+from probmotion.seeds import RandomNumbers
+
+__all__ = ["MixturePosterior"]
+
+
+class MixturePosterior:
+    """p(X | y) for a turned Gaussian mixture; the prior itself where there is no evidence.
+
+    Parameters
+    ----------
+    base_fields : ndarray, (K, 1 + r, 3, F, 3)
+        Base fields of means and factors, metres; F = L·J.
+    yaws : ndarray, (A,)
+        Azimuths, radians.
+    weights : ndarray, (K,)
+        Probabilities of the styles.
+    noise : float
+        δ, metres.
+    shape : tuple
+        (L, J, 3).
+    likelihood : Likelihood or None
+        The evidence; it must offer ``linear()``.
+
+    Raises
+    ------
+    NotConjugate
+        If the likelihood is not linear in the positions with Gaussian noise.
+    """
+
+    def __init__(
+        self,
+        base_fields: np.ndarray,
+        yaws: np.ndarray,
+        weights: np.ndarray,
+        noise: float,
+        shape: tuple[int, ...],
+        likelihood: Likelihood | None,
+    ) -> None:
+        self.shape = shape
+        self.noise = noise
+        self._fields = base_fields
+        self._turns = turning_coefficients(yaws)
+        self._information, self._shift, constant_part = _evidence(likelihood, base_fields.shape[3])
+        variance = noise**2
+        self._shrink = np.linalg.inv(np.eye(3) + variance * self._information)
+        metric = self._shrink @ self._information
+        pull = np.einsum("fij,fj->fi", self._shrink, self._shift)
+        moved = np.einsum("fij,knefj->knefi", metric, base_fields)
+        gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, moved, optimize=True)
+        turns = self._turns
+        self._gram = np.einsum("kijcd,ac,ad->kaij", gram, turns, turns, optimize=True)
+        linear = np.einsum("fx,kicfx->kic", pull, base_fields, optimize=True)
+        self._linear = np.einsum("kic,ac->kai", linear, turns)
+        constant_part -= 0.5 * np.linalg.slogdet(np.linalg.inv(self._shrink))[1].sum()
+        constant_part += 0.5 * variance * float((self._shift * pull).sum())
+        log_weights = np.log(weights)[:, None] - math.log(len(yaws))
+        # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z
+        self._offset = (
+            log_weights + constant_part + self._linear[..., 0] - 0.5 * self._gram[..., 0, 0]
+        )
+        self._slope = self._linear[..., 1:] - self._gram[..., 0, 1:]
+        self._curvature = self._gram[..., 1:, 1:]
+
+    @cached_property
+    def _latent_precision(self) -> np.ndarray:
+        return np.eye(self._slope.shape[-1]) + self._curvature
+
+    @cached_property
+    def _latent_mean(self) -> np.ndarray:
+        return np.linalg.solve(self._latent_precision, self._slope[..., None])[..., 0]
+
+    @cached_property
+    def _latent_root(self) -> np.ndarray:
+        """C with C Cᵀ = Cov[z | y, k, a], (K, A, r, r): precision = L Lᵀ, so C = L⁻ᵀ."""
+        lower = np.linalg.cholesky(self._latent_precision)
+        return np.swapaxes(np.linalg.inv(lower), -1, -2)
+
+    @cached_property
+    def _noise_root(self) -> np.ndarray:
+        """Cholesky factor of S, the covariance of X / δ given m + W z and y, (F, 3, 3)."""
+        return np.linalg.cholesky(self._shrink)
+
+    @cached_property
+    def _log_joint(self) -> np.ndarray:
+        """log p(y, k, a), (K, A)."""
+        log_det = np.linalg.slogdet(self._latent_precision)[1]
+        return self._offset + 0.5 * ((self._slope * self._latent_mean).sum(axis=-1) - log_det)
+
+    @property
+    def log_evidence(self) -> float:
+        """log p(y)."""
+        return float(logsumexp(self._log_joint.reshape(-1)))
+
+    @property
+    def component_probabilities(self) -> np.ndarray:
+        """p(style k, azimuth a | y), (K, A)."""
+        return np.exp(self._log_joint - self.log_evidence)
+
+    def mean(self) -> np.ndarray:
+        """Return E[X | y], (L, J, 3), metres."""
+        weights = self.component_probabilities
+        latent = np.concatenate([np.ones((*weights.shape, 1)), self._latent_mean], axis=-1)
+        base = np.einsum("ka,kai,ac->kic", weights, latent, self._turns, optimize=True)
+        clean = np.einsum("kic,kicfx->fx", base, self._fields, optimize=True)
+        return self._given_clean(clean).reshape(self.shape)
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n independent draws, (n, L, J, 3), metres."""
+        probabilities = self.component_probabilities
+        chosen = rng.choice(probabilities.size, size=n, p=_normalised(probabilities.reshape(-1)))
+        style, azimuth = np.divmod(chosen, probabilities.shape[1])
+        unit = rng.standard_normal((n, self._slope.shape[-1]))
+        spread = (self._latent_root[style, azimuth] @ unit[..., None])[..., 0]
+        return self._motions(rng, style, azimuth, self._latent_mean[style, azimuth] + spread)
+
+    def complete(self, rng: RandomNumbers, latent: np.ndarray) -> np.ndarray:
+        """Return one draw of p(X | z, y) per z: ``(n, r) → (n, L, J, 3)``, metres."""
+        logits = np.asarray(self._log_terms(latent))
+        logits = logits - logits.max(axis=-1, keepdims=True)
+        cumulative = np.cumsum(np.exp(logits), axis=-1)
+        level = rng.random((len(latent), 1)) * cumulative[:, -1:]
+        chosen = (cumulative < level).sum(axis=-1)
+        style, azimuth = np.divmod(chosen, self._offset.shape[1])
+        return self._motions(rng, style, azimuth, latent)
+
+    def log_likelihood(self, latent: Array) -> Array:
+        """Return log p(y | z), style, yaw and small noise integrated out: ``(…, r) → (…)``."""
+        return logsumexp(self._log_terms(latent))
+
+    def log_density(self, positions: Array) -> Array:
+        """Return the normalised log p(X | y): ``(…, L, J, 3) → (…)``, any array library."""
+        xp = array_namespace(positions)
+        K, width, _, F, _ = self._fields.shape
+        A = len(self._turns)
+        n = math.prod(positions.shape[:-3])
+        flat = xp.reshape(positions, (n, F, 3))
+        # Given (k, a), X is Gaussian with precision Q = Λ + I/δ² around the latent subspace.
+        centred = flat - constant(self._given_clean(np.zeros((F, 3))), flat)
+        precision = self._information + np.eye(3) / self.noise**2
+        weighted = xp.sum(constant(precision, flat) * centred[:, :, None, :], axis=-1)
+        square = xp.sum(weighted * centred, axis=(-2, -1))
+        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields)
+        products = xp.reshape(weighted, (n, F * 3)) @ constant(shrunk.reshape(-1, F * 3).T, flat)
+        turned = xp.reshape(products, (n, K, width, 3)) @ constant(self._turns.T, flat)
+        turned = xp.permute_dims(turned, (0, 1, 3, 2))
+        gram = self._clean_gram
+        slope = turned[..., 1:] - constant(gram[..., 0, 1:], flat)
+        slope = slope + constant(self._slope, flat)
+        total = self._latent_precision + gram[..., 1:, 1:]
+        half = constant(np.linalg.inv(np.linalg.cholesky(total)), flat)
+        latent = xp.sum(half * slope[..., None, :], axis=-1)
+        log_det = np.linalg.slogdet(total)[1]
+        offset = self._offset - self.log_evidence - 0.5 * (log_det + gram[..., 0, 0])
+        logits = turned[..., 0] + 0.5 * xp.sum(latent**2, axis=-1) + constant(offset, flat)
+        norm = F * 3 * math.log(2 * math.pi) - np.linalg.slogdet(precision)[1].sum()
+        value = logsumexp(xp.reshape(logits, (n, K * A))) - 0.5 * (square + float(norm))
+        return xp.reshape(value, positions.shape[:-3])
+
+    @cached_property
+    def _clean_gram(self) -> np.ndarray:
+        """Gram matrices of S·(mean, factors) under Q = Λ + I/δ², (K, A, 1 + r, 1 + r).
+
+        S Q S = S / δ², because S Q = I/δ².
+        """
+        moved = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields) / self.noise**2
+        gram = np.einsum("kicfx,kjdfx->kijcd", self._fields, moved, optimize=True)
+        return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
+
+    def _log_terms(self, latent: Array) -> Array:
+        """log π p(y | z, k, a), ``(…, r) → (…, K·A)``."""
+        xp = array_namespace(latent)
+        rank = self._slope.shape[-1]
+        batch = latent.shape[:-1]
+        n = math.prod(batch)
+        flat = xp.reshape(latent, (n, rank))
+        slope = constant(self._slope.reshape(-1, rank).T, flat)
+        curvature = constant(self._curvature.reshape(-1, rank * rank).T, flat)
+        square = xp.reshape(flat[:, :, None] * flat[:, None, :], (n, rank * rank))
+        offset = constant(self._offset.reshape(-1), flat)
+        terms = offset + flat @ slope - 0.5 * (square @ curvature)
+        return xp.reshape(terms, (*batch, terms.shape[-1]))
+
+    def _given_clean(self, clean: np.ndarray) -> np.ndarray:
+        """E[X | m + W z = clean, y] = S (clean + δ² η): ``(…, F, 3) → (…, F, 3)``."""
+        return np.einsum("fij,...fj->...fi", self._shrink, clean + self.noise**2 * self._shift)
+
+    def _motions(
+        self,
+        rng: RandomNumbers,
+        style: np.ndarray,
+        azimuth: np.ndarray,
+        latent: np.ndarray,
+    ) -> np.ndarray:
+        """Draw X given style, azimuth and z, (n, L, J, 3)."""
+        n = len(latent)
+        out = np.empty((n, *self._fields.shape[3:]))
+        for row in range(n):
+            weights = np.concatenate([[1.0], latent[row]])[:, None] * self._turns[azimuth[row]]
+            out[row] = np.tensordot(weights, self._fields[style[row]], axes=2)
+        noise = rng.standard_normal(out.shape)
+        spread = np.einsum("fij,nfj->nfi", self._noise_root, noise)
+        out = self._given_clean(out) + self.noise * spread
+        return out.reshape(n, *self.shape)
+
+
+def _evidence(likelihood: Likelihood | None, F: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Λ (F, 3, 3), η (F, 3) and the part of log p(y | X) that does not depend on X."""
+    if likelihood is None:
+        return np.zeros((F, 3, 3)), np.zeros((F, 3)), 0.0
+    linear = getattr(likelihood, "linear", None)
+    if linear is None:
+        raise NotConjugate(
+            f"the likelihood {type(likelihood).__name__} has no linear(), which leaves no closed "
+            "form"
+        )
+    axes, target, precision = linear()
+    M = axes.shape[1]
+    target = target.reshape(len(axes), F, M)
+    precision = precision.reshape(len(axes), F)
+    information = np.einsum("vf,vmi,vmj->fij", precision, axes, axes)
+    shift = np.einsum("vf,vmi,vfm->fi", precision, axes, target)
+    seen = precision > 0
+    log_norm = 0.5 * M * float(np.log(precision[seen] / (2 * math.pi)).sum())
+    energy = float((precision[..., None] * target**2).sum())
+    return information, shift, log_norm - 0.5 * energy
+
+
+def _normalised(probabilities: np.ndarray) -> np.ndarray:
+    return probabilities / probabilities.sum()

@@ -1,0 +1,5 @@
+"""The physical prior over pairs of poses: joint limits and penetration."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,320 @@
+"""Compiled: the walk over one person's bones that checks each and corrects it.
+
+Joints are in the order of ``person17``. A frame's columns are a body's left, up and forward axes;
+for bones of the right side the left axis is turned about, so that one table serves both sides and a
+mirrored pose is judged as its mirror image.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from probmotion.models.pose_pairs.joint_limits_frames import (
+    NO_LENGTH,
+    Frame,
+    Vector,
+    cell_of,
+    from_frame,
+    in_frame,
+    least_rotation,
+    line_frame,
+    product,
+    unit,
+)
+from probmotion.motion.skeleton import Skeleton
+
+__all__ = ["PARTS", "LimitArrays", "local_directions", "project_poses"]
+
+PARTS = ("hip", "knee", "ankle", "chest", "shoulder", "elbow", "wrist", "neck", "head")
+"""Bones that have a table, by the joint they end in; the two sides share one."""
+HIP, KNEE, ANKLE, CHEST, SHOULDER, ELBOW, WRIST, NECK, HEAD = range(9)
+
+# Joints of `person17`, and the last joint of what hangs from the spine.
+PELVIS, SPINE, CHEST_JOINT, NECK_JOINT, HEAD_JOINT = range(5)
+LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_HIP, RIGHT_HIP = 5, 8, 11, 14
+LAST_OF_TRUNK = 10
+N_JOINTS = 17
+_PARENTS = np.array(Skeleton.preset("person17").parents)
+
+_UP = (0.0, 1.0, 0.0)
+_BISECTIONS = 12
+
+
+class LimitArrays(NamedTuple):
+    """What the compiled walk reads of a table of limits.
+
+    ``allowed`` (parts, bins, cells) bool; ``bin_rings`` and ``cell_rings`` (rings, 2): how many
+    cells each ring has and the index of its first; ``centres`` (cells, 3); ``rest`` (parts, 3);
+    ``tilt``: sine of the largest sideways tilt of the spine against the hips.
+    """
+
+    allowed: np.ndarray
+    bin_rings: np.ndarray
+    cell_rings: np.ndarray
+    centres: np.ndarray
+    rest: np.ndarray
+    tilt: float
+
+
+@numba.njit(cache=True)
+def _row(rows: np.ndarray, number: int) -> Vector:
+    return (rows[number, 0], rows[number, 1], rows[number, 2])
+
+
+@numba.njit(cache=True)
+def _put(rows: np.ndarray, number: int, v: Vector) -> None:
+    rows[number, 0], rows[number, 1], rows[number, 2] = v
+
+
+@numba.njit(cache=True)
+def _mirrored(v: Vector) -> Vector:
+    return (-v[0], v[1], v[2])
+
+
+@numba.njit(cache=True)
+def _of_side(frame: Frame, side: int) -> Frame:
+    """Return the frame in which bones of the left side, 0, or of the right, 1, are judged."""
+    left, up, forward = frame
+    return frame if side == 0 else ((-left[0], -left[1], -left[2]), up, forward)
+
+
+@numba.njit(cache=True)
+def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
+    """Give a bone a new direction; bones up to ``last``, which hang from it, turn along."""
+    old = _row(directions, joint)
+    _put(directions, joint, new)
+    if old == NO_LENGTH:
+        return
+    turn = least_rotation(old, new)
+    for below in range(joint + 1, last + 1):
+        _put(directions, below, unit(from_frame(turn, _row(directions, below))))
+
+
+@numba.njit(cache=True)
+def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) -> Vector:
+    """Return where the way from ``u`` to the nearest allowed cell's centre enters allowed cells."""
+    best, closest = 0, -2.0
+    for cell in range(len(limits.centres)):
+        if limits.allowed[part, condition, cell]:
+            x, y, z = _row(limits.centres, cell)
+            c = u[0] * x + u[1] * y + u[2] * z
+            if c > closest:
+                best, closest = cell, c
+    centre = _row(limits.centres, best)
+    outside, inside = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (outside + inside)
+        between = _between(u, centre, middle)
+        cell = cell_of(between, limits.cell_rings)
+        if between != NO_LENGTH and limits.allowed[part, condition, cell]:
+            inside = middle
+        else:
+            outside = middle
+    return _between(u, centre, inside)
+
+
+@numba.njit(cache=True)
+def _between(a: Vector, b: Vector, share: float) -> Vector:
+    """Return the unit vector on the way from one to another."""
+    return unit(
+        (
+            (1.0 - share) * a[0] + share * b[0],
+            (1.0 - share) * a[1] + share * b[1],
+            (1.0 - share) * a[2] + share * b[2],
+        )
+    )
+
+
+@numba.njit(cache=True)
+def _check(
+    part: int,
+    joint: int,
+    last: int,
+    frame: Frame,
+    condition: Vector,
+    limits: LimitArrays,
+    correct: bool,
+    directions: np.ndarray,
+    valid: np.ndarray,
+    local: np.ndarray,
+) -> Vector:
+    """Judge one bone in ``frame`` given its condition; correct it where asked; return it there.
+
+    A bone without length is valid, and stands in its mean direction for what hangs from it.
+    """
+    direction = _row(directions, joint)
+    valid[joint] = True
+    if direction == NO_LENGTH:
+        u = _row(limits.rest, part)
+        _set_and_turn(directions, joint, from_frame(frame, u), last)
+    else:
+        u = in_frame(frame, direction)
+        met = cell_of(condition, limits.bin_rings)
+        valid[joint] = limits.allowed[part, met, cell_of(u, limits.cell_rings)]
+        if correct and not valid[joint]:
+            u = _nearest_allowed(u, part, met, limits)
+            _set_and_turn(directions, joint, from_frame(frame, u), last)
+    _put(local[joint], 0, condition)
+    _put(local[joint], 1, u)
+    return u
+
+
+@numba.njit(cache=True)
+def _walk_person(
+    limits: LimitArrays,
+    correct: bool,
+    directions: np.ndarray,
+    valid: np.ndarray,
+    local: np.ndarray,
+) -> None:
+    """Judge the 16 bones, each parent before its children, correcting ``directions`` in place.
+
+    ``local`` (17, 2, 3) gets each bone's condition and direction. The frame in which a bone is
+    judged depends on bones that are already right, and no correction changes a frame that was
+    used before it; therefore the result is valid throughout.
+    """
+    given = (limits, correct, directions, valid, local)
+    pelvis = line_frame(
+        _row(directions, LEFT_HIP), _row(directions, RIGHT_HIP), _row(directions, SPINE)
+    )
+    spine = _check_spine(pelvis, *given)
+
+    # In that frame the hips are mirror images of each other: one is judged, both are moved.
+    hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, *given)
+    valid[RIGHT_HIP] = valid[LEFT_HIP]
+    local[RIGHT_HIP] = local[LEFT_HIP]
+    if correct and not valid[LEFT_HIP]:
+        _set_and_turn(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
+    for side in range(2):
+        joint = LEFT_HIP if side == 0 else RIGHT_HIP
+        _limb(KNEE, joint, _of_side(pelvis, side), hip, *given)
+
+    trunk = product(pelvis, least_rotation(_UP, spine))
+    chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, *given)
+    below = product(trunk, least_rotation(_row(limits.rest, CHEST), chest))
+    for side in range(2):
+        joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
+        condition = chest if side == 0 else _mirrored(chest)
+        _check(SHOULDER, joint, joint + 2, _of_side(below, side), condition, *given)
+
+    # The line of the shoulders tells how the trunk is twisted, which its bones do not.
+    trunk = line_frame(
+        _row(directions, LEFT_SHOULDER),
+        _row(directions, RIGHT_SHOULDER),
+        _row(directions, CHEST_JOINT),
+    )
+    neck = _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, chest, *given)
+    below = product(trunk, least_rotation(_row(limits.rest, NECK), neck))
+    _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, *given)
+    for side in range(2):
+        joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
+        sided = _of_side(trunk, side)
+        _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), *given)
+
+
+@numba.njit(cache=True)
+def _check_spine(
+    pelvis: Frame,
+    limits: LimitArrays,
+    correct: bool,
+    directions: np.ndarray,
+    valid: np.ndarray,
+    local: np.ndarray,
+) -> Vector:
+    """Judge the spine; return it in the frame of the pelvis.
+
+    That frame holds the spine in its left-up plane: what is left to judge is one angle.
+    """
+    if _row(directions, SPINE) == NO_LENGTH:
+        _put(directions, SPINE, pelvis[1])
+    u = in_frame(pelvis, _row(directions, SPINE))
+    valid[SPINE] = abs(u[0]) <= limits.tilt
+    if correct and not valid[SPINE]:
+        # A hair inside, so that rounding does not undo it.
+        tilt = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
+        u = (tilt, np.sqrt(1.0 - tilt * tilt), 0.0)
+        _set_and_turn(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
+    _put(local[SPINE], 0, _UP)
+    _put(local[SPINE], 1, u)
+    return u
+
+
+@numba.njit(cache=True)
+def _limb(
+    part: int,
+    joint: int,
+    frame: Frame,
+    condition: Vector,
+    limits: LimitArrays,
+    correct: bool,
+    directions: np.ndarray,
+    valid: np.ndarray,
+    local: np.ndarray,
+) -> None:
+    """Judge the two bones that hang from ``joint``: thigh and shin, or upper arm and forearm."""
+    given = (limits, correct, directions, valid, local)
+    first = _check(part, joint + 1, joint + 2, frame, condition, *given)
+    below = product(frame, least_rotation(_row(limits.rest, part), first))
+    _check(part + 1, joint + 2, joint + 2, below, first, *given)
+
+
+@numba.njit(cache=True)
+def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
+    """Write each bone's unit vector; that of a bone without length is 0."""
+    for joint in range(1, N_JOINTS):
+        here, above = tree[joint], tree[_PARENTS[joint]]
+        bone = (
+            pose[here, 0] - pose[above, 0],
+            pose[here, 1] - pose[above, 1],
+            pose[here, 2] - pose[above, 2],
+        )
+        _put(directions, joint, unit(bone))
+
+
+@numba.njit(cache=True)
+def project_poses(
+    poses: np.ndarray, trees: np.ndarray, limits: LimitArrays
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which joints' bones are valid, (n, J), and the nearest valid poses, (n, J, 3).
+
+    ``trees`` (K, 17) are the joints of each person in the order of ``person17``.
+    """
+    n = len(poses)
+    nearest = poses.copy()
+    valid = np.ones(poses.shape[:2], dtype=np.bool_)
+    directions, before = np.zeros((N_JOINTS, 3)), np.zeros((N_JOINTS, 3))
+    judged, local = np.ones(N_JOINTS, dtype=np.bool_), np.zeros((N_JOINTS, 2, 3))
+    for pose in range(n):
+        for tree in trees:
+            _directions(poses[pose], tree, directions)
+            before[:] = directions
+            _walk_person(limits, True, directions, judged, local)
+            if judged.all():
+                continue
+            for joint in range(1, N_JOINTS):
+                here, above = tree[joint], tree[_PARENTS[joint]]
+                valid[pose, here] = judged[joint]
+                length = 0.0
+                for i in range(3):
+                    length += (poses[pose, here, i] - poses[pose, above, i]) ** 2
+                # What a bone adds is its turning alone, so that what is not turned is not rounded.
+                for i in range(3):
+                    turned = np.sqrt(length) * (directions[joint, i] - before[joint, i])
+                    moved = nearest[pose, above, i] - poses[pose, above, i]
+                    nearest[pose, here, i] = poses[pose, here, i] + moved + turned
+    return valid, nearest
+
+
+@numba.njit(cache=True)
+def local_directions(poses: np.ndarray, limits: LimitArrays) -> np.ndarray:
+    """Return each bone's condition and direction in its frame, (n, 17, 2, 3), uncorrected."""
+    local = np.zeros((len(poses), N_JOINTS, 2, 3))
+    directions, judged = np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.bool_)
+    tree = np.arange(N_JOINTS)
+    for pose in range(len(poses)):
+        _directions(poses[pose], tree, directions)
+        _walk_person(limits, False, directions, judged, local[pose])
+    return local

@@ -1,0 +1,173 @@
+"""The physical prior over poses of people who interact closely (Yin et al. 2018, eq. 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from probmotion.arrays import Array, to_numpy
+from probmotion.data.pair_sets import check_close_people
+from probmotion.models.pose_pairs.joint_limits import JointLimits
+from probmotion.models.pose_pairs.penetration import penetration_depth
+from probmotion.models.pose_pairs.pose_chart import PoseChart
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_positive, check_shape
+
+__all__ = ["PosePairPrior"]
+
+# Walkers of an ensemble that start at one pose start this far apart, so that no two are the same.
+_JITTER = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairPrior:
+    """f(Θ) = 0 with more than ``max_invalid`` invalid joint angles, else exp(−E(X(Θ))/2σ_p²).
+
+    ``E = ‖X − X̂‖² + w ρ²`` (eq. 2): X̂ is the nearest pose within the joint limits, ρ the sum of
+    penetration depths, both in metres. The density is relative to uniform turns and directions,
+    normal bone lengths and places (:meth:`PoseChart.log_measure`): the published prior says
+    nothing of where the pair stands or how long its bones are, and alone would not be a density.
+    It is known up to a constant.
+
+    Parameters
+    ----------
+    seed : ndarray, (J, 3) or (S, J, 3)
+        The pose that θ = 0 stands for, metres; with S poses the first, and all are where chains
+        start.
+    skeleton : Skeleton
+        Its J joints, with bone radii: K trees.
+    fps : float
+        Frames per second of the motion that the poses are from.
+    limits : JointLimits, optional
+        What joints can do; the table that is shipped by default.
+    penetration_weight : float
+        w.
+    position_noise : float
+        σ_p, metres.
+    max_invalid : int
+        Most joint angles beyond the limits.
+    bone_noise, root_noise : float
+        See :class:`~probmotion.models.pose_pairs.pose_chart.PoseChart`.
+
+    Raises
+    ------
+    ValueError
+        If a seed is not of people in metres within reach of each other, or is outside the prior's
+        support; the message names the joints.
+    """
+
+    seed: np.ndarray
+    skeleton: Skeleton
+    fps: float = 30.0
+    limits: JointLimits | None = None
+    penetration_weight: float = 10.0
+    position_noise: float = 0.05
+    max_invalid: int = 8
+    bone_noise: float = 0.05
+    root_noise: float = 1.0
+    chart: PoseChart = field(init=False, repr=False)
+    joint_limits: JointLimits = field(init=False, repr=False)
+
+    frames = 1
+    differentiable = False
+
+    def __post_init__(self) -> None:
+        check_positive("fps", self.fps)
+        check_positive("penetration_weight", self.penetration_weight)
+        check_positive("position_noise", self.position_noise)
+        check_count("max_invalid", self.max_invalid, least=0)
+        poses = np.asarray(self.seed, dtype=np.float64)
+        poses = poses[None] if poses.ndim == 2 else poses
+        check_shape("seed", poses, ("S", self.skeleton.n_joints, 3))
+        if len(poses) == 0:
+            raise ValueError("seed has no pose, expected at least one")
+        if self.skeleton.radii is None:
+            raise ValueError("skeleton has no bone radii, expected one per joint for penetration")
+        for number, pose in enumerate(poses):
+            check_close_people(f"seed {number}", pose, self.skeleton)
+        chart = PoseChart(poses[0], self.skeleton, self.bone_noise, self.root_noise)
+        limits = JointLimits.shipped() if self.limits is None else self.limits
+        object.__setattr__(self, "joint_limits", limits.on(self.skeleton))
+        object.__setattr__(self, "chart", chart)
+        object.__setattr__(self, "seed", poses)
+        for number, pose in enumerate(poses):
+            invalid = self.invalid_joints(pose)
+            if len(invalid) > self.max_invalid:
+                raise ValueError(
+                    f"seed {number} has {len(invalid)} joint angles beyond the limits "
+                    f"({', '.join(invalid)}), expected at most max_invalid={self.max_invalid}"
+                )
+
+    @property
+    def dim(self) -> int:
+        """6 K + 3 (J − K): 108 for two people of 17 joints."""
+        return self.chart.dim
+
+    def motion(self, theta: Array) -> Array:
+        """Return the pose at θ as a motion of one frame: ``(…, dim) → (…, 1, J, 3)``, metres."""
+        return self.chart.positions(theta)[..., None, :, :]
+
+    def coordinates(self, poses: np.ndarray) -> np.ndarray:
+        """Return a θ of each pose: ``(…, J, 3) → (…, dim)``; for ``initial=`` of a sampler."""
+        return self.chart.coordinates(poses)
+
+    def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n points to start at, (n, dim): seeds in turn, a millimetre off."""
+        chosen = self.seed_coordinates()[np.arange(n) % len(self.seed)]
+        return chosen + _JITTER * rng.standard_normal((n, self.dim))
+
+    def seed_coordinates(self) -> np.ndarray:
+        """Return θ of the seeds, (S, dim)."""
+        return self.chart.coordinates(self.seed)
+
+    def log_density(self, theta: Array) -> np.ndarray:
+        """Return log f(Θ) with the measure it is relative to, up to a constant: NumPy arrays.
+
+        ``(…, dim) → (…)``; −∞ outside the support.
+        """
+        theta = to_numpy(theta)
+        log_measure = self.log_measure(theta)
+        flat = theta.reshape(-1, self.dim)
+        # A bone can be longer than any number.
+        with np.errstate(over="ignore", invalid="ignore"):
+            positions = self.motion(flat)
+        inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
+        log_f = np.full(len(flat), -np.inf)
+        log_f[inside] = self.log_plausibility(positions[inside])
+        return np.where(log_f > -np.inf, log_measure.reshape(-1), 0.0).reshape(
+            log_measure.shape
+        ) + log_f.reshape(log_measure.shape)
+
+    def log_measure(self, theta: Array) -> np.ndarray:
+        """Return the log density of the measure that f is relative to: ``(…, dim) → (…)``."""
+        return self.chart.log_measure(theta)
+
+    def log_plausibility(self, positions: Array) -> np.ndarray:
+        """Return log f of poses (eq. 2): ``(…, 1, J, 3) → (…)``; 0 at most."""
+        positions = to_numpy(positions)
+        check_shape("positions", positions, ("…", 1, self.skeleton.n_joints, 3))
+        poses = np.ascontiguousarray(positions.reshape(-1, self.skeleton.n_joints, 3))
+        valid, nearest = self.joint_limits.project(poses)
+        apart = ((poses - nearest) ** 2).sum(axis=(-2, -1))
+        energy = apart + self.penetration_weight * penetration_depth(poses, self.skeleton) ** 2
+        allowed = (~valid).sum(axis=-1) <= self.max_invalid
+        log_f = np.where(allowed, -0.5 * energy / self.position_noise**2, -np.inf)
+        return log_f.reshape(positions.shape[:-3])
+
+    def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
+        """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
+
+        ``joint_speeds`` holds the squared turns, radians², and stretches, metres², of joints.
+        """
+        return self.chart.speeds(joint_speeds[..., 0], joint_speeds[..., 1])
+
+    def invalid_joints(self, pose: np.ndarray) -> list[str]:
+        """Return the joints of a pose (J, 3) whose bones are beyond the limits, by name."""
+        valid, _ = self.joint_limits.project(np.asarray(pose, dtype=np.float64)[None])
+        ends = [joint for joint, _ in self.skeleton.bones]
+        return [
+            self.skeleton.joint_names[joint]
+            for joint, fine in zip(ends, valid[0], strict=True)
+            if not fine
+        ]

@@ -1,0 +1,152 @@
+"""Enhanced lifting: each person of a 2D pair alone, with joint limits (Yin et al. 2018, figure 10).
+
+The baseline that knows nothing of other people. From a seed's pose it bends the joints until they
+project onto the annotation, with the seed's bone lengths kept, and pulls the bones into their
+limits:
+
+    E = Σ_visible ‖x_j − p_j‖² + w_v ‖X − X̂‖² + w_s Σ ‖α‖²
+
+with x the orthographic picture of the pose X, X̂ the nearest valid pose to X, and α how far each
+joint is bent from the seed, which decides what no visible joint does. X̂ is found anew after each
+minimisation over X (alternating projections). Nothing is random.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from probmotion.interaction.annotations.views import image_axes, pair_frames
+from probmotion.interaction.geometry.coordinates import align_rigidly
+from probmotion.models.pose_pairs.joint_limits import JointLimits
+from probmotion.models.pose_pairs.pose_chart import PoseChart
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
+
+__all__ = ["lift_people"]
+
+_STEP = 1e-5
+"""Of central differences, radians and metres."""
+
+
+def lift_people(
+    keypoints: np.ndarray,
+    visible: np.ndarray,
+    seed: np.ndarray,
+    skeleton: Skeleton,
+    view: np.ndarray,
+    *,
+    limits: JointLimits | None = None,
+    validity_weight: float = 0.01,
+    seed_weight: float = 1e-3,
+    rounds: int = 4,
+) -> np.ndarray:
+    """Return the 3D pose-pair of a 2D one, each person lifted alone.
+
+    Parameters
+    ----------
+    keypoints : ndarray, (J, 2)
+        2D pair, metres, x right, y up; hidden joints are never read.
+    visible : ndarray of bool, (J,)
+        Which are annotated; at least two.
+    seed : ndarray, (J, 3)
+        Where the search starts, metres; its bone lengths are kept.
+    skeleton : Skeleton
+        The J joints; every tree has the joints of ``person17``.
+    view : ndarray, (2,)
+        View (φ, θ) of the annotation in the pair's own frame, known or estimated: from there the
+        seed is looked at first.
+    limits : JointLimits, optional
+        Those that come with the package by default.
+    validity_weight : float
+        w_v. Greater ones made hidden joints of real dances worse, not better.
+    seed_weight : float
+        w_s, m² per square radian.
+    rounds : int
+        Minimisations over X; X̂ is that of the one before.
+
+    Returns
+    -------
+    positions : ndarray, (J, 3)
+        Metres in the annotation's axes: right, up, towards the viewer. Each person's depth is the
+        seed's, as no orthographic picture tells it.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, a visible value is not finite, or fewer than two joints are visible.
+    """
+    n_joints = skeleton.n_joints
+    check_shape("keypoints", keypoints, (n_joints, 2))
+    check_shape("visible", visible, (n_joints,))
+    check_shape("seed", seed, (n_joints, 3))
+    check_shape("view", view, (2,))
+    for name, weight in (("validity_weight", validity_weight), ("seed_weight", seed_weight)):
+        check_positive(name, weight)
+    check_count("rounds", rounds)
+    visible = np.asarray(visible, dtype=bool)
+    if visible.sum() < 2:
+        raise ValueError(f"visible has {visible.sum()} joints, expected at least 2")
+    keypoints = np.where(visible[:, None], keypoints, 0.0)
+    check_finite("keypoints", keypoints)
+    limits = JointLimits.shipped() if limits is None else limits
+    positions = _seen_from(np.asarray(seed, dtype=np.float64), keypoints, visible, skeleton, view)
+    for root in skeleton.roots:
+        joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
+        person = skeleton.subset(joints)
+        lifting = _Lifting(PoseChart(positions[joints], person), keypoints[joints], visible[joints])
+        positions[joints] = lifting.solve(
+            limits.on(person), validity_weight**0.5, seed_weight**0.5, rounds
+        )
+    return positions
+
+
+def _seen_from(
+    seed: np.ndarray,
+    keypoints: np.ndarray,
+    visible: np.ndarray,
+    skeleton: Skeleton,
+    view: np.ndarray,
+) -> np.ndarray:
+    """Return the seed in the axes of the picture, moved in its plane onto the visible joints."""
+    right, up = image_axes(pair_frames(seed[None], skeleton), np.asarray(view)[None])[0, :, 0].T
+    turned = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
+    moved = align_rigidly(turned[:, :2], keypoints, visible)
+    return np.concatenate([moved, turned[:, 2:]], axis=-1)
+
+
+class _Lifting:
+    """Least squares over the angles and the place of one person, whose bones keep their lengths."""
+
+    def __init__(self, chart: PoseChart, keypoints: np.ndarray, visible: np.ndarray) -> None:
+        self.chart, self.keypoints, self.visible = chart, keypoints, visible
+        # θ: the root's turn (3) and place (3), then two angles and a log length per bone.
+        kept = [5, *range(6 + 2, chart.dim, 3)]
+        self.free = np.delete(np.arange(chart.dim), kept)
+
+    def solve(
+        self, limits: JointLimits, validity: float, closeness: float, rounds: int
+    ) -> np.ndarray:
+        """Return the person's pose, (J, 3)."""
+        point = np.zeros(len(self.free))
+        for _ in range(rounds):
+            valid = limits.nearest_valid(self.positions(point))
+
+            def residuals(at: np.ndarray, valid: np.ndarray = valid) -> np.ndarray:
+                pose = self.positions(at)
+                apart = (pose[..., :2] - self.keypoints)[..., self.visible, :]
+                parts = (apart, validity * (pose - valid), closeness * at[..., 5:])
+                return np.concatenate([p.reshape(*at.shape[:-1], -1) for p in parts], axis=-1)
+
+            def slopes(at: np.ndarray) -> np.ndarray:
+                steps = _STEP * np.eye(len(at))
+                return ((residuals(at + steps) - residuals(at - steps)) / (2 * _STEP)).T
+
+            point = least_squares(residuals, point, slopes, method="lm", xtol=1e-9, ftol=1e-9).x
+        return self.positions(point)
+
+    def positions(self, point: np.ndarray) -> np.ndarray:
+        """Return poses in the picture's axes: ``(…, free) → (…, J, 3)``."""
+        theta = np.zeros((*point.shape[:-1], self.chart.dim))
+        theta[..., self.free] = point
+        return self.chart.positions(theta)

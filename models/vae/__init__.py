@@ -1,0 +1,5 @@
+"""The motion VAE learnt from 2D tracks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

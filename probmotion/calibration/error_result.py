@@ -1,0 +1,185 @@
+"""`BiasBudget`: the parts of a sampler's error, with their intervals."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from probmotion.calibration.error_measures import MEASURES
+from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.files import written_whole
+from probmotion.metrics.intervals import t_interval
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["BiasBudget", "KeptValues"]
+
+_FLOOR, _WHOLE = "floor", "whole"
+
+
+class BiasBudget:
+    """The parts of a sampler's error on one problem at one setting.
+
+    Parameters
+    ----------
+    setting : str
+        What it is called.
+    values : mapping of str to sequence of mapping
+        What was measured, by sampler in the chain's order, exact draws first, then by seed. Each
+        sampler is called by the part that it adds.
+    notes : sequence of str
+        Which parts are absent, and why.
+    """
+
+    def __init__(
+        self,
+        setting: str,
+        values: Mapping[str, Sequence[Mapping[str, float]]],
+        notes: Sequence[str] = (),
+    ) -> None:
+        self.setting = setting
+        self.notes = list(notes)
+        self.chain, *self.parts = values
+        first = values[self.chain][0]
+        self.values = {
+            measure: {
+                link: np.array([found[measure] for found in by_seed])
+                for link, by_seed in values.items()
+            }
+            for measure in MEASURES
+            if measure in first
+        }
+
+    def differences(self, measure: str) -> dict[str, np.ndarray]:
+        """Return each part seed by seed, (seeds,); they add up to the whole.
+
+        Raises
+        ------
+        ValueError
+            If it was not measured; the message lists what was.
+        """
+        if measure not in self.values:
+            raise ValueError(f"measure is {measure!r}, expected one of {', '.join(self.values)}")
+        links = list(self.values[measure].items())
+        return {part: after - before for (_, before), (part, after) in itertools.pairwise(links)}
+
+    def table(self) -> pd.DataFrame:
+        """Return the tidy table: setting, measure, part, mean, low, high.
+
+        A row per part; before them ``floor``, what is measured of exact draws, and after them
+        ``whole``, the sum of the parts. ``low`` to ``high`` is a 95 % interval of the mean over
+        seeds: a part whose interval holds 0 is not told from chance. Each interval is for itself:
+        of twenty parts that are nothing, one is told from chance.
+        """
+        import pandas as pd
+
+        rows = []
+        for measure, by_link in self.values.items():
+            parts = self.differences(measure)
+            whole = np.sum(list(parts.values()), axis=0)
+            for part, values in {_FLOOR: by_link[self.chain], **parts, _WHOLE: whole}.items():
+                rows.append(
+                    (self.setting, measure, part, float(values.mean()), *t_interval(values))
+                )
+        return pd.DataFrame(rows, columns=["setting", "measure", "part", "mean", "low", "high"])
+
+    @property
+    def findings(self) -> list[str]:
+        """A sentence per measure: the parts that are told from chance, the largest first."""
+        sentences = []
+        table = self.table().set_index(["measure", "part"])
+        for measure in self.values:
+            rows = {part: table.loc[(measure, part)] for part in [*self.parts, _WHOLE]}
+            told = {part: row for part, row in rows.items() if row["low"] > 0 or row["high"] < 0}
+            whole = told.pop(_WHOLE, None)
+            rows.pop(_WHOLE)
+            ordered = sorted(told, key=lambda part: -abs(told[part]["mean"]))
+            listed = [f"{part} {_in_words(told[part])}" for part in ordered]
+            quiet = [part for part in rows if part not in told]
+            words = f"{measure}: "
+            words += (
+                f"{_in_words(whole)} in all"
+                if whole is not None
+                else "in all not told from exact draws"
+            )
+            if listed:
+                words += f"; {', '.join(listed)}"
+            if quiet:
+                words += f"; not told from chance: {', '.join(quiet)}"
+            sentences.append(words)
+        return sentences
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw the parts, stacked from exact draws' floor, a panel per measure; return where.
+
+        Raises
+        ------
+        ValueError
+            If the path does not end in ``.png``.
+        """
+        from probmotion.plots.error_plots import draw_budget
+
+        draw_budget(self.table(), path, words=MEASURES, notes=self.notes)
+        return Path(path)
+
+    def write(self, path: str | Path) -> None:
+        """Write the table as CSV."""
+        with written_whole(Path(path)) as unfinished:
+            self.table().to_csv(unfinished, index=False)
+
+
+class KeptValues:
+    """What was measured of each sampler and seed, kept in a folder if there is one.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where ``bias_budget.json`` is; it is made.
+    question : object
+        What was asked for: what is kept answers no other question.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds the answer to another.
+    OSError
+        If it cannot be written to.
+    """
+
+    def __init__(self, folder: Path | None, question: Any) -> None:
+        self.path = None if folder is None else folder / "bias_budget.json"
+        self.question = fingerprint(question)
+        self._values: dict[str, dict[str, float]] = {}
+        if self.path is None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            kept = json.loads(self.path.read_text(encoding="utf-8"))
+            if kept["question"] != self.question:
+                raise ValueError(
+                    f"out is {str(folder)!r}, which holds another budget, expected a new folder"
+                )
+            self._values = kept["values"]
+
+    def get(self, name: str, seed: int) -> dict[str, float] | None:
+        """Return what was measured, if it was."""
+        return self._values.get(f"{name} {seed}")
+
+    def put(self, name: str, seed: int, values: dict[str, float]) -> None:
+        """Keep what was measured."""
+        self._values[f"{name} {seed}"] = values
+        if self.path is None:
+            return
+        text = json.dumps({"question": self.question, "values": self._values}, indent=1)
+        with written_whole(self.path) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+
+
+def _in_words(row: Any) -> str:
+    return f"{row['mean']:+.3g} ({row['low']:+.3g} to {row['high']:+.3g})"

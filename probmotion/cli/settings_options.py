@@ -1,0 +1,211 @@
+"""Samplers' settings as command-line options, made from their dataclasses.
+
+A setting that is a number or a word is an option of its own. One that is an object (a guidance, a
+proposal) is written as in Python: ``DPS`` or ``DPS(strength=0.5)``.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import types
+from collections.abc import Iterable
+from dataclasses import field, fields, is_dataclass, make_dataclass
+from functools import partial
+from inspect import Parameter, signature
+from keyword import iskeyword
+from typing import TYPE_CHECKING, Any, Union, get_args
+
+from probmotion.posteriors.sampling import (
+    default_sampler,
+    importable_samplers,
+    load_sampler,
+    sampler_names,
+)
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+__all__ = [
+    "object_from_text",
+    "objects_as_words",
+    "option_name",
+    "presets_of",
+    "sampler_called",
+    "settings_of_samplers",
+    "text_of_object",
+]
+
+
+def option_name(sampler: str) -> str:
+    """Return the field of a sampler's settings: its name as an identifier."""
+    name = re.sub(r"\W", "_", sampler)
+    return name if name.isidentifier() and not iskeyword(name) else f"sampler_{name}"
+
+
+def settings_of_samplers(quick: bool = False) -> type[Any]:
+    """Return a dataclass with one field per registered sampler: its settings.
+
+    Parameters
+    ----------
+    quick : bool
+        Whether they begin from :data:`probmotion.comparison.QUICK` rather than the defaults.
+    """
+    begin = {}
+    if quick:
+        from probmotion.comparison.quick import quick_samplers
+
+        begin = quick_samplers()
+    entries: dict[str, tuple[type, Any]] = {}
+    for name, kind in importable_samplers().items():
+        default = partial(_same, begin[name]) if quick else kind
+        # Of two that other packages call nearly alike, the first has options.
+        entries.setdefault(option_name(name), (kind, field(default_factory=default)))
+    settings = make_dataclass(
+        "Settings", [(name, *entry) for name, entry in entries.items()], frozen=True
+    )
+    settings.__doc__ = "Settings of the samplers."
+    return settings
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def presets_of(kind: type) -> list[str]:
+    """Return the names of a sampler's presets: class methods that need no argument."""
+    return [
+        name
+        for name, held in vars(kind).items()
+        if isinstance(held, classmethod)
+        and not name.startswith("_")
+        and all(
+            parameter.default is not Parameter.empty
+            for parameter in signature(getattr(kind, name)).parameters.values()
+        )
+    ]
+
+
+def sampler_called(name: str, settings: Any) -> Any:
+    """Return the sampler ``name`` with its settings, or the preset ``sampler.preset``.
+
+    Parameters
+    ----------
+    name : str
+        A registered sampler, or one and a preset of its, such as ``"mas.reference_code"``.
+    settings : object
+        An instance of :func:`settings_of_samplers`'s class.
+
+    Raises
+    ------
+    ValueError
+        If there is no such sampler or preset, with the known ones, or it has no defaults.
+    """
+    # Others may have a point in their names.
+    base, _, preset = (name, "", "") if name in sampler_names() else name.partition(".")
+    kind = load_sampler(base)
+    if not preset:
+        given = getattr(settings, option_name(base), None)
+        return given if type(given) is kind else default_sampler(base)
+    known = presets_of(kind)
+    if preset not in known:
+        names = ", ".join(f"{base}.{one}" for one in known) or f"{base} alone, which has no presets"
+        raise ValueError(f"sampler is {name!r}, expected {names}")
+    return getattr(kind, preset)()
+
+
+def objects_as_words() -> ConstructorRegistry:
+    """Return tyro's rules for settings that are one of several dataclasses."""
+    from tyro.constructors import ConstructorRegistry
+
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_rule)
+    return registry
+
+
+def _rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    kinds = _kinds(info.type)
+    if not kinds:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="|".join(kind.__name__ for kind in kinds),
+        instance_from_str=lambda words: object_from_text(words[0], kinds),
+        is_instance=lambda value: isinstance(value, tuple(kinds)),
+        str_from_instance=lambda value: [text_of_object(value)],
+    )
+
+
+def _kinds(annotation: Any) -> list[type]:
+    """Return the dataclasses that an annotation stands for: those of a union, or of a protocol."""
+    if isinstance(annotation, types.UnionType) or getattr(annotation, "__origin__", None) is Union:
+        kinds = list(get_args(annotation))
+        return kinds if all(is_dataclass(kind) for kind in kinds) else []
+    if getattr(annotation, "_is_protocol", False):
+        public = vars(sys.modules[annotation.__module__])
+        named = [public[name] for name in public.get("__all__", [])]
+        return [kind for kind in named if isinstance(kind, type) and is_dataclass(kind)]
+    return []
+
+
+def object_from_text(text: str, kinds: Iterable[type]) -> Any:
+    """Return the object that ``text`` writes, such as ``"DPS"`` or ``"DPS(strength=0.5)"``.
+
+    Only the names in ``kinds`` and literal values are understood; nothing is evaluated.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such expression, or a name or setting is unknown; the message lists the
+        known ones.
+    """
+    known = {kind.__name__: kind for kind in kinds}
+    try:
+        built = _build(ast.parse(text.strip(), mode="eval").body, known)
+    except SyntaxError:
+        built = None
+    if type(built) not in known.values():
+        raise ValueError(
+            f"{text!r} is not an object, expected one of {', '.join(known)}, with settings in "
+            "parentheses such as Name(setting=1)"
+        )
+    return built
+
+
+def _build(tree: ast.expr, known: dict[str, type]) -> Any:
+    name = tree.func if isinstance(tree, ast.Call) else tree
+    if not isinstance(name, ast.Name):
+        return ast.literal_eval(tree)
+    if name.id not in known:
+        raise ValueError(f"{name.id!r} is unknown, expected one of {', '.join(known)}")
+    kind: Any = known[name.id]
+    if not isinstance(tree, ast.Call):
+        return kind()
+    settings = [entry.name for entry in fields(kind) if entry.init]
+    for keyword in tree.keywords:
+        if keyword.arg not in settings:
+            raise ValueError(
+                f"{name.id} has no setting {keyword.arg!r}, expected one of {', '.join(settings)}"
+            )
+    return kind(
+        *(_build(value, known) for value in tree.args),
+        **{str(keyword.arg): _build(keyword.value, known) for keyword in tree.keywords},
+    )
+
+
+def text_of_object(value: Any) -> str:
+    """Return the text that :func:`object_from_text` reads as ``value``; defaults are left out."""
+    changed = [
+        f"{entry.name}={_text(getattr(value, entry.name))}"
+        for entry in fields(value)
+        if entry.init and getattr(value, entry.name) != entry.default
+    ]
+    name = type(value).__name__
+    return f"{name}({', '.join(changed)})" if changed else name
+
+
+def _text(value: Any) -> str:
+    return text_of_object(value) if is_dataclass(value) else repr(value)

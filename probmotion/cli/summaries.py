@@ -1,0 +1,265 @@
+"""What is in a file: a few lines of words, and a picture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probmotion.cli.training_options import listed
+from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.draws import MotionDraws
+
+__all__ = ["Summary", "kind_of_network", "summarise"]
+
+
+_MODEL = "model.safetensors"
+_LOSSES = ("loss", "validation_loss")
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """A file's content in words, and motions of it to look at.
+
+    Parameters
+    ----------
+    text : str
+        A few lines.
+    skeleton : Skeleton
+        The J joints.
+    motions : ndarray, (n, L, J, 3)
+        What to draw, metres; n is 0 where there is no 3D motion.
+    label : str
+        What to call them.
+    """
+
+    text: str
+    skeleton: Skeleton
+    motions: np.ndarray
+    label: str
+
+    def draw(self, path: Path) -> None:
+        """Write a picture of the motions.
+
+        Raises
+        ------
+        ValueError
+            If there is no 3D motion to draw.
+        """
+        from probmotion.plots.skeletons import draw_skeletons
+
+        if not len(self.motions):
+            raise ValueError("picture is given, but the file holds no 3D motion; expected one")
+        sided = bool(self.skeleton.mirrored_pairs)
+        draw_skeletons(
+            {self.label: self.motions},
+            self.skeleton,
+            path,
+            moments=8 if len(self.motions) == 1 else 5,
+            heading=np.pi / 3 if sided else None,
+        )
+
+
+def summarise(path: Path, fps: float | None = None, skeleton: str | None = None) -> Summary:
+    """Return a summary of a file of motion, keypoints or draws, or of a trained network.
+
+    Parameters
+    ----------
+    path : Path
+        The file; of a network also the folder of its training run.
+    fps : float, optional
+        Frames per second of keypoints in JSON or a table, which do not hold it.
+    skeleton : str, optional
+        Preset that keypoints in JSON are of, where their number does not tell, or whose joints
+        are taken from a table.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is none of these, or is damaged.
+    FileNotFoundError
+        If there is no such file.
+    """
+    if path.suffix == ".nc":
+        return _of_draws(path, MotionDraws.load(path))
+    if path.suffix == ".safetensors":
+        return _of_checkpoint(path)
+    if (path / _MODEL).is_file():
+        return _of_checkpoint(path / _MODEL)
+    if _holds_keypoints(path):
+        from probmotion.io.files import read_keypoints
+
+        return _of_tracks(path, read_keypoints(path, fps, skeleton))
+    from probmotion.io.files import read_motion
+
+    return _of_motion(path, read_motion(path))
+
+
+def kind_of_network(path: Path) -> str:
+    """Return the kind of the trained network in a file, or in the folder of its training run.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no checkpoint.
+    FileNotFoundError
+        If there is no such file.
+    """
+    file = path / _MODEL if path.is_dir() else path
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"there is no network {file}, expected a file, the folder of a training run or the "
+            "name of one in the package"
+        )
+    return str(_header(file)["kind"])
+
+
+def _holds_keypoints(path: Path) -> bool:
+    if path.suffix == ".npz":
+        from zipfile import BadZipFile, ZipFile
+
+        try:
+            with ZipFile(path) as archive:
+                names = archive.namelist()
+        except BadZipFile:
+            return False
+        return "keypoints.npy" in names and "positions.npy" not in names
+    return path.suffix.lower() in (".json", ".csv", ".h5", ".hdf5") or path.is_dir()
+
+
+def _of_motion(path: Path, motion: Motion) -> Summary:
+    size = motion.positions.reshape(-1, 3)
+    low, high = size.min(axis=0), size.max(axis=0)
+    root = motion.positions[:, motion.skeleton.roots[0]]
+    walked = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
+    text = [
+        f"{path}: a motion",
+        _length(motion.frames, motion.fps),
+        _joints(motion.skeleton),
+        f"  height {low[1]:.2f} to {high[1]:.2f} m; the root travels {walked:.2f} m over ground",
+        f"  local rotations: {'yes' if motion.rotations is not None else 'no'}",
+    ]
+    return Summary("\n".join(text), motion.skeleton, motion.positions[None], motion.name)
+
+
+def _of_tracks(path: Path, tracks: list[KeypointTrack]) -> Summary:
+    count = f"{len(tracks)} keypoint track{'s' if len(tracks) != 1 else ''}"
+    text = [f"{path}: {count}"]
+    for track in tracks:
+        seen = (track.confidence > 0).mean()
+        text += [f"  {track.name}:", _length(track.frames, track.fps), f"  {seen:.0%} seen"]
+    skeleton = tracks[0].skeleton
+    text.append(_joints(skeleton))
+    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+
+
+def _of_draws(path: Path, draws: MotionDraws) -> Summary:
+    attributes, sizes = draws.dataset.attrs, draws.dataset.sizes
+    sampler = str(attributes["sampler"])
+    evaluations = ", ".join(f"{n} {kind}" for kind, n in draws.counts.items()) or "none counted"
+    text = [
+        f"{path}: draws of {sampler}",
+        f"  {sizes['chain']} x {sizes['draw']} (chains x draws), seed {attributes['seed']}, "
+        f"{draws.seconds:.1f} s",
+        _length(sizes["frame"], draws.fps),
+        _joints(draws.skeleton),
+        f"  evaluations: {evaluations}",
+        f"  settings: {attributes['settings']}",
+    ]
+    return Summary("\n".join(text), draws.skeleton, draws.flat()[:4], sampler)
+
+
+def _of_checkpoint(path: Path) -> Summary:
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    header = _header(path)
+    try:
+        kind, card = header["kind"], header["settings"]
+        # A denoiser has the joints and the size of the prior that it was trained beside.
+        network = card["network"].get("prior", card["network"])
+        skeleton = Skeleton(network["joint_names"], network["parents"])
+        shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
+        text = [
+            f"{path}: a {kind} of {header['numbers']} numbers",
+            f"  {shape}",
+            _joints(skeleton),
+            *_learnt_from(kind, card["network"]),
+            _progress(card),
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise _no_checkpoint(path) from error
+    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint's file says of itself, with the number of its ``numbers``."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})["probmotion"])
+            sizes = [np.prod(file.get_slice(name).get_shape()) for name in file.keys()]  # noqa: SIM118
+        return {"kind": header["kind"], **header, "numbers": sum(map(int, sizes))}
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise _no_checkpoint(path) from error
+
+
+def _no_checkpoint(path: Path) -> ValueError:
+    from probmotion.io.errors import MotionFileError
+
+    return MotionFileError(
+        f"{path} is damaged or of another program, expected a checkpoint of this one"
+    )
+
+
+def _learnt_from(kind: str, network: dict[str, Any]) -> list[str]:
+    """Return what a network learnt from, in lines."""
+    if kind == "motion-dvae":
+        data = network["data"]
+        learnt_from = f"  learnt from {data['frames']} frames of {_clips(data['clips'])}"
+        return [_windows(network), learnt_from]
+    if kind == "motion-denoiser":
+        noise = network["noise"]
+        return [
+            _windows(network["prior"]),
+            f"  learnt from noisy joints of {_clips(network['clips'])}",
+            f"  noise of {noise['least']:g} to {noise['most']:g} m, outliers in "
+            f"{noise['outliers']:.0%} of windows, hidden joints in {noise['hidden']:.0%}",
+        ]
+    data = network["data"]
+    return [f"  learnt from {data['tracks']} tracks of {', '.join(data['clips'])}"]
+
+
+def _windows(network: dict[str, Any]) -> str:
+    frames, fps = network["size"]["frames"], network["fps"]
+    return f"  windows of {frames} frames at {fps:g} fps, {(frames - 1) / fps:.2f} s"
+
+
+def _clips(names: list[str]) -> str:
+    return f"{len(names)} clips: {listed(names)}"
+
+
+def _progress(card: dict[str, Any]) -> str:
+    """Return how long a network was trained, and its last losses."""
+    last, training = card["history"][-1] if card["history"] else {}, card["training"]
+    losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
+    return (
+        f"  step {card['step']} of {training['steps']}, batches of {training['batch']}, "
+        f"{card['seconds']:.0f} s{losses}"
+    )
+
+
+def _length(frames: int, fps: float) -> str:
+    return f"  {frames} frames at {fps:g} fps, {(frames - 1) / fps:.2f} s"
+
+
+def _joints(skeleton: Skeleton) -> str:
+    roots = ", ".join(skeleton.joint_names[root] for root in skeleton.roots)
+    return (
+        f"  {skeleton.n_joints} joints below {roots}, "
+        f"{len(skeleton.mirrored_pairs)} left-right pairs"
+    )

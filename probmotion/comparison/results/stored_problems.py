@@ -1,0 +1,149 @@
+"""What is kept of a comparison's problems, so that its page can be made without making them anew.
+
+A user's own problem is nowhere but in the memory of the run; its truth, evidence and a few
+reference draws are what a picture needs of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from probmotion.files import written_whole
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
+from probmotion.posteriors.problem import Problem
+from probmotion.validation import check_count
+
+__all__ = ["KeptProblem", "keep_problem", "read_kept"]
+
+_FILE = "problem.npz"
+_ARRAYS = ("truth", "reference", "held_out", "keypoints", "joints")
+_CAMERA = ("rotation", "translation", "focal", "centre", "orthographic")
+
+
+@dataclass(frozen=True, eq=False)
+class KeptProblem:
+    """What there is to be seen of a problem.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+        Of its motions.
+    fps : float
+        Frames per second.
+    has_evidence : bool
+        Whether its posterior has any, of whatever kind.
+    truth : ndarray, (L, J, 3), optional
+        Metres.
+    reference : ndarray, (n, L, J, 3), optional
+        Reference draws, metres.
+    held_out : ndarray, (n, L, J, 3), optional
+        Real motions that were held out, metres.
+    camera : Cameras, optional
+        The first camera of its evidence, a batch of one.
+    keypoints : ndarray, (L, J, 2), optional
+        What that camera shows, image units; NaN where hidden.
+    joints : ndarray, (L, J, 3), optional
+        Noisy 3D joints, metres; NaN where hidden.
+    """
+
+    skeleton: Skeleton
+    fps: float
+    has_evidence: bool = False
+    truth: np.ndarray | None = None
+    reference: np.ndarray | None = None
+    held_out: np.ndarray | None = None
+    camera: Cameras | None = None
+    keypoints: np.ndarray | None = None
+    joints: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, problem: Problem, draws: int = 8, seed: int = 0) -> KeptProblem:
+        """Return what is to be seen of a problem, with so many reference draws where it has any."""
+        check_count("draws", draws)
+        posterior, likelihood = problem.posterior, problem.posterior.likelihood
+        camera = keypoints = joints = held_out = None
+        if isinstance(likelihood, Keypoints2D):
+            camera = likelihood.cameras.view(0)
+            seen = likelihood.entries.visible[0]
+            keypoints = np.where(seen[..., None], likelihood.keypoints[0], np.nan)
+        elif isinstance(likelihood, Joints3D):
+            joints = np.where(likelihood.entries.visible[..., None], likelihood.joints, np.nan)
+        if problem.held_out is not None:
+            held_out = problem.held_out[:: max(1, len(problem.held_out) // draws)][:draws]
+        return cls(
+            skeleton=posterior.skeleton,
+            fps=float(posterior.fps),
+            has_evidence=likelihood is not None,
+            truth=problem.truth,
+            reference=problem.reference(seed, draws) if problem.has_reference else None,
+            held_out=held_out,
+            camera=camera,
+            keypoints=keypoints,
+            joints=joints,
+        )
+
+
+def keep_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int = 0) -> None:
+    """Write what is to be seen of a problem into ``folder``, which is made where it is missing.
+
+    ``seed`` is that of the reference draws.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written to.
+    """
+    kept = KeptProblem.of(problem, draws, seed)
+    arrays: dict[str, np.ndarray] = {
+        "joint_names": np.array(kept.skeleton.joint_names),
+        "parents": np.array(kept.skeleton.parents),
+        "fps": np.array(kept.fps),
+        "has_evidence": np.array(kept.has_evidence),
+    }
+    for name in _ARRAYS:
+        if (held := getattr(kept, name)) is not None:
+            arrays[name] = np.asarray(held, dtype=np.float32)
+    if kept.camera is not None:
+        arrays |= {f"camera_{name}": np.asarray(getattr(kept.camera, name)) for name in _CAMERA}
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with written_whole(folder / _FILE) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_kept(folder: str | Path) -> KeptProblem | None:
+    """Return what :func:`keep_problem` wrote into ``folder``, or None where it wrote nothing.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    path = Path(folder) / _FILE
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            arrays = {name: held[name] for name in held.files}
+        camera = None
+        if "camera_rotation" in arrays:
+            numbers = {name: arrays[f"camera_{name}"] for name in _CAMERA}
+            camera = Cameras(**numbers | {"orthographic": bool(numbers["orthographic"])})
+        skeleton = Skeleton(arrays["joint_names"].tolist(), arrays["parents"].tolist())
+        return KeptProblem(
+            skeleton,
+            float(arrays["fps"]),
+            bool(arrays["has_evidence"]),
+            camera=camera,
+            **{name: arrays[name].astype(np.float64) for name in _ARRAYS if name in arrays},
+        )
+    except (OSError, BadZipFile, KeyError, ValueError, EOFError) as error:
+        raise ValueError(
+            f"{path} is damaged ({error}), expected a file that keep_problem() wrote"
+        ) from error

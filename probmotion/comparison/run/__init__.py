@@ -1,0 +1,5 @@
+"""Execution of an experiment grid: runs, pilots, worker processes, limits."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

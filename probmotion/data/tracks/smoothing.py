@@ -1,0 +1,151 @@
+"""Steps along time: gaps filled, detections smoothed, tracks brought to one frame rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.signal import savgol_filter
+
+from probmotion.data.tracks.step_reports import StepReport, entries_of, seen
+from probmotion.motion.motion import KeypointTrack
+from probmotion.validation import check_positive
+
+__all__ = ["fill_gaps", "resample_tracks", "smooth_tracks"]
+
+Step = tuple[list[KeypointTrack], StepReport]
+_HIGHEST_FPS = 10_000
+_ROUNDING = 1e-3  # as for motions: see probmotion.motion.resampling
+_SAME_TIME = 1e-6  # frames
+_DEGREE = 2
+
+
+def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step:
+    """Fill each joint's short gaps by monotone cubic interpolation (PCHIP), without overshoot.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Tracks of any skeletons.
+    longest : float
+        The longest gap to fill, seconds. A joint that is unseen for longer, or before its first or
+        after its last seen frame, stays unseen: nothing is extrapolated.
+
+    Returns
+    -------
+    tracks : list of KeypointTrack
+        A filled entry has the lesser of the confidences at the two ends of its gap.
+    report : StepReport
+        ``entries_changed`` counts what was filled.
+    """
+    check_positive("longest", longest)
+    filled = []
+    for track in tracks:
+        keypoints, confidence = track.keypoints.copy(), track.confidence.copy()
+        for joint in range(track.skeleton.n_joints):
+            known = np.flatnonzero(confidence[:, joint] > 0)
+            gaps = np.diff(known) - 1
+            short = np.flatnonzero((gaps > 0) & (gaps <= longest * track.fps + _ROUNDING))
+            if not len(short):
+                continue
+            path = PchipInterpolator(known, keypoints[known, joint])
+            for start, stop in zip(known[short], known[short + 1], strict=True):
+                frames = np.arange(start + 1, stop)
+                keypoints[frames, joint] = path(frames)
+                confidence[frames, joint] = min(confidence[start, joint], confidence[stop, joint])
+        filled.append(replace(track, keypoints=keypoints, confidence=confidence))
+    count = entries_of(filled) - entries_of(tracks)
+    why = f"filled gaps of at most {longest:g} s"
+    return filled, StepReport.of("gaps", tracks, filled, why, entries_changed=count)
+
+
+def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> Step:
+    """Smooth each joint's path over its runs of seen frames (Savitzky and Golay, degree 2).
+
+    Every position becomes that of a parabola fitted to the frames around it, so that paths of
+    constant acceleration stay what they are, at their ends too.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Tracks of any skeletons.
+    window : float
+        How long a time the fit sees, seconds; an odd number of frames, at most those of the run.
+        Where that is fewer than 5, nothing changes.
+
+    Returns
+    -------
+    tracks : list of KeypointTrack
+        Confidences and what is unseen stay.
+    report : StepReport
+        ``entries_changed`` counts what was smoothed.
+    """
+    check_positive("window", window)
+    smoothed = []
+    changed = 0
+    for track in tracks:
+        keypoints = track.keypoints.copy()
+        for joint in range(track.skeleton.n_joints):
+            for start, stop in _runs(track.confidence[:, joint] > 0):
+                width = min(round(window * track.fps), stop - start)
+                width -= width % 2 == 0
+                if width > _DEGREE + 1:
+                    run = keypoints[start:stop, joint]
+                    keypoints[start:stop, joint] = savgol_filter(run, width, _DEGREE, axis=0)
+                    changed += stop - start
+        smoothed.append(replace(track, keypoints=keypoints))
+    why = f"fitted parabolas to windows of {window:g} s"
+    return smoothed, StepReport.of("smooth", tracks, smoothed, why, entries_changed=changed)
+
+
+def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
+    """Bring tracks to one frame rate, by linear interpolation in time.
+
+    The first frame stays; the last is the last one of the new rate that is not after the track's
+    end. An entry between two old frames is seen where both were, with their confidences
+    interpolated; unseen stays unseen.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Tracks of any frame rates.
+    fps : float
+        Frames per second, above 0 and at most 10 000.
+    """
+    check_positive("fps", fps)
+    if fps > _HIGHEST_FPS:
+        raise ValueError(f"fps is {fps:g}, expected at most {_HIGHEST_FPS} frames per second")
+    resampled = [track if track.fps == fps else _resampled(track, float(fps)) for track in tracks]
+    rates = sorted({f"{track.fps:g}" for track in tracks}, key=float)
+    why = f"brought {' and '.join(rates) or 'no'} fps to {fps:g}"
+    return resampled, StepReport.of("resample", tracks, resampled, why)
+
+
+def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
+    last = track.frames - 1
+    frames = int(np.floor(last / track.fps * fps + _ROUNDING)) + 1
+    time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
+    near = np.round(time)
+    # Frames that coincide with old ones need no neighbour, which may be unseen.
+    time = np.where(np.abs(time - near) < _SAME_TIME, near, time)
+    before = time.astype(int)
+    after = np.ceil(time).astype(int)
+    weight = (time - before)[:, np.newaxis]
+    there = seen(track)[before] & seen(track)[after]
+    confidence = (1 - weight) * track.confidence[before] + weight * track.confidence[after]
+    weight = weight[..., np.newaxis]
+    keypoints = (1 - weight) * track.keypoints[before] + weight * track.keypoints[after]
+    return replace(
+        track,
+        keypoints=np.where(there[..., np.newaxis], keypoints, np.nan),
+        confidence=np.where(there, confidence, 0.0),
+        fps=fps,
+    )
+
+
+def _runs(there: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first frame and the end of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]

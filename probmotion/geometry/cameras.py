@@ -1,0 +1,234 @@
+"""Cameras: batches of views, perspective or orthographic, and what they see.
+
+Axes are OpenCV's: x right, y down, z forward. A world point X is at R X + t in the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant, to_numpy
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
+
+__all__ = ["Cameras"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """V cameras that look at one scene.
+
+    Parameters
+    ----------
+    rotation : ndarray, (V, 3, 3)
+        World to camera.
+    translation : ndarray, (V, 3)
+        World to camera, metres.
+    focal : ndarray, (V,)
+        Perspective: image units per unit slope. Orthographic: image units per metre.
+    centre : ndarray, (V, 2), optional
+        Principal point, image units; the origin by default.
+    orthographic : bool
+        Whether the projection ignores depth.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a value is not finite, a focal length is not above zero, or a
+        rotation is not orthonormal with determinant 1 (to 1e-6).
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    focal: np.ndarray
+    centre: np.ndarray | None = None
+    orthographic: bool = True
+
+    def __post_init__(self) -> None:
+        rotation = np.asarray(self.rotation, dtype=np.float64)
+        check_shape("rotation", rotation, ("V", 3, 3))
+        n_views = len(rotation)
+        if n_views == 0:
+            raise ValueError("rotation has no camera, expected at least one")
+        translation = np.asarray(self.translation, dtype=np.float64)
+        focal = np.asarray(self.focal, dtype=np.float64)
+        centre = np.zeros((n_views, 2)) if self.centre is None else self.centre
+        centre = np.asarray(centre, dtype=np.float64)
+        check_shape("translation", translation, (n_views, 3))
+        check_shape("focal", focal, (n_views,))
+        check_shape("centre", centre, (n_views, 2))
+        for name, value in (("rotation", rotation), ("translation", translation)):
+            check_finite(name, value)
+        check_finite("centre", centre)
+        for value in focal:
+            check_positive("focal", float(value))
+        gap = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
+        if gap > 1e-6:
+            raise ValueError(
+                f"rotation is off an orthonormal matrix by {gap:.2g}, expected at most 1e-6"
+            )
+        if (np.linalg.det(rotation) < 0).any():
+            raise ValueError("rotation has a reflection (determinant -1), expected determinant 1")
+        for name, value in (
+            ("rotation", rotation),
+            ("translation", translation),
+            ("focal", focal),
+            ("centre", centre),
+        ):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def ring(
+        cls,
+        n_views: int,
+        *,
+        elevation: float = 0.0,
+        distance: float = 7.0,
+        start: float = 0.0,
+        perspective: bool = False,
+    ) -> Cameras:
+        """Return cameras evenly around the vertical axis that look at the origin.
+
+        Parameters
+        ----------
+        n_views : int
+            Number of cameras V.
+        elevation : float
+            Radians above the horizon.
+        distance : float
+            Metres from the origin. A perspective camera's focal length is the same number, so
+            that both kinds of camera show the origin's plane at one image unit per metre
+            (MAS, appendix C).
+        start : float
+            Azimuth of the first camera, radians; 0 stands on the +Z axis.
+        perspective : bool
+            Perspective cameras rather than orthographic ones.
+        """
+        check_count("n_views", n_views)
+        azimuth = start + 2 * np.pi * np.arange(n_views) / n_views
+        return cls.around(
+            azimuth, np.full(n_views, elevation), distance=distance, perspective=perspective
+        )
+
+    @classmethod
+    def around(
+        cls,
+        azimuth: np.ndarray,
+        elevation: np.ndarray,
+        *,
+        distance: float = 7.0,
+        perspective: bool = False,
+    ) -> Cameras:
+        """Return cameras at the given azimuths and elevations (V,), radians, facing the origin."""
+        check_positive("distance", distance)
+        azimuth = np.atleast_1d(np.asarray(azimuth, dtype=np.float64))
+        check_finite("azimuth", azimuth)
+        check_finite("elevation", np.atleast_1d(np.asarray(elevation, dtype=np.float64)))
+        elevation = np.broadcast_to(np.asarray(elevation, dtype=np.float64), azimuth.shape)
+        ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+        zero = np.zeros_like(ca)
+        right = np.stack([ca, zero, -sa], axis=-1)
+        down = np.stack([se * sa, -ce, se * ca], axis=-1)
+        forward = np.stack([-ce * sa, -se, -ce * ca], axis=-1)
+        n_views = len(azimuth)
+        return cls(
+            rotation=np.stack([right, down, forward], axis=-2),
+            translation=np.tile([0.0, 0.0, distance], (n_views, 1)),
+            focal=np.full(n_views, distance if perspective else 1.0),
+            orthographic=not perspective,
+        )
+
+    @property
+    def n_views(self) -> int:
+        """Number of cameras V."""
+        return len(self.focal)
+
+    @property
+    def azimuth(self) -> np.ndarray:
+        """Azimuth of each camera's position as seen from what it looks at, radians, (V,)."""
+        forward = self.rotation[:, 2]
+        return np.arctan2(-forward[:, 0], -forward[:, 2])
+
+    @property
+    def elevation(self) -> np.ndarray:
+        """Elevation of each camera above the horizon, radians, (V,)."""
+        return np.arcsin(np.clip(-self.rotation[:, 2, 1], -1.0, 1.0))
+
+    @property
+    def upright(self) -> bool:
+        """Whether every camera's image x axis is horizontal (no roll)."""
+        return bool(np.abs(self.rotation[:, 0, 1]).max() < 1e-12)
+
+    @property
+    def image_axes(self) -> np.ndarray:
+        """P: the image axes in the world times the focal length, (V, 2, 3).
+
+        For orthographic cameras ``project(X) = P X + offset``.
+        """
+        return self.focal[:, None, None] * self.rotation[:, :2]
+
+    @property
+    def offset(self) -> np.ndarray:
+        """Image of the world's origin under orthographic projection, (V, 2)."""
+        return self.focal[:, None] * self.translation[:, :2] + self.centre
+
+    def view(self, index: int) -> Cameras:
+        """Return one of the cameras as a batch of one."""
+        one = slice(index, index + 1) if index >= 0 else slice(index, index + 1 or None)
+        assert self.centre is not None
+        return Cameras(
+            self.rotation[one],
+            self.translation[one],
+            self.focal[one],
+            self.centre[one],
+            self.orthographic,
+        )
+
+    def as_orthographic(self) -> Cameras:
+        """Return orthographic cameras that agree with these at the world origin's depth."""
+        if self.orthographic:
+            return self
+        focal = self.focal / self.translation[:, 2]
+        return Cameras(self.rotation, self.translation, focal, self.centre, orthographic=True)
+
+    def depth(self, points: Array) -> Array:
+        """Return points' distances along the z axes: ``(…, L, J, 3) → (…, V, L, J)``."""
+        forward = constant(self.rotation[:, 2], points)
+        depth = constant(self.translation[:, 2], points)
+        xp = array_namespace(points)
+        moved = xp.sum(points[..., None, :, :, :] * forward[:, None, None, :], axis=-1)
+        return moved + depth[:, None, None]
+
+    def project(self, points: Array) -> Array:
+        """Return what the cameras see: ``(…, L, J, 3) → (…, V, L, J, 2)``, image units.
+
+        Raises
+        ------
+        ValueError
+            If a perspective camera has a point beside or behind it. (Not checked while JAX
+            traces the function, where values are not known yet.)
+        """
+        check_shape("points", points, ("…", "L", "J", 3))
+        xp = array_namespace(points)
+        axes = constant(self.image_axes, points)
+        # (…, 1, L, J, 3) @ (V, 1, 3, 2)
+        plane = xp.matmul(points[..., None, :, :, :], xp.matrix_transpose(axes)[:, None, :, :])
+        if self.orthographic:
+            return plane + constant(self.offset, points)[:, None, None, :]
+        shift = self.focal[:, None] * self.translation[:, :2]
+        depth = self.depth(points)
+        self._refuse_behind(depth)
+        centre = constant(self.centre, points)[:, None, None, :]
+        return (plane + constant(shift, points)[:, None, None, :]) / depth[..., None] + centre
+
+    def _refuse_behind(self, depth: Array) -> None:
+        if type(depth).__name__.endswith("Tracer"):
+            return
+        nearest = to_numpy(depth)
+        if nearest.size and nearest.min() <= 0:
+            view = int(np.argwhere(nearest <= 0)[0][-3])
+            raise ValueError(
+                f"points has a joint {nearest.min():.3g} m in front of camera {view}, expected "
+                "every joint in front of every camera; move the cameras away or centre the motion"
+            )

@@ -1,0 +1,320 @@
+"""Rotations: vectors, matrices, quaternions, six numbers and Euler angles.
+
+Every function runs on NumPy, torch and JAX arrays of any batch shape, under ``jax.jit`` and with
+finite gradients at the identity and at half turns. Rotations are active: ``R @ x`` turns x. A
+quaternion is (w, x, y, z). Angles are radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant
+from probmotion.validation import check_shape
+
+__all__ = [
+    "euler_to_matrix",
+    "geodesic_angle",
+    "matrix_to_euler",
+    "matrix_to_quaternion",
+    "matrix_to_six_numbers",
+    "matrix_to_vector",
+    "quaternion_product",
+    "quaternion_to_matrix",
+    "quaternion_to_vector",
+    "six_numbers_to_matrix",
+    "slerp",
+    "slerp_quaternions",
+    "vector_to_matrix",
+    "vector_to_quaternion",
+]
+
+# Below this squared angle the series are as exact as float64: the first term left out is 1e-19.
+_SMALL = 1e-6
+
+
+def vector_to_matrix(vector: Array) -> Array:
+    """Return the matrix of a rotation vector (axis times angle): ``(…, 3) → (…, 3, 3)``.
+
+    Rodrigues' formula, ``R = I + sin θ/θ K + (1 − cos θ)/θ² K²``.
+    """
+    check_shape("vector", vector, ("…", 3))
+    xp = array_namespace(vector)
+    square = xp.sum(vector**2, axis=-1)[..., None, None]
+    small = square < _SMALL
+    angle = _safe_sqrt(square, small)
+    first = xp.where(small, 1 - square / 6 + square**2 / 120, xp.sin(angle) / angle)
+    # (1 − cos θ)/θ² as a sine of the half angle, which loses no digit for small angles.
+    half = xp.where(small, 1 - square / 24 + square**2 / 1920, 2 * xp.sin(angle / 2) / angle)
+    cross = _cross_matrix(vector)
+    return constant(np.eye(3), vector) + first * cross + half**2 / 2 * xp.matmul(cross, cross)
+
+
+def matrix_to_vector(matrix: Array) -> Array:
+    """Return the rotation vector of a matrix: ``(…, 3, 3) → (…, 3)``, of length at most π."""
+    return quaternion_to_vector(matrix_to_quaternion(matrix))
+
+
+def vector_to_quaternion(vector: Array) -> Array:
+    """Return the unit quaternion of a rotation vector: ``(…, 3) → (…, 4)``."""
+    check_shape("vector", vector, ("…", 3))
+    xp = array_namespace(vector)
+    square = xp.sum(vector**2, axis=-1, keepdims=True)
+    small = square < _SMALL
+    angle = _safe_sqrt(square, small)
+    real = xp.where(small, 1 - square / 8 + square**2 / 384, xp.cos(angle / 2))
+    ratio = xp.where(small, 0.5 - square / 48 + square**2 / 3840, xp.sin(angle / 2) / angle)
+    return xp.concat([real, ratio * vector], axis=-1)
+
+
+def quaternion_to_vector(quaternion: Array) -> Array:
+    """Return the rotation vector of a quaternion: ``(…, 4) → (…, 3)``, of length at most π.
+
+    The quaternion may have any length above zero.
+    """
+    quaternion = _short(_unit(quaternion))
+    xp = array_namespace(quaternion)
+    real, imaginary = quaternion[..., :1], quaternion[..., 1:]
+    square = xp.sum(imaginary**2, axis=-1, keepdims=True)
+    small = square < _SMALL
+    sine = _safe_sqrt(square, small)
+    # 2 atan(s/w)/s; the series in s/w is read only where w is near 1.
+    tangent = xp.where(small, square / xp.where(small, real, xp.ones_like(real)) ** 2, square)
+    series = 2 * (1 - tangent / 3 + tangent**2 / 5) / xp.where(small, real, xp.ones_like(real))
+    return xp.where(small, series, 2 * xp.atan2(sine, real) / sine) * imaginary
+
+
+def quaternion_to_matrix(quaternion: Array) -> Array:
+    """Return the matrix of a quaternion of any length above zero: ``(…, 4) → (…, 3, 3)``."""
+    quaternion = _unit(quaternion)
+    xp = array_namespace(quaternion)
+    real = quaternion[..., :1, None]
+    cross = _cross_matrix(quaternion[..., 1:])
+    # R = I + 2 w K + 2 K², K the cross product with the imaginary part.
+    return constant(np.eye(3), quaternion) + 2 * real * cross + 2 * xp.matmul(cross, cross)
+
+
+def matrix_to_quaternion(matrix: Array) -> Array:
+    """Return the unit quaternion of a matrix, w at least 0: ``(…, 3, 3) → (…, 4)``.
+
+    4 q qᵀ is linear in R; its row of the largest diagonal entry is q up to a factor of at least 2,
+    at every angle.
+    """
+    check_shape("matrix", matrix, ("…", 3, 3))
+    xp = array_namespace(matrix)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (
+        [matrix[..., row, column] for column in range(3)] for row in range(3)
+    )
+    entries = [
+        [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+    ]
+    products = xp.stack([xp.stack(row, axis=-1) for row in entries], axis=-2)
+    diagonal = xp.stack([entries[index][index] for index in range(4)], axis=-1)
+    largest = xp.astype(xp.argmax(diagonal, axis=-1), matrix.dtype)
+    chosen = largest[..., None] == constant(np.arange(4), matrix)
+    row = xp.sum(xp.where(chosen[..., None], products, xp.zeros_like(products)), axis=-2)
+    return _short(_unit(row))
+
+
+def quaternion_product(first: Array, second: Array) -> Array:
+    """Return the quaternion of ``second``, then ``first``: ``(…, 4), (…, 4) → (…, 4)``."""
+    check_shape("first", first, ("…", 4))
+    check_shape("second", second, ("…", 4))
+    xp = array_namespace(first, second)
+    a, b, c, d = (first[..., index] for index in range(4))
+    w, x, y, z = (second[..., index] for index in range(4))
+    return xp.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
+    )
+
+
+def six_numbers_to_matrix(numbers: Array) -> Array:
+    """Return the matrix whose first two columns are nearest to six numbers.
+
+    Zhou et al. 2019, "On the continuity of rotation representations in neural networks", eq. 15:
+    Gram-Schmidt on the columns (0:3) and (3:6), ``(…, 6) → (…, 3, 3)``. The two must not be
+    parallel.
+    """
+    check_shape("numbers", numbers, ("…", 6))
+    xp = array_namespace(numbers)
+    first = _unit(numbers[..., :3])
+    second = numbers[..., 3:]
+    second = _unit(second - xp.sum(first * second, axis=-1, keepdims=True) * first)
+    third = xp.linalg.cross(first, second)
+    return xp.stack([first, second, third], axis=-1)
+
+
+def matrix_to_six_numbers(matrix: Array) -> Array:
+    """Return the first two columns of a matrix one after the other: ``(…, 3, 3) → (…, 6)``."""
+    check_shape("matrix", matrix, ("…", 3, 3))
+    xp = array_namespace(matrix)
+    return xp.concat([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
+
+
+def euler_to_matrix(angles: Array, order: str) -> Array:
+    """Return the matrix of three turns about moving axes: ``(…, 3) → (…, 3, 3)``.
+
+    Parameters
+    ----------
+    angles : Array, (…, 3)
+        Radians, in the order of ``order``.
+    order : str
+        Three of ``X``, ``Y``, ``Z``, neighbours different: ``"ZXY"`` is ``R_z R_x R_y``, as a
+        BVH's channels ``Zrotation Xrotation Yrotation``.
+
+    Raises
+    ------
+    ValueError
+        If ``order`` is not such a word.
+    """
+    check_shape("angles", angles, ("…", 3))
+    axes = _axes(order)
+    xp = array_namespace(angles)
+    turns = [_turn(angles[..., index], axis) for index, axis in enumerate(axes)]
+    return xp.matmul(xp.matmul(turns[0], turns[1]), turns[2])
+
+
+def matrix_to_euler(matrix: Array, order: str) -> Array:
+    """Return the angles of three turns about moving axes: ``(…, 3, 3) → (…, 3)``.
+
+    The middle angle is in [−π/2, π/2], or in [0, π] where the first and last axis are the same.
+    Where it is at the end of its range (gimbal lock), the first angle is 0.
+
+    Parameters
+    ----------
+    matrix : Array, (…, 3, 3)
+        Rotation matrices.
+    order : str
+        As for :func:`euler_to_matrix`.
+    """
+    check_shape("matrix", matrix, ("…", 3, 3))
+    i, j, last = _axes(order)
+    k = 3 - i - j
+    parity = 1.0 if (j - i) % 3 == 1 else -1.0
+    xp = array_namespace(matrix)
+    if last == i:
+        sine, cosine = matrix[..., j, i], -parity * matrix[..., k, i]
+    else:
+        sine, cosine = -parity * matrix[..., j, k], matrix[..., k, k]
+    square = sine**2 + cosine**2
+    locked = square < float(xp.finfo(matrix.dtype).eps) ** 2
+    radius = xp.where(locked, xp.zeros_like(square), _safe_sqrt(square, locked))
+    zero, one = xp.zeros_like(sine), xp.ones_like(cosine)
+    first = xp.atan2(xp.where(locked, zero, sine), xp.where(locked, one, cosine))
+    # What is left once the first turn is undone has a row that depends on the last angle alone,
+    # and is of length 1 even where the first angle is ill determined.
+    row = (
+        xp.cos(first)[..., None] * matrix[..., j, :]
+        + parity * xp.sin(first)[..., None] * matrix[..., k, :]
+    )
+    if last == i:
+        middle = xp.atan2(radius, matrix[..., i, i])
+        third = xp.atan2(-parity * row[..., k], row[..., j])
+    else:
+        middle = xp.atan2(parity * matrix[..., i, k], radius)
+        third = xp.atan2(parity * row[..., i], row[..., j])
+    return xp.stack([first, middle, third], axis=-1)
+
+
+def geodesic_angle(first: Array, second: Array) -> Array:
+    """Return the angle of the rotation from ``first`` to ``second``, in [0, π].
+
+    Matrices, ``(…, 3, 3), (…, 3, 3) → (…)``. The gradient at equal rotations is 0.
+    """
+    xp = array_namespace(first, second)
+    quaternion = matrix_to_quaternion(xp.matmul(xp.matrix_transpose(first), second))
+    square = xp.sum(quaternion[..., 1:] ** 2, axis=-1)
+    none = square == 0
+    sine = xp.where(none, xp.zeros_like(square), _safe_sqrt(square, none))
+    return 2 * xp.atan2(sine, quaternion[..., 0])
+
+
+def slerp(first: Array, second: Array, fraction: Array) -> Array:
+    """Return the rotations on the way from ``first`` to ``second`` at constant speed.
+
+    Parameters
+    ----------
+    first, second : Array, (…, 3, 3)
+        Rotation matrices.
+    fraction : Array, (…)
+        0 at ``first``, 1 at ``second``; broadcast against the batch axes.
+
+    Returns
+    -------
+    Array, (…, 3, 3)
+        The shorter way; at half a turn, where both are as long, one of them.
+    """
+    xp = array_namespace(first, second)
+    step = matrix_to_vector(xp.matmul(xp.matrix_transpose(first), second))
+    return xp.matmul(first, vector_to_matrix(fraction[..., None] * step))
+
+
+def slerp_quaternions(first: Array, second: Array, fraction: Array) -> Array:
+    """Return :func:`slerp` of unit quaternions, ``(…, 4), (…, 4), (…) → (…, 4)``.
+
+    q and −q are the same rotation: the result starts at ``first`` and ends at ±``second``.
+    """
+    inverse = first * constant([1.0, -1.0, -1.0, -1.0], first)
+    step = quaternion_to_vector(quaternion_product(inverse, second))
+    return quaternion_product(first, vector_to_quaternion(fraction[..., None] * step))
+
+
+def _axes(order: str) -> tuple[int, int, int]:
+    axes = tuple("XYZ".find(letter) for letter in order.upper())
+    if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
+        raise ValueError(
+            f"order is {order!r}, expected three of X, Y and Z with different neighbours, such as "
+            "'ZXY'"
+        )
+    return axes[0], axes[1], axes[2]
+
+
+def _turn(angle: Array, axis: int) -> Array:
+    """Return the matrices of turns about one axis: ``(…) → (…, 3, 3)``."""
+    xp = array_namespace(angle)
+    fixed, cosine, sine = np.zeros((3, 3, 3))
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    fixed[axis, axis] = 1
+    cosine[j, j] = cosine[k, k] = 1
+    sine[j, k], sine[k, j] = -1, 1
+    grown = angle[..., None, None]
+    return (
+        constant(fixed, angle)
+        + xp.cos(grown) * constant(cosine, angle)
+        + xp.sin(grown) * constant(sine, angle)
+    )
+
+
+def _cross_matrix(vector: Array) -> Array:
+    """Return K with ``K @ x = vector × x``: ``(…, 3) → (…, 3, 3)``."""
+    xp = array_namespace(vector)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    zero = xp.zeros_like(x)
+    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
+    return xp.stack([xp.stack(list(row), axis=-1) for row in rows], axis=-2)
+
+
+def _safe_sqrt(square: Array, excluded: Array) -> Array:
+    """Return √square, 1 where ``excluded``: a gradient there would be infinite, then NaN."""
+    xp = array_namespace(square)
+    return xp.sqrt(xp.where(excluded, xp.ones_like(square), square))
+
+
+def _unit(vector: Array) -> Array:
+    xp = array_namespace(vector)
+    return vector / xp.sqrt(xp.sum(vector**2, axis=-1, keepdims=True))
+
+
+def _short(quaternion: Array) -> Array:
+    """Return q or −q, the one with w at least 0."""
+    xp = array_namespace(quaternion)
+    return xp.where(quaternion[..., :1] < 0, -quaternion, quaternion)

@@ -1,0 +1,319 @@
+"""Triangulation: the motion that comes nearest to its pictures in V views, in closed form.
+
+Every joint of every frame is a least-squares problem of its own, with 3 unknowns and 2 V
+equations. A camera shows the point X at (u, v) = (a/c, b/c), where a, b, c are the rows of its
+projection matrix times (X, 1). With a', b', c' the rows' first three entries,
+
+    J = [a' − u c', b' − v c'] / c,
+    JᵀJ = (a'a'ᵀ + b'b'ᵀ − u (a'c'ᵀ + c'a'ᵀ) − v (b'c'ᵀ + c'b'ᵀ) + (u² + v²) c'c'ᵀ) / c²,
+
+so the normal equations of all points are a few fixed matrices, made of the cameras alone, times a
+few numbers per view and point. Orthographic cameras are the case c' = 0, c = 1.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant, to_numpy
+from probmotion.geometry.cameras import Cameras
+from probmotion.validation import check_count, check_finite, check_shape
+
+__all__ = ["triangulate"]
+
+_POOR = 1e3
+"""Condition number of the normal equations from which a warning is due: two views 3.6° apart."""
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Which entries of a symmetric 3×3 matrix are kept, in this order."""
+
+
+def triangulate(
+    keypoints: Array,
+    cameras: Cameras,
+    weights: Array | None = None,
+    initial: Array | None = None,
+    iterations: int = 2,
+) -> Array:
+    """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for every frame and joint (MAS, section 4.2).
+
+    Orthographic cameras need one solve. Perspective ones are linearised ``iterations`` times,
+    each time with the exact residual and gradient, the derivative with respect to depth among
+    them; the normal matrix is the first linearisation's (simplified Gauss-Newton), which a move
+    of ‖δ‖ changes by about 2‖δ‖/depth only.
+
+    Parameters
+    ----------
+    keypoints : Array, (…, V, L, J, 2)
+        x, image units; NumPy, torch or JAX.
+    cameras : Cameras
+        The V views.
+    weights : Array, (V,), (…, V) or (…, V, L, J), optional
+        w, 1 by default; where it is 0 the keypoint is not read and may be NaN.
+    initial : Array, (…, L, J, 3), optional
+        Where perspective cameras are linearised first, metres; by default the solution of the
+        linear equations that say "X is on the ray". Orthographic cameras need none.
+    iterations : int
+        Linearisations of perspective cameras.
+
+    Returns
+    -------
+    Array, (…, L, J, 3)
+        Metres.
+
+    Warns
+    -----
+    UserWarning
+        If the views are so nearly parallel that the normal equations' condition number is above
+        1000; the message says how large it is.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two views, shapes disagree, a keypoint is not finite, the views
+        (or those that see some joint) determine no point, or a point is behind a perspective
+        camera. (What depends on values is not checked while JAX traces the function.)
+    """
+    V = cameras.n_views
+    if V < 2:
+        raise ValueError(f"cameras has {V} view, expected at least two")
+    check_shape("keypoints", keypoints, ("…", V, "L", "J", 2))
+    check_count("iterations", iterations)
+    xp = array_namespace(keypoints)
+    *batch, _, L, J, _ = keypoints.shape
+    points = (*batch, L, J)
+    if initial is not None:
+        check_shape("initial", initial, (*points, 3))
+    if 0 in points:
+        return constant(np.zeros((*points, 3)), keypoints)
+    seen = _views_first(keypoints, 1)
+    weight = None
+    if weights is not None:
+        weights = _full_weights(weights, keypoints)
+        weight = _views_first(weights, 0)
+        seen = xp.where(weight > 0, seen, xp.zeros_like(seen))
+    equations = _equations(cameras, keypoints)
+    ones = xp.ones_like(seen[0, :1, :])
+    # Singular equations divide by 0 here; they are reported below.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if cameras.orthographic or initial is None:
+            normal, pull = _on_rays(xp, equations, seen, weight)
+            factors = _factor(normal)
+            found = xp.stack(_solve(factors, pull))
+        else:
+            found = xp.permute_dims(xp.reshape(initial, (-1, 3)), (1, 0))
+        inverse_depth = None
+        for iteration in range(0 if cameras.orthographic else iterations):
+            x, y, z = found[0, :], found[1, :], found[2, :]
+            image = equations.projection @ xp.stack([x, y, z, ones[0, :]])
+            inverse_depth = 1 / image[2 * V :, :]
+            image = xp.reshape(image[: 2 * V, :], seen.shape) * inverse_depth
+            if iteration == 0:
+                normal = _normal(xp, equations, inverse_depth, image, weight)
+                factors = _factor(normal)
+            pull = _pull(xp, equations, inverse_depth, image, seen, weight)
+            dx, dy, dz = _solve(factors, pull)
+            found = xp.stack([x + dx, y + dy, z + dz])
+        if not type(found).__name__.endswith("Tracer"):
+            _refuse_unfit(xp, keypoints, weights, points, found, normal, factors, inverse_depth)
+    return xp.reshape(xp.permute_dims(found, (1, 0)), (*points, 3))
+
+
+class _Equations(NamedTuple):
+    """The fixed matrices of V cameras."""
+
+    projection: Array  # (3 V, 4): rows a, then b, then c
+    square: Array  # (6, V): a'a'ᵀ + b'b'ᵀ
+    cross: Array  # (6, 2 V): −(a'c'ᵀ + c'a'ᵀ), then the same with b'
+    depth: Array  # (6, V): c'c'ᵀ
+    pull: Array  # (3, 2 V): a', then b'
+    pull_depth: Array  # (3, V): −c'
+
+
+def _equations(cameras: Cameras, like: Array) -> _Equations:
+    found = _numpy_equations(cameras)
+    if isinstance(like, np.ndarray) and like.dtype == np.float64:
+        return found
+    return _Equations(*(constant(matrix, like) for matrix in found))
+
+
+@lru_cache(maxsize=8)
+def _numpy_equations(cameras: Cameras) -> _Equations:
+    assert cameras.centre is not None
+    metric = np.concatenate([cameras.rotation, cameras.translation[:, :, None]], axis=2)
+    c = (
+        metric[:, 2]
+        if not cameras.orthographic
+        else np.tile([0.0, 0.0, 0.0, 1.0], (len(metric), 1))
+    )
+    a, b = (
+        cameras.focal[:, None] * metric[:, axis] + cameras.centre[:, axis, None] * c
+        for axis in (0, 1)
+    )
+
+    def products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.stack([(p[:, i] * q[:, j] + p[:, j] * q[:, i]) / 2 for i, j in _PAIRS])
+
+    a_, b_, c_ = a[:, :3], b[:, :3], c[:, :3]
+    return _Equations(
+        projection=np.concatenate([a, b, c]),
+        square=products(a_, a_) + products(b_, b_),
+        cross=np.concatenate([-2 * products(a_, c_), -2 * products(b_, c_)], axis=1),
+        depth=products(c_, c_),
+        pull=np.ascontiguousarray(np.concatenate([a_, b_]).T),
+        pull_depth=np.ascontiguousarray(-c_.T),
+    )
+
+
+def _normal(
+    xp: Any, equations: _Equations, inverse_depth: Array, image: Array, weight: Array | None
+) -> Array:
+    """Return Σ_v w JᵀJ at the given image points (2, V, N), (6, N)."""
+    scale = inverse_depth * inverse_depth
+    if weight is not None:
+        scale = scale * weight
+    first = scale * image
+    second = first * image
+    total = equations.square @ scale + equations.cross @ xp.reshape(first, (-1, image.shape[2]))
+    return total + equations.depth @ (second[0, ...] + second[1, ...])
+
+
+def _pull(
+    xp: Any,
+    equations: _Equations,
+    inverse_depth: Array,
+    image: Array,
+    seen: Array,
+    weight: Array | None,
+) -> Array:
+    """Return Σ_v w Jᵀ (seen − image), (3, N)."""
+    residual = (seen - image) * inverse_depth
+    if weight is not None:
+        residual = residual * weight
+    along = residual * image
+    across = equations.pull @ xp.reshape(residual, (-1, image.shape[2]))
+    return across + equations.pull_depth @ (along[0, ...] + along[1, ...])
+
+
+def _on_rays(
+    xp: Any, equations: _Equations, seen: Array, weight: Array | None
+) -> tuple[Array, Array]:
+    """Return the normal equations of (a' − u c')·X = u c₄ − a₄ and its like, u, v as seen.
+
+    They are the least-squares problem itself where c' = 0.
+    """
+    _, V, N = seen.shape
+    origin = equations.projection[:, 3:]
+    residual = seen * origin[2 * V :, :] - xp.reshape(origin[: 2 * V, :], (2, V, 1))
+    if weight is not None:
+        residual = residual * weight
+    along = residual * seen
+    across = equations.pull @ xp.reshape(residual, (2 * V, N))
+    pull = across + equations.pull_depth @ (along[0, ...] + along[1, ...])
+    return _normal(xp, equations, xp.ones_like(seen[0, ...]), seen, weight), pull
+
+
+def _factor(normal: Array) -> tuple[Array, ...]:
+    """Return the L D Lᵀ factors of symmetric matrices (6, N): 1/D and L's entries, (N,) each."""
+    a, b, c, d, e, f = (normal[i, ...] for i in range(6))
+    inverse_1 = 1 / a
+    l21, l31 = b * inverse_1, c * inverse_1
+    inverse_2 = 1 / (d - l21 * b)
+    rest = e - l21 * c
+    l32 = rest * inverse_2
+    return inverse_1, inverse_2, 1 / (f - l31 * c - l32 * rest), l21, l31, l32
+
+
+def _solve(factors: tuple[Array, ...], right: Array) -> tuple[Array, Array, Array]:
+    """Return the solutions x, y, z of the factored equations, (N,) each."""
+    inverse_1, inverse_2, inverse_3, l21, l31, l32 = factors
+    p, q, s = right[0, :], right[1, :], right[2, :]
+    q = q - l21 * p
+    z = (s - l31 * p - l32 * q) * inverse_3
+    y = q * inverse_2 - l32 * z
+    return p * inverse_1 - l21 * y - l31 * z, y, z
+
+
+def _views_first(values: Array, trailing: int) -> Array:
+    """Move the views to the front: ``(…, V, L, J[, 2]) → ([2,] V, N)``, N all the points."""
+    xp = array_namespace(values)
+    V, L, J = values.shape[len(values.shape) - trailing - 3 :][:3]
+    if trailing:
+        stacked = xp.permute_dims(xp.reshape(values, (-1, V, L * J, 2)), (3, 1, 0, 2))
+        return xp.reshape(stacked, (2, V, -1))
+    return xp.reshape(xp.permute_dims(xp.reshape(values, (-1, V, L * J)), (1, 0, 2)), (V, -1))
+
+
+def _full_weights(weights: Array, keypoints: Array) -> Array:
+    """Return weights of shape (…, V, L, J)."""
+    xp = array_namespace(keypoints)
+    weights = weights if hasattr(weights, "shape") else np.asarray(weights)
+    if isinstance(weights, np.ndarray) and not isinstance(keypoints, np.ndarray):
+        weights = constant(weights, keypoints)
+    full = tuple(keypoints.shape[:-1])
+    if tuple(weights.shape) in (full[:-2], full[-3:-2]):
+        weights = weights[..., None, None]
+    else:
+        check_shape("weights", weights, full)
+    return xp.broadcast_to(weights, full)
+
+
+def _refuse_unfit(
+    xp: Any,
+    keypoints: Array,
+    weights: Array | None,
+    points: tuple[int, ...],
+    found: Array,
+    normal: Array,
+    factors: tuple[Array, ...],
+    inverse_depth: Array | None,
+) -> None:
+    """Warn of poor conditions; raise where there is no solution."""
+    if weights is None and not np.isfinite(_number(xp.sum(found))):
+        check_finite("keypoints", keypoints)
+    if weights is not None and not _number(xp.min(weights)) >= 0:
+        raise ValueError(
+            f"weights is {_number(xp.min(weights)):g} at its least, expected 0 or more"
+        )
+    # trace³/determinant is never below the condition number, and cheap.
+    trace = normal[0, ...] + normal[3, ...] + normal[5, ...]
+    bound = trace * trace * trace * (factors[0] * factors[1] * factors[2])
+    if not (_number(xp.max(bound)) < _POOR and _number(xp.min(bound)) > 0):
+        _report_condition(to_numpy(normal), points)
+    if inverse_depth is not None and not _number(xp.min(inverse_depth)) > 0:
+        view, point = np.argwhere(~(to_numpy(inverse_depth) > 0))[0]
+        *_, frame, joint = np.unravel_index(point, points)
+        raise ValueError(
+            f"keypoints put joint {joint} of frame {frame} behind camera {view}, expected every "
+            "joint in front of every camera; check the cameras, or give an initial motion"
+        )
+
+
+def _number(value: Array) -> float:
+    return float(to_numpy(value))
+
+
+def _report_condition(normal: np.ndarray, points: tuple[int, ...]) -> None:
+    matrices = np.empty((normal.shape[1], 3, 3))
+    for entry, (i, j) in zip(normal, _PAIRS, strict=True):
+        matrices[:, i, j] = matrices[:, j, i] = entry
+    values = np.linalg.eigvalsh(np.nan_to_num(matrices))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        condition = np.where(values[:, 0] > 0, values[:, 2] / values[:, 0], np.inf)
+    worst = int(condition.argmax())
+    *_, frame, joint = (int(i) for i in np.unravel_index(worst, points))
+    if not condition[worst] < 0.01 / np.finfo(normal.dtype).eps:
+        raise ValueError(
+            f"keypoints of joint {joint} in frame {frame} determine no point (condition number "
+            f"{condition[worst]:.2g}), expected two views of it that are not parallel"
+        )
+    if condition[worst] > _POOR:
+        warnings.warn(
+            f"the views are nearly parallel: the condition number is {condition[worst]:.3g} at "
+            f"joint {joint} of frame {frame}, so depths are that much less certain",
+            stacklevel=3,
+        )

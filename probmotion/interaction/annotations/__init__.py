@@ -1,0 +1,5 @@
+"""2D annotations of people together, and the views they were taken from."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,310 @@
+"""Interaction coordinates of a pose-pair, and how unlike two pose-pairs are in them.
+
+Yin, Huang, Cohen-Or and Zhang, "Sampling of closely interacting pose-pairs", eqs. 7 and 8. Edges
+come from :mod:`probmotion.interaction.geometry.graphs`; nothing here counts the characters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from probmotion.arrays import Array, array_namespace, constant, to_numpy
+from probmotion.interaction.geometry.graphs import check_graph, graph_edges
+from probmotion.validation import check_positive, check_shape
+
+__all__ = [
+    "align_motions",
+    "align_rigidly",
+    "cartesian_distance",
+    "dissimilarity",
+    "interaction_coordinates",
+    "interaction_distance",
+]
+
+
+def align_rigidly(source: Array, target: Array, visible: Array | None = None) -> Array:
+    """Return ``source`` after the rotation and translation that bring it nearest to ``target``.
+
+    Nearest in the sum of squares over the visible joints; no reflection, no scaling (Kabsch
+    1976). All joints of ``source`` are moved, hidden ones too.
+
+    Parameters
+    ----------
+    source, target : Array
+        Joints, shape (…, J, D), D = 2 or 3, metres; batch axes broadcast.
+    visible : Array, optional
+        Which joints count, bool, shape (…, J); all by default. A hidden joint of ``target`` is
+        never read.
+
+    Returns
+    -------
+    Array
+        Shape (…, J, D), metres.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    """
+    visible = _check_pairs(source, target, visible)
+    xp = array_namespace(source, target)
+    counted = _weights(source, visible)[..., None]
+    total = xp.sum(counted, axis=-2, keepdims=True)
+    total = xp.where(total > 0, total, xp.ones_like(total))
+    if visible is not None:
+        target = xp.where(counted > 0, target, xp.zeros_like(target))
+    source_centre = xp.sum(counted * source, axis=-2, keepdims=True) / total
+    target_centre = xp.sum(counted * target, axis=-2, keepdims=True) / total
+    centred = source - source_centre
+    moments = xp.matrix_transpose(counted * centred) @ (target - target_centre)
+    left, _, right = xp.linalg.svd(moments, full_matrices=False)
+    # Of the best orthogonal matrix that mirrors, the direction that matters least is turned back.
+    mirrored = (xp.linalg.det(left) * xp.linalg.det(right) < 0)[..., None, None]
+    least = constant([0.0] * (source.shape[-1] - 1) + [1.0], source)[:, None]
+    right = xp.where(mirrored, right * (1 - 2 * least), right)
+    return centred @ (left @ right) + target_centre
+
+
+def align_motions(motions: Array, target: Array) -> Array:
+    """Return ``motions`` each moved and turned, as a whole, to where it is nearest to ``target``.
+
+    Parameters
+    ----------
+    motions, target : Array
+        Shapes (…, L, J, 3) and (L, J, 3), metres; see :func:`align_rigidly`.
+
+    Returns
+    -------
+    Array
+        Shape (…, L, J, 3), metres.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    """
+    xp = array_namespace(motions, target)
+    points = xp.reshape(motions, (*motions.shape[:-3], -1, 3))
+    return xp.reshape(align_rigidly(points, xp.reshape(target, (-1, 3))), motions.shape)
+
+
+def interaction_coordinates(points: Array, edges: Array) -> Array:
+    """Return the vectors ``p_i − p_j`` of the edges (eq. 7), shape (…, E, D), metres.
+
+    Parameters
+    ----------
+    points : Array
+        Joints, shape (…, J, D), metres.
+    edges : Array
+        Edges (i, j), integers, shape (E, 2).
+
+    Raises
+    ------
+    ValueError
+        If a shape is not as stated.
+    """
+    check_shape("points", points, ("…", "J", "D"))
+    first, second = _ends(edges, points)
+    xp = array_namespace(points)
+    return xp.take(points, first, axis=-2) - xp.take(points, second, axis=-2)
+
+
+def dissimilarity(
+    first: Array,
+    second: Array,
+    first_edges: Array,
+    second_edges: Array,
+    epsilon: float = 0.05,
+    visible: Array | None = None,
+) -> Array:
+    """Return the dissimilarity of two pose-pairs in interaction coordinates (eq. 8), metres.
+
+    ``d = Σ_{T₁} w₁ ‖u₁ − u₂‖ / W₁ + Σ_{T₂} w₂ ‖u₁ − u₂‖ / W₂`` with the weights ``w_k = 1 / max(ε,
+    ‖u_k‖)`` of the pair whose graph it is, and ``W_k`` their sum: short edges count most. The
+    pairs are compared as they stand; see :func:`align_rigidly`.
+
+    Scaling both pairs and ε by s scales d by s. So does scaling the pairs alone where every edge
+    is at least ε before and after.
+
+    Parameters
+    ----------
+    first, second : Array
+        Joints, shape (…, J, D), metres; batch axes broadcast.
+    first_edges, second_edges : Array
+        The graph of each pair, integers, shape (E, 2) each; E may differ.
+    epsilon : float
+        ε, metres.
+    visible : Array, optional
+        Which joints count, bool, shape (…, J); edges with a hidden end are left out of the sums
+        and of W.
+
+    Returns
+    -------
+    Array
+        Shape (…), metres; infinite where a graph has no edge that counts.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or ``epsilon`` is not above 0.
+    """
+    visible = _check_pairs(first, second, visible)
+    check_positive("epsilon", epsilon)
+    xp = array_namespace(first, second)
+    counted = _weights(first, visible)
+    total = None
+    for own, edges in ((first, first_edges), (second, second_edges)):
+        i, j = _ends(edges, own)
+        between = interaction_coordinates(first, edges) - interaction_coordinates(second, edges)
+        length = _norm(interaction_coordinates(own, edges))
+        both = xp.take(counted, i, axis=-1) * xp.take(counted, j, axis=-1)
+        weight = both / xp.where(length > epsilon, length, xp.full_like(length, epsilon))
+        # A hidden joint's number may be anything; its edges must not bring it in.
+        apart = xp.where(both > 0, _norm(between), xp.zeros_like(_norm(between)))
+        term = _mean(apart, weight)
+        total = term if total is None else total + term
+    return total
+
+
+def interaction_distance(
+    first: Array, second: Array, graph: str = "delaunay", epsilon: float = 0.05
+) -> Array:
+    """Return the dissimilarity (eq. 8) of pose-pairs, triangulated and rigidly aligned, metres.
+
+    It is symmetric, and the same wherever either pair stands and however it is turned.
+
+    Parameters
+    ----------
+    first, second : Array
+        Joints, shape (…, J, D), D = 2 or 3, metres; batch axes broadcast.
+    graph : str
+        One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
+    epsilon : float
+        ε of eq. 8, metres.
+
+    Returns
+    -------
+    Array
+        Shape (…), metres.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the graph is unknown, or ``epsilon`` is not above 0.
+    """
+    _check_pairs(first, second, None)
+    check_graph(graph)
+    xp = array_namespace(first, second)
+    batch = np.broadcast_shapes(tuple(first.shape[:-2]), tuple(second.shape[:-2]))
+    joints = tuple(first.shape[-2:])
+    first = xp.reshape(xp.broadcast_to(first, batch + joints), (-1, *joints))
+    second = xp.reshape(xp.broadcast_to(second, batch + joints), (-1, *joints))
+    edges_of = _remembering_edges(graph)
+    found = [
+        dissimilarity(
+            align_rigidly(first[k, ...], second[k, ...]),
+            second[k, ...],
+            edges_of(first[k, ...]),
+            edges_of(second[k, ...]),
+            epsilon,
+        )
+        for k in range(math.prod(batch))
+    ]
+    return xp.reshape(xp.stack(found), batch) if found else xp.zeros(batch, dtype=first.dtype)
+
+
+def cartesian_distance(first: Array, second: Array, visible: Array | None = None) -> Array:
+    """Return the root mean square distance of corresponding joints after rigid alignment, metres.
+
+    This is the paper's comparison with Cartesian coordinates. Symmetric, and the same wherever
+    either pair stands and however it is turned.
+
+    Parameters
+    ----------
+    first, second : Array
+        Joints, shape (…, J, D), metres; batch axes broadcast.
+    visible : Array, optional
+        Which joints count, bool, shape (…, J); all by default.
+
+    Returns
+    -------
+    Array
+        Shape (…), metres; infinite where no joint is visible.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit.
+    """
+    visible = _check_pairs(first, second, visible)
+    xp = array_namespace(first, second)
+    weight = _weights(first, visible)
+    if visible is not None:
+        second = xp.where(weight[..., None] > 0, second, xp.zeros_like(second))
+    apart = align_rigidly(first, second, visible) - second
+    squared = xp.where(weight > 0, xp.sum(apart**2, axis=-1), xp.zeros_like(apart[..., 0]))
+    return _root(_mean(squared, weight))
+
+
+def _remembering_edges(graph: str) -> Callable[[Array], np.ndarray]:
+    """Return :func:`graph_edges`, which triangulates equal pairs once."""
+    known: dict[bytes, np.ndarray] = {}
+
+    def edges(points: Array) -> np.ndarray:
+        numbers = to_numpy(points).astype(np.float64)
+        key = numbers.tobytes()
+        if key not in known:
+            known[key] = graph_edges(numbers, graph)
+        return known[key]
+
+    return edges
+
+
+def _check_pairs(first: Array, second: Array, visible: Array | None) -> Array | None:
+    """Return ``visible`` after a check that all shapes fit."""
+    check_shape("first", first, ("…", "J", "D"))
+    check_shape("second", second, ("…", *first.shape[-2:]))
+    if visible is not None:
+        check_shape("visible", visible, ("…", first.shape[-2]))
+    return visible
+
+
+def _weights(points: Array, visible: Array | None) -> Array:
+    """Return 1 for visible joints and 0 for hidden ones, (…, J)."""
+    xp = array_namespace(points)
+    if visible is None:
+        return xp.ones(points.shape[-2:-1], dtype=points.dtype)
+    return constant(to_numpy(visible), points)
+
+
+def _ends(edges: Array, like: Array) -> tuple[Array, Array]:
+    """Return the first and the second joints of edges, in the library of ``like``."""
+    numbers = to_numpy(edges)
+    check_shape("edges", numbers, ("E", 2))
+    xp = array_namespace(like)
+    indices = xp.asarray(numbers.astype(np.int64))
+    return indices[:, 0], indices[:, 1]
+
+
+def _norm(vectors: Array) -> Array:
+    """Return the lengths of vectors, (…, D) → (…), whose gradient at 0 is 0."""
+    return _root(array_namespace(vectors).sum(vectors**2, axis=-1))
+
+
+def _root(squared: Array) -> Array:
+    xp = array_namespace(squared)
+    some = squared > 0
+    return xp.where(some, xp.sqrt(xp.where(some, squared, xp.ones_like(squared))), squared)
+
+
+def _mean(values: Array, weight: Array) -> Array:
+    """Return the weighted mean over the last axis, infinite where no weight is above 0."""
+    xp = array_namespace(values)
+    weight = xp.broadcast_to(weight, values.shape)
+    total = xp.sum(weight, axis=-1)
+    none = total <= 0
+    mean = xp.sum(values * weight, axis=-1) / xp.where(none, xp.ones_like(total), total)
+    return xp.where(none, xp.full_like(mean, float("inf")), mean)

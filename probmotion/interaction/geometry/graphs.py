@@ -1,0 +1,179 @@
+"""Which joints of a pose-pair are looked at together: the edges of a graph over all joints.
+
+The reference, in NumPy and SciPy, in the plane and in space. The compiled counterpart for many
+projections is :mod:`probmotion.interaction.geometry.graph_kernels`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import Delaunay, QhullError
+
+from probmotion.seeds import generator
+from probmotion.validation import check_finite, check_shape
+
+__all__ = [
+    "GRAPHS",
+    "JOGGLE",
+    "N_NEIGHBOURS",
+    "check_graph",
+    "graph_edges",
+    "is_degenerate",
+    "joggle_offsets",
+]
+
+GRAPHS = ("delaunay", "nearest-neighbours", "gabriel", "complete")
+N_NEIGHBOURS = 6
+JOGGLE = 1e-5
+"""How far degenerate joints are moved, in units of their extent."""
+
+# Determinants of joints inside the unit box that are this close to 0 have no certain sign.
+_TIE = 1e-13
+
+
+def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
+    """Return the edges of a graph over joints.
+
+    - ``delaunay``: the Delaunay triangulation (Qhull), tetrahedra in space. Degenerate joints
+      (:func:`is_degenerate`) are first moved by fixed tiny offsets.
+    - ``nearest-neighbours``: i and j where either is among the other's six nearest.
+    - ``gabriel``: i and j where no joint lies strictly inside the ball whose diameter they are;
+      a part of the Delaunay triangulation.
+    - ``complete``: all.
+
+    Parameters
+    ----------
+    points : numpy.ndarray
+        Joints, shape (J, D), D = 2 or 3, in any unit.
+    graph : str
+        One of :data:`GRAPHS`.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape (E, 2), integers, i < j, rows in lexicographic order.
+
+    Raises
+    ------
+    ValueError
+        If ``points`` is not (J, 2) or (J, 3), not finite, or the graph is unknown.
+    """
+    points = _checked(points)
+    check_graph(graph)
+    first, second = np.triu_indices(points.shape[0], 1)
+    if graph == "delaunay":
+        adjacent = _delaunay_adjacency(points)
+    elif graph == "nearest-neighbours":
+        adjacent = _neighbour_adjacency(points)
+    elif graph == "gabriel":
+        adjacent = _gabriel_adjacency(points)
+    else:
+        adjacent = np.ones((points.shape[0],) * 2, dtype=bool)
+    kept = adjacent[first, second]
+    return np.stack([first[kept], second[kept]], axis=-1)
+
+
+def is_degenerate(points: np.ndarray) -> bool:
+    """Return whether the Delaunay triangulation of joints does not exist or is not the only one.
+
+    That is where joints repeat, where all lie on a line (in space: in a plane), and where those
+    of two neighbouring triangles lie on one circle (tetrahedra, on one sphere).
+
+    Parameters
+    ----------
+    points : numpy.ndarray
+        Joints, shape (J, D), D = 2 or 3.
+
+    Raises
+    ------
+    ValueError
+        If ``points`` is not (J, 2) or (J, 3), or not finite.
+    """
+    points = _checked(points)
+    if len(np.unique(points, axis=0)) < len(points):
+        return True
+    return len(points) > points.shape[1] and _triangulation(points) is None
+
+
+def check_graph(graph: str) -> None:
+    """Raise ``ValueError`` unless ``graph`` is one of :data:`GRAPHS`."""
+    if graph not in GRAPHS:
+        raise ValueError(f"graph is {graph!r}, expected one of {', '.join(GRAPHS)}")
+
+
+def joggle_offsets(n_joints: int, n_axes: int) -> np.ndarray:
+    """Return the fixed offsets in [-1, 1] that degenerate joints are moved by, (J, D)."""
+    return 2.0 * generator(0, "joggle").random((n_joints, 3))[:, :n_axes].copy() - 1.0
+
+
+def _checked(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    check_shape("points", points, ("J", 3 if points.shape[-1:] == (3,) else 2))
+    check_finite("points", points)
+    return points
+
+
+def _delaunay_adjacency(points: np.ndarray) -> np.ndarray:
+    """Return which joints share a triangle, (J, J) bool."""
+    n_joints, n_axes = points.shape
+    if n_joints <= n_axes:
+        return np.ones((n_joints, n_joints), dtype=bool)
+    simplices = _triangulation(points)
+    if simplices is None:
+        unit = _in_unit_box(points)
+        simplices = Delaunay(unit + JOGGLE * joggle_offsets(n_joints, n_axes)).simplices
+    adjacent = np.zeros((n_joints, n_joints), dtype=bool)
+    adjacent[simplices[:, :, None], simplices[:, None, :]] = True
+    return adjacent
+
+
+def _triangulation(points: np.ndarray) -> np.ndarray | None:
+    """Return the joints of every triangle or tetrahedron, None where degenerate."""
+    unit = _in_unit_box(points)
+    try:
+        found = Delaunay(unit)
+    except QhullError:
+        return None
+    if len(np.unique(found.simplices)) < len(unit) or _has_ties(unit, found):
+        return None
+    # A joint between two others on the hull: rounding may have made a triangle of the three.
+    legs = unit[found.simplices[:, 1:]] - unit[found.simplices[:, :1]]
+    return found.simplices[np.abs(np.linalg.det(legs)) >= _TIE]
+
+
+def _in_unit_box(points: np.ndarray) -> np.ndarray:
+    """Return the joints in units of their extent, about the middle."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = (high - low).max()
+    return (points - 0.5 * (low + high)) / (extent if extent > 1e-150 else 1.0)
+
+
+def _has_ties(unit: np.ndarray, found: Delaunay) -> bool:
+    """Return whether a joint lies on the circumcircle (sphere) of a neighbouring triangle."""
+    simplices, neighbours = found.simplices, found.neighbors
+    which, side = np.nonzero(neighbours >= 0)
+    other = simplices[neighbours[which, side]]
+    opposite = other[~(other[:, :, None] == simplices[which][:, None, :]).any(axis=-1)]
+    # Lifted to the paraboloid, joints of one circle lie in one plane: their determinant is 0.
+    apart = unit[simplices[which]] - unit[opposite][:, None]
+    lifted = np.concatenate([apart, (apart**2).sum(axis=-1, keepdims=True)], axis=-1)
+    return bool((np.abs(np.linalg.det(lifted)) < _TIE).any())
+
+
+def _neighbour_adjacency(points: np.ndarray) -> np.ndarray:
+    """Return which joints are near, (J, J) bool; of equally near ones the first come first."""
+    n_joints = len(points)
+    squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
+    np.fill_diagonal(squared, np.inf)
+    nearest = np.argsort(squared, axis=1, kind="stable")[:, : min(N_NEIGHBOURS, n_joints - 1)]
+    near = np.zeros((n_joints, n_joints), dtype=bool)
+    np.put_along_axis(near, nearest, True, axis=1)
+    return near | near.T
+
+
+def _gabriel_adjacency(points: np.ndarray) -> np.ndarray:
+    """Return which balls on a diameter are empty, (J, J) bool."""
+    to = points[:, None] - points[None]  # [i, k]: from k to i
+    # k sees the diameter i–j under more than a right angle exactly when it is inside the ball.
+    seen = np.einsum("ikd,jkd->ijk", to, to)
+    return ~(seen < 0).any(axis=-1)

@@ -1,0 +1,227 @@
+"""Compiled: how unlike the 3D shape contexts of poses are after the best rigid motion.
+
+Bins are those of :func:`probmotion.interaction.geometry.shape_context.shape_contexts` in space,
+taken again for every two poses, because turning a pose moves its joints to other bins. That is
+dear, so a pair of poses is given up as soon as it must exceed a limit: merging bins never increases
+a χ² cost, and the counts of the rings alone do not change with the rotation.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from probmotion.interaction.geometry.rigid_kernels import align
+from probmotion.interaction.geometry.shape_context import RING_EDGES
+
+__all__ = ["N_RINGS", "ring_counts", "shape_minima", "shape_table"]
+
+N_RINGS = len(RING_EDGES) + 1
+_N_BANDS, _N_SECTORS = 4, 8
+_N_BINS = N_RINGS * _N_BANDS * _N_SECTORS
+_SQUARED_EDGES = tuple(edge**2 for edge in RING_EDGES)
+_FEWER = 1e-12
+"""By how much rounded sums may differ."""
+
+
+@numba.njit(cache=True)
+def ring_counts(poses: np.ndarray) -> np.ndarray:
+    """Return how many joints lie in each ring around each joint, (n, J, 5) uint8."""
+    counts = np.zeros((poses.shape[0], poses.shape[1], N_RINGS), dtype=np.uint8)
+    for n in range(poses.shape[0]):
+        for i in range(poses.shape[1]):
+            for j in range(poses.shape[1]):
+                if j != i:
+                    squared = 0.0
+                    for axis in range(3):
+                        squared += (poses[n, j, axis] - poses[n, i, axis]) ** 2
+                    counts[n, i, _ring(squared)] += 1
+    return counts
+
+
+@numba.njit(cache=True)
+def shape_table(
+    first: np.ndarray,
+    first_rings: np.ndarray,
+    second: np.ndarray,
+    second_rings: np.ndarray,
+    table: np.ndarray,
+) -> None:
+    """Write the mean χ² cost of every two poses' shape contexts to ``table`` (n, m)."""
+    limits = np.empty(1)
+    for a in range(first.shape[0]):
+        for b in range(second.shape[0]):
+            limits[0] = np.inf
+            shape_minima(
+                first[a : a + 1],
+                first_rings[a : a + 1],
+                second[b : b + 1],
+                second_rings[b : b + 1],
+                limits,
+            )
+            table[a, b] = limits[0]
+
+
+@numba.njit(cache=True)
+def shape_minima(
+    truths: np.ndarray,
+    truth_rings: np.ndarray,
+    draws: np.ndarray,
+    draw_rings: np.ndarray,
+    least: np.ndarray,
+) -> None:
+    """Lower ``least`` (G,) to each true pose's cost against its nearest draw.
+
+    Draws are turned onto the true pose, whose vertical is the one that counts.
+    """
+    n_joints = truths.shape[1]
+    gains = _gains(n_joints - 1)
+    rotation, horn, turned = np.empty((3, 3)), np.empty((4, 4)), np.empty((n_joints, 3))
+    contexts = np.empty((n_joints, _N_BINS), dtype=np.uint8)
+    counts, bins = np.zeros(_N_BINS, dtype=np.uint8), np.empty(n_joints, dtype=np.int64)
+    spare = np.empty(n_joints)
+    for g in range(truths.shape[0]):
+        _fill_contexts(truths[g], contexts, bins)
+        for s in range(draws.shape[0]):
+            if _ring_costs(truth_rings[g], draw_rings[s], gains, spare) > least[g] + _FEWER:
+                continue
+            align(truths[g], draws[s], rotation, horn)
+            _turn(draws[s], rotation, turned)
+            found = _cost(turned, contexts, gains, spare, least[g], counts, bins)
+            least[g] = min(least[g], found)
+
+
+@numba.njit(cache=True)
+def _gains(most: int) -> np.ndarray:
+    """Return what a bin's k-th joint saves where the other pose has h: ``2hk/(h+k)``'s step."""
+    gains = np.zeros((most + 1, most + 1))
+    for h in range(1, most + 1):
+        for k in range(1, most + 1):
+            before = 2.0 * h * (k - 1) / (h + k - 1)
+            gains[h, k] = (2.0 * h * k / (h + k) - before) / (most * (most + 1))
+    return gains
+
+
+@numba.njit(cache=True)
+def _ring_costs(
+    first: np.ndarray, second: np.ndarray, gains: np.ndarray, after: np.ndarray
+) -> float:
+    """Return the cost of rings alone, and write what the joints after each one add to it."""
+    n_joints = first.shape[0]
+    total = 0.0
+    for i in range(n_joints - 1, -1, -1):
+        after[i] = total
+        total += 1.0 / n_joints
+        for ring in range(N_RINGS):
+            h = first[i, ring]
+            for k in range(1, second[i, ring] + 1):
+                total -= gains[h, k]
+    return total
+
+
+@numba.njit(cache=True)
+def _cost(
+    joints: np.ndarray,
+    contexts: np.ndarray,
+    gains: np.ndarray,
+    after: np.ndarray,
+    limit: float,
+    counts: np.ndarray,
+    bins: np.ndarray,
+) -> float:
+    """Return the mean χ² cost of a pose against shape contexts, infinite where over the limit.
+
+    With N joints in both histograms a joint's cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
+    """
+    n_joints = joints.shape[0]
+    across, along = _heading(joints)
+    total = 0.0
+    for i in range(n_joints):
+        _fill_bins(joints, i, across, along, bins)
+        total += 1.0 / n_joints
+        for j in range(n_joints):
+            if j != i:
+                counts[bins[j]] += 1
+                total -= gains[contexts[i, bins[j]], counts[bins[j]]]
+        for j in range(n_joints):
+            counts[bins[j]] = 0
+        if total + after[i] > limit + _FEWER:
+            return np.inf
+    return max(total, 0.0)
+
+
+@numba.njit(cache=True)
+def _fill_contexts(joints: np.ndarray, contexts: np.ndarray, bins: np.ndarray) -> None:
+    """Write the shape contexts of a pose, (J, bins)."""
+    contexts[:] = 0
+    across, along = _heading(joints)
+    for i in range(joints.shape[0]):
+        _fill_bins(joints, i, across, along, bins)
+        for j in range(joints.shape[0]):
+            if j != i:
+                contexts[i, bins[j]] += 1
+
+
+@numba.njit(cache=True)
+def _heading(joints: np.ndarray) -> tuple[float, float]:
+    """Return where the second half of the joints is from the first half on the ground, x and z."""
+    half = joints.shape[0] // 2
+    x = z = 0.0
+    for j in range(half):
+        other = joints.shape[0] - half + j
+        x += joints[other, 0] - joints[j, 0]
+        z += joints[other, 2] - joints[j, 2]
+    return x, z
+
+
+@numba.njit(cache=True)
+def _fill_bins(
+    joints: np.ndarray, i: int, heading_x: float, heading_z: float, bins: np.ndarray
+) -> None:
+    """Write the bin in which joint i sees each joint."""
+    for j in range(joints.shape[0]):
+        x = joints[j, 0] - joints[i, 0]
+        y = joints[j, 1] - joints[i, 1]
+        z = joints[j, 2] - joints[i, 2]
+        squared = x * x + y * y + z * z
+        # Bands of equal area: sin > ½ where 4 y² > d².
+        steep = 4.0 * y * abs(y)
+        band = int(steep >= -squared) + int(y >= 0.0) + int((steep >= squared) & (squared > 0.0))
+        sector = _octant(x * heading_z - z * heading_x, x * heading_x + z * heading_z)
+        bins[j] = (_ring(squared) * _N_BANDS + band) * _N_SECTORS + sector
+
+
+# No branches below, so that many joints are done at once.
+
+
+@numba.njit(cache=True)
+def _ring(squared: float) -> int:
+    near, next_near, next_far, far = _SQUARED_EDGES
+    return (
+        int(squared >= near)
+        + int(squared >= next_near)
+        + int(squared >= next_far)
+        + int(squared >= far)
+    )
+
+
+@numba.njit(cache=True)
+def _octant(across: float, along: float) -> int:
+    """Return which eighth of a turn atan2(across, along) is in, from 0 on."""
+    lower = (across < 0.0) | ((across == 0.0) & (along < 0.0))
+    up, right = (-across, -along) if lower else (across, along)
+    left = (right <= 0.0) & (up > 0.0)
+    opposite, adjacent = (-right, up) if left else (up, right)
+    steep = (opposite >= adjacent) & (opposite > 0.0)
+    return 4 * int(lower) + 2 * int(left) + int(steep)
+
+
+@numba.njit(cache=True)
+def _turn(joints: np.ndarray, rotation: np.ndarray, turned: np.ndarray) -> None:
+    for j in range(joints.shape[0]):
+        for i in range(3):
+            turned[j, i] = (
+                rotation[i, 0] * joints[j, 0]
+                + rotation[i, 1] * joints[j, 1]
+                + rotation[i, 2] * joints[j, 2]
+            )

@@ -1,0 +1,164 @@
+"""Reading motions from AMC files, each with the ASF file of its skeleton.
+
+A bone with the axes C (:mod:`probmotion.io.asf`) and the turns M of a frame is turned by
+C M C⁻¹ against its parent; of the turns that a file lists, the first is done first. The position
+of a bone's end is that of its parent's end plus the turned bone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.geometry.rotations import euler_to_matrix
+from probmotion.io.acclaim_text import AcclaimText
+from probmotion.io.asf import AcclaimSkeleton, read_asf
+from probmotion.io.errors import shortened
+from probmotion.motion.motion import Motion
+from probmotion.validation import check_positive
+
+__all__ = ["read_amc"]
+
+_DECLARATIONS = (":FULLY-SPECIFIED", ":DEGREES")
+_RATE = ":SAMPLES-PER-SECOND"
+
+
+def read_amc(
+    path: str | Path, skeleton_path: str | Path | None = None, fps: float = 120.0
+) -> Motion:
+    """Read a motion from an AMC file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    skeleton_path : str or Path, optional
+        The ASF file of its skeleton. By default the one beside it of the same name, or of the
+        subject's: ``02.asf`` for ``02_01.amc``.
+    fps : float
+        Frames per second, which few files hold: 120 in most of the CMU database, 60 in some of it.
+        A file that declares another rate is refused.
+
+    Returns
+    -------
+    motion : Motion
+        In metres. It has no rotations: each bone turns on its own, which rotations of the joints
+        could not express where several bones begin.
+
+    Raises
+    ------
+    MotionFileError
+        If a file is truncated, damaged or none of its format; the message names the line.
+    FileNotFoundError
+        If there is no such file, or none of its skeleton.
+    ValueError
+        If ``fps`` is not above 0.
+    """
+    path = Path(path)
+    check_positive("fps", fps)
+    text = AcclaimText.of(path)
+    _check_declarations(text, fps)
+    body = read_asf(_beside(path) if skeleton_path is None else skeleton_path)
+    values = _values(text, body)
+    return Motion(_world_positions(body, values), body.skeleton, fps, name=path.stem)
+
+
+def _beside(path: Path) -> Path:
+    """Return the ASF file that belongs to an AMC file by its name."""
+    stems = dict.fromkeys((path.stem, path.stem.rpartition("_")[0] or path.stem))
+    candidates = [path.with_name(f"{stem}.asf") for stem in stems]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise FileNotFoundError(
+        f"there is no {' or '.join(map(str, candidates))} with the skeleton of {path}, expected "
+        "one of them, or skeleton_path="
+    )
+
+
+def _check_declarations(text: AcclaimText, fps: float) -> None:
+    """Refuse a file that is no AMC, or declares another unit or rate before its first frame."""
+    declared = {}
+    for number, words in text.lines:
+        if not words[0].startswith(":"):
+            break
+        declared[words[0].upper()] = words[1:]
+        if words[0].upper() == _RATE and text.numbers(number, _RATE, words[1:], 1) != [fps]:
+            text.fail(number, f"{_RATE} is {words[1]}, expected {fps:g} as fps")
+    else:
+        text.fail(text.length, "the file ends before its first frame, expected one at least")
+    for wanted in _DECLARATIONS:
+        if wanted not in declared:
+            text.fail(number, f"{shortened(words[0])} came, expected {wanted} before it")
+
+
+def _values(text: AcclaimText, body: AcclaimSkeleton) -> np.ndarray:
+    """Return the values of all frames, (L, C): a column per channel, joints in order."""
+    columns: dict[str, slice] = {}
+    width = 0
+    for name, channels in zip(body.skeleton.joint_names, body.channels, strict=True):
+        if channels:
+            columns[name] = slice(width, width + len(channels))
+            width += len(channels)
+    rows: list[list[float]] = []
+    awaited: set[str] = set()
+    frame = 0
+    for number, words in text.lines:
+        name = words[0]
+        if name.startswith(":") and not rows:
+            continue
+        if len(words) == 1 and name.isascii() and name.isdigit() and len(name) < 10:
+            _check_whole(text, number, awaited, frame)
+            if rows and int(name) != frame + 1:
+                text.fail(number, f"frame {name} came after {frame}, expected {frame + 1}")
+            frame, awaited = int(name), set(columns)
+            rows.append([0.0] * width)
+        elif not rows or name not in awaited:
+            wanted = "a bone that moves, once in a frame" if rows else "the number of a frame"
+            text.fail(number, f"{shortened(name)} came, expected {wanted}")
+        else:
+            place = columns[name]
+            count = place.stop - place.start
+            rows[-1][place] = text.numbers(number, shortened(name), words[1:], count)
+            awaited.remove(name)
+    _check_whole(text, text.length, awaited, frame)
+    return np.array(rows).reshape(len(rows), width)
+
+
+def _check_whole(text: AcclaimText, number: int, awaited: set[str], frame: int) -> None:
+    if awaited:
+        text.fail(
+            number,
+            f"frame {frame} ends without {shortened(min(awaited))}, expected all bones that move",
+        )
+
+
+def _world_positions(body: AcclaimSkeleton, values: np.ndarray) -> np.ndarray:
+    """Return positions (L, J, 3), metres."""
+    L, J = len(values), body.skeleton.n_joints
+    positions = np.zeros((L, J, 3))
+    world = np.empty((J, L, 3, 3))
+    starts = np.cumsum([0, *map(len, body.channels)])
+    for joint in body.skeleton.topological_order:
+        channels = body.channels[joint]
+        moved = dict(zip(channels, values[:, starts[joint] : starts[joint + 1]].T, strict=True))
+        C = body.axes[joint]
+        world[joint] = C @ _turns(moved, L) @ C.T
+        parent = body.skeleton.parents[joint]
+        if parent < 0:
+            for axis, channel in enumerate(("TX", "TY", "TZ")):
+                positions[:, joint, axis] = body.unit * moved.get(channel, 0.0)
+        else:
+            world[joint] = world[parent] @ world[joint]
+            positions[:, joint] = positions[:, parent] + world[joint] @ body.offsets[joint]
+    return positions
+
+
+def _turns(moved: dict[str, np.ndarray], frames: int) -> np.ndarray:
+    """Return M (L, 3, 3) of the channels of one joint."""
+    order = [channel[1] for channel in moved if channel.startswith("R")]
+    order += [axis for axis in "XYZ" if axis not in order]
+    still = np.zeros(frames)
+    angles = [np.deg2rad(moved.get(f"R{axis}", still)) for axis in reversed(order)]
+    return np.asarray(euler_to_matrix(np.stack(angles, axis=-1), "".join(reversed(order))))

@@ -1,0 +1,166 @@
+"""Reading motions from BVH files.
+
+A joint's world transform is its parent's, times the translation, times the rotations of its
+channels in the order in which they are listed: the first is the outermost. A position channel
+replaces the offset along its axis, on roots and on other joints, as in Blender's importer.
+BVH has no unit and no axes; files are Y up, right-handed, and the unit is inferred.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.geometry.rotations import euler_to_matrix
+from probmotion.io.bvh_parsing import BVHJoint, parse_bvh
+from probmotion.io.errors import MotionFileWarning, read_bytes
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_positive
+
+__all__ = ["read_bvh"]
+
+_UNITS = {
+    "metres": 1.0,
+    "1/0.45 inch, as in conversions of the CMU database": 0.0254 / 0.45,
+    "centimetres": 0.01,
+    "millimetres": 0.001,
+}
+# From a foot to the farther hand of an adult, along the bones.
+_REACH = 2.4
+
+
+def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = False) -> Motion:
+    """Read a motion from a BVH file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    scale : float, optional
+        Metres per unit of the file. By default the unit among metres, centimetres, millimetres
+        and the CMU database's 1/0.45 inch by which the longest chain of bones comes nearest to
+        2.4 m, an adult's from foot to hand. A unit other than metres is announced by a
+        :class:`MotionFileWarning`.
+    end_sites : bool
+        Whether End Sites become joints, called after their parent with ``_end``. They have no
+        channel and only give the last bones a length, so that they are left out by default: the
+        CMU database's 31 joints come back as 31.
+
+    Returns
+    -------
+    motion : Motion
+        In metres, joints in the file's order, at the file's rate; a frame time that is printed
+        with a few digits stands for the integer rate that it rounds. Rotations are kept unless a
+        joint that is no root moves against its parent, which rotations could not express.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is truncated, mis-ordered or damaged; the message names the line.
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If ``scale`` is not above 0.
+    """
+    path = Path(path)
+    if scale is not None:
+        check_positive("scale", scale)
+    content = parse_bvh(read_bytes(path), str(path))
+    joints = [joint for joint in content.joints if end_sites or not joint.end_site]
+    skeleton = _skeleton(content.joints, joints)
+    rotations, translations = _local_transforms(joints, content.values)
+    positions = _world_positions(rotations, translations, skeleton)
+    if scale is None:
+        scale = _inferred_scale(positions, skeleton, path)
+    # Rotations and constant offsets describe the motion only if no bone has a channel that moves.
+    bones = [joint for joint, _ in skeleton.bones]
+    rigid = not np.ptp(translations[:, bones], axis=0).any()
+    rest_offsets = translations[0].copy()
+    for root in skeleton.roots:
+        rest_offsets[root] = joints[root].offset
+    return Motion(
+        positions * scale,
+        skeleton,
+        content.fps,
+        rotations=rotations if rigid else None,
+        rest_offsets=rest_offsets * scale if rigid else None,
+        name=path.stem,
+    )
+
+
+def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:
+    """Return the skeleton of ``joints``, whose parents are indices into ``every``."""
+    place = {id(joint): index for index, joint in enumerate(joints)}
+    parents = [-1 if joint.parent < 0 else place[id(every[joint.parent])] for joint in joints]
+    taken = {joint.name for joint in joints if not joint.end_site}
+    names = []
+    for joint in joints:
+        name, count = joint.name, 1
+        while joint.end_site and name in taken:  # a second End Site of one joint
+            count += 1
+            name = f"{joint.name}{count}"
+        taken.add(name)
+        names.append(name)
+    return Skeleton(names, parents)
+
+
+def _local_transforms(joints: list[BVHJoint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations (L, J, 3, 3) and translations (L, J, 3) against the parents."""
+    rotations = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
+    translations = np.tile(np.array([joint.offset for joint in joints]), (len(values), 1, 1))
+    column = 0
+    for index, joint in enumerate(joints):
+        angles = np.zeros((len(values), 3))
+        order = ""
+        for axis, kind in joint.channels or ():
+            if kind == "POSITION":
+                translations[:, index, "XYZ".index(axis)] = values[:, column]
+            else:
+                angles[:, len(order)] = np.deg2rad(values[:, column])
+                order += axis
+            column += 1
+        if order:  # axes without a channel turn by 0, wherever they stand
+            order += "".join(axis for axis in "XYZ" if axis not in order)
+            rotations[:, index] = euler_to_matrix(angles, order)
+    return rotations, translations
+
+
+def _world_positions(
+    rotations: np.ndarray, translations: np.ndarray, skeleton: Skeleton
+) -> np.ndarray:
+    """Return positions (L, J, 3); unlike ``forward_kinematics``, bones may change with time."""
+    world = np.array(rotations)
+    positions = np.array(translations)
+    for joint in skeleton.topological_order:
+        parent = skeleton.parents[joint]
+        if parent >= 0:
+            offset = world[:, parent] @ translations[:, joint, :, np.newaxis]
+            positions[:, joint] = positions[:, parent] + offset[..., 0]
+            world[:, joint] = world[:, parent] @ rotations[:, joint]
+    return positions
+
+
+def _inferred_scale(positions: np.ndarray, skeleton: Skeleton, path: Path) -> float:
+    """Return metres per unit from the longest chain of bones; warn unless it is 1."""
+    reach = np.zeros(skeleton.n_joints)  # from each joint to its farthest descendant
+    longest = 0.0
+    for joint in reversed(skeleton.topological_order):
+        parent = skeleton.parents[joint]
+        if parent >= 0:
+            bone = np.linalg.norm(positions[:, joint] - positions[:, parent], axis=-1).mean()
+            longest = max(longest, reach[parent] + reach[joint] + bone)
+            reach[parent] = max(reach[parent], reach[joint] + bone)
+    if longest == 0:
+        return 1.0
+    unit = min(_UNITS, key=lambda name: abs(np.log(longest * _UNITS[name] / _REACH)))
+    if _UNITS[unit] != 1:
+        warnings.warn(
+            f"{path}: its longest chain of bones measures {longest:.3g}, so its unit was taken "
+            f"for {unit} ({_UNITS[unit]:.4g} m); read_bvh(path, scale=…) takes another",
+            MotionFileWarning,
+            stacklevel=4,
+        )
+    return _UNITS[unit]

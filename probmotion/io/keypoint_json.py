@@ -1,0 +1,364 @@
+"""Keypoint tracks from the JSON of COCO, AlphaPose and OpenPose.
+
+=====================  ==========================================================================
+flavour                content
+=====================  ==========================================================================
+COCO annotations       ``{"images": […], "annotations": [{"image_id", "keypoints", …}], …}``
+COCO results,          ``[{"image_id": "12.jpg", "keypoints": [x, y, confidence, …], "idx": 1},
+AlphaPose              …]``
+AlphaPose "open",      ``{"12.jpg": {"people": [{"pose_keypoints_2d": […]}]}, …}``,
+AlphaPose "cmu"        ``{"12.jpg": {"bodies": [{"joints": […]}]}, …}``
+OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": […]}]}``, one per
+                       frame; one such file; or a list of frames in one file
+=====================  ==========================================================================
+
+Frames are the images that a file lists (COCO annotations, OpenPose). Results name only images
+with a detection: there the frame is the last number in the image's name, and every frame between
+the first and the last belongs to the track. A keypoint with confidence 0 was not seen: it is NaN.
+The visibility v of COCO annotations becomes the confidence v/2: 0 not labelled, 0.5 labelled but
+hidden, 1 visible.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probmotion.io.errors import MotionFileError, read_bytes, shortened
+from probmotion.io.keypoint_layouts import keypoint_skeleton
+from probmotion.io.keypoint_linking import link_people
+from probmotion.io.keypoint_tracks import (
+    Detection,
+    Frames,
+    frame_number,
+    keypoint_values,
+    natural,
+    tracks_of,
+)
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.presets import PRESETS
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_positive
+
+__all__ = ["read_keypoint_json"]
+
+_BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}
+_TWO_LAYOUTS = {25: " ('body25' and 'body25b' have as many)"}
+
+
+def read_keypoint_json(
+    path: str | Path,
+    fps: float,
+    skeleton: Skeleton | str | None = None,
+    people: int | None = None,
+) -> list[KeypointTrack]:
+    """Read every person's keypoint track.
+
+    Parameters
+    ----------
+    path : str or Path
+        A JSON file, or a folder of OpenPose files, one per frame.
+    fps : float
+        Frames per second, which these files do not hold.
+    skeleton : Skeleton or str, optional
+        The detector's keypoints in its order, or the name of a layout in
+        :data:`~probmotion.io.keypoint_layouts.LAYOUTS` or of a preset. By default what COCO
+        ``categories`` say, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25
+        are ambiguous.
+    people : int, optional
+        How many people to follow from image to image where the file has no track ids; see
+        :func:`~probmotion.io.keypoint_linking.link_people`.
+
+    Returns
+    -------
+    tracks : list of KeypointTrack
+        One per person, and video where the images belong to several. People are told apart by
+        ``track_id``, ``idx`` or ``person_id``; without them a frame may hold one person, unless
+        ``people`` says how many to follow.
+
+    Raises
+    ------
+    MotionFileError
+        If the file holds no such tracks, or is damaged; the message says where.
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If ``fps`` is not above 0, ``skeleton`` is no known name, or ``people`` are more than any
+        image shows.
+    """
+    path = Path(path)
+    check_positive("fps", fps)
+    given = keypoint_skeleton(skeleton) if isinstance(skeleton, str) else skeleton
+    frames: Frames | None = None
+    if path.is_dir():
+        detections, frames = _folder(path)
+    else:
+        content = _load(path)
+        if isinstance(content, dict) and "annotations" in content:
+            detections, frames = _annotations(content, path)
+            given = given or _category_skeleton(content, path)
+        elif isinstance(content, dict) and "people" in content:
+            detections, frames = _people(content, "", 0, f"{path}"), {"": range(1)}
+        elif isinstance(content, list) and _all_hold(content, "people"):
+            detections = [
+                found
+                for number, frame in enumerate(content)
+                for found in _people(frame, "", number, f"{path}, frame {number}")
+            ]
+            frames = {"": range(len(content))}
+        elif isinstance(content, list) and _all_hold(content, "keypoints"):
+            detections = _results(content, path)
+        elif isinstance(content, dict) and (
+            _all_hold(content.values(), "people") or _all_hold(content.values(), "bodies")
+        ):
+            detections = [
+                found
+                for image, frame in content.items()
+                for found in _people(
+                    frame, *frame_number(image, f"{path}, image"), f"{path}, {shortened(image)}"
+                )
+            ]
+        else:
+            raise MotionFileError(
+                f"{path} holds {_described(content)}, expected keypoints of COCO (annotations, or "
+                "a list with image_id and keypoints), AlphaPose or OpenPose (people)"
+            )
+    counts = sorted({len(detection.values) for detection in detections})
+    if len(counts) > 1:
+        raise MotionFileError(f"{path}: people have {counts} keypoints, expected one number")
+    if people is not None:
+        check_count("people", people)
+        if all(detection.person is None for detection in detections):
+            detections = link_people(detections, people)
+    return tracks_of(detections, frames, _checked_skeleton(given, counts, path), float(fps), path)
+
+
+# --- flavours --------------------------------------------------------------------------------
+
+
+def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], Frames]:
+    """Return the people of COCO annotations; frames are the images of each video, in order."""
+    where = f"{path}, images"
+    images = _dicts(content.get("images"), where)
+    order = next(
+        (key for key in ("frame_id", "file_name", "id") if all(key in image for image in images)),
+        "id",
+    )
+    in_order = sorted(images, key=lambda image: natural(_identity(image, (order,), where) or ""))
+    places: dict[Any, tuple[str, int]] = {}
+    length: dict[str, int] = {}
+    for image in in_order:
+        video = _identity(image, ("video_id", "vid_id"), where) or ""
+        image_id = _identity(image, ("id",), where)
+        if image_id is None or image_id in places:
+            raise MotionFileError(
+                f"{where}: id {shortened(image_id)} came, expected an id for each image, "
+                "all different"
+            )
+        length[video] = length.get(video, 0) + 1
+        places[image_id] = video, length[video] - 1
+
+    detections = []
+    for number, person in enumerate(_dicts(content["annotations"], f"{path}, annotations")):
+        where = f"{path}, annotations[{number}]"
+        image_id = _identity(person, ("image_id",), where)
+        if image_id not in places:
+            raise MotionFileError(
+                f"{where} has image_id {shortened(image_id)}, expected the id of an image"
+            )
+        values = keypoint_values(person.get("keypoints"), where)
+        if not np.isin(values[:, 2], (0, 1, 2)).all():
+            raise MotionFileError(
+                f"{where} holds a visibility that is not 0, 1 or 2, expected COCO's x, y, v"
+            )
+        values[:, 2] /= 2
+        track_id = _identity(person, ("track_id", "instance_id"), where)
+        detections.append(Detection(*places[image_id], track_id, values, where))
+    return detections, {video: range(count) for video, count in length.items()}
+
+
+def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
+    """Return the people of COCO results and of AlphaPose's own list."""
+    detections = []
+    for number, person in enumerate(content):
+        where = f"{path}, [{number}]"
+        place = frame_number(person.get("image_id"), f"{where}, image_id")
+        values = keypoint_values(person["keypoints"], where)
+        track_id = _identity(person, ("track_id", "idx"), where)
+        detections.append(Detection(*place, track_id, values, where))
+    return detections
+
+
+def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[Detection]:
+    """Return the people of one frame of OpenPose, or of AlphaPose in its forms."""
+    key = "people" if "people" in frame else "bodies"
+    detections = []
+    for index, person in enumerate(_dicts(frame[key], f"{where}, {key}")):
+        place = f"{where}, {key}[{index}]"
+        names = ("pose_keypoints_2d", "pose_keypoints", "joints")
+        keypoints = next((person[name] for name in names if name in person), None)
+        if keypoints == []:  # a face or a hand without a body
+            continue
+        track_id = _identity(person, ("person_id", "idx", "track_id"), place)
+        values = keypoint_values(keypoints, place)
+        detections.append(Detection(video, number, track_id, values, place))
+    return detections
+
+
+def _folder(path: Path) -> tuple[list[Detection], Frames]:
+    """Return the people of an OpenPose folder; its files are the frames, evenly numbered."""
+    files = sorted(path.glob("*.json"), key=lambda file: natural(file.name))
+    if not files:
+        raise MotionFileError(f"{path} holds no .json file, expected OpenPose's, one per frame")
+    detections: list[Detection] = []
+    numbers: dict[str, list[int]] = {}
+    for file in files:
+        content = _load(file)
+        if not isinstance(content, dict) or "people" not in content:
+            raise MotionFileError(
+                f"{file} holds {_described(content)}, expected one OpenPose frame: people"
+            )
+        video, number = frame_number(file.name, str(file))
+        numbers.setdefault(video, []).append(number)
+        detections += _people(content, video, number, str(file))
+    frames = {}
+    for video, found in numbers.items():
+        found.sort()
+        step = found[1] - found[0] if len(found) > 1 else 1
+        for before, after in pairwise(found):
+            if after - before != step or step == 0:
+                raise MotionFileError(
+                    f"{path}: frame {after} follows frame {before}, expected frames numbered "
+                    f"evenly, in steps of {max(step, 1)}"
+                )
+        frames[video] = range(found[0], found[-1] + 1, step)
+    return detections, frames
+
+
+# --- pieces ----------------------------------------------------------------------------------
+
+
+def _load(path: Path) -> Any:
+    content = read_bytes(path)
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise MotionFileError(
+            f"{path} is no JSON ({str(error)[:80]}), expected keypoints"
+        ) from error
+
+
+def _dicts(value: Any, where: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise MotionFileError(f"{where} is {shortened(value)}, expected a list of objects")
+    return value
+
+
+def _all_hold(items: Iterable[Any], key: str) -> bool:
+    """Whether there is an item, and each is an object with ``key``."""
+    listed = list(items)
+    return bool(listed) and all(isinstance(item, dict) and key in item for item in listed)
+
+
+def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
+    """Return the first of ``keys`` as text, None where there is none; OpenPose's -1 is none."""
+    value = next((item[key] for key in keys if item.get(key) is not None), None)
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if value is None or value == [] or value == -1:
+        return None
+    if not isinstance(value, int | str):
+        raise MotionFileError(f"{where}: {keys[0]} is {shortened(value)}, expected a number")
+    return str(value)
+
+
+def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
+    """Return the skeleton of the COCO categories that were annotated, None where they have none.
+
+    The file's edges form no tree in general: a category whose joints are those of a preset has
+    its parents; another has those of the spanning tree that is found first from its first joint.
+    """
+    where = f"{path}, categories"
+    key = ("category_id",)
+    used = {_identity(person, key, where) for person in content["annotations"]}
+    categories = content.get("categories", [])
+    found: Skeleton | None = None
+    for category in _dicts(categories, where):
+        names = category.get("keypoints")
+        if _identity(category, ("id",), where) not in used or not names:
+            continue
+        where = f"{path}, category {shortened(category.get('name'))}"
+        try:
+            skeleton = _named_skeleton(names, category.get("skeleton") or [])
+        except (ValueError, TypeError) as error:
+            raise MotionFileError(f"{where}: {str(error)[:200]}") from error
+        if found is not None and skeleton != found:
+            raise MotionFileError(
+                f"{where} has other keypoints than the category before, expected the same"
+            )
+        found = skeleton
+    return found
+
+
+def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"keypoints is {shortened(names)}, expected a list of names")
+    rootless = Skeleton(names, [-1] * len(names))
+    for preset in map(Skeleton.preset, PRESETS):
+        if preset.canonical_names == rootless.canonical_names:
+            return Skeleton(names, preset.parents)
+    parents: dict[int, int] = {}
+    neighbours: dict[int, list[int]] = {}
+    for first, second in edges:
+        if not {first, second} <= set(range(1, len(names) + 1)):
+            raise ValueError(
+                f"skeleton has the edge {shortened([first, second])}, expected keypoint numbers "
+                f"from 1 to {len(names)}"
+            )
+        neighbours.setdefault(first - 1, []).append(second - 1)
+        neighbours.setdefault(second - 1, []).append(first - 1)
+    for root in range(len(names)):
+        if root in parents:
+            continue
+        parents[root] = -1
+        waiting = [root]
+        while waiting:
+            joint = waiting.pop(0)
+            for neighbour in neighbours.get(joint, []):
+                if neighbour not in parents:
+                    parents[neighbour] = joint
+                    waiting.append(neighbour)
+    return Skeleton(names, [parents[joint] for joint in range(len(names))])
+
+
+def _checked_skeleton(skeleton: Skeleton | None, counts: list[int], path: Path) -> Skeleton:
+    """Return the skeleton of ``counts[0]`` keypoints: the given one, or the usual one."""
+    if not counts:
+        raise MotionFileError(f"{path}: no person in any frame, expected at least one")
+    (count,) = counts
+    if skeleton is None:
+        if count not in _BY_COUNT:
+            raise MotionFileError(
+                f"{path}: people have {count} keypoints of unknown names, expected the argument "
+                f"skeleton to name them{_TWO_LAYOUTS.get(count, '')}"
+            )
+        return keypoint_skeleton(_BY_COUNT[count])
+    if skeleton.n_joints != count:
+        raise MotionFileError(
+            f"{path}: people have {count} keypoints, expected {skeleton.n_joints}, the joints of "
+            "the skeleton"
+        )
+    return skeleton
+
+
+def _described(content: Any) -> str:
+    if isinstance(content, dict):
+        return f"the keys {', '.join(key[:40] for key in list(content)[:8])}"
+    return f"a {type(content).__name__} with {shortened(content)}"

@@ -1,0 +1,101 @@
+"""Following people from image to image, where a detector says who is where but not who is who."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from probmotion.io.keypoint_tracks import Detection
+
+__all__ = ["link_people"]
+
+
+def link_people(detections: Sequence[Detection], people: int) -> list[Detection]:
+    """Return the detections of ``people`` people, with track ids ``"0"``, ``"1"``, …
+
+    A video begins at its first image with that many people or more, where the most confident are
+    named from left to right; earlier images are linked backwards. In every other image detections
+    go to the people so that the keypoints' distances to where each person is expected are least in
+    all (Hungarian method): where they were last seen, moved on as they moved then. Who is left over
+    is left out. People who change places while hidden can be confused.
+
+    Parameters
+    ----------
+    detections : sequence of Detection
+        Without ids, in any order.
+    people : int
+        How many to follow, at most as many as there ever are in one image.
+
+    Returns
+    -------
+    list of Detection
+        Those that were linked, in the order of videos and frames.
+
+    Raises
+    ------
+    ValueError
+        If no image of a video shows that many people.
+    """
+    videos: dict[str, dict[int, list[Detection]]] = {}
+    for detection in detections:
+        videos.setdefault(detection.video, {}).setdefault(detection.frame, []).append(detection)
+    linked: list[Detection] = []
+    for frames in videos.values():
+        order = sorted(frames)
+        full = [number for number in order if len(frames[number]) >= people]
+        if not full:
+            most = max(len(found) for found in frames.values())
+            raise ValueError(f"people is {people}, expected at most the {most} of one image")
+        sure = sorted(frames[full[0]], key=lambda found: -found.values[:, 2].mean())[:people]
+        first = sorted(sure, key=lambda found: float(_middle(found.values)[0]))
+        named = {full[0]: dict(enumerate(first))}
+        at = order.index(full[0])
+        for way in (order[at + 1 :], order[:at][::-1]):
+            followed = [_Person(found) for found in first]
+            for number in way:
+                named[number] = _assigned(frames[number], followed, number)
+                for person, found in named[number].items():
+                    followed[person] = _Person(found, followed[person].last)
+        for number in order:
+            linked += [replace(found, person=str(k)) for k, found in sorted(named[number].items())]
+    return linked
+
+
+class _Person:
+    """Where someone was last seen, and how fast the middle of their keypoints moved then."""
+
+    def __init__(self, last: Detection, before: Detection | None = None) -> None:
+        self.last = last
+        self.step = np.zeros(2)
+        if before is not None:
+            self.step = _middle(last.values) - _middle(before.values)
+            self.step /= last.frame - before.frame
+
+    def expected(self, frame: int) -> np.ndarray:
+        values = self.last.values.copy()
+        values[:, :2] += self.step * (frame - self.last.frame)
+        return values
+
+
+def _assigned(found: list[Detection], followed: list[_Person], frame: int) -> dict[int, Detection]:
+    from scipy.optimize import linear_sum_assignment
+
+    where = [person.expected(frame) for person in followed]
+    cost = np.array([[_distance(expected, one.values) for one in found] for expected in where])
+    return {int(k): found[int(one)] for k, one in zip(*linear_sum_assignment(cost), strict=True)}
+
+
+def _distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Mean distance of the keypoints that both have; of the middles where they share none."""
+    both = (first[:, 2] > 0) & (second[:, 2] > 0)
+    if not both.any():
+        return float(np.linalg.norm(_middle(first) - _middle(second)))
+    return float(np.linalg.norm(first[both, :2] - second[both, :2], axis=-1).mean())
+
+
+def _middle(values: np.ndarray) -> np.ndarray:
+    """Return the middle of the keypoints that were seen, (2,); 0 where there is none."""
+    seen = values[:, 2] > 0
+    return values[seen, :2].mean(axis=0) if seen.any() else np.zeros(2)

@@ -1,0 +1,189 @@
+"""Detections of people in single images → one keypoint track per person."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probmotion.io.errors import MotionFileError, shortened
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.skeleton import Skeleton
+
+__all__ = ["Detection", "Frames", "frame_number", "keypoint_values", "natural", "tracks_of"]
+
+_LARGEST = 1e9
+_LONGEST_TRACK = 500_000
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One person in one image.
+
+    Attributes
+    ----------
+    video : str
+        Which sequence of images the image belongs to.
+    frame : int
+        Its place in that sequence.
+    person : str or None
+        The track's identity, None where the file has none.
+    values : ndarray, (J, 3)
+        x, y and confidence of each keypoint.
+    where : str
+        Where in the file it stands, for errors.
+    """
+
+    video: str
+    frame: int
+    person: str | None
+    values: np.ndarray
+    where: str
+
+
+Frames = dict[str, range]
+"""Frames of each video: the first, the end and the step between two."""
+
+
+def keypoint_values(value: Any, where: str) -> np.ndarray:
+    """Return a flat list ``[x, y, confidence, x, y, …]`` as an array (J, 3).
+
+    Raises
+    ------
+    MotionFileError
+        If it is no such list.
+    """
+    if not isinstance(value, list) or not value or len(value) % 3:
+        raise MotionFileError(
+            f"{where} holds {shortened(value)}, expected a list of x, y, confidence per keypoint"
+        )
+    for number in value:
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            raise MotionFileError(f"{where} holds {shortened(number)}, expected numbers")
+        if abs(number) > _LARGEST:
+            raise MotionFileError(
+                f"{where} holds {shortened(number)}, expected numbers between -1e9 and 1e9"
+            )
+    values = np.array(value, dtype=np.float64).reshape(-1, 3)
+    confidence = values[:, 2]
+    if not (confidence >= 0).all():
+        raise MotionFileError(
+            f"{where} holds the confidence {confidence[~(confidence >= 0)][0]:g}, expected 0 or "
+            "more"
+        )
+    if np.isnan(values[confidence > 0]).any():
+        raise MotionFileError(f"{where} holds NaN where confidence is above 0, expected numbers")
+    return values
+
+
+def frame_number(image: Any, where: str) -> tuple[str, int]:
+    """Return the video and the frame of an image: ``"walk_012.png"`` → ``("walk_", 12)``.
+
+    The frame is the last number in the image's name; what stands around it names the video.
+
+    Raises
+    ------
+    MotionFileError
+        If the name holds no number.
+    """
+    if isinstance(image, int) and not isinstance(image, bool):
+        return "", _frame(str(image), where)
+    stem = re.sub(r"\.[A-Za-z]\w*$", "", image) if isinstance(image, str) else ""
+    numbers = list(re.finditer(r"[0-9]+", stem))
+    if not numbers:
+        raise MotionFileError(
+            f"{where} is called {shortened(image)}, expected a name with the frame's number"
+        )
+    last = numbers[-1]
+    return stem[: last.start()] + stem[last.end() :], _frame(last[0], where)
+
+
+def _frame(number: str, where: str) -> int:
+    if not number.isdecimal() or len(number) > 18:
+        raise MotionFileError(
+            f"{where} is frame {shortened(number)}, expected a number of at most 18 digits"
+        )
+    return int(number)
+
+
+def natural(text: str) -> tuple[tuple[str, int], ...]:
+    """Return a sort key by which ``"frame10"`` comes after ``"frame9"``."""
+    parts = re.findall(r"([^0-9]*)([0-9]{0,19})", text)
+    return tuple((word, int(number or -1)) for word, number in parts)
+
+
+def tracks_of(
+    detections: Sequence[Detection],
+    frames: Frames | None,
+    skeleton: Skeleton,
+    fps: float,
+    file: Path,
+) -> list[KeypointTrack]:
+    """Return one track per video and person, sorted by both.
+
+    Every track of a video spans all of its frames; where a person was not detected, keypoints
+    are NaN and confidence is 0.
+
+    Parameters
+    ----------
+    detections : sequence of Detection
+        In any order.
+    frames : dict of str to range, or None
+        The frames of each video; None: all from the first with a detection to the last.
+    skeleton, fps
+        Of every track.
+    file : Path
+        For names and errors.
+
+    Raises
+    ------
+    MotionFileError
+        If people cannot be told apart, or there are more than 500 000 frames.
+    """
+    unnamed = sum(detection.person is None for detection in detections)
+    if 0 < unnamed < len(detections):
+        raise MotionFileError(
+            f"{file}: {unnamed} of {len(detections)} detections have no track id, expected an id "
+            "for all or none"
+        )
+    grouped: dict[tuple[str, str], dict[int, Detection]] = {}
+    seen: dict[str, list[int]] = {}
+    for detection in detections:
+        seen.setdefault(detection.video, []).append(detection.frame)
+        track = grouped.setdefault((detection.video, detection.person or ""), {})
+        if detection.frame in track:
+            who = "two people without a track id"
+            if detection.person is not None:
+                who = f"person {shortened(detection.person)} twice"
+            raise MotionFileError(
+                f"{detection.where}: frame {detection.frame} holds {who}, expected track ids "
+                "(track_id, idx or person_id) that tell people apart, or how many people to follow"
+            )
+        track[detection.frame] = detection
+    if frames is None:
+        frames = {video: range(min(each), max(each) + 1) for video, each in seen.items()}
+
+    tracks = []
+    for video, person in sorted(grouped, key=lambda key: (natural(key[0]), natural(key[1]))):
+        span = frames[video]
+        if len(span) > _LONGEST_TRACK:
+            raise MotionFileError(
+                f"{file}: frames run from {span[0]} to {span[-1]}, expected {_LONGEST_TRACK} at "
+                "most"
+            )
+        values = np.zeros((len(span), skeleton.n_joints, 3))
+        for frame, detection in grouped[video, person].items():
+            values[span.index(frame)] = detection.values
+        confidence = values[..., 2]
+        words = [file.stem, video if len(seen) > 1 else "", person]
+        name = " ".join(word for word in words if word)
+        keypoints = np.where(confidence[..., np.newaxis] > 0, values[..., :2], np.nan)
+        try:
+            tracks.append(KeypointTrack(keypoints, confidence, skeleton, fps, name))
+        except ValueError as error:
+            raise MotionFileError(f"{file}: {error}") from error
+    return tracks

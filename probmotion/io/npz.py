@@ -1,0 +1,316 @@
+"""Motions and keypoint tracks as ``.npz`` archives, without pickles.
+
+A motion's archive holds
+
+======================  ==========================  ================================================
+key                     shape                       meaning
+======================  ==========================  ================================================
+``positions``           (L, J, 3) or (L, P, J, 3)   metres; P people who share one skeleton
+``fps``                 ()                          frames per second
+``joint_names``         (J,)                        strings
+``parents``             (J,)                        integers, -1 for a root
+``up_axis``             (), optional                ``"y"`` (where absent) or ``"z"``
+``persons``             (P,), optional              what to call the people
+``rotations``           (L, J, 3, 3), optional      local rotation matrices
+``rest_offsets``        (J, 3), optional            metres, with ``rotations``
+``radii``               (J,), optional              metres, bone radii
+``name``                (), optional                what to call the clip
+======================  ==========================  ================================================
+
+A track's archive holds ``keypoints`` (L, J, 2) and ``confidence`` (L, J), or (V, L, J, 2) and
+(V, L, J) with V ``camera_names``, beside ``fps``, ``joint_names`` and ``parents``. Other keys
+are left alone.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from probmotion.files import written_whole
+from probmotion.io.errors import MotionFileError, MotionFileWarning, read_bytes, shortened
+from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.skeleton import Skeleton
+
+__all__ = ["read_keypoint_npz", "read_npz", "write_npz"]
+
+_LARGEST = 1e9
+# World up to Y up, right-handed: (x, y, z) of a Z-up world is (x, z, -y) here.
+_Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def read_npz(path: str | Path) -> Motion:
+    """Read a motion from an ``.npz`` archive.
+
+    People in one archive become one skeleton with one root per person; their joints are called
+    ``person:joint``. A world with Z up is turned to Y up about the x axis. Joints that have no
+    position in any frame are left out, with a :class:`MotionFileWarning` that names them.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no such archive, or is damaged; the message names the key.
+    FileNotFoundError
+        If there is no such file.
+    """
+    archive = Archive(Path(path))
+    if "positions" not in archive.keys and "keypoints" in archive.keys:
+        archive.fail("keypoints came without positions, expected 3D: use read_keypoints for 2D")
+    positions = archive.numbers("positions")
+    if positions.ndim not in (3, 4) or positions.shape[-1] != 3 or 0 in positions.shape:
+        archive.fail(
+            f"positions has shape {positions.shape}, expected (L, J, 3) or (L, P, J, 3) with at "
+            "least one of each"
+        )
+    skeleton = archive.skeleton(positions.shape[-2])
+    fps = archive.frame_rate()
+    turn = archive.turn_to_y_up()
+    try:
+        if positions.ndim == 4:
+            skeleton = _crowd(skeleton, archive.names("persons", "person", positions.shape[1]))
+            positions = positions.reshape(len(positions), -1, 3)
+        positions, skeleton = _without_unseen(positions, skeleton, archive.path)
+        rotations, rest_offsets = archive.kinematics(*positions.shape[:2])
+        return Motion(
+            positions if turn is None else positions @ turn.T,
+            skeleton,
+            fps,
+            rotations=rotations,
+            rest_offsets=rest_offsets,
+            name=archive.word("name", archive.path.stem),
+        )
+    except MotionFileError:
+        raise
+    except ValueError as error:
+        raise MotionFileError(f"{archive.path}: {error}") from error
+
+
+def write_npz(motion: Motion, path: str | Path) -> None:
+    """Write a motion to an ``.npz`` archive, from which it reads back exactly.
+
+    Parameters
+    ----------
+    motion : Motion
+        What to write.
+    path : str or Path
+        The file; replaced whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If the folder is missing or cannot be written to.
+    """
+    skeleton = motion.skeleton
+    arrays: dict[str, Any] = {
+        "positions": motion.positions,
+        "fps": np.float64(motion.fps),
+        "joint_names": np.array(skeleton.joint_names),
+        "parents": np.array(skeleton.parents, dtype=np.int32),
+        "up_axis": np.array("y"),
+    }
+    if motion.name:
+        arrays["name"] = np.array(motion.name)
+    if motion.rotations is not None and motion.rest_offsets is not None:
+        arrays |= {"rotations": motion.rotations, "rest_offsets": motion.rest_offsets}
+    if skeleton.radii is not None:
+        arrays["radii"] = np.array(skeleton.radii)
+    with written_whole(Path(path)) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[KeypointTrack]:
+    """Read the keypoint tracks of an ``.npz`` archive, one per camera.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    fps : float, optional
+        Frames per second, in place of the file's own.
+
+    Raises
+    ------
+    MotionFileError
+        If the file is no such archive, or is damaged; the message names the key.
+    FileNotFoundError
+        If there is no such file.
+    """
+    archive = Archive(Path(path))
+    keypoints = archive.numbers("keypoints")
+    confidence = archive.numbers("confidence")
+    if keypoints.ndim not in (3, 4) or keypoints.shape[-1] != 2 or 0 in keypoints.shape:
+        archive.fail(
+            f"keypoints has shape {keypoints.shape}, expected (L, J, 2) or (V, L, J, 2) with at "
+            "least one of each"
+        )
+    if confidence.shape != keypoints.shape[:-1]:
+        archive.fail(f"confidence has shape {confidence.shape}, expected {keypoints.shape[:-1]}")
+    skeleton = archive.skeleton(keypoints.shape[-2])
+    rate = archive.frame_rate() if fps is None else fps
+    names = [archive.path.stem]
+    if keypoints.ndim == 4:
+        cameras = archive.names("camera_names", "camera", len(keypoints))
+        names = [f"{archive.path.stem} {camera}" for camera in cameras]
+    else:
+        keypoints, confidence = keypoints[np.newaxis], confidence[np.newaxis]
+    try:
+        return [
+            KeypointTrack(points, weights, skeleton, rate, name=name)
+            for points, weights, name in zip(keypoints, confidence, names, strict=True)
+        ]
+    except ValueError as error:
+        raise MotionFileError(f"{archive.path}: {error}") from error
+
+
+class Archive:
+    """The arrays of one ``.npz`` file, each read and checked when it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        content = read_bytes(path)
+        try:
+            self.zip = zipfile.ZipFile(io.BytesIO(content))
+            self.keys = [name.removesuffix(".npy") for name in self.zip.namelist()]
+        except Exception as error:  # a damaged zip fails in a dozen ways, MemoryError among them
+            raise MotionFileError(
+                f"{path} is no npz archive ({str(error)[:80]}), expected one with the keys "
+                "positions, fps, joint_names and parents"
+            ) from error
+
+    def fail(self, problem: str) -> NoReturn:
+        raise MotionFileError(f"{self.path}: {problem}")
+
+    def array(self, key: str) -> np.ndarray:
+        """Return the array of ``key``."""
+        if key not in self.keys:
+            found = ", ".join(name[:40] for name in self.keys[:12]) or "none"
+            self.fail(
+                f"key {key} is missing, expected positions (or keypoints and confidence), fps, "
+                f"joint_names and parents; the keys found are {found}"
+            )
+        try:
+            member = io.BytesIO(self.zip.read(f"{key}.npy"))
+            return np.lib.format.read_array(member, allow_pickle=False)
+        except Exception as error:  # see __init__; a pickled object array is a ValueError
+            raise MotionFileError(
+                f"{self.path}: key {key} cannot be read ({str(error)[:80]}), expected an array of "
+                "numbers or strings"
+            ) from error
+
+    def numbers(self, key: str) -> np.ndarray:
+        """Return an array of numbers as float64; NaN passes, infinite and absurd ones do not."""
+        array = self.array(key)
+        if array.dtype.kind not in "fiu":
+            self.fail(f"{key} is of {shortened(array.dtype)}, expected real numbers")
+        array = array.astype(np.float64)
+        absurd = np.abs(array) > _LARGEST
+        if absurd.any():
+            self.fail(f"{key} holds {array[absurd][0]:g}, expected numbers between -1e9 and 1e9")
+        return array
+
+    def names(self, key: str, kind: str, count: int) -> list[str]:
+        """Return ``count`` names; ``person0``, ``person1``, … where ``key`` is absent."""
+        if key not in self.keys:
+            return [f"{kind}{index}" for index in range(count)]
+        array = self.array(key)
+        if array.dtype.kind != "U" or array.shape != (count,):
+            self.fail(
+                f"{key} is of {shortened(array.dtype)} and shape {array.shape}, expected {count} "
+                "strings"
+            )
+        return array.tolist()
+
+    def word(self, key: str, default: str) -> str:
+        """Return the one string of ``key``, ``default`` where it is absent."""
+        if key not in self.keys:
+            return default
+        array = self.array(key)
+        if array.dtype.kind != "U" or array.shape != ():
+            self.fail(
+                f"{key} is of {shortened(array.dtype)} and shape {array.shape}, expected a string"
+            )
+        return str(array)
+
+    def frame_rate(self) -> float:
+        fps = self.numbers("fps")
+        if fps.size != 1 or not fps.item() > 0:
+            self.fail(f"fps is {shortened(fps.tolist())}, expected one number above 0")
+        return fps.item()
+
+    def skeleton(self, n_joints: int) -> Skeleton:
+        self.array("joint_names")  # unlike persons, joints must be named
+        names = self.names("joint_names", "joint", n_joints)
+        parents = self.numbers("parents")
+        if parents.shape != (n_joints,) or (parents != np.round(parents)).any():
+            self.fail(f"parents has shape {parents.shape}, expected {n_joints} integers")
+        sizes = None
+        if "radii" in self.keys:
+            radii = self.numbers("radii")
+            if radii.shape != (n_joints,) or not (radii >= 0).all():
+                self.fail(f"radii has shape {radii.shape}, expected {n_joints} numbers, 0 or more")
+            sizes = radii.tolist()
+        try:
+            return Skeleton(names, [int(parent) for parent in parents], sizes)
+        except ValueError as error:
+            raise MotionFileError(f"{self.path}: {error}") from error
+
+    def turn_to_y_up(self) -> np.ndarray | None:
+        """Return the rotation from the file's world to Y up, None where that is the same."""
+        up = self.word("up_axis", "y").lower()
+        if up not in ("y", "z"):
+            self.fail(f"up_axis is {shortened(up)}, expected 'y' or 'z'")
+        if up == "z" and "rotations" in self.keys:
+            self.fail("up_axis is 'z' and rotations came, expected 'y' where there are rotations")
+        return _Z_UP_TO_Y_UP if up == "z" else None
+
+    def kinematics(self, frames: int, n_joints: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return rotations and rest offsets, None where there are none."""
+        if "rotations" not in self.keys:
+            return None, None
+        rotations, rest_offsets = self.numbers("rotations"), self.numbers("rest_offsets")
+        for key, array, expected in (
+            ("rotations", rotations, (frames, n_joints, 3, 3)),
+            ("rest_offsets", rest_offsets, (n_joints, 3)),
+        ):
+            if array.shape != expected:
+                self.fail(f"{key} has shape {array.shape}, expected {expected}")
+        return rotations, rest_offsets
+
+
+def _crowd(skeleton: Skeleton, persons: list[str]) -> Skeleton:
+    """Return the skeleton of several people, joints called ``person:joint``."""
+    names = [f"{person}:{joint}" for person in persons for joint in skeleton.joint_names]
+    parents = [
+        parent if parent < 0 else parent + number * skeleton.n_joints
+        for number in range(len(persons))
+        for parent in skeleton.parents
+    ]
+    radii = None if skeleton.radii is None else skeleton.radii * len(persons)
+    return Skeleton(names, parents, radii)
+
+
+def _without_unseen(
+    positions: np.ndarray, skeleton: Skeleton, path: Path
+) -> tuple[np.ndarray, Skeleton]:
+    """Return positions and skeleton without the joints that are NaN in every frame."""
+    unseen = np.isnan(positions).all(axis=(0, 2))
+    if not unseen.any() or unseen.all():
+        return positions, skeleton
+    left_out = ", ".join(np.array(skeleton.joint_names)[unseen])
+    warnings.warn(
+        f"{path}: the joints {left_out} have no position in any frame and were left out",
+        MotionFileWarning,
+        stacklevel=4,
+    )
+    kept = np.flatnonzero(~unseen)
+    return positions[:, kept], skeleton.subset(kept.tolist())

@@ -1,0 +1,5 @@
+"""Skeletons, motions and 2D keypoint tracks, and what turns one into another."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

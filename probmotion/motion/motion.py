@@ -1,0 +1,218 @@
+"""`Motion`: a skeleton's joints through time; `KeypointTrack`: their pictures in one camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from probmotion.motion.resampling import resample
+from probmotion.motion.retargeting import matching_joints
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
+
+__all__ = ["KeypointTrack", "Motion"]
+
+
+_MOST_CONFIDENT = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Joint positions of one clip.
+
+    Parameters
+    ----------
+    positions : ndarray, (L, J, 3)
+        Metres, world Y up, right-handed.
+    skeleton : Skeleton
+        Names and parents of the J joints.
+    fps : float
+        Frames per second.
+    rotations : ndarray, (L, J, 3, 3), optional
+        Local rotation matrices of the joints in their parents' frames, where the source had them.
+    rest_offsets : ndarray, (J, 3), optional
+        Offset of each joint from its parent in the rest pose, metres; given with ``rotations``.
+    name : str
+        What to call the clip in tables, the file's stem by default.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit the skeleton, a value is NaN or infinite, there is no frame, a
+        rotation is not orthonormal, or ``fps`` is not above zero.
+    """
+
+    positions: np.ndarray
+    skeleton: Skeleton
+    fps: float
+    rotations: np.ndarray | None = None
+    rest_offsets: np.ndarray | None = None
+    name: str = field(default="")
+
+    def __post_init__(self) -> None:
+        positions = np.asarray(self.positions, dtype=np.float64)
+        check_shape("positions", positions, ("L", self.skeleton.n_joints, 3))
+        if len(positions) == 0:
+            raise ValueError("positions has no frame, expected at least one")
+        check_finite("positions", positions)
+        check_positive("fps", self.fps)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "fps", float(self.fps))
+        if (self.rotations is None) != (self.rest_offsets is None):
+            raise ValueError("rotations and rest_offsets are given one without the other")
+        if self.rotations is not None and self.rest_offsets is not None:
+            check_shape("rotations", self.rotations, (*positions.shape[:2], 3, 3))
+            check_finite("rotations", self.rotations)
+            product = self.rotations @ np.swapaxes(self.rotations, -1, -2)
+            gap = float(np.abs(product - np.eye(3)).max())
+            if gap > 1e-3:
+                raise ValueError(
+                    f"rotations is off orthonormal matrices by {gap:.2g}, expected at most 0.001"
+                )
+            check_shape("rest_offsets", self.rest_offsets, (self.skeleton.n_joints, 3))
+            check_finite("rest_offsets", self.rest_offsets)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return len(self.positions)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.frames - 1) / self.fps
+
+    def window(self, start: int, frames: int) -> Motion:
+        """Return ``frames`` frames from frame ``start``."""
+        check_count("frames", frames)
+        if not 0 <= start <= self.frames - frames:
+            raise ValueError(
+                f"start is {start} with frames {frames}, expected a window inside the "
+                f"{self.frames} frames of {self.name or 'the motion'}"
+            )
+        stop = start + frames
+        rotations = None if self.rotations is None else self.rotations[start:stop]
+        return replace(self, positions=self.positions[start:stop], rotations=rotations)
+
+    def resample(self, fps: float) -> Motion:
+        """Return the clip at another frame rate.
+
+        Positions are interpolated linearly in time and local rotations along the geodesic, so
+        that a motion sampled below ``fps`` gains no overshoot. Where both are given, the positions
+        of a frame between two old ones are those of the joints' straight paths. See
+        :func:`~probmotion.motion.resampling.resample`.
+
+        Raises
+        ------
+        ValueError
+            If ``fps`` is not a number above 0 and at most 10 000.
+        """
+        if fps == self.fps:
+            return self
+        positions, rotations = resample(self.positions, self.rotations, self.fps, fps)
+        return replace(self, positions=positions, rotations=rotations, fps=float(fps))
+
+    def centred(self) -> Motion:
+        """Return the motion with the first root's mean position over its frames at the origin."""
+        root = self.skeleton.roots[0]
+        positions = self.positions - self.positions[:, root].mean(axis=0)
+        return replace(self, positions=positions, rotations=None, rest_offsets=None)
+
+    def turned(self, yaw: float) -> Motion:
+        """Return the motion turned by ``yaw`` radians about the vertical axis."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return replace(self, positions=self.positions @ turn.T, rotations=None, rest_offsets=None)
+
+    def retarget(self, skeleton: Skeleton) -> Motion:
+        """Return the motion on another skeleton, joints matched by their (canonical) names.
+
+        Positions stay where they are: proportions are the motion's, and no joint is made up.
+        Rotations are dropped unless the skeletons are equal.
+
+        Raises
+        ------
+        ValueError
+            If a joint of ``skeleton`` has no counterpart here; the message names it.
+        """
+        if self.skeleton == skeleton:
+            return self
+        chosen = matching_joints(self.skeleton, skeleton)
+        return replace(
+            self,
+            positions=self.positions[:, chosen],
+            skeleton=skeleton,
+            rotations=None,
+            rest_offsets=None,
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Motion({self.name or 'unnamed'}: {self.frames} frames at {self.fps:g} fps, "
+            f"{self.skeleton.n_joints} joints)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTrack:
+    """Keypoints of one camera through time.
+
+    Parameters
+    ----------
+    keypoints : ndarray, (L, J, 2)
+        Image coordinates, x right and y down, pixels or the camera's unit. Entries that were not
+        seen are NaN and have confidence 0.
+    confidence : ndarray, (L, J)
+        Between 0 (not seen) and 1; heatmaps peak a little above 1, and COCO's annotations count
+        to 2.
+    skeleton : Skeleton
+        Names and parents of the J joints.
+    fps : float
+        Frames per second.
+    name : str
+        What to call the track.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, a confidence is negative, beyond 2 or not finite, or a keypoint that
+        has a confidence above 0 is not finite.
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    skeleton: Skeleton
+    fps: float
+    name: str = field(default="")
+
+    def __post_init__(self) -> None:
+        keypoints = np.asarray(self.keypoints, dtype=np.float64)
+        confidence = np.asarray(self.confidence, dtype=np.float64)
+        check_shape("keypoints", keypoints, ("L", self.skeleton.n_joints, 2))
+        check_shape("confidence", confidence, keypoints.shape[:2])
+        if len(keypoints) == 0:
+            raise ValueError("keypoints has no frame, expected at least one")
+        check_finite("confidence", confidence)
+        if confidence.min() < 0:
+            raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
+        if confidence.max() > _MOST_CONFIDENT:
+            raise ValueError(
+                f"confidence is {confidence.max():g} at its most, expected 0 (not seen) to 1, or "
+                f"{_MOST_CONFIDENT} where annotations count so far: they are weights of losses"
+            )
+        unseen = ~np.isfinite(keypoints).all(axis=-1)
+        if (unseen & (confidence > 0)).any():
+            frame, joint = np.argwhere(unseen & (confidence > 0))[0]
+            raise ValueError(
+                f"keypoints is not finite at frame {frame}, joint {joint}, where confidence is "
+                f"{confidence[frame, joint]:g}; expected confidence 0 there"
+            )
+        check_positive("fps", self.fps)
+        object.__setattr__(self, "keypoints", keypoints)
+        object.__setattr__(self, "confidence", confidence)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return len(self.keypoints)

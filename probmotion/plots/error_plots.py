@@ -1,0 +1,148 @@
+"""What a sampler's error is made of: parts stacked from exact draws' floor."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probmotion.plots.colours import CYCLE, GREY, INK, save_figure
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_budget"]
+
+_COLUMNS = ("setting", "measure", "part", "mean", "low", "high")
+_FLOOR, _WHOLE = "floor", "whole"
+_COLOURS = {
+    part: CYCLE[place]
+    for part, place in (
+        ("remainder", 8), ("discretisation", 2), ("single view", 3), ("noise sharing", 4),
+        ("guidance", 5), ("network", 1),
+    )
+}  # fmt: skip
+_PALE, _FULL = 0.35, 0.95
+_WIDTH = 0.8
+_LETTERS = 26
+
+
+def draw_budget(
+    table: pd.DataFrame,
+    path: str | Path | None = None,
+    *,
+    words: Mapping[str, str] | None = None,
+    notes: Sequence[str] = (),
+) -> Figure:
+    """Return a figure of the parts of one setting's error, a panel per measure; write it as PNG.
+
+    At the left of a panel the parts are stacked from 0, the floor that exact draws have: positive
+    ones up, negative ones down. The black line across them is the whole. To the right each part
+    stands alone with its interval. What is not told from chance is pale.
+
+    Parameters
+    ----------
+    table : DataFrame
+        As :meth:`~probmotion.calibration.error_result.BiasBudget.table` of one setting.
+    path : str or Path, optional
+        Where to write, ``.png``; nowhere by default.
+    words : mapping of str to str, optional
+        What to call the measures; their names by default.
+    notes : sequence of str
+        Below the picture.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or the table is not of one setting.
+    """
+    from matplotlib.figure import Figure
+
+    missing = [name for name in _COLUMNS if name not in table]
+    if missing:
+        raise ValueError(f"table lacks the columns {', '.join(missing)}")
+    settings = list(dict.fromkeys(table["setting"]))
+    if len(settings) != 1:
+        raise ValueError(f"table is of {len(settings)} settings, expected one")
+    measures = list(dict.fromkeys(table["measure"]))
+    parts = [part for part in dict.fromkeys(table["part"]) if part not in (_FLOOR, _WHOLE)]
+    colours = {part: _colour(part, place) for place, part in enumerate(parts)}
+    figure = Figure(figsize=(0.8 + 2.75 * len(measures), 4.6), layout="constrained")
+    for axes, measure in zip(
+        figure.subplots(1, len(measures), squeeze=False)[0], measures, strict=True
+    ):
+        rows = table[table["measure"] == measure].set_index("part")
+        _draw_stack(axes, rows, colours)
+        _draw_alone(axes, rows, colours)
+        _dress(axes, len(parts))
+        title = textwrap.fill((words or {}).get(measure, measure), _LETTERS)
+        axes.set_title(title, loc="left", size=10, color=INK)
+    figure.axes[0].set_ylabel("above exact draws", color=INK, size=9.5)
+    _write_key(figure, colours, notes)
+    figure.suptitle(settings[0], size=12, color=INK, x=0.01, ha="left", weight="bold")
+    if path is not None:
+        save_figure(figure, path)
+    return figure
+
+
+def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
+    up = down = 0.0
+    for part, colour in colours.items():
+        height = float(rows.loc[part, "mean"])
+        bottom = up if height >= 0 else down
+        axes.bar(
+            0.0, height, _WIDTH, bottom=bottom, color=colour, alpha=_opacity(rows.loc[part]),
+            edgecolor="white", linewidth=0.8,
+        )  # fmt: skip
+        up, down = (up + height, down) if height >= 0 else (up, down + height)
+    whole = float(rows.loc[_WHOLE, "mean"])
+    axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [whole, whole], color="black", linewidth=2.2)
+
+
+def _draw_alone(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
+    """Draw every part and the whole with their intervals, side by side."""
+    for place, (part, colour) in enumerate([*colours.items(), (_WHOLE, "black")], start=1):
+        row = rows.loc[part]
+        where = 0.25 + 0.55 * place
+        opacity = _opacity(row)
+        axes.plot([where, where], [row["low"], row["high"]], color=colour, alpha=opacity,
+                  linewidth=2.2, solid_capstyle="butt")  # fmt: skip
+        axes.plot(where, row["mean"], "o" if part != _WHOLE else "D", color=colour, alpha=opacity,
+                  markersize=5.5)  # fmt: skip
+
+
+def _dress(axes: Axes, n_parts: int) -> None:
+    axes.axhline(0.0, color=INK, linewidth=0.8)
+    axes.set_xlim(-0.6, 0.25 + 0.55 * (n_parts + 1) + 0.4)
+    axes.set_xticks([])
+    axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="y")
+    axes.set_axisbelow(True)
+    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8.5)
+    for name in ("top", "right", "bottom"):
+        axes.spines[name].set_visible(False)
+
+
+def _write_key(figure: Figure, colours: Mapping[str, str], notes: Sequence[str]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Patch(color=colour, label=part) for part, colour in colours.items()]
+    handles.append(Line2D([], [], color="black", marker="D", markersize=5, label=_WHOLE))
+    handles.append(Line2D([], [], linestyle="", label="pale: not told from chance"))
+    key = figure.legend(
+        handles=handles, loc="outside lower center", ncols=len(handles), frameon=False,
+        labelcolor=INK, fontsize=9, title="; ".join(notes), title_fontsize=8.5,
+    )  # fmt: skip
+    key.get_title().set_color(INK)
+
+
+def _colour(part: str, place: int) -> str:
+    """A part has one colour in all pictures; black is the whole's."""
+    return _COLOURS.get(part, CYCLE[6 + place % 2])
+
+
+def _opacity(row: Any) -> float:
+    return _FULL if row["low"] > 0 or row["high"] < 0 else _PALE

@@ -1,0 +1,180 @@
+"""Where truths stand among draws: rank histograms, distribution functions and coverage.
+
+After Talts et al. (2018), figures 1 and 2, and Säilynoja et al. (2022), figure 3.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import binom
+
+from probmotion.metrics.uniformity import ecdf_band, evaluation_points
+from probmotion.plots.colours import CYCLE, GREY, INK, save_figure
+from probmotion.validation import check_shape
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_ranks"]
+
+_LEVEL = 0.95
+_MOST_BINS, _PER_BIN = 20, 10
+_ACROSS = 5
+_LETTERS = 130
+# Inches: the figure's width; above a block's panels, a line of its title, and below; and a row.
+_WIDTH, _HEAD, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
+
+
+def draw_ranks(
+    blocks: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None
+) -> Figure:
+    """Return a figure of simulated truths' ranks, a block per sampler, and write it as PNG.
+
+    A block has a histogram per quantity, all quantities' F(z) − z (the empirical distribution
+    function less the uniform one), and the share of truths within credible sets against their
+    level. The grey bands are where uniform ranks stay with a probability of 95 %: all bars of a
+    histogram, or all points of a line, at once. A histogram like ∪, and a share below the level,
+    are of draws too close together; like ∩, and above, of draws too far apart.
+
+    Parameters
+    ----------
+    blocks : mapping of mapping of ndarray, (n,)
+        By what stands above the block, such as the sampler's verdict, then by quantity: ranks in
+        [0, 1], one per simulation, at least two.
+    path : str or Path, optional
+        Where to write, ``.png``; nowhere by default.
+
+    Raises
+    ------
+    ValueError
+        If there is no block, one has no quantity, or ranks have another shape.
+    """
+    from matplotlib.figure import Figure
+
+    if not blocks:
+        raise ValueError("blocks is empty, expected at least one sampler with ranks")
+    for title, ranks in blocks.items():
+        if not ranks:
+            raise ValueError(f"blocks[{title!r}] is empty, expected at least one quantity")
+        for name, values in ranks.items():
+            check_shape(f"blocks[{title!r}][{name!r}]", values, ("n",))
+    titles = [textwrap.fill(title, _LETTERS) for title in blocks]
+    heads = [_HEAD + _LINE * (1 + title.count("\n")) for title in titles]
+    heights = [
+        head + _PANEL * max(2, -(-len(ranks) // _ACROSS)) + _FOOT
+        for head, ranks in zip(heads, blocks.values(), strict=True)
+    ]
+    # A layout that is solved for takes time with the square of the number of panels.
+    figure = Figure(figsize=(_WIDTH, sum(heights)))
+    parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
+    for part, title, head, height, ranks in zip(
+        parts, titles, heads, heights, blocks.values(), strict=True
+    ):
+        part.suptitle(
+            title, size=12, color=INK, weight="bold", x=0.01, ha="left", va="top",
+            y=1 - 0.3 * _LINE / height,
+        )  # fmt: skip
+        place = {"top": 1 - head / height, "bottom": _FOOT / height}
+        left, middle, right = part.subfigures(1, 3, width_ratios=[1.9, 1, 1])
+        colours = {name: CYCLE[at % len(CYCLE)] for at, name in enumerate(ranks)}
+        _draw_histograms(left, ranks, colours, {"left": 0.065, "right": 0.985, **place})
+        wide = {"left": 0.13, "right": 0.97, **place}
+        _draw_difference(middle.subplots(gridspec_kw=wide), ranks, colours)
+        _draw_coverage(right.subplots(gridspec_kw=wide), ranks, colours)
+    if path is not None:
+        save_figure(figure, path)
+    return figure
+
+
+def _draw_histograms(
+    part: Any,
+    ranks: Mapping[str, np.ndarray],
+    colours: Mapping[str, str],
+    place: Mapping[str, float],
+) -> None:
+    """A panel per quantity; the band holds all its bars at once (Bonferroni)."""
+    columns = min(_ACROSS, len(ranks))
+    panels = part.subplots(
+        -(-len(ranks) // columns),
+        columns,
+        squeeze=False,
+        sharex=True,
+        gridspec_kw={"hspace": 0.4, "wspace": 0.3, **place},
+    ).ravel()
+    for axes, (name, values) in zip(panels, ranks.items(), strict=False):
+        n = len(values)
+        bins = max(2, min(_MOST_BINS, n // _PER_BIN))
+        low, high = (
+            float(binom.ppf(tail, n, 1 / bins))
+            for tail in (0.5 * (1 - _LEVEL) / bins, 1 - 0.5 * (1 - _LEVEL) / bins)
+        )
+        axes.axhspan(low, high, color=GREY, alpha=0.6, linewidth=0)
+        axes.axhline(n / bins, color=INK, linewidth=0.7)
+        axes.hist(values, np.linspace(0, 1, bins + 1), color=colours[name], alpha=0.75, rwidth=0.92)
+        axes.set_title(name, loc="left", size=9, color=colours[name])
+        axes.set(xlim=(0, 1), xticks=[0, 0.5, 1], ylim=(0, max(1.05 * high, axes.get_ylim()[1])))
+        axes.set_xticklabels(["0", "½", "1"])
+        _plain(axes)
+    for axes in panels[len(ranks) :]:
+        axes.set_visible(False)
+    part.supxlabel("rank of the truth among draws", size=9.5, color=INK)
+
+
+def _draw_difference(
+    axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]
+) -> None:
+    sizes = {len(values) for values in ranks.values()}
+    for n in sizes:
+        _draw_band(axes, n, less=1)
+    for name, values in ranks.items():
+        points = evaluation_points(len(values))
+        counts = np.searchsorted(np.sort(values), points, side="right")
+        axes.plot(points, counts / len(values) - points, color=colours[name], linewidth=1.2)
+    axes.set_title("distribution function less uniform", loc="left", size=9.5, color=INK)
+    axes.set_xlabel("rank", size=9.5, color=INK)
+    axes.set_xlim(0, 1)
+    _plain(axes)
+
+
+def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]) -> None:
+    from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
+
+    for n in {len(values) for values in ranks.values()}:
+        _draw_band(axes, n, less=0)
+    words = {DENSITY: "highest density", DISTANCE: "balls (TARP)"}
+    for name, values in ranks.items():
+        points = evaluation_points(len(values))
+        levels = np.sort(credible_level(name, values))
+        held = np.searchsorted(levels, points, side="right") / len(values)
+        axes.plot(
+            points, held, color=colours[name], label=words.get(name),
+            linewidth=2.4 if name in words else 1.0,
+        )  # fmt: skip
+    if set(ranks) - set(words):
+        axes.plot([], [], color=INK, linewidth=1.0, label="central intervals")
+    axes.set_title("truths within credible sets", loc="left", size=9.5, color=INK)
+    axes.set_xlabel("level", size=9.5, color=INK)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    _plain(axes)
+    axes.legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left")
+
+
+def _draw_band(axes: Axes, n: int, less: float) -> None:
+    """Fill where uniform numbers' distribution function, ``less`` times the level, stays."""
+    points = evaluation_points(n)
+    lower, upper = ecdf_band(n, _LEVEL)
+    off = less * points
+    axes.fill_between(points, lower - off, upper - off, color=GREY, alpha=0.6, linewidth=0)
+    axes.plot([0, 1], [0, 1 - less], color=INK, linewidth=0.7)
+
+
+def _plain(axes: Axes) -> None:
+    for name in ("top", "right"):
+        axes.spines[name].set_visible(False)
+    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8)

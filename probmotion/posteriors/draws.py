@@ -1,0 +1,311 @@
+"""`MotionDraws`: what every sampler returns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from probmotion.files import written_whole
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_finite, check_shape
+
+if TYPE_CHECKING:
+    from probmotion.posteriors.posterior import MotionPosterior
+
+__all__ = ["MotionDraws", "library_versions", "settings_of"]
+
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class MotionDraws:
+    """Draws over (chain, draw, frame, joint, axis), with statistics and provenance.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        ``positions`` (chain, draw, frame, joint, axis) in metres; where they exist ``theta``
+        (chain, draw, coordinate), ``log_density`` (chain, draw), per-draw statistics (chain, draw)
+        and per-chain ones (chain); ``state_*``: what the sampler needs to go on. Attributes hold
+        the skeleton, fps, sampler, settings, seed, versions and the run's counts: seconds and
+        evaluations of the denoiser, density and gradient.
+
+    Notes
+    -----
+    Make one with :meth:`of`, or :meth:`load` one that was saved.
+    """
+
+    dataset: xr.Dataset
+
+    @classmethod
+    def of(
+        cls,
+        posterior: MotionPosterior,
+        sampler: Any,
+        positions: np.ndarray,
+        *,
+        seed: int,
+        seconds: float,
+        theta: np.ndarray | None = None,
+        log_density: np.ndarray | None = None,
+        statistics: Mapping[str, np.ndarray] | None = None,
+        counts: Mapping[str, int] | None = None,
+        state: Mapping[str, np.ndarray] | None = None,
+        independent: bool = False,
+    ) -> MotionDraws:
+        """Return the draws of a finished run.
+
+        Parameters
+        ----------
+        posterior : MotionPosterior
+            What was drawn from.
+        sampler : Sampler
+            A dataclass with a ``name``; its fields become the settings.
+        positions : ndarray, (chains, draws, L, J, 3)
+            Metres.
+        seed : int
+            The seed that was given.
+        seconds : float
+            Wall-clock time of the run.
+        theta : ndarray, (chains, draws, dim), optional
+            The draws in the posterior's coordinates.
+        log_density : ndarray, (chains, draws), optional
+            log p(θ) + log p(y | θ) at each draw.
+        statistics : mapping of ndarray, optional
+            Arrays over (chain,) or (chain, draw): ``acceptance``, ``divergent``, …
+        counts : mapping of int, optional
+            ``denoiser``, ``density``, ``gradient``: evaluations, each of one motion (one view of
+            one motion for a 2D denoiser).
+        state : mapping of ndarray, optional
+            What the sampler needs to go on where it stopped.
+        independent : bool
+            Whether the draws are independent of each other by construction, so that
+            chain diagnostics say nothing.
+
+        Raises
+        ------
+        ValueError
+            If a shape disagrees or a position is NaN or infinite.
+        """
+        skeleton = posterior.skeleton
+        positions = np.asarray(positions, dtype=np.float64)
+        check_shape(
+            "positions", positions, ("chain", "draw", posterior.frames, skeleton.n_joints, 3)
+        )
+        check_finite("positions", positions)
+        shape = positions.shape[:2]
+        data: dict[str, Any] = {
+            "positions": (("chain", "draw", "frame", "joint", "axis"), positions)
+        }
+        if theta is not None:
+            check_shape("theta", theta, (*shape, posterior.dim))
+            data["theta"] = (("chain", "draw", "coordinate"), theta)
+        if log_density is not None:
+            check_shape("log_density", log_density, shape)
+            data["log_density"] = (("chain", "draw"), log_density)
+        for name, values in (statistics or {}).items():
+            values = np.asarray(values)
+            check_shape(name, values, shape[: values.ndim])
+            data[name] = (("chain", "draw")[: values.ndim], values)
+        for name, values in (state or {}).items():
+            values = np.asarray(values)
+            axes = tuple(f"state_{name}_{axis}" for axis in range(values.ndim))
+            data[f"state_{name}"] = (axes, values)
+        attributes = {
+            "format": "probmotion draws",
+            "format_version": _VERSION,
+            "sampler": sampler.name,
+            "settings": json.dumps(settings_of(sampler), sort_keys=True),
+            "seed": int(seed),
+            "seconds": float(seconds),
+            "independent": int(independent),
+            "fps": float(posterior.fps),
+            "parents": np.asarray(skeleton.parents, dtype=np.int32),
+            "versions": json.dumps(library_versions(), sort_keys=True),
+        }
+        if skeleton.radii is not None:
+            attributes["radii"] = np.asarray(skeleton.radii)
+        for name, count in (counts or {}).items():
+            attributes[f"evaluations_{name}"] = int(count)
+        coordinates = {
+            "chain": np.arange(shape[0]),
+            "draw": np.arange(shape[1]),
+            "joint": list(skeleton.joint_names),
+            "axis": ["x", "y", "z"],
+        }
+        return cls(xr.Dataset(data, coordinates, attributes))
+
+    @property
+    def positions(self) -> xr.DataArray:
+        """The motions, (chain, draw, frame, joint, axis), metres."""
+        return self.dataset["positions"]
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The skeleton of every draw."""
+        names = [str(name) for name in self.dataset["joint"].values]
+        parents = np.atleast_1d(self.dataset.attrs["parents"]).tolist()
+        radii = self.dataset.attrs.get("radii")
+        return Skeleton(names, parents, None if radii is None else np.atleast_1d(radii).tolist())
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return float(self.dataset.attrs["fps"])
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time of the run."""
+        return float(self.dataset.attrs["seconds"])
+
+    @property
+    def independent(self) -> bool:
+        """Whether the draws are independent by construction, not the states of a chain."""
+        return bool(self.dataset.attrs["independent"])
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Evaluations by kind: ``denoiser``, ``density``, ``gradient``."""
+        prefix = "evaluations_"
+        return {
+            str(name).removeprefix(prefix): int(value)
+            for name, value in self.dataset.attrs.items()
+            if str(name).startswith(prefix)
+        }
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """What the sampler needs to go on where it stopped; empty for independent draws."""
+        return {
+            str(name).removeprefix("state_"): values.values
+            for name, values in self.dataset.data_vars.items()
+            if str(name).startswith("state_")
+        }
+
+    def flat(self) -> np.ndarray:
+        """Return all draws in a row, (chains × draws, L, J, 3), chain by chain."""
+        positions = self.positions.values
+        return positions.reshape(-1, *positions.shape[2:])
+
+    def motion(self, draw: int, chain: int = 0) -> Motion:
+        """Return one draw as a :class:`~probmotion.Motion`."""
+        positions = self.positions.isel(chain=chain, draw=draw).values
+        name = f"{self.dataset.attrs['sampler']}-{chain}-{draw}"
+        return Motion(positions, self.skeleton, self.fps, name=name)
+
+    def playback(self, chain: int = 0) -> Motion:
+        """Return a chain's draws one after the other, as one motion to be looked through.
+
+        Of single poses (L = 1) that shows how the chain walks; any draw that pleases can be where
+        another run starts: ``initial=draws.dataset["theta"].values[:, k]``.
+        """
+        chains = self.positions.sizes["chain"]
+        if not 0 <= chain < chains:
+            raise ValueError(f"chain is {chain!r}, expected a number from 0 to {chains - 1}")
+        positions = self.positions.isel(chain=chain).values
+        name = f"{self.dataset.attrs['sampler']}-{chain}"
+        return Motion(
+            positions.reshape(-1, *positions.shape[2:]), self.skeleton, self.fps, name=name
+        )
+
+    def motions(self) -> Iterator[Motion]:
+        """Yield every draw, chain by chain."""
+        for chain in range(self.dataset.sizes["chain"]):
+            for draw in range(self.dataset.sizes["draw"]):
+                yield self.motion(draw, chain)
+
+    def to_arviz(self) -> xr.DataTree:
+        """Return the ArviZ tree: ``posterior`` (positions, theta) and ``sample_stats``."""
+        inside = [name for name in ("positions", "theta") if name in self.dataset]
+        statistics = {
+            ("lp" if name == "log_density" else str(name)): values
+            for name, values in self.dataset.data_vars.items()
+            if values.dims[:1] == ("chain",) and name not in inside
+        }
+        return xr.DataTree.from_dict(
+            {
+                "posterior": self.dataset[inside].assign_attrs(self.dataset.attrs),
+                "sample_stats": xr.Dataset(statistics),
+            }
+        )
+
+    def citations(self) -> list[str]:
+        """Return the works to cite for these draws."""
+        from probmotion.citations import citations_of
+
+        attributes, names = self.dataset.attrs, self.skeleton.canonical_names
+        people = sum(names[root].endswith("pelvis") for root in self.skeleton.roots)
+        return citations_of(attributes["sampler"], attributes["settings"], people)
+
+    def save(self, path: str | Path) -> None:
+        """Write the draws as netCDF, ``.nc``; nothing is left at ``path`` if writing fails.
+
+        Raises
+        ------
+        ValueError
+            If ``path`` has another ending.
+        """
+        if Path(path).suffix != ".nc":
+            raise ValueError(f"path is {str(path)!r}, expected a name that ends in .nc")
+        # netCDF's integers have 32 bits; seeds and counts may need more.
+        wide = {
+            str(name): str(value)
+            for name, value in self.dataset.attrs.items()
+            if isinstance(value, int) and not -(2**31) <= value < 2**31
+        }
+        with written_whole(Path(path)) as unfinished:
+            self.dataset.assign_attrs(wide).to_netcdf(unfinished, engine="scipy")
+
+    @classmethod
+    def load(cls, path: str | Path) -> MotionDraws:
+        """Read draws that :meth:`save` wrote.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one that :meth:`save` wrote.
+        """
+        try:
+            with xr.open_dataset(path, engine="scipy") as opened:
+                dataset = opened.load()
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            raise ValueError(
+                f"path is {str(path)!r}, which is no netCDF file, expected one that save() wrote"
+            ) from error
+        if dataset.attrs.get("format_version") != _VERSION:
+            raise ValueError(
+                f"path is {str(path)!r} with format version "
+                f"{dataset.attrs.get('format_version')}, expected {_VERSION}"
+            )
+        counted = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
+        return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counted]}))
+
+
+def settings_of(sampler: Any) -> dict[str, Any]:
+    """Return a sampler's settings as JSON holds them; none of one that is no dataclass."""
+    if not is_dataclass(sampler) or isinstance(sampler, type):
+        return {}
+    return json.loads(json.dumps(asdict(sampler), default=repr))
+
+
+def library_versions() -> dict[str, str]:
+    """Return the versions of the packages that draws, and what is measured of them, depend on."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    samplers = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
+    packages = (*samplers, "arviz-stats", "scikit-learn")
+    return {package: version(package) for package in packages}

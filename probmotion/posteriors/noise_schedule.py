@@ -1,0 +1,111 @@
+"""The noise schedule and the DDPM posterior, shared by training and sampling.
+
+x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε; level 0 is clean, level T is (almost) pure noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from probmotion.validation import check_count
+
+__all__ = ["NoiseSchedule", "PosteriorStep"]
+
+
+class PosteriorStep(NamedTuple):
+    """q(x_s | x_t, x₀) = N(``clean`` x₀ + ``noisy`` x_t, ``deviation``² I)."""
+
+    clean: float
+    noisy: float
+    deviation: float
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSchedule:
+    """Signal levels ᾱ_0 = 1 > ᾱ_1 > … > ᾱ_T > 0.
+
+    Parameters
+    ----------
+    alpha_bar : ndarray, (T + 1,)
+        Share of the signal's variance left at each level.
+    times : ndarray, (T + 1,), optional
+        The level's number in the schedule it was taken from, which a network was trained with;
+        0..T by default.
+    """
+
+    alpha_bar: np.ndarray
+    times: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        levels = np.asarray(self.alpha_bar, dtype=np.float64)
+        if levels.ndim != 1 or len(levels) < 2 or levels[0] != 1.0 or levels[-1] <= 0:
+            raise ValueError(
+                f"alpha_bar has shape {levels.shape}, expected (T + 1,) numbers falling from 1"
+            )
+        if (np.diff(levels) >= 0).any():
+            raise ValueError("alpha_bar does not fall at every level, expected it to")
+        times = np.arange(len(levels)) if self.times is None else np.asarray(self.times)
+        object.__setattr__(self, "alpha_bar", levels)
+        object.__setattr__(self, "times", times)
+
+    @classmethod
+    def cosine(cls, steps: int, *, power: int = 2, offset: float = 0.008) -> NoiseSchedule:
+        """Return the cosine schedule of Nichol and Dhariwal (2021), equation 17.
+
+        Parameters
+        ----------
+        steps : int
+            Number of steps T.
+        power : int
+            ᾱ ∝ cos^power; 2 as published, 4 in the MAS authors' code.
+        offset : float
+            Keeps the first steps from being too small.
+
+        Notes
+        -----
+        As published, β_t is at most 0.999.
+        """
+        check_count("steps", steps)
+        angle = (np.arange(steps + 1) / steps + offset) / (1 + offset) * np.pi / 2
+        raw = np.cos(angle) ** power
+        beta = np.minimum(1 - raw[1:] / raw[:-1], 0.999)
+        return cls(np.concatenate([[1.0], np.cumprod(1 - beta)]))
+
+    @property
+    def steps(self) -> int:
+        """Number of steps T."""
+        return len(self.alpha_bar) - 1
+
+    def strided(self, steps: int) -> NoiseSchedule:
+        """Return a schedule of ``steps`` steps whose levels are a subset of these.
+
+        Raises
+        ------
+        ValueError
+            If ``steps`` is more than the schedule has.
+        """
+        check_count("steps", steps)
+        if steps > self.steps:
+            raise ValueError(f"steps is {steps}, expected at most the schedule's {self.steps}")
+        assert self.times is not None
+        kept = np.round(np.linspace(0, self.steps, steps + 1)).astype(int)
+        return NoiseSchedule(self.alpha_bar[kept], self.times[kept])
+
+    def posterior(self, t: int) -> PosteriorStep:
+        """Return q(x_{t−1} | x_t, x₀), t = 1..T (Ho et al. 2020, equations 6 and 7).
+
+        ``deviation`` is √β̃_t, β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t), and 0 at the last step.
+        """
+        if not 1 <= t <= self.steps:
+            raise ValueError(f"t is {t}, expected a level from 1 to {self.steps}")
+        now, after = self.alpha_bar[t], self.alpha_bar[t - 1]
+        alpha = now / after
+        beta = 1 - alpha
+        return PosteriorStep(
+            clean=float(np.sqrt(after) * beta / (1 - now)),
+            noisy=float(np.sqrt(alpha) * (1 - after) / (1 - now)),
+            deviation=float(np.sqrt(beta * (1 - after) / (1 - now))),
+        )

@@ -1,0 +1,9 @@
+from .diffusion.ancestral3d import Ancestral3D as Ancestral3D
+from .diffusion.mas import MultiViewAncestral as MultiViewAncestral
+from .diffusion.mvpc import MultiViewPredictorCorrector as MultiViewPredictorCorrector
+from .diffusion.sds import ScoreDistillation as ScoreDistillation
+from .exact import ExactSampler as ExactSampler
+from .mcmc.ensemble import Ensemble as Ensemble
+from .mcmc.metropolis import MetropolisHastings as MetropolisHastings
+from .mcmc.nuts import NUTS as NUTS
+from .variational.dvae import DVAEInference as DVAEInference

@@ -1,0 +1,95 @@
+"""MAS's state where the noisy views are not projections of one noisy 3D motion.
+
+That is so where the views are perspective, or where each has noise of its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probmotion.geometry.cameras import Cameras
+from probmotion.geometry.triangulation import triangulate
+from probmotion.posteriors.noise_schedule import NoiseSchedule
+from probmotion.posteriors.protocols import Denoises2D
+from probmotion.posteriors.sampling import UnsupportedPosterior
+from probmotion.samplers.diffusion.views import Views
+from probmotion.seeds import NormalStreams
+
+__all__ = ["SeparateViews"]
+
+
+class SeparateViews:
+    """V noisy views per draw, (B, V, L, J, 2), normalised units.
+
+    Parameters
+    ----------
+    prior : Denoises2D
+        Its denoiser is called on all views at once.
+    cameras : Cameras
+        The V cameras.
+    views : Views
+        Their orthographic counterparts, which project the noise, and their weights.
+    schedule : NoiseSchedule
+        The noise levels.
+    shape : tuple of int
+        (L, J, 3).
+    shared_noise : bool
+        Project one 3D noise into all views.
+    """
+
+    def __init__(
+        self,
+        prior: Denoises2D,
+        cameras: Cameras,
+        views: Views,
+        schedule: NoiseSchedule,
+        shape: tuple[int, ...],
+        shared_noise: bool,
+    ) -> None:
+        self.prior = prior
+        self.cameras = cameras
+        self.views = views
+        self.schedule = schedule
+        self.shape = shape
+        self.shared_noise = shared_noise
+        self.counts = {"denoiser": 0}
+        self._last: np.ndarray | None = None
+
+    def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
+        """Return unit noise in every view; at the first level a new batch begins."""
+        if t == self.schedule.steps:
+            self._last = None
+        if self.shared_noise:
+            return self.views.project(streams.normal(*self.shape))
+        return streams.normal(self.views.n_views, *self.shape[:-1], 2)
+
+    def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
+        """Return the triangulation of the denoised views, (B, L, J, 3)."""
+        self.counts["denoiser"] += len(x_t) * self.views.n_views
+        clean = self._denoise(x_t, float(self.schedule.alpha_bar[t]))
+        if self.cameras.orthographic:
+            return self.views.combine(clean)
+        scale = self.prior.scale
+        motions = triangulate(clean * scale, self.cameras, self.views.weights, initial=self._last)
+        self._last = motions
+        return motions / scale
+
+    def embed(self, motions: np.ndarray) -> np.ndarray:
+        """Return what the cameras see of clean motions, (B, V, L, J, 2)."""
+        if self.cameras.orthographic:
+            return self.views.project(motions)
+        scale = self.prior.scale
+        return self.cameras.project(motions * scale) / scale
+
+    def _denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        try:
+            return self.prior.denoise(x_t, alpha_bar, self.cameras)
+        except ValueError as error:
+            if self.cameras.orthographic:
+                raise
+            raise UnsupportedPosterior(
+                "mas",
+                "with perspective views needs a denoiser of such views, but "
+                f"{type(self.prior).__name__} says: {error}",
+                word="perspective",
+            ) from error

@@ -1,0 +1,5 @@
+"""Markov chain Monte Carlo: Metropolis-Hastings, NUTS and the ensemble."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

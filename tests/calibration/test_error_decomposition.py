@@ -1,0 +1,374 @@
+"""Bias budgets against closed forms: a Gaussian prior, on which every part is known.
+
+On it a step of a sampler is linear, so that the covariance after T steps is a product of small
+matrices, and for T → ∞ the design's items 1 to 6 say what it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from probmotion import Keypoints2D, Motion, MotionPosterior, NoiseSchedule, UnsupportedPosterior
+from probmotion.calibration.error_decomposition import bias_budget
+from probmotion.calibration.error_measures import BiasMeasures
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.problem import Problem
+from probmotion.problems import load_problem
+from probmotion.samplers.diffusion.guidance import WeightedTriangulation
+
+JOINTS = 60
+budget_of = partial(bias_budget, progress=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Joints that are independent, each N(mean_j, covariance), metres; one frame."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    fault: float = 1.0
+    scale: float = 1.0
+    frames: int = 1
+    fps: float = 20.0
+
+    @property
+    def skeleton(self):
+        return Skeleton([f"joint-{j}" for j in range(len(self.mean))], [-1] * len(self.mean))
+
+    @property
+    def dim(self):
+        return self.mean.size
+
+    def motion(self, theta):
+        return theta.reshape(*theta.shape[:-1], 1, *self.mean.shape)
+
+    def sample(self, rng, n):
+        root = np.linalg.cholesky(self.covariance)
+        return self.mean + rng.standard_normal((n, 1, *self.mean.shape)) @ root.T
+
+    def log_density(self, positions):
+        raise NotImplementedError
+
+    def given(self, likelihood):
+        axes, target, precision = likelihood.linear()
+        information = np.linalg.inv(self.covariance) + precision.flat[0] * axes[0].T @ axes[0]
+        covariance = np.linalg.inv(information)
+        seen = precision.flat[0] * target[0, 0] @ axes[0]
+        mean = (self.mean @ np.linalg.inv(self.covariance) + seen) @ covariance
+        return replace(self, mean=mean, covariance=covariance)
+
+    def exact_posterior(self, likelihood):
+        return self if likelihood is None else self.given(likelihood)
+
+    def denoise_motion(self, x_t, alpha_bar):
+        return self._denoise(np.eye(3), x_t, alpha_bar)
+
+    def denoise(self, x_t, alpha_bar, cameras):
+        views = [self._denoise(P, x_t[:, v], alpha_bar) for v, P in enumerate(cameras.image_axes)]
+        return self.fault * np.stack(views, axis=1)
+
+    def view_covariance_product(self, x_t, alpha_bar, cameras, vectors):
+        views = []
+        for v, P in enumerate(cameras.image_axes):
+            S = P @ self.covariance @ P.T
+            views.append(vectors[:, v] @ (S - math.sqrt(alpha_bar) * S @ gain(S, alpha_bar)))
+        return np.stack(views, axis=1)
+
+    def _denoise(self, P, x_t, alpha_bar):
+        mean, S = self.mean @ P.T, P @ self.covariance @ P.T
+        return mean + (x_t - math.sqrt(alpha_bar) * mean) @ gain(S, alpha_bar)
+
+
+def gain(S, alpha_bar):
+    """G with E[x₀ | x_t] = x_t G for x₀ ~ N(0, S)."""
+    noisy = alpha_bar * S + (1 - alpha_bar) * np.eye(len(S))
+    return math.sqrt(alpha_bar) * np.linalg.solve(noisy, S)
+
+
+def centred(*variances):
+    return Points(np.zeros((JOINTS, 3)), np.diag(variances))
+
+
+def problem_of(prior, likelihood=None):
+    return Problem("points", "joints of one Gaussian", MotionPosterior(prior, likelihood))
+
+
+def covariance_after(S, T, views=None, shared_noise=True):
+    """A joint's covariance after T steps: of `ancestral3d`, or with views of `mas`."""
+    schedule = NoiseSchedule.cosine(T)
+    axes = np.eye(3)[None] if views is None else views
+    inverse = np.linalg.inv(np.einsum("vcx,vcy->xy", axes, axes))
+    rows = np.concatenate(list(axes))
+    # The state is X, or all views side by side; `embed` makes the state of a motion.
+    embed = np.eye(3) if shared_noise else rows
+
+    def estimate(alpha_bar):
+        blocks = [gain(P @ S @ P.T, alpha_bar).T for P in axes]
+        if shared_noise:
+            parts = [P.T @ G @ P for P, G in zip(axes, blocks, strict=True)]
+            return inverse @ np.sum(parts, axis=0)
+        parts = [P.T @ G for P, G in zip(axes, blocks, strict=True)]
+        return inverse @ np.concatenate(parts, axis=1)
+
+    covariance = np.eye(len(embed))
+    for t in range(T, 1, -1):
+        step = schedule.posterior(t)
+        move = step.clean * embed @ estimate(schedule.alpha_bar[t])
+        move = move + step.noisy * np.eye(len(embed))
+        covariance = move @ covariance @ move.T + step.deviation**2 * np.eye(len(embed))
+    last = estimate(schedule.alpha_bar[1])
+    return last @ covariance @ last.T
+
+
+def ring(n_views, elevation):
+    return Cameras.ring(n_views, elevation=elevation).image_axes
+
+
+def log_trace(covariance, S):
+    return math.log(np.trace(covariance) / np.trace(S))
+
+
+def means(budget, measure):
+    table = budget.table()
+    return table[table["measure"] == measure].set_index("part")["mean"]
+
+
+def test_isotropic_the_steps_alone_shrink_and_views_change_nothing():
+    """Items 1, 5 and 6: .955 at T = 100, .995 at 1000; independent noise leaves M⁻¹."""
+    S = np.eye(3)
+    found = budget_of(problem_of(centred(1, 1, 1)), steps=100, seeds=2, draws=100)
+    spread = means(found, "spread")
+    error = math.sqrt(2 / (100 * 2 * JOINTS * 3))
+    assert spread["remainder"] == pytest.approx(math.log(0.995), abs=4 * math.sqrt(2) * error)
+    discretisation = spread["remainder"] + spread["discretisation"]
+    assert discretisation == pytest.approx(math.log(0.955), abs=4 * math.sqrt(2) * error)
+    # The views' denoiser is then the 3D one, and noise and all are shared.
+    assert spread["single view"] == pytest.approx(0, abs=1e-10)
+    views = ring(5, math.pi / 16)
+    coarse, here, fine = (
+        covariance_after(S, T, views, shared_noise=False) for T in (200, 100, 400)
+    )
+    limit = np.linalg.inv(np.einsum("vcx,vcy->xy", views, views))
+    np.testing.assert_allclose(2 * fine - coarse, limit, atol=3e-3)
+    # At T = 100 the steps take a little more from it than from the motion.
+    sharing = log_trace(here, covariance_after(S, 100))
+    assert spread["noise sharing"] == pytest.approx(sharing, abs=4 * math.sqrt(2) * error)
+    expected = log_trace(here, S)
+    assert spread["whole"] == pytest.approx(expected, abs=4 * math.sqrt(2) * error)
+    assert means(found, "mean").abs().max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("true", "elevation", "drawn"),
+    [
+        # Item 2: elevation mixes vertical and horizontal.
+        ((1, 0.05, 1), math.radians(15), (0.835, 0.114, 0.835)),
+        # Item 3: what is large shrinks, what is small inflates; level views, but for no warning.
+        ((0.01, 0.01, 1), 1e-9, (0.055, 0.01, 0.675)),
+    ],
+)
+def test_conditioning_on_single_views_shrinks_large_directions_and_inflates_small(
+    true, elevation, drawn
+):
+    prior = centred(*true)
+    S, T = prior.covariance, 40
+    found = budget_of(
+        problem_of(prior), steps=T, seeds=2, draws=100, settings={"elevation": elevation}
+    )
+    after = covariance_after(S, T, ring(5, elevation))
+    before = covariance_after(S, T)
+    spread = means(found, "spread")
+    assert spread["single view"] == pytest.approx(log_trace(after, before), abs=0.01)
+    # Steps enter only as far as they do so alone.
+    assert log_trace(after, before) == pytest.approx(log_trace(np.diag(drawn), S), abs=0.02)
+    # Small directions mix what is alike: joints, and axes of one variance.
+    small = BiasMeasures(problem_of(prior)).small.reshape(JOINTS, 3, -1)
+    inflated, right = (
+        np.einsum("jxd,xy,jyd->d", small, covariance, small) for covariance in (after, before)
+    )
+    expected = np.log(inflated / right).mean()
+    assert means(found, "small")["single view"] == pytest.approx(expected, abs=0.03)
+    assert expected > 0.3
+
+
+def test_parts_add_up_exactly_seed_by_seed():
+    found = budget_of(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
+    assert found.parts == ["remainder", "discretisation", "single view", "noise sharing"]
+    table = found.table()
+    assert list(table.columns) == ["setting", "measure", "part", "mean", "low", "high"]
+    assert set(table["setting"]) == {"points, V = 5, T = 5"}
+    for measure, links in found.values.items():
+        whole = links["noise sharing"] - links["exact"]
+        parts = np.sum(list(found.differences(measure).values()), axis=0)
+        np.testing.assert_allclose(parts, whole, atol=1e-12)
+        rows = table[table["measure"] == measure].set_index("part")
+        np.testing.assert_allclose(rows.loc[found.parts, "mean"].sum(), rows.loc["whole", "mean"])
+        assert (rows["low"] < rows["high"]).all()
+    # Five steps shrink, and are said to; the mean is nobody's fault.
+    said = {words.partition(":")[0]: words for words in found.findings}
+    assert "discretisation -" in said["spread"]
+    assert said["mean"].startswith("mean: in all not told from exact draws; not told from chance")
+
+
+def test_measures_of_draws_that_are_moved_and_stretched():
+    problem = problem_of(centred(1, 0.3, 0.1))
+    measures = BiasMeasures(problem)
+    exact = problem.reference(11, 400)
+    total = 1.4 * JOINTS
+    floor = measures.of(exact, seed=2)
+    shift = np.random.default_rng(0).normal(size=exact.shape[1:])
+    moved = measures.of(exact + shift, seed=2)
+    apart = float((shift**2).sum()) / total
+    # W₂² of a shift is its square along a direction: on average ‖shift‖² / D.
+    for measure in ("mean", "distance"):
+        assert moved[measure] - floor[measure] == pytest.approx(apart, rel=0.15)
+    for measure in ("spread", "small"):
+        assert moved[measure] == pytest.approx(floor[measure], abs=1e-9)
+    stretched = measures.of(1.5 * exact, seed=2)
+    for measure in ("spread", "small"):
+        assert stretched[measure] - floor[measure] == pytest.approx(2 * math.log(1.5), abs=1e-9)
+    # Of Gaussians: (1.5 σ − σ)² along every direction.
+    assert stretched["distance"] - floor["distance"] == pytest.approx(0.25, rel=0.1)
+    assert abs(stretched["mean"]) < 0.005
+    # The last 5 % of the variance, all of it of the axis of variance .1.
+    assert 0.048 * total < measures.small_variances.sum() < 0.051 * total
+    small = measures.small.reshape(JOINTS, 3, -1)
+    assert (small[:, 2] ** 2).sum() > 0.98 * small.shape[-1]
+
+
+def test_a_denoiser_that_is_right_adds_nothing_and_a_wrong_one_does():
+    prior = centred(1, 0.3, 0.1)
+    run = partial(budget_of, problem_of(prior), steps=10, seeds=2, draws=30)
+    right, wrong = run(learnt=prior), run(learnt=replace(prior, fault=0.8))
+    for measure in right.values:
+        np.testing.assert_array_equal(right.differences(measure)["network"], 0)
+        for part in right.parts[:-1]:
+            np.testing.assert_array_equal(
+                right.differences(measure)[part], wrong.differences(measure)[part]
+            )
+    assert means(wrong, "spread")["network"] < -0.3
+    assert run(shared_noise=True).parts == ["remainder", "discretisation", "single view"]
+
+
+def evidence(prior, noise):
+    drawn = prior.sample(np.random.default_rng(1), 1)[0]
+    motion = Motion(drawn, prior.skeleton, prior.fps)
+    return Keypoints2D.observe(motion, Cameras.ring(1, elevation=0.3), noise, seed=0)
+
+
+def test_guidance_is_what_guiding_costs_beside_denoisers_given_the_evidence():
+    prior = centred(1, 0.3, 0.1)
+    run = partial(budget_of, steps=10, seeds=2, draws=30)
+    idle = run(problem_of(prior, evidence(prior, 1e5)), learnt=prior)
+    assert idle.parts == ["remainder", "discretisation", "single view", "guidance", "network"]
+    for measure in idle.values:
+        np.testing.assert_allclose(idle.differences(measure)["guidance"], 0, atol=1e-6)
+        np.testing.assert_array_equal(idle.differences(measure)["network"], 0)
+    sharp = problem_of(prior, evidence(prior, 0.05))
+    found = run(sharp)
+    # The mean of exact draws given y is not told from that of the reference.
+    assert abs(means(found, "mean")["floor"]) < 0.02
+    assert any("no learnt denoiser" in note for note in found.notes)
+    # Evidence as one more view is the design's example of what fails.
+    naive = run(sharp, settings={"guidance": WeightedTriangulation()})
+    row = naive.table().set_index(["measure", "part"]).loc[("mean", "guidance")]
+    assert row["low"] > 10 * means(found, "mean")["guidance"] > 0
+    for part in ("remainder", "discretisation", "single view"):
+        np.testing.assert_array_equal(
+            naive.differences("mean")[part], found.differences("mean")[part]
+        )
+
+
+def test_what_is_stopped_goes_on(tmp_path):
+    prior = centred(1, 0.3, 0.1)
+    run = partial(budget_of, problem_of(prior), steps=4, seeds=2, draws=12)
+    whole = run(out=tmp_path / "whole")
+
+    calls = []
+    of = BiasMeasures.of
+
+    def stop_at_the_sixth(self, positions, seed):
+        calls.append(seed)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return of(self, positions, seed)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(BiasMeasures, "of", stop_at_the_sixth)
+        with pytest.raises(KeyboardInterrupt):
+            run(out=tmp_path / "parts")
+        again = run(out=tmp_path / "parts")
+    assert len(calls) == 6 + 10 - 5
+    assert again.table().equals(whole.table())
+    csv = [(tmp_path / name / "bias_budget.csv").read_text() for name in ("whole", "parts")]
+    assert csv[0] == csv[1]
+    with pytest.raises(ValueError, match="holds another budget, expected a new folder"):
+        budget_of(problem_of(prior), steps=5, seeds=2, draws=12, out=tmp_path / "parts")
+
+
+def test_the_batch_changes_nothing():
+    run = partial(budget_of, problem_of(centred(1, 0.3, 0.1)), steps=4, seeds=2, draws=12)
+    one, other = (run(settings={"batch": batch}).table() for batch in (5, 256))
+    np.testing.assert_allclose(one["mean"], other["mean"], atol=1e-9)
+
+
+def test_gaits_have_a_manifold_and_a_picture(tmp_path):
+    problem = load_problem("gait", frames=4, components=3)
+    found = budget_of(problem, steps=8, seeds=2, draws=40)
+    assert list(found.values) == ["spread", "small", "off", "mean", "distance"]
+    off = found.table().set_index(["measure", "part"]).loc["off"]
+    assert abs(off.loc["floor", "mean"]) < 0.1
+    assert off.loc["discretisation", "high"] < 0
+    assert off.loc["single view", "low"] > 0
+    path = found.plot(tmp_path / "budget.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_gaits_given_evidence_have_exact_denoisers():
+    problem = load_problem("gait-monocular", frames=4, components=3)
+    found = budget_of(problem, steps=20, seeds=2, draws=60)
+    spread = means(found, "spread")
+    # At 200 steps the 3D sampler given y draws from the posterior, but for what steps leave.
+    assert abs(spread["remainder"]) < 0.4
+    assert abs(means(found, "mean")["remainder"]) < 0.1
+    assert found.parts == ["remainder", "discretisation", "single view", "guidance"]
+
+
+def test_what_does_not_fit_is_refused_in_a_sentence():
+    problem = problem_of(centred(1, 1, 1))
+    for wrong, words in (
+        ({"seeds": 1}, "seeds is 1, expected an integer of at least 2"),
+        ({"draws": 3}, "draws is 3, expected an integer of at least 10"),
+        ({"settings": {"perspective": True}}, "settings has 'perspective', expected some of n_vie"),
+        ({"learnt": Points(np.zeros((3, 3)), np.eye(3))}, "learnt is of 1 frames of 3 joints"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            budget_of(problem, **wrong)
+
+    with pytest.raises(ValueError, match="problem is 'points', which nobody knows exactly"):
+        budget_of(problem_of(Flat()))
+    seen = problem_of(centred(1, 1, 1), evidence(centred(1, 1, 1), 0.1))
+    with pytest.raises(ValueError, match="shared_noise is False, expected True where there is"):
+        budget_of(seen, shared_noise=False)
+
+    class Blind(Flat):
+        skeleton, frames = problem.posterior.skeleton, 1
+
+    with pytest.raises(UnsupportedPosterior, match="mas needs a prior with Denoises2D, which Bli"):
+        budget_of(problem, learnt=Blind())
+
+
+class Flat:
+    """A prior of which nothing is known."""
+
+    skeleton = Skeleton(["point"], [-1])
+    frames, fps, dim = 1, 20.0, 3
+
+    def motion(self, theta):
+        return theta.reshape(*theta.shape[:-1], 1, 1, 3)

@@ -1,0 +1,433 @@
+"""A fingerprint tells two questions apart and knows one question again."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections import deque
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from decimal import Decimal
+from functools import cached_property, lru_cache, partial, update_wrapper, wraps
+from multiprocessing import get_context
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import expon, norm
+from threadpoolctl import threadpool_info, threadpool_limits
+from toy_samplers import Holder, Plain, PriorDraws, generation, monocular
+
+from probmotion.comparison.results import fingerprint as fingerprints
+from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.threads import one_thread
+
+
+def scaled(noise):
+    """Return a function within a function, as many are written."""
+
+    def log_density(x, *, power=2):
+        return sum(-((each / noise) ** power) for each in x[..., 0])
+
+    return log_density
+
+
+def counting(n):
+    """Return a function that calls itself."""
+
+    def count(k):
+        return 0 if k == n else 1 + count(k + 1)
+
+    return count
+
+
+def unfinished():
+    """Return a function of what is not assigned yet."""
+
+    def read():
+        return later
+
+    if Slotted is None:
+        later = 1
+    return read
+
+
+def told(function, **attributes):
+    """Return the function with attributes."""
+    vars(function).update(attributes)
+    return function
+
+
+class Prior:
+    """An object that a method is bound to."""
+
+    def __init__(self, noise):
+        self.noise = noise
+
+    def log_density(self, x):
+        return -((x / self.noise) ** 2)
+
+    @lru_cache  # noqa: B019
+    def known(self):
+        return self.noise
+
+    @classmethod
+    def named(cls):
+        return cls.__name__
+
+
+class Wrapper:
+    """A decorator with a number of its own and its function's name."""
+
+    def __init__(self, function, noise):
+        update_wrapper(self, function)
+        self.noise = noise
+
+    def __call__(self, x):
+        return self.__wrapped__(x) / self.noise
+
+
+MARKER = object()
+
+
+def functions():
+    """Return functions that differ though most have the same names."""
+    return [
+        *(scaled(0.1), scaled(0.2), scaled(np.array(0.2)), counting(1), counting(2), unfinished()),
+        *(lambda x: x, lambda x: 2 * x, lambda x: 3 * x, lambda x: abs(x), lambda x: all(x)),
+        *(lambda *x: x, lambda x, y: x - y, lambda y, x: x - y, lambda x, y: y - x),
+        *(lambda x=1: x, lambda x=2: x, lambda *, x=1: x, lambda *, x=2: x, lambda *, y=2: y),
+        *(lambda x: x[..., :1], lambda x: x * 1j, lambda x: x in {"a", "b", "c", "d"}),
+        *((lambda: lambda: 1), (lambda: lambda: 2)),
+        *(Prior(1).log_density, Prior(2).log_density, Prior(1).known, Prior(2).known),
+        *(Prior.log_density, Prior.named, Prior, [].append, [1].append, "a".upper, str.upper),
+        *(partial(scaled(1), 1), partial(scaled(2), 1), partial(scaled(2), 2)),
+        *(lru_cache(scaled(1)), lru_cache(scaled(2)), wraps(scaled(1))(scaled(2))),
+        *(told(scaled(1), noise=1), told(scaled(1), noise=2)),
+        *(Wrapper(scaled(1), 1), Wrapper(scaled(1), 2), Wrapper(scaled(2), 2)),
+        *(np.sin, np.cos, np.mean, torch.sin, torch.cos, np.add.reduce, np.maximum.reduce),
+        *(norm.logpdf, norm.cdf, expon.logpdf, partial(norm.logpdf, scale=2), np.random.normal),
+        *(lambda x, y=MARKER: x if y else y, lambda x, *, y=MARKER: x if y else y),
+        *(np, torch, slice(1), slice(2), 1j, Network),
+    ]
+
+
+def functions_found():
+    return [fingerprint(function) for function in functions()]
+
+
+class Slotted:
+    __slots__ = ("value",)
+
+
+class Network(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 2)
+
+
+DIFFERENT = [
+    None,
+    True,
+    1,
+    1.0,
+    "1",
+    b"1",
+    [1],
+    (1,),
+    [[1], []],
+    [[], [1]],
+    {"a": 1},
+    {"a": 2},
+    {1, 2},
+    {"north", "east", "south", "west"},
+    np.array([1.0]),
+    np.array([[1.0]]),
+    np.array([1.0], dtype=np.float32),
+    torch.tensor([1.0]),
+    np.float64(1.0),
+    Holder(1),
+    Holder(2),
+    Holder(Holder(1)),
+    Plain(1),
+    Plain(2),
+    Plain,
+    len,
+    partial(int, "1"),
+    partial(int, "2"),
+    Path("a"),
+    Path("b"),
+]
+
+
+def test_different_things_have_different_fingerprints():
+    assert len({fingerprint(value) for value in DIFFERENT}) == len(DIFFERENT)
+
+
+@pytest.mark.parametrize("value", DIFFERENT, ids=range(len(DIFFERENT)))
+def test_a_copy_has_the_same_fingerprint(value):
+    assert fingerprint(copy.deepcopy(value)) == fingerprint(value)
+
+
+def test_a_worker_finds_the_same_fingerprints():
+    """They travel as cells do, to a process with another seed of Python's hashes."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(fingerprint, DIFFERENT))
+    assert found == [fingerprint(value) for value in DIFFERENT]
+
+
+def test_functions_are_told_apart_by_what_they_do():
+    found = functions_found()
+    doubles = [k for k, each in enumerate(found) if each in found[:k]]
+    assert doubles == []
+    assert found == functions_found()
+
+
+def test_a_worker_finds_the_same_fingerprints_of_functions():
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert pool.submit(functions_found).result() == functions_found()
+
+
+def test_where_a_function_stands_and_how_often_it_ran_do_not_count():
+    source = "def f(x):\n    return [each + 0.5 for each in x]\n"
+    found = set()
+    for file, above in (("one", ""), ("another", "\n\n")):
+        space = {"__name__": "somewhere"}
+        exec(compile(above + source, file, "exec"), space)
+        found.add(fingerprint(space["f"]))
+        for _ in range(1000):  # until Python has made its code faster
+            space["f"]([1.0, 2.0])
+        found.add(fingerprint(space["f"]))
+    assert len(found) == 1
+
+
+def test_an_own_posterior_of_another_noise_is_another_question():
+    found = [
+        fingerprint([Plain(function)])
+        for noise in (0.1, 0.2)
+        for function in (scaled(noise), Prior(noise).log_density, partial(scaled(noise), 0))
+    ]
+    assert len(set(found)) == 6
+
+
+def test_an_object_that_holds_its_own_method_ends():
+    knots = [Prior(1), Prior(1), Prior(2)]
+    for knot in knots:
+        knot.step = knot.log_density
+    one, again, other = map(fingerprint, knots)
+    assert one == again != other
+
+
+def test_caches_and_order_do_not_count():
+    holder = Holder(1)
+    before = fingerprint(holder)
+    holder.cache["filled"] = 1
+    assert fingerprint(holder) == before
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    problem = monocular()
+    fresh = fingerprint(problem)
+    problem.reference(0, 3)
+    assert fingerprint(problem) == fresh == fingerprint(monocular())
+
+
+def test_problems_and_samplers_are_told_apart_by_all_that_matters():
+    problem = monocular()
+    louder = replace(problem.posterior.likelihood, noise=0.06)
+    moved = replace(problem, truth=problem.truth + 1e-9)
+    other = replace(problem, posterior=replace(problem.posterior, likelihood=louder))
+    found = {fingerprint(each) for each in (problem, moved, other, generation())}
+    assert len(found) == 4
+    assert fingerprint(PriorDraws()) != fingerprint(PriorDraws(spread=1.1))
+
+
+def test_a_network_is_its_weights():
+    torch.manual_seed(0)
+    one, two = Network(), Network()
+    assert fingerprint(one) != fingerprint(two)
+    two.load_state_dict(one.state_dict())
+    assert fingerprint(one) == fingerprint(two)
+
+
+class Computes:
+    def __init__(self, value):
+        self.value = value
+
+    @cached_property
+    def half(self):
+        return self.value / 2
+
+
+def test_what_an_object_computed_from_the_rest_does_not_count():
+    fresh, used = Computes(3.0), Computes(3.0)
+    assert used.half == 1.5
+    assert fingerprint(used) == fingerprint(fresh) != fingerprint(Computes(4.0))
+
+
+def test_an_object_that_holds_itself_ends():
+    knot = Plain(1)
+    knot.value = [knot]
+    assert fingerprint(knot) != fingerprint(Plain([1]))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(Lock(), np.random.default_rng(0), object(), (x for x in "a")),
+        *(scaled(np.random.default_rng(0)), np.random.default_rng(0).normal),
+    ],
+    ids=["lock", "generator", "object", "iteration", "closed over", "bound"],
+)
+def test_what_cannot_be_told_apart_is_refused(value):
+    with pytest.raises(ValueError, match="which cannot be told from another"):
+        fingerprint([value])
+
+
+def slotted(value):
+    made = Slotted()
+    made.value = value
+    return made
+
+
+@pytest.mark.parametrize(
+    ("one", "again", "other"),
+    [
+        (slotted(1), slotted(1), slotted(2)),
+        (torch.device("cpu"), torch.device("cpu"), torch.device("meta")),
+        (torch.float32, torch.float32, torch.float64),
+        (np.dtype("f4"), np.dtype("float32"), np.dtype("f8")),
+        (range(3), range(3), range(4)),
+        (Decimal("1.5"), Decimal("1.5"), Decimal("1.6")),
+        (deque([1, 2]), deque([1, 2]), deque([2, 1])),
+        (
+            np.array([[1], "a"], dtype=object),
+            np.array([[1], "a"], dtype=object),
+            np.array([[2], "a"], dtype=object),
+        ),
+    ],
+    ids=["slots", "device", "torch dtype", "dtype", "range", "decimal", "deque", "objects"],
+)
+def test_what_a_sampler_may_hold_is_told_by_its_value(one, again, other):
+    assert fingerprint(Plain(one)) == fingerprint(Plain(again))
+    assert fingerprint(Plain(one)) != fingerprint(Plain(other))
+
+
+def test_methods_of_a_script_s_classes_count_and_an_installed_package_s_do_not(monkeypatch):
+    def of(factor):
+        """Return an object of a class as it is after an edit."""
+
+        class Mine:
+            width = property(lambda self: factor)
+
+            def sample(self):
+                return [2.0] if factor == 3 else [factor]
+
+            @staticmethod
+            def name():
+                return "mine"
+
+        return Mine()
+
+    class Heir(type(of(1))):
+        pass
+
+    assert fingerprint(of(1)) == fingerprint(of(1))
+    assert fingerprint(of(1)) != fingerprint(of(2))
+    before = fingerprint(Heir())
+    monkeypatch.setattr(Heir.__mro__[1], "name", staticmethod(lambda: "other"))
+    assert fingerprint(Heir()) != before
+    before = fingerprint(norm)
+    monkeypatch.setattr(type(norm), "_pdf", lambda self, x: x)
+    assert fingerprint(norm) == before
+
+
+SCRIPT = """
+import functools
+import numpy as np
+
+SHIFT, TABLE = 1.0, np.zeros(3)
+seen = []
+
+def helper(x):
+    seen.append(x)
+    return innermost(x) + SHIFT if x else helper(x)
+
+def innermost(x):
+    return [each + TABLE for each in x]
+
+@functools.cache
+def kept(x):
+    return 2 * x
+
+class Part:
+    width = 3.0
+
+    def area(self):
+        return kept(self.width)
+
+class Mine:
+    def __init__(self):
+        self.calls = 0
+
+    def sample(self, x):
+        return helper(Part().area())
+
+def density(x):
+    return helper(x)
+"""
+
+
+@pytest.mark.parametrize("asked", ["Mine()", "density"])
+def test_what_a_script_s_functions_read_of_it_counts(asked):
+    def of(source, before=()):
+        space = {"__name__": "a_script"}
+        exec(compile(source, "script.py", "exec"), space)
+        space["seen"] += before
+        return fingerprint(eval(asked, space))
+
+    changes = [
+        ("1.0", "0.0"),
+        ("zeros", "ones"),
+        ("each + T", "each - T"),
+        ("innermost(x) +", "x +"),
+    ]
+    if asked == "Mine()":
+        changes += [("3.0", "4.0"), ("2 * x", "3 * x"), ("kept(self", "abs(self")]
+    found = [of(SCRIPT), *(of(SCRIPT.replace(*change)) for change in changes)]
+    assert len(set(found)) == len(found)
+    # Lists fill as it runs, and what is not read does not matter.
+    assert of(SCRIPT, before=[1]) == of(SCRIPT + "\nother = 5\n") == found[0]
+
+
+def test_another_version_of_an_installed_package_is_another_question(monkeypatch):
+    from tqdm import tqdm
+
+    held = [[tqdm], [tqdm.format_num], [tqdm([], disable=True)]]
+    before = [fingerprint(each) for each in held]
+    monkeypatch.setattr(fingerprints, "version", lambda name: "0.0")
+    fingerprints._installed_version.cache_clear()
+    assert not set(before) & {fingerprint(each) for each in held}
+    fingerprints._installed_version.cache_clear()
+
+
+def threads():
+    """Threads of every library that is loaded, by its file."""
+    return {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
+
+
+def test_one_thread_is_one_thread_and_then_what_it_was(monkeypatch):
+    with one_thread():
+        pass  # Loads what it needs, which another test may not have done yet.
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with threadpool_limits(2):
+        before, torch_before = threads(), torch.get_num_threads()
+        with one_thread():
+            assert set(threads().values()) == {1}
+            assert torch.get_num_threads() == 1
+            assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+        assert threads() == before
+        assert torch.get_num_threads() == torch_before
+    assert os.environ["OMP_NUM_THREADS"] == "3"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ

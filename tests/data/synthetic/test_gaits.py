@@ -1,0 +1,71 @@
+"""Procedural gaits: bodies of constant bones that move like what they are called."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion.data.synthetic.gaits import GAITS, make_gait, make_gaits
+
+
+@pytest.mark.parametrize("style", list(GAITS))
+def test_bones_keep_their_lengths(style):
+    clip = make_gait(style, 1, frames=60)
+    joint, parent = np.array(clip.skeleton.bones).T
+    lengths = np.linalg.norm(clip.positions[:, joint] - clip.positions[:, parent], axis=-1)
+    assert (lengths > 0.02).all()
+    np.testing.assert_allclose(lengths, lengths[[0]].repeat(60, axis=0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("style", list(GAITS))
+def test_bodies_stand_upright_and_walk_forwards(style):
+    clip = make_gait(style, 0, frames=60)
+    positions = clip.positions
+    nose = positions[:, clip.skeleton.index("nose")]
+    root = positions[:, clip.skeleton.roots[0]]
+    assert positions[..., 1].min() > -0.15
+    assert positions[..., 1].max() < 2.0
+    # On its way at the start, +Z, and facing there.
+    assert root[5, 2] > root[0, 2]
+    assert nose[0, 2] > root[0, 2]
+    left = positions[0, clip.skeleton.index("left_hip"), 0]
+    assert left > positions[0, clip.skeleton.index("right_hip"), 0]
+
+
+def test_running_is_faster_than_walking():
+    def speed(style):
+        clips = [make_gait(style, number, frames=60) for number in range(20)]
+        return np.mean([np.linalg.norm(c.positions[-1, 0] - c.positions[0, 0]) for c in clips])
+
+    assert speed("run") > 2 * speed("walk")
+
+
+def test_opposite_legs_swing_in_opposite_phase():
+    clip = make_gait("walk", 0, frames=90)
+    left, right = (
+        clip.positions[:, clip.skeleton.index(f"{side}_ankle"), 2] - clip.positions[:, 0, 2]
+        for side in ("left", "right")
+    )
+    assert np.corrcoef(left, right)[0, 1] < -0.8
+
+
+def test_a_clip_is_the_same_whatever_else_is_made():
+    many = {clip.name: clip for clip in make_gaits(50, seed=3)}
+    np.testing.assert_array_equal(many["run-4"].positions, make_gait("run", 4, seed=3).positions)
+    assert not np.array_equal(many["run-4"].positions, make_gait("run", 4, seed=4).positions)
+
+
+def test_shares_are_kept():
+    names = [clip.name.rpartition("-")[0] for clip in make_gaits(300)]
+    assert {name: names.count(name) for name in set(names)} == {
+        "walk": 150,
+        "run": 90,
+        "march": 60,
+    }
+
+
+def test_unknown_style_lists_the_known_ones():
+    with pytest.raises(ValueError, match="style is 'crawl', expected one of walk, run, march"):
+        make_gait("crawl")
+    with pytest.raises(ValueError, match=r"styles\['walk'\] is 0, expected a finite number above"):
+        make_gaits(10, styles={"walk": 0})

@@ -1,0 +1,168 @@
+"""Steps that drop: by hand-computed cases, and reports that add up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion.data.tracks.filters import (
+    drop_crowds,
+    drop_low_quality,
+    drop_short,
+    hide_strays,
+    hide_uncertain,
+)
+from probmotion.data.tracks.step_reports import StepReport
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.skeleton import Skeleton
+
+SQUARE = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
+CORNERS = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+
+
+def square(
+    frames: int = 10, at: tuple[float, float] = (0, 0), side: float = 1.0, **more: object
+) -> KeypointTrack:
+    """A square that stands still, with its least corner at ``at``."""
+    keypoints = np.tile(CORNERS * side + at, (frames, 1, 1))
+    settings = {"fps": 10.0, "name": "square"} | more
+    return KeypointTrack(keypoints, np.full((frames, 4), 0.9), SQUARE, **settings)
+
+
+def with_confidence(track: KeypointTrack, confidence: np.ndarray) -> KeypointTrack:
+    return KeypointTrack(track.keypoints, confidence, SQUARE, track.fps, track.name)
+
+
+def assert_adds_up(report: StepReport) -> None:
+    assert report.tracks_before == report.tracks_after + report.tracks_dropped
+    assert report.frames_before == report.frames_after + report.frames_dropped
+
+
+def test_uncertain_entries_are_hidden_and_the_threshold_itself_is_sure() -> None:
+    confidence = np.full((10, 4), 0.9)
+    confidence[0], confidence[1, 2] = 0.3, 0.29
+    (track,), report = hide_uncertain([with_confidence(square(), confidence)], threshold=0.3)
+    hidden = np.zeros((10, 4), dtype=bool)
+    hidden[1, 2] = True
+    np.testing.assert_array_equal(np.isnan(track.keypoints).all(-1), hidden)
+    np.testing.assert_array_equal(track.confidence, np.where(hidden, 0, confidence))
+    assert report.entries_changed == 1
+    assert_adds_up(report)
+    (again,), second = hide_uncertain([track], threshold=0.3)
+    assert second.entries_changed == 0
+    np.testing.assert_array_equal(again.keypoints, track.keypoints)
+
+
+def test_short_tracks_are_dropped_by_their_time_and_not_their_frames() -> None:
+    tracks = [square(9), square(10), square(15, fps=15.0), square(14, fps=15.0), square(30, fps=60)]
+    kept, report = drop_short(tracks, seconds=1.0)
+    assert kept == [tracks[1], tracks[2]]
+    assert (report.tracks_dropped, report.frames_dropped) == (3, 9 + 14 + 30)
+    assert_adds_up(report)
+    # Frame rates that files round keep their tracks.
+    assert drop_short([square(60, fps=1 / 0.016666)], seconds=1.0)[0]
+
+
+def test_quality_is_the_share_of_sure_entries() -> None:
+    confidence = np.full((10, 4), 0.9)
+    confidence[:4] = 0.2  # 16 of 40 entries
+    tracks = [with_confidence(square(), confidence), square()]
+    assert drop_low_quality(tracks, threshold=0.3, share=0.6)[0] == tracks
+    kept, report = drop_low_quality(tracks, threshold=0.3, share=0.61)
+    assert kept == tracks[1:]
+    assert (report.tracks_dropped, report.frames_dropped) == (1, 10)
+    assert_adds_up(report)
+    assert drop_low_quality(tracks, threshold=0.2, share=1.0)[0] == tracks
+    with pytest.raises(ValueError, match=r"share is 1.5, expected a share of at most 1"):
+        drop_low_quality(tracks, share=1.5)
+
+
+def test_crowds_small_ones_behind_are_dropped_and_the_large_one_kept() -> None:
+    large = square(side=4, name="video 0")
+    inside = square(at=(1, 1), name="video 1")  # all of it inside; a sixteenth of the large one
+    beside = square(at=(3.75, 0), name="video 2")  # a quarter inside
+    other = square(at=(1, 1), name="another 0")
+    tracks = [large, inside, beside, other]
+    kept, report = drop_crowds(tracks, overlap=0.3)
+    assert kept == [large, beside, other]
+    assert_adds_up(report)
+    assert drop_crowds(tracks, overlap=0.2)[0] == [large, other]
+    assert drop_crowds(tracks, overlap=1.0)[0] == tracks
+    never = with_confidence(square(name="video 3"), np.zeros((10, 4)))
+    assert drop_crowds([*tracks, never], overlap=0.3)[0] == [*kept, never]
+    # Whatever the order.
+    assert drop_crowds(tracks[::-1], overlap=0.2)[0] == [other, large]
+
+
+def test_crowds_two_alike_are_both_dropped_and_views_are_none() -> None:
+    twins = [square(name="walk 0"), square(name="walk 1")]
+    assert drop_crowds(twins)[0] == []
+    views = [square(name="walk/0"), square(name="walk/1")]
+    assert drop_crowds(views)[0] == views
+    assert drop_crowds(views, videos=["same", "same"])[0] == []
+    assert drop_crowds([twins[0], square(11, name="walk 1")])[1].tracks_dropped == 0
+
+
+def test_crowds_count_the_frames_in_which_the_track_is_seen() -> None:
+    """Seen in 4 frames, of which the other is there in 1: overlap 1/4; and of 10, 1: 1/10."""
+    own, other = np.zeros((10, 4)), np.zeros((10, 4))
+    own[:4], other[3:] = 0.9, 0.9
+    tracks = [with_confidence(square(name=f"v {i}"), c) for i, c in enumerate((own, other))]
+    assert drop_crowds(tracks, overlap=0.26)[0] == tracks
+    assert drop_crowds(tracks, overlap=0.24)[0] == tracks[1:]
+    with pytest.raises(ValueError, match="videos has 1 names, expected 2, one per track"):
+        drop_crowds(tracks, videos=["v"])
+    with pytest.raises(ValueError, match=r"the video 'v' have \[10, 12\] frames, expected one"):
+        drop_crowds([tracks[0], square(12)], videos=["v", "v"])
+
+
+def test_strays_are_hidden_and_quick_joints_are_not() -> None:
+    frames = 30
+    track = square(frames)
+    keypoints = track.keypoints.copy()
+    keypoints[:, 1, 0] += 0.5 * np.arange(frames)  # quick, one way
+    keypoints[12, 2] += (0, 3.0)
+    keypoints[20:22, 3] -= (5.0, 0)
+    wild = KeypointTrack(keypoints, track.confidence, SQUARE, 30)
+    (kept,), report = hide_strays([wild], distance=0.15, window=0.25)
+    hidden = np.argwhere(kept.confidence == 0).tolist()
+    assert hidden == [[12, 2], [20, 3], [21, 3]]
+    assert np.isnan(kept.keypoints[12, 2]).all()
+    assert report.entries_changed == 3
+    assert_adds_up(report)
+    (again,), second = hide_strays([kept], distance=0.15, window=0.25)
+    assert second.entries_changed == 0
+    np.testing.assert_array_equal(again.keypoints, kept.keypoints)
+
+
+def test_strays_are_not_judged_with_too_few_neighbours() -> None:
+    confidence = np.full((10, 4), 0.9)
+    confidence[:, 1] = 0
+    for frames, changed in (((4, 5), 0), ((4, 5, 6), 1)):
+        confidence[frames, 1] = 0.9
+        track = with_confidence(square(), confidence)
+        track.keypoints[5, 1] = 50.0
+        assert hide_strays([track], distance=0.1, window=1.0)[1].entries_changed == changed
+
+
+def test_a_single_joint_has_no_size_and_no_strays() -> None:
+    track = with_confidence(square(), 0.9 * (np.arange(40).reshape(10, 4) % 4 == 0))
+    track.keypoints[5, 0] = 50.0
+    (same,), report = hide_strays([track])
+    assert same is track
+    assert report.entries_changed == 0
+
+
+def test_no_tracks_give_no_tracks() -> None:
+    for step in (hide_uncertain, hide_strays, drop_short, drop_low_quality, drop_crowds):
+        kept, report = step([])
+        assert kept == []
+        assert report.tracks_before == report.frames_before == report.tracks_dropped == 0
+
+
+def test_a_report_is_one_line_of_numbers_and_words() -> None:
+    _, report = drop_short([square(9), square(20)])
+    assert str(report) == (
+        "short: 2 tracks of 29 frames became 1 of 20; 1 track and 9 frames dropped, 0 joints "
+        "changed; dropped tracks of less than 1 s"
+    )

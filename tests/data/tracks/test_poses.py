@@ -1,0 +1,119 @@
+"""Centring and mirroring: invariances, and what becomes of frames without a root."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.data.tracks.poses import centre_tracks, mirror_tracks, mirrored_track
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.skeleton import Skeleton
+from probmotion.motion.splits import clip_of
+
+PERSON = Skeleton.preset("person14")
+
+
+def moving(frames: int = 12, name: str = "walk/left", seed: int = 0) -> KeypointTrack:
+    rng = np.random.default_rng(seed)
+    keypoints = rng.normal(size=(frames, 14, 2)) + np.linspace(0, 50, frames)[:, None, None]
+    confidence = rng.uniform(0.3, 1, size=(frames, 14))
+    confidence[3, 5] = 0
+    keypoints[3, 5] = np.nan
+    return KeypointTrack(keypoints, confidence, PERSON, 20, name)
+
+
+def without_root(track: KeypointTrack, frames: slice) -> KeypointTrack:
+    confidence, keypoints = track.confidence.copy(), track.keypoints.copy()
+    confidence[frames, 0], keypoints[frames, 0] = 0, np.nan
+    return KeypointTrack(keypoints, confidence, PERSON, 20, track.name)
+
+
+def test_the_root_of_every_frame_is_the_origin_and_bones_stay() -> None:
+    track = moving()
+    (centred,), report = centre_tracks([track])
+    np.testing.assert_array_equal(centred.keypoints[:, 0], np.zeros((12, 2)))
+    np.testing.assert_allclose(np.diff(centred.keypoints, axis=1), np.diff(track.keypoints, axis=1))
+    np.testing.assert_array_equal(centred.confidence, track.confidence)
+    assert report.entries_changed == report.tracks_dropped == 0
+    (again,), _ = centre_tracks([centred])
+    np.testing.assert_array_equal(again.keypoints, centred.keypoints)
+
+
+def test_where_a_track_is_does_not_matter() -> None:
+    track = moving()
+    moved = KeypointTrack(track.keypoints + np.array([300, -7]), track.confidence, PERSON, 20)
+    for per in ("frame", "sequence"):
+        (one,), _ = centre_tracks([track], per=per)
+        (other,), _ = centre_tracks([moved], per=per)
+        np.testing.assert_allclose(one.keypoints, other.keypoints, atol=1e-10)
+
+
+def test_frames_without_a_root_are_hidden_or_keep_their_path() -> None:
+    track = without_root(moving(), slice(5, 8))
+    (per_frame,), report = centre_tracks([track], per="frame")
+    assert (per_frame.confidence[5:8] == 0).all()
+    assert np.isnan(per_frame.keypoints[5:8]).all()
+    assert (per_frame.frames, report.entries_changed) == (12, 3 * 13)
+    (whole,), report = centre_tracks([track], per="sequence")
+    np.testing.assert_array_equal(whole.confidence, track.confidence)
+    known = track.confidence[:, 0] > 0
+    np.testing.assert_allclose(whole.keypoints[known, 0].mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(np.diff(whole.keypoints, axis=0), np.diff(track.keypoints, axis=0))
+    assert report.entries_changed == 0
+
+
+def test_tracks_that_never_show_their_root_are_dropped() -> None:
+    tracks = [without_root(moving(), slice(0, 12)), moving(7)]
+    for per in ("frame", "sequence"):
+        kept, report = centre_tracks(tracks, per=per)
+        assert [track.frames for track in kept] == [7]
+        assert (report.tracks_dropped, report.frames_dropped) == (1, 12)
+        assert report.frames_before == report.frames_after + report.frames_dropped
+    with pytest.raises(ValueError, match="per is 'clip', expected 'frame' or 'sequence'"):
+        centre_tracks(tracks, per="clip")
+    assert centre_tracks([])[0] == mirror_tracks([])[0] == []
+
+
+def test_mirrored_twice_is_the_track() -> None:
+    for name in ("walk/left", "walk", ""):
+        track = moving(name=name)
+        twice = mirrored_track(mirrored_track(track))
+        np.testing.assert_array_equal(twice.keypoints, track.keypoints)
+        np.testing.assert_array_equal(twice.confidence, track.confidence)
+        assert twice.name == name
+    assert clip_of(mirrored_track(moving(name="walk")).name) == "walk"
+
+
+def test_joints_change_sides_and_x_its_sign() -> None:
+    track = moving()
+    mirrored = mirrored_track(track)
+    for own, other in (
+        ("pelvis", "pelvis"),
+        ("left_knee", "right_knee"),
+        ("right_wrist", "left_wrist"),
+    ):
+        here, there = PERSON.index(own), PERSON.index(other)
+        np.testing.assert_array_equal(
+            mirrored.keypoints[:, here], track.keypoints[:, there] * [-1, 1]
+        )
+        np.testing.assert_array_equal(mirrored.confidence[:, here], track.confidence[:, there])
+    tracks, report = mirror_tracks([track, moving(5)])
+    assert [made.name for made in tracks[2:]] == ["walk/left mirrored"] * 2
+    assert (report.tracks_after, report.frames_before, report.frames_after) == (4, 17, 34)
+
+
+def test_it_is_what_a_camera_sees_of_the_mirrored_body() -> None:
+    """The body mirrored in 3D and seen by the same camera, that looks along z."""
+    motion = make_gait("walk", frames=10)
+    joints = motion.positions
+    order = np.arange(motion.skeleton.n_joints)
+    for left, right in motion.skeleton.mirrored_pairs:
+        order[left], order[right] = right, left
+    camera = Cameras.around([0.0], 0.2)
+    seen, wanted = (
+        np.asarray(camera.project(body))[0] for body in (joints, joints[:, order] * [-1, 1, 1])
+    )
+    track = KeypointTrack(seen, np.ones(seen.shape[:2]), motion.skeleton, 30)
+    np.testing.assert_allclose(mirrored_track(track).keypoints, wanted, atol=1e-12)

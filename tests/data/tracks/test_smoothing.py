@@ -1,0 +1,120 @@
+"""Steps along time: exact on the motions that they must leave alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion.data.tracks.smoothing import fill_gaps, resample_tracks, smooth_tracks
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.skeleton import Skeleton
+
+BALL = Skeleton(["ball"], [-1])
+
+
+def ball(path: np.ndarray, fps: float = 10.0, gaps: tuple[int, ...] = ()) -> KeypointTrack:
+    """One joint along ``path`` (L, 2), unseen in the frames ``gaps``."""
+    confidence = np.linspace(0.5, 0.9, len(path))[:, None]
+    confidence[list(gaps)] = 0
+    keypoints = np.where(confidence[..., None] > 0, path[:, None], np.nan)
+    return KeypointTrack(keypoints, confidence, BALL, fps, "ball")
+
+
+def line(frames: int, fps: float = 10.0) -> np.ndarray:
+    time = np.arange(frames) / fps
+    return np.stack([3 * time - 1, 2 - time], axis=-1)
+
+
+def test_short_gaps_of_a_straight_path_are_filled_exactly() -> None:
+    track = ball(line(20), gaps=(0, 5, 6, 10, 11, 12, 19))
+    (filled,), report = fill_gaps([track], longest=0.2)
+    np.testing.assert_allclose(filled.keypoints[[5, 6], 0], line(20)[[5, 6]], atol=1e-12)
+    unseen = [0, 10, 11, 12, 19]  # the ends, and a gap of .3 s
+    np.testing.assert_array_equal(np.flatnonzero(filled.confidence[:, 0] == 0), unseen)
+    assert np.isnan(filled.keypoints[unseen]).all()
+    assert filled.confidence[5, 0] == filled.confidence[6, 0] == track.confidence[4, 0]
+    others = np.setdiff1d(np.arange(20), [5, 6])
+    np.testing.assert_array_equal(filled.keypoints[others], track.keypoints[others])
+    assert report.entries_changed == 2
+    assert fill_gaps([track], longest=0.3)[1].entries_changed == 5
+    assert fill_gaps([filled], longest=0.2)[1].entries_changed == 0
+
+
+def test_gaps_are_filled_smoothly_and_without_overshoot() -> None:
+    step = np.zeros((12, 2))
+    step[6:] = 1.0
+    (filled,), _ = fill_gaps([ball(step, gaps=(5, 6))], longest=0.2)
+    path = filled.keypoints[:, 0, 0]
+    assert path.min() == 0
+    assert path.max() == 1
+    assert (np.diff(path) >= 0).all()
+    # PCHIP between flat ends is Hermite's 3 s² - 2 s³ at s = 1/3 and 2/3.
+    np.testing.assert_allclose(path[5:7], [7 / 27, 20 / 27], atol=1e-12)
+
+
+def test_parabolas_are_left_alone_ends_included() -> None:
+    time = np.arange(40) / 10
+    path = np.stack([time**2 - 3 * time, 1 - 0.5 * time**2], axis=-1)
+    track = ball(path, gaps=(9, 10, 17))
+    (smoothed,), report = smooth_tracks([track], window=0.7)
+    np.testing.assert_allclose(smoothed.keypoints, track.keypoints, atol=1e-10)
+    np.testing.assert_array_equal(smoothed.confidence, track.confidence)
+    assert report.entries_changed == 9 + 6 + 22
+    # A run of fewer than five frames is left as it is: bit for bit.
+    short = ball(np.random.default_rng(0).normal(size=(9, 2)), gaps=(4,))
+    (same,), report = smooth_tracks([short], window=0.7)
+    np.testing.assert_array_equal(same.keypoints, short.keypoints)
+    assert report.entries_changed == 0
+
+
+def test_noise_is_lessened_by_what_the_fit_says() -> None:
+    """The variance left is the sum of squared weights, (3 n² - 7) · 3 / (4 n (n² - 4))."""
+    noise = np.random.default_rng(1).normal(size=(4000, 2))
+    (smoothed,), _ = smooth_tracks([ball(noise)], window=0.7)
+    expected = 3 * (3 * 7**2 - 7) / (4 * 7 * (7**2 - 4))
+    assert smoothed.keypoints[10:-10].var() == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize(("old", "new"), [(60, 20), (60, 25), (30, 30), (20, 50), (29.97, 20)])
+def test_resampling_a_straight_path_is_exact(old: float, new: float) -> None:
+    (track,), report = resample_tracks([ball(line(61, old), old)], fps=new)
+    assert track.fps == new
+    np.testing.assert_allclose(track.keypoints[:, 0], line(track.frames, new), atol=1e-9)
+    assert 0 <= 60 / old - (track.frames - 1) / new + 1e-9 < 1 / new + 1e-9
+    confidence = 0.5 + 0.4 * np.arange(track.frames) / new * old / 60
+    np.testing.assert_allclose(track.confidence[:, 0], confidence, atol=1e-9)
+    assert report.frames_after == track.frames
+
+
+def test_unseen_stays_unseen_and_only_neighbours_that_count_matter() -> None:
+    track = ball(line(13, 60), 60, gaps=(4, 6))
+    (third,), _ = resample_tracks([track], fps=20)  # frames 0 3 6 9 12
+    np.testing.assert_array_equal(third.confidence[:, 0] > 0, [True, True, False, True, True])
+    np.testing.assert_array_equal(third.keypoints[1], track.keypoints[3])
+    assert np.isnan(third.keypoints[2]).all()
+    # A rate that a file rounds: 3.0000000000000004 old frames per new one are 3.
+    rounded = ball(line(13), 1 / 0.016667, gaps=(4, 8))
+    (third,), _ = resample_tracks([rounded], fps=1 / 0.050001)
+    np.testing.assert_array_equal(third.confidence[:, 0] > 0, np.ones(5, dtype=bool))
+    (doubled,), _ = resample_tracks([track], fps=120)
+    unseen = np.flatnonzero(doubled.confidence[:, 0] == 0)
+    np.testing.assert_array_equal(unseen, [7, 8, 9, 11, 12, 13])
+    single = ball(line(1))
+    assert resample_tracks([single], fps=3)[0][0].frames == 1
+
+
+def test_tracks_of_several_rates_and_bad_numbers() -> None:
+    tracks = [ball(line(31, 30), 30), ball(line(61, 60), 60)]
+    resampled, report = resample_tracks(tracks, fps=20)
+    np.testing.assert_allclose(resampled[0].keypoints, resampled[1].keypoints, atol=1e-12)
+    assert report.why == "brought 30 and 60 fps to 20"
+    for step in (fill_gaps, smooth_tracks):
+        assert step([])[0] == []
+    with pytest.raises(ValueError, match="fps is None, expected a finite number above 0"):
+        resample_tracks(tracks, fps=None)
+    with pytest.raises(ValueError, match="fps is 20000, expected at most 10000"):
+        resample_tracks(tracks, fps=20000)
+    with pytest.raises(ValueError, match="longest is 0, expected"):
+        fill_gaps(tracks, longest=0)
+    with pytest.raises(ValueError, match="window is -1, expected"):
+        smooth_tracks(tracks, window=-1)

@@ -1,0 +1,98 @@
+"""A 2D denoiser learnt from a prior's own motions: then MAS runs on what the prior knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion import MotionPosterior, Skeleton
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.diffusion import projected_denoiser
+from probmotion.models.diffusion.projected_denoiser import denoiser_of
+from probmotion.models.diffusion.training import DiffusionTrainee
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.models.vae.model import MotionVAEModel
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.samplers import MultiViewAncestral
+
+ARM = Skeleton(["pelvis", "neck", "left_shoulder", "right_shoulder"], [-1, 0, 1, 1])
+REST = np.array([[0, 0, 0], [0, 0.5, 0], [0.2, 0, 0], [-0.2, 0, 0]])
+BRIEF = TrainingSettings(steps=60, batch=32, learning_rate=5e-3, warmup=5, ema=0.9)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    size = replace(MotionVAESettings.tiny(), frames=4, latent=2)
+    model = MotionVAEModel.of(size, ArticulatedBody(ARM, REST))
+    with torch.no_grad():
+        model.vae.bone_decoder.leave.weight.mul_(10)
+    return MotionVAE(model.vae, model.pose, size, ArticulatedBody(ARM, REST), 20.0)
+
+
+def learnt(prior, out, **options):
+    settings = {"size": "tiny", "motions": 20, "views": 4, "training": BRIEF} | options
+    return denoiser_of(prior, out, progress=False, **settings)
+
+
+def test_mas_runs_on_it_and_draws_bodies_of_the_prior_s_size(prior, tmp_path):
+    denoiser = learnt(prior, tmp_path)
+    assert (denoiser.skeleton, denoiser.frames, denoiser.fps) == (ARM, 4, 20.0)
+    draws = MultiViewAncestral(steps=20).sample(
+        MotionPosterior(denoiser), draws=8, seed=0, progress=False
+    )
+    assert draws.positions.shape == (1, 8, 4, 4, 3)
+    trunk = np.linalg.norm(draws.positions[..., 1, :] - draws.positions[..., 0, :], axis=-1)
+    assert 0.4 < np.median(trunk) < 0.6
+
+
+def test_the_same_call_goes_on_where_it_was(prior, tmp_path):
+    first = learnt(prior, tmp_path)
+    again = learnt(prior, tmp_path)
+    assert first.card == again.card
+    rng = np.random.default_rng(0)
+    views = rng.standard_normal((1, 2, 4, 4, 2))
+    np.testing.assert_array_equal(first.denoise(views, 0.5, None), again.denoise(views, 0.5, None))
+    with pytest.raises(ValueError, match="holds a run"):
+        learnt(prior, tmp_path, seed=1)
+
+
+def test_a_tenth_of_the_motions_is_held_out_in_all_views(prior, tmp_path, monkeypatch):
+    parts = []
+
+    class Spy(DiffusionTrainee):
+        def __init__(self, tracks, validation, *rest, **options):
+            for part in (tracks, validation):
+                parts.append({track.name.partition("/")[0] for track in part})
+            super().__init__(tracks, validation, *rest, **options)
+
+    monkeypatch.setattr(projected_denoiser, "DiffusionTrainee", Spy)
+    learnt(prior, tmp_path, training=replace(BRIEF, steps=1))
+    assert [len(part) for part in parts] == [18, 2]
+    assert not parts[0] & parts[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"motions": 1}, "motions is 1, expected an integer of at least 2"),
+        ({"views": 0}, "views is 0, expected an integer of at least 1"),
+        ({"size": "large"}, "size is 'large', expected one of tiny, small, paper"),
+    ],
+)
+def test_wrong_numbers_are_refused(prior, tmp_path, options, sentence):
+    with pytest.raises(ValueError, match=f"^{sentence}"):
+        learnt(prior, tmp_path, **options)
+
+
+def test_a_size_that_has_no_network_is_refused(prior, tmp_path):
+    with pytest.raises(ValueError, match="size is 'reference-code', expected one of tiny, small"):
+        denoiser_of(prior, tmp_path, size="reference-code")
+
+
+def test_a_prior_that_cannot_be_sampled_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="prior is object, expected one that can be sampled"):
+        denoiser_of(object(), tmp_path)

@@ -1,0 +1,125 @@
+"""What motion is learnt from in pictures: cameras, closed forms, the best hypothesis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion.geometry.cameras import Cameras
+from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.vae.losses import (
+    best_guess,
+    guess_terms,
+    pictured,
+    reconstruction,
+    roughness,
+    weighted_sum,
+)
+from probmotion.models.vae.pose_network import PoseGuesses
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.motion.skeleton import Skeleton
+
+B, H, L = 3, 4, 5
+SKELETON = Skeleton(
+    ["pelvis", "neck", "left_hip", "left_knee", "left_ankle", "right_hip", "right_knee",
+     "right_ankle"],
+    [-1, 0, 0, 2, 3, 0, 5, 6],
+)  # fmt: skip
+REST = np.array(
+    [[0, 0, 0], [0, 0.5, 0], [0.1, 0, 0], [0, -0.4, 0.05], [0, -0.4, -0.05], [-0.1, 0, 0],
+     [0, -0.4, 0.05], [0, -0.4, -0.05]]
+)  # fmt: skip
+BODY = ArticulatedBody(SKELETON, REST)
+
+
+def random_guesses(seed: int = 0, size: float = 0.3) -> PoseGuesses:
+    rng = np.random.default_rng(seed)
+    n = len(BODY.bones)
+    return PoseGuesses(
+        torch.tensor(vector_to_matrix(rng.normal(size=(B, H, L, 3)))),
+        torch.tensor(0.1 * rng.normal(size=(B, H, L, 2))),
+        torch.tensor(size * rng.normal(size=(B, H, L, n, 3))),
+        torch.tensor(0.1 * rng.normal(size=(B, H, BODY.n_groups))),
+    )
+
+
+def positions_of(guesses: PoseGuesses) -> torch.Tensor:
+    translation = torch.nn.functional.pad(guesses.translation, (0, 1))
+    return BODY.positions(guesses.turns, guesses.rotation, translation, guesses.log_lengths)
+
+
+@pytest.mark.parametrize("perspective", [True, False])
+def test_pictures_are_those_of_cameras_on_the_horizon(perspective: bool) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4, 6, 3))
+    camera = Cameras.around([0.7], [0.0], distance=7.0, perspective=perspective)
+    expected = camera.project(points)[0]
+    # World → the camera's axes, y up and z towards it.
+    turned = np.einsum("ij,...j->...i", camera.rotation[0], points) * [1, -1, -1]
+    found = pictured(torch.tensor(turned), 7.0 if perspective else None)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_what_is_not_seen_is_not_missed() -> None:
+    rng = np.random.default_rng(1)
+    positions = torch.tensor(rng.normal(size=(B, L, 8, 3)))
+    keypoints = torch.tensor(rng.normal(size=(B, L, 8, 2)))
+    weight = torch.tensor((rng.random((B, L, 8)) < 0.7).astype(float))
+    expected = np.zeros(B)
+    for b, t, j in zip(*np.nonzero(weight.numpy()), strict=True):
+        error = positions[b, t, j, :2].numpy() * [1, -1] - keypoints[b, t, j].numpy()
+        expected[b] += error @ error
+    found = reconstruction(positions, keypoints, weight, None)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    other = torch.where(weight[..., None] > 0, keypoints, 100.0)
+    np.testing.assert_array_equal(reconstruction(positions, other, weight, None), found)
+
+
+def test_roughness_of_a_steady_turn_is_known() -> None:
+    step = torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)
+    times = torch.arange(L, dtype=torch.float64)
+    rotation = vector_to_matrix(times[:, None] * step)
+    turns = (0.1 * times)[:, None, None].expand(L, 2, 3)
+    translation = torch.stack([0.3 * times, torch.zeros_like(times)], dim=-1)
+    # ½‖R − I‖² = 2(1 − cos a); six rotation numbers; one of the translation.
+    each = 2 * (1 - np.cos(0.2)) + 6 * 0.1**2 + 0.3**2
+    found = roughness(turns, rotation, translation)
+    assert float(found) == pytest.approx((L - 1) * each, rel=1e-12)
+    still = roughness(turns[:1].expand(L, 2, 3), rotation[:1].expand(L, 3, 3), translation[:1])
+    assert float(still) == 0
+
+
+def test_the_terms_of_the_truth_are_what_they_should_be() -> None:
+    guesses = random_guesses()
+    positions = positions_of(guesses)
+    truth = pictured(positions[:, 2], 7.0)
+    terms = guess_terms(BODY, guesses, truth, torch.ones(B, L, 8), 7.0)
+    assert {name: tuple(value.shape) for name, value in terms.items()} == dict.fromkeys(
+        ("reconstruction", "smoothness", "ranges", "lengths"), (B, H)
+    )
+    np.testing.assert_allclose(terms["reconstruction"][:, 2], 0, atol=1e-20)
+    assert terms["reconstruction"][:, [0, 1, 3]].min() > 0.1
+    np.testing.assert_allclose(terms["ranges"], BODY.range_excess(guesses.turns).sum(dim=-1))
+    lengths = L * (guesses.log_lengths**2).sum(dim=-1)
+    np.testing.assert_allclose(terms["lengths"], lengths)
+    one = roughness(guesses.turns[1, 3], guesses.rotation[1, 3], guesses.translation[1, 3])
+    assert float(terms["smoothness"][1, 3]) == pytest.approx(float(one))
+
+
+def test_weights_are_those_of_the_settings() -> None:
+    terms = {"reconstruction": torch.tensor([1.0, 2.0]), "kl": torch.tensor([10.0, 0.0])}
+    settings = replace(MotionVAESettings.tiny(), reconstruction=3.0, kl=0.5)
+    np.testing.assert_allclose(weighted_sum(terms, settings), [8.0, 6.0])
+
+
+def test_the_best_guess_of_each_sequence_is_taken_whole() -> None:
+    guesses = random_guesses()
+    losses = torch.tensor([[3.0, 1, 2, 4], [0, 1, 2, 3], [3, 2, 1, 0.5]])
+    best = best_guess(guesses, losses)
+    for b, h in enumerate((1, 0, 3)):
+        for name in ("rotation", "translation", "turns", "log_lengths"):
+            np.testing.assert_array_equal(getattr(best, name)[b], getattr(guesses, name)[b, h])

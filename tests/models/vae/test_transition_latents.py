@@ -1,0 +1,171 @@
+"""Long motions: segments stay as they are, and what is between them has no seams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion import Skeleton
+from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.vae import transition_latents
+from probmotion.models.vae.model import MotionVAEModel
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.models.vae.transition_latents import (
+    _corrected,
+    _joined,
+    _shared_frames,
+    greatest_acceleration,
+    long_motion,
+)
+
+ARMS = Skeleton(
+    ["pelvis", "neck", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder"],
+    [-1, 0, 1, 2, 3, 1],
+)
+REST = np.array(
+    [
+        [0, 0, 0],
+        [0, 0.5, 0],
+        [0.2, 0, 0],
+        [0.05, -0.3, 0],
+        [0, -0.25, 0.05],
+        [-0.2, 0, 0],
+    ]
+)
+BODY = ArticulatedBody(ARMS, REST)
+
+
+def mover(pace=1.0, **options):
+    """A prior of fresh weights whose bodies move about, as fast as asked."""
+    size = replace(MotionVAESettings.tiny(), latent=4, **options)
+    model = MotionVAEModel.of(size, BODY)
+    with torch.no_grad():
+        model.vae.bone_decoder.leave.weight.mul_(40)
+        model.vae.time_decoder.times.mul_(pace)
+    return MotionVAE(model.vae, model.pose, size, BODY, 20.0)
+
+
+def codes(n=3, seed=0):
+    return np.random.default_rng(seed).standard_normal((n, 4))
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return mover()
+
+
+def test_segments_stand_in_the_long_motion_as_they_are(prior):
+    z = codes()
+    found = long_motion(prior, z, iterations=3, transitions=1)
+    assert found.shape == (3 * 10 + 2 * 6, 6, 3)
+    for number, segment in enumerate(prior.motion(z)):
+        np.testing.assert_allclose(found[16 * number : 16 * number + 10], segment, atol=1e-9)
+
+
+def test_one_segment_is_itself(prior):
+    np.testing.assert_allclose(long_motion(prior, codes(1)), prior.motion(codes(1))[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("pace", [0.5, 0.3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_nothing_accelerates_more_at_the_joins_than_within_segments(pace, seed):
+    prior, z = mover(pace), codes(seed=seed)
+    segments = prior.motion(z)
+    allowed = max(greatest_acceleration(segment) for segment in segments)
+    side_by_side = greatest_acceleration(np.concatenate(segments))
+    assert side_by_side > 1.5 * allowed
+    found = long_motion(prior, z)
+    assert greatest_acceleration(found) <= allowed * (1 + 1e-9)
+
+
+def test_a_seam_that_no_transition_smooths_is_told():
+    """Bodies that stand still in poses far apart have to move from one to the other."""
+    still, z = mover(pace=0.01), 2 * codes(2)
+    with pytest.warns(
+        UserWarning, match=r"accelerates [\d.]+ times as much at the seam after segm"
+    ):
+        found = long_motion(still, z, iterations=3)
+    within = max(greatest_acceleration(part) for part in still.motion(z))
+    assert greatest_acceleration(found) > within
+
+
+def test_a_code_that_is_met_is_found(prior):
+    """Between the ends of one motion of the prior that motion is the transition."""
+    whole = codes(1, seed=3)
+    motion = torch.as_tensor(vector_to_matrix(prior.turns(whole)[0]))
+    before, after = motion[:2], motion[-2:]
+    joined, missed = _joined([motion], before, after)
+    torch.testing.assert_close(joined, motion)
+    assert float(missed) == pytest.approx(0.0, abs=1e-12)
+    other = torch.as_tensor(vector_to_matrix(prior.turns(codes(1, seed=4))[0]))
+    shared = _shared_frames(10)
+    assert shared == [0, 1, 8, 9]
+    corrected = _corrected(other, motion[shared])
+    torch.testing.assert_close(corrected[shared], motion[shared])
+    turned = corrected @ corrected.mT
+    torch.testing.assert_close(turned, torch.eye(3, dtype=turned.dtype).expand_as(turned))
+
+
+def test_optimised_transitions_are_nearer_to_the_prior_s(prior, monkeypatch):
+    """The longer the codes are optimised, the less is taken off at the ends."""
+    missed = []
+    joined = transition_latents._joined
+
+    def spy(*parts):
+        found = joined(*parts)
+        missed.append(float(found[1].detach()))
+        return found
+
+    monkeypatch.setattr(transition_latents, "_joined", spy)
+    ended = []
+    for iterations in (1, 50):
+        long_motion(prior, codes(2), iterations=iterations, transitions=1)
+        ended.append(missed[-1])
+    assert ended[1] < 0.8 * ended[0] < 0.8 * missed[0]
+
+
+def test_more_codes_make_a_transition_longer(prior):
+    for count in (1, 2, 3):
+        found = long_motion(prior, codes(2), iterations=2, transitions=count)
+        assert len(found) == 2 * 10 + count * 8 - 2
+        np.testing.assert_allclose(found[-10:], prior.motion(codes(2))[1], atol=1e-9)
+
+
+def test_a_transition_depends_on_its_neighbours_alone(prior):
+    options = {"iterations": 5, "transitions": 1}
+    four, two = (long_motion(prior, codes(n), **options) for n in (4, 2))
+    np.testing.assert_allclose(four[:26], two, atol=1e-12)
+
+
+def test_the_body_stays_where_it_begins_and_has_its_bones(prior):
+    found = long_motion(prior, codes(2), iterations=3)
+    np.testing.assert_allclose(found[:, 0], np.tile(prior.rigid.translations[0], (len(found), 1)))
+    lengths = np.linalg.norm(found[:, 1:] - found[:, ARMS.parents[1:]], axis=-1)
+    want = np.broadcast_to(np.linalg.norm(REST[1:], axis=-1), lengths.shape)
+    np.testing.assert_allclose(lengths, want, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("z", "options", "sentence"),
+    [
+        (np.zeros((2, 3)), {}, r"z has shape \(2, 3\), expected \(S, 4\)"),
+        (np.zeros((0, 4)), {}, "segments is 0, expected an integer of at least 1"),
+        (np.full((2, 4), np.nan), {}, "z has 8 values that are NaN or infinite"),
+        (np.zeros((2, 4)), {"iterations": 0}, "iterations is 0, expected an integer of at least"),
+        (np.zeros((2, 4)), {"transitions": 0}, "transitions is 0, expected an integer of at least"),
+        (np.zeros((2, 4)), {"prior_weight": -1.0}, "prior_weight is -1.0, expected a finite numb"),
+    ],
+)
+def test_wrong_arguments_are_refused(prior, z, options, sentence):
+    with pytest.raises(ValueError, match=f"^{sentence}"):
+        long_motion(prior, z, **options)
+
+
+def test_short_motions_leave_no_room():
+    with pytest.raises(ValueError, match="prior has motions of 4 frames, expected at least 5"):
+        long_motion(mover(frames=4), codes(2))

@@ -1,0 +1,108 @@
+"""Joints with holes on another skeleton and at another rate: as motions are, but for the holes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion import Motion, Skeleton, seeds
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.motion.occlusion import joints_at_rate, joints_on_skeleton
+
+PERSON = Skeleton.preset("person14")
+
+
+def walk(frames: int = 20, fps: float = 30.0) -> Motion:
+    return make_gait("walk", frames=frames, fps=fps)
+
+
+@pytest.mark.parametrize("preset", ["h36m17", "smpl22", "person17", "cmu31"])
+def test_joints_are_those_that_a_motion_is_retargeted_to(preset: str) -> None:
+    source = Skeleton.preset(preset)
+    rng = seeds.generator(0, preset)
+    places = rng.normal(size=(3, source.n_joints, 3))
+    joints, confidence = joints_on_skeleton(places, np.ones(places.shape[:2]), source, PERSON)
+    wanted = Motion(places, source, 30.0).retarget(PERSON)
+    np.testing.assert_array_equal(joints, wanted.positions)
+    np.testing.assert_array_equal(confidence, 1.0)
+
+
+def test_the_same_skeleton_changes_nothing_but_what_is_hidden() -> None:
+    places = walk().retarget(PERSON).positions
+    confidence = np.full((20, 14), 0.5)
+    confidence[3, 4] = 0.0
+    joints, shown = joints_on_skeleton(places, confidence, PERSON, PERSON)
+    np.testing.assert_array_equal(shown, confidence)
+    assert np.isnan(joints[3, 4]).all()
+    assert np.isnan(joints).sum() == 3
+
+
+def test_pelvis_and_neck_are_midway() -> None:
+    names = ["LHip", "RHip", "LShoulder", "RShoulder", "Nose", *(
+        f"{side}{part}" for side in "LR" for part in ("Elbow", "Wrist", "Knee", "Ankle")
+    )]  # fmt: skip
+    source = Skeleton(names, [-1] * len(names))
+    rng = seeds.generator(0, "midway")
+    places, confidence = rng.normal(size=(50, 13, 3)), rng.uniform(0.1, 2.0, (50, 13))
+    confidence[7, 0] = 0.0
+    joints, shown = joints_on_skeleton(places, confidence, source, PERSON)
+    seen = np.arange(50) != 7
+    np.testing.assert_allclose(joints[seen, 0], places[seen, :2].mean(axis=1))
+    np.testing.assert_allclose(joints[:, 1], places[:, 2:4].mean(axis=1))
+    assert np.isnan(joints[7, 0]).all()
+    assert shown[7, 0] == 0
+    assert shown[7, 1] > 0
+    # The mean of two joints with variances 1/w has a quarter of their sum.
+    variance = (1 / confidence[:, 2] + 1 / confidence[:, 3]) / 4
+    np.testing.assert_allclose(shown[:, 1], 1 / variance)
+
+
+def test_every_joint_that_is_missing_is_named() -> None:
+    source = Skeleton(["LHip", "LShoulder", "Nose"], [-1, 0, 1])
+    with pytest.raises(ValueError, match="lacks pelvis, neck, left_elbow, left_wrist, right_sh"):
+        joints_on_skeleton(np.zeros((2, 3, 3)), np.ones((2, 3)), source, PERSON)
+    twice = Skeleton(["lfemur", "lhipjoint", "left_hip"], [1, -1, 1])
+    with pytest.raises(ValueError, match="several joints that are the prior's 'lHip'"):
+        joints_on_skeleton(np.zeros((2, 3, 3)), np.ones((2, 3)), twice, Skeleton(["lHip"], [-1]))
+
+
+@pytest.mark.parametrize(("fps", "new_fps"), [(60, 30), (25, 30), (30, 25), (30, 60), (50, 30)])
+def test_rates_are_brought_as_motions_are(fps: float, new_fps: float) -> None:
+    motion = walk(31, fps)
+    joints, shown = joints_at_rate(motion.positions, np.ones((31, 17)), fps, new_fps)
+    wanted = motion.resample(new_fps)
+    np.testing.assert_allclose(joints, wanted.positions, atol=1e-12)
+    assert shown.shape == joints.shape[:2]
+    assert shown.min() >= 1 - 1e-12
+
+
+def test_a_joint_is_hidden_where_a_neighbour_is() -> None:
+    motion = walk(21, 20.0)
+    confidence = np.ones((21, 17))
+    confidence[6, 3] = 0.0
+    places = np.where(confidence[..., None] > 0, motion.positions, np.nan)
+    joints, shown = joints_at_rate(places, confidence, 20.0, 30.0)
+    # At 30 a second frame t is at 2 t / 3 of the old ones: 8 is at 5⅓, 9 at 6, 10 at 6⅔.
+    assert np.flatnonzero(shown[:, 3] == 0).tolist() == [8, 9, 10]
+    np.testing.assert_array_equal(np.isnan(joints).any(axis=-1), shown == 0)
+    wanted = motion.resample(30.0).positions
+    seen = shown > 0
+    np.testing.assert_allclose(joints[seen], wanted[seen], atol=1e-12)
+
+
+def test_frames_that_stay_have_no_neighbour() -> None:
+    confidence = np.ones((9, 1))
+    confidence[1::2] = 0.0  # every second frame is hidden, and half the rate asks for the others
+    places = np.where(confidence[..., None] > 0, np.arange(9.0)[:, None, None], np.nan)
+    joints, shown = joints_at_rate(np.broadcast_to(places, (9, 1, 3)), confidence, 60.0, 30.0)
+    np.testing.assert_array_equal(shown, 1.0)
+    np.testing.assert_allclose(joints[:, 0, 0], [0, 2, 4, 6, 8])
+
+
+def test_confidence_is_the_precision_of_what_is_interpolated() -> None:
+    rng = seeds.generator(0, "precision")
+    confidence = np.array([[4.0], [0.25], [1.0]])
+    noise = rng.normal(size=(20_000, 3, 1, 3)) / np.sqrt(confidence)[..., None]
+    found = [joints_at_rate(each, confidence, 20.0, 30.0)[0] for each in noise[:4000]]
+    _, shown = joints_at_rate(noise[0], confidence, 20.0, 30.0)
+    np.testing.assert_allclose(np.var(found, axis=(0, 3)), 1 / shown, rtol=0.06)

@@ -1,0 +1,81 @@
+"""The picture of a bias budget: bars, lines and intervals are what the table says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probmotion.plots.error_plots import draw_budget
+
+COLUMNS = ["setting", "measure", "part", "mean", "low", "high"]
+TABLE = pd.DataFrame(
+    [
+        ("V = 5", "spread", "floor", 0.1, 0.0, 0.2),
+        ("V = 5", "spread", "discretisation", -0.2, -0.3, -0.1),
+        ("V = 5", "spread", "single view", 0.5, 0.4, 0.6),
+        ("V = 5", "spread", "guidance", 0.3, -0.1, 0.7),
+        ("V = 5", "spread", "whole", 0.6, 0.5, 0.7),
+        ("V = 5", "off", "floor", 0.0, -0.1, 0.1),
+        ("V = 5", "off", "discretisation", -1.0, -1.1, -0.9),
+        ("V = 5", "off", "single view", 2.0, 1.5, 2.5),
+        ("V = 5", "off", "guidance", -0.5, -0.6, -0.4),
+        ("V = 5", "off", "whole", 0.5, -0.2, 1.2),
+    ],
+    columns=COLUMNS,
+)
+
+
+def test_parts_are_stacked_from_the_floor_and_negative_ones_hang_below(tmp_path):
+    path = tmp_path / "budget.png"
+    figure = draw_budget(TABLE, path, words={"off": "off the manifold"})
+    assert path.read_bytes().startswith(b"\x89PNG")
+    spread, off = figure.axes
+    assert (spread.get_title(loc="left"), off.get_title(loc="left")) == (
+        "spread",
+        "off the manifold",
+    )
+    for axes, spans in (
+        (spread, [(-0.2, 0.0), (0.0, 0.5), (0.5, 0.8)]),
+        (off, [(-1.0, 0.0), (0.0, 2.0), (-1.5, -1.0)]),
+    ):
+        drawn = [sorted((bar.get_y(), bar.get_y() + bar.get_height())) for bar in axes.patches]
+        np.testing.assert_allclose(drawn, spans, atol=1e-12)
+
+
+def test_the_whole_and_every_interval_are_drawn():
+    axes = draw_budget(TABLE).axes[0]
+    across = [line for line in axes.lines if len(set(line.get_ydata())) == 1]
+    assert any(np.allclose(line.get_ydata(), 0.6) and len(line.get_xdata()) == 2 for line in across)
+    spans = [tuple(line.get_ydata()) for line in axes.lines if len(set(line.get_ydata())) == 2]
+    assert spans == [(-0.3, -0.1), (0.4, 0.6), (-0.1, 0.7), (0.5, 0.7)]
+
+
+def test_what_is_not_told_from_chance_is_pale():
+    figure = draw_budget(TABLE)
+    opaque = [[bar.get_alpha() > 0.5 for bar in axes.patches] for axes in figure.axes]
+    assert opaque == [[True, True, False], [True, True, True]]
+
+
+def test_a_part_has_one_colour_whatever_others_there_are():
+    some = TABLE[TABLE["part"] != "discretisation"]
+    one, other = (draw_budget(table).axes[0].patches for table in (TABLE, some))
+    assert [bar.get_facecolor() for bar in one[1:]] == [bar.get_facecolor() for bar in other]
+    assert len({bar.get_facecolor()[:3] for bar in one}) == 3
+
+
+def test_notes_and_the_setting_can_be_read():
+    figure = draw_budget(TABLE, notes=["network is no part: no learnt denoiser was given"])
+    assert figure.get_suptitle() == "V = 5"
+    (key,) = figure.legends
+    assert key.get_title().get_text() == "network is no part: no learnt denoiser was given"
+    words = [text.get_text() for text in key.get_texts()]
+    assert words[:4] == ["discretisation", "single view", "guidance", "whole"]
+
+
+def test_tables_that_are_no_budget_are_refused():
+    with pytest.raises(ValueError, match="table lacks the columns low, high"):
+        draw_budget(TABLE.drop(columns=["low", "high"]))
+    two = pd.concat([TABLE, TABLE.assign(setting="V = 12")])
+    with pytest.raises(ValueError, match="table is of 2 settings, expected one"):
+        draw_budget(two)

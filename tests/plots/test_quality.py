@@ -1,0 +1,97 @@
+"""Quality against cost: points where the table says, labels that can be read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probmotion.plots.colours import style_of
+from probmotion.plots.quality import plot_quality_against_cost
+
+SAMPLERS = {
+    "exact": (0.01, 1.0), "ancestral3d": (3.0, 1.03), "mas": (4.0, 1.6), "mvpc": (4.2, 1.1),
+    "sds": (40.0, 2.3), "mh": (2.0, 1.3), "nuts": (9.0, 1.02), "ensemble": (1.5, 1.05),
+}  # fmt: skip
+
+
+def table(problems=("gait",), seeds=3, spread=0.1):
+    rng = np.random.default_rng(0)
+    rows = []
+    for problem in problems:
+        for name, (seconds, swd) in SAMPLERS.items():
+            for seed in range(seeds):
+                rows.append(
+                    (problem, name, seed, "seconds", seconds * np.exp(spread * rng.normal()))
+                )
+                rows.append((problem, name, seed, "swd", swd * np.exp(spread * rng.normal())))
+    return pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"])
+
+
+def test_a_dozen_samplers_have_a_dozen_styles():
+    assert len({style_of(place) for place in range(12)}) == 12
+
+
+def words(axes):
+    return {text.get_text(): text for text in axes.texts if text.get_text()}
+
+
+def test_points_are_means_over_seeds():
+    data = table()
+    axes = plot_quality_against_cost(data).axes[0]
+    drawn = sorted(
+        (line.get_xdata()[0], line.get_ydata()[0])
+        for line in axes.lines
+        if line.get_marker() not in ("None", "", None)
+    )
+    means = data.pivot_table(index="sampler", columns="metric", values="value")
+    np.testing.assert_allclose(drawn, sorted(means[["seconds", "swd"]].to_numpy().tolist()))
+
+
+def test_bars_span_the_seeds():
+    data = table()
+    axes = plot_quality_against_cost(data).axes[0]
+    mas = data[(data["sampler"] == "mas") & (data["metric"] == "swd")]["value"]
+    spans = [tuple(line.get_ydata()) for line in axes.lines]
+    assert (mas.min(), mas.max()) in spans
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 0.4])
+def test_labels_cover_neither_each_other_nor_leave_the_panel(spread):
+    figure = plot_quality_against_cost(table(("gait", "gait-monocular"), spread=spread))
+    for axes in figure.axes:
+        labels = words(axes)
+        assert set(labels) == set(SAMPLERS)
+        boxes = [text.get_window_extent() for text in labels.values()]
+        for i, box in enumerate(boxes):
+            assert axes.bbox.x0 <= box.x0
+            assert box.x1 <= axes.bbox.x1 + 1
+            for other in boxes[:i]:
+                assert not box.overlaps(other)
+
+
+def test_samplers_without_a_point_are_listed_with_the_reason(tmp_path):
+    data = table()
+    data = data[~data["sampler"].isin(["sds", "nuts"])]
+    data.loc[len(data) + 100] = ("gait", "sds", 0, "unsupported", 1.0)
+    data.loc[len(data) + 100] = ("gait", "nuts", 0, "failed", 1.0)
+    data.attrs["words"] = {"gait/sds": "evidence"}
+    path = tmp_path / "plot.png"
+    figure = plot_quality_against_cost(data, path)
+    listed = figure.axes[0].get_title("right")
+    assert listed == "no point: sds (evidence)\nno point: nuts (failed)"
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_number_that_has_no_logarithm_is_no_point():
+    data = table(seeds=1)
+    data.loc[(data["sampler"] == "mas") & (data["metric"] == "swd"), "value"] = np.inf
+    data.loc[(data["sampler"] == "nuts") & (data["metric"] == "seconds"), "value"] = 0.0
+    axes = plot_quality_against_cost(data).axes[0]
+    assert set(words(axes)) == set(SAMPLERS) - {"mas", "nuts"}
+    assert "no point: mas (not measured)" in axes.get_title("right")
+
+
+def test_a_table_without_the_metric_is_refused():
+    with pytest.raises(ValueError, match="'recall'"):
+        plot_quality_against_cost(table(), quality="recall")

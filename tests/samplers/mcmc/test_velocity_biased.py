@@ -1,0 +1,216 @@
+"""Proposals that the evidence guides, and densities that are estimates: is the target right?
+
+The target is a normal density in three dimensions. Its evidence pretends to compare views: which
+annotation is closest, and so how long steps are, changes abruptly with the first coordinate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from probmotion import MotionPosterior, UnsupportedPosterior
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.protocols import ComparesViews, HasCoordinateSpeeds
+from probmotion.posteriors.truncation import TruncatedPosterior
+from probmotion.samplers import NUTS, MetropolisHastings
+from probmotion.samplers.mcmc.proposals import Isotropic, VelocityBiased
+
+POINT = Skeleton(["point"], [-1])
+CHAINS, DRAWS, THIN = 40, 500, 20
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """θ ~ N(0, 2² I), the position of one joint."""
+
+    skeleton = POINT
+    frames = 1
+    fps = 30.0
+    dim = 3
+
+    def motion(self, theta):
+        return theta[..., None, None, :]
+
+    def log_density(self, theta):
+        return -0.125 * (theta**2).sum(axis=-1)
+
+    def initial(self, rng, n):
+        return 2 * rng.standard_normal((n, 3))
+
+    def coordinate_speeds(self, joint_speeds):
+        return np.repeat(joint_speeds[..., 0, :1], 3, axis=-1) * np.array([1.0, 0.1, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """log L = −(x₀ − 1)²/2, seen with noise whose size depends on x₀; unbiased in the mean of L."""
+
+    noise: float = 0.0
+    unbiased: bool = True
+    differentiable = False
+
+    def evaluate(self, positions, generators=None):
+        x = positions[..., 0, 0, 0]
+        log_density = -0.5 * (x - 1) ** 2
+        if generators is not None:
+            size = self.noise * (x > 1)
+            blur = size * np.array([rng.standard_normal() for rng in generators])
+            log_density = log_density + blur - (0.5 * size**2 if self.unbiased else 0)
+        return log_density, np.stack([x > 1, x > 0], axis=-1).astype(int)
+
+    def joint_speeds(self, closest):
+        return np.repeat(np.where(closest, 9.0, 0.01)[..., None, None], 2, axis=-1).mean(axis=-3)
+
+    def log_density(self, positions):
+        return self.evaluate(positions)[0]
+
+    def simulate(self, rng, positions):
+        return self
+
+
+class WithoutRatio(VelocityBiased):
+    """The same steps, accepted as if they were symmetric."""
+
+    def log_ratio(self, theta, guide, proposed, proposed_guide, state):
+        return np.zeros(len(theta))
+
+
+def moments(sampler, likelihood):
+    """Mean and variance of the first coordinate over chains, in standard errors off the truth."""
+    posterior = MotionPosterior(Point(), likelihood)
+    rng = np.random.default_rng(0)
+    # Precision 1/4 + 1, mean 1 · 1/1.25: draws to start from, so that nothing need be forgotten.
+    start = np.column_stack(
+        [0.8 + np.sqrt(0.8) * rng.standard_normal(CHAINS), 2 * rng.standard_normal((CHAINS, 2))]
+    )
+    draws = sampler.sample(posterior, draws=DRAWS, chains=CHAINS, initial=start, progress=False)
+    x = draws.dataset["theta"].values[..., 0]
+    off = []
+    for found, truth in ((x.mean(axis=1), 0.8), (((x - 0.8) ** 2).mean(axis=1), 0.8)):
+        off.append((found.mean() - truth) / (found.std(ddof=1) / np.sqrt(CHAINS)))
+    return np.abs(off)
+
+
+def mh(proposal, **settings):
+    return MetropolisHastings(proposal=proposal, warmup=0, thin=THIN, **settings)
+
+
+STEPS = {"scale": 1.0, "base": 0.3, "bias": 1.0, "target": None}
+# Two numbers, each beyond 4 with probability 1e-4 if the chain is right.
+LIMIT = 4.0
+
+
+def test_the_toys_are_what_they_say():
+    assert isinstance(Pictures(), ComparesViews)
+    assert isinstance(Point(), HasCoordinateSpeeds)
+
+
+def test_velocity_biased_chains_have_the_right_moments():
+    assert moments(mh(VelocityBiased(**STEPS)), Pictures()).max() < LIMIT
+
+
+def test_leaving_out_the_ratio_of_variances_is_noticed():
+    assert moments(mh(WithoutRatio(**STEPS)), Pictures()).max() > 2 * LIMIT
+
+
+@pytest.mark.parametrize("proposal", [Isotropic(1.0, None), VelocityBiased(**STEPS)])
+def test_pseudo_marginal_chains_have_the_right_moments(proposal):
+    sampler = mh(proposal, pseudo_marginal=True)
+    assert moments(sampler, Pictures(noise=0.7)).max() < LIMIT
+
+
+def test_an_estimate_that_is_biased_is_noticed():
+    sampler = mh(Isotropic(1.0, None), pseudo_marginal=True)
+    assert moments(sampler, Pictures(noise=1.2, unbiased=False)).max() > 2 * LIMIT
+
+
+def test_the_ratio_is_that_of_the_normal_densities():
+    from scipy.stats import norm
+
+    proposal = VelocityBiased(scale=0.7, base=0.2, bias=2.0)
+    rng = np.random.default_rng(1)
+    theta, proposed, guide, other = rng.random((4, 5, 3))
+    state = proposal.begin(theta)
+    there, back = (0.7 * np.sqrt(0.04 + 2 * some) for some in (guide, other))
+    expected = (norm.logpdf(theta, proposed, back) - norm.logpdf(proposed, theta, there)).sum(1)
+    found = proposal.log_ratio(theta, guide, proposed, other, state)
+    assert np.allclose(found, expected)
+    assert np.allclose(proposal.log_ratio(proposed, other, theta, guide, state), -expected)
+
+
+@pytest.mark.parametrize("pseudo_marginal", [False, True])
+def test_a_run_goes_on_as_if_it_had_not_stopped(pseudo_marginal, tmp_path):
+    sampler = MetropolisHastings(
+        proposal=VelocityBiased(), warmup=30, thin=2, pseudo_marginal=pseudo_marginal
+    )
+    posterior = MotionPosterior(Point(), Pictures(noise=0.5))
+    whole = sampler.sample(posterior, draws=20, chains=3, seed=4, progress=False)
+    first = sampler.sample(posterior, draws=8, chains=3, seed=4, progress=False)
+    first.save(tmp_path / "first.nc")
+    kept = type(first).load(tmp_path / "first.nc")
+    rest = sampler.sample(posterior, draws=12, chains=3, seed=4, initial=kept, progress=False)
+    theta = [run.dataset["theta"].values for run in (first, rest)]
+    assert np.array_equal(np.concatenate(theta, axis=1), whole.dataset["theta"].values)
+
+
+def test_chains_with_fresh_views_do_not_depend_on_each_other():
+    """Some proposals leave the prior's support, where no views are drawn for them."""
+
+    class Bounded(Point):
+        def log_density(self, theta):
+            return np.where(np.abs(theta).max(axis=-1) < 2, 0.0, -np.inf)
+
+    posterior = MotionPosterior(Bounded(), Pictures(noise=0.5))
+    sampler = mh(Isotropic(1.5, None), pseudo_marginal=True)
+    start = np.zeros((4, 3))
+    together = sampler.sample(posterior, draws=20, chains=4, initial=start, progress=False)
+    alone = sampler.sample(posterior, draws=20, chains=1, initial=start[:1], progress=False)
+    assert float(together.dataset["acceptance"].mean()) < 0.6
+    theta = [run.dataset["theta"].values[0] for run in (together, alone)]
+    assert np.array_equal(*theta)
+    kept = [run.dataset["log_density"].values[0] for run in (together, alone)]
+    assert np.array_equal(*kept)
+
+
+def test_estimates_of_another_posterior_are_not_gone_on_from():
+    sampler = mh(Isotropic(1.0, None), pseudo_marginal=True)
+    first = sampler.sample(MotionPosterior(Point(), Pictures(0.5)), draws=3, progress=False)
+
+    class Steeper(Pictures):
+        def evaluate(self, positions, generators=None):
+            log_density, closest = super().evaluate(positions, generators)
+            return 3 * log_density - 1, closest
+
+    with pytest.raises(ValueError, match="initial is a run of another posterior"):
+        sampler.sample(
+            MotionPosterior(Point(), Steeper(0.5)), draws=3, initial=first, progress=False
+        )
+
+
+def test_evidence_that_compares_no_views_is_refused(two_bumps):
+    for sampler in (mh(VelocityBiased()), mh(Isotropic(), pseudo_marginal=True)):
+        with pytest.raises(UnsupportedPosterior, match="needs evidence that compares views"):
+            sampler.sample(MotionPosterior(two_bumps), draws=2, progress=False)
+
+
+def test_nuts_says_what_has_no_gradient():
+    with pytest.raises(UnsupportedPosterior, match="which Pictures has not; ensemble, mh would do"):
+        NUTS().sample(MotionPosterior(Point(), Pictures()), draws=2, progress=False)
+
+
+def test_settings_that_are_none_are_refused(two_bumps):
+    with pytest.raises(ValueError, match=r"proposal is <class .*VelocityBiased'>, expected an obj"):
+        MetropolisHastings(proposal=VelocityBiased)
+    with pytest.raises(ValueError, match="proposal is 'isotropic'"):
+        MetropolisHastings(proposal="isotropic")
+    with pytest.raises(ValueError, match=r"target is '0\.2'"):
+        VelocityBiased(target="0.2")
+
+
+def test_truncation_and_fresh_views_exclude_each_other():
+    posterior = TruncatedPosterior(Point(), Pictures(noise=0.5), limit=100)
+    with pytest.raises(ValueError, match="truncation of an unbiased estimate is biased"):
+        mh(Isotropic(), pseudo_marginal=True).sample(posterior, draws=2, progress=False)

@@ -1,0 +1,362 @@
+"""Amortised inference: a linear Gaussian whose posterior is known, two modes, repeatability."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion import Cameras, Joints3D, Keypoints2D, MotionPosterior, UnsupportedPosterior, seeds
+from probmotion.metrics.distribution import mean_error, trace_ratio
+from probmotion.motion.skeleton import Skeleton
+from probmotion.problems import load_problem
+from probmotion.samplers.variational.amortised import AmortisedPosterior, AmortisedSettings
+from probmotion.samplers.variational.amortised_network import ConditionalVAE
+from probmotion.samplers.variational.simulated_pairs import (
+    MotionCoordinates,
+    PrincipalCoordinates,
+    SimulatedPairs,
+    observed_entries,
+    simulate_pairs,
+)
+from probmotion.seeds import NormalStreams
+
+SMALL = AmortisedSettings(
+    steps=800, pairs=8000, latent=6, components=8, experts=4, hidden=48, learning_rate=5e-3
+)
+BRIEF = replace(SMALL, steps=30, pairs=600)
+
+
+def streams(n, seed=0):
+    return NormalStreams.of_draws(seed, [(0, i) for i in range(n)])
+
+
+def drawn(posterior, settings=SMALL, n=2000, seed=0):
+    fitted = AmortisedPosterior.fit(posterior, settings, seed, False)
+    return fitted.draw(streams(n))
+
+
+def smooth_gaussian(gaussian_motion, frames=6, joints=2):
+    """Three smooth directions and small noise around a mean."""
+    rng = np.random.default_rng(3)
+    D = frames * joints * 3
+    factor = rng.standard_normal((D, 3)) * np.array([1.0, 0.5, 0.2])
+    mean = rng.standard_normal((frames, joints, 3))
+    return gaussian_motion(mean, factor @ factor.T + 0.05**2 * np.eye(D))
+
+
+@dataclass(frozen=True, eq=False)
+class TwoHeights:
+    """One joint, three frames: its depth is ±1 whatever one sees from the front."""
+
+    frames: int = 3
+    fps: float = 20.0
+    dim: int = 9
+
+    @property
+    def skeleton(self):
+        return Skeleton(["joint"], [-1])
+
+    def motion(self, theta):
+        return theta.reshape(*theta.shape[:-1], 3, 1, 3)
+
+    def sample(self, rng, n):
+        found = 0.05 * rng.standard_normal((n, 3, 1, 3))
+        found += rng.standard_normal((n, 1, 1, 3)) * np.array([1.0, 1.0, 0.1])
+        found[..., 2] += rng.choice([-1.0, 1.0], size=(n, 1, 1), p=[0.3, 0.7])
+        return found
+
+
+def front():
+    return Cameras.around([0.0], [0.0])
+
+
+# --- what is drawn
+
+
+@pytest.mark.parametrize(
+    "evidence",
+    [
+        "none",
+        "joints",
+        pytest.param("keypoints", marks=pytest.mark.slow),
+        pytest.param("hidden", marks=pytest.mark.slow),
+    ],
+)
+def test_a_linear_gaussian_posterior_is_learnt(gaussian_motion, evidence):
+    """Mean within a fifth of the posterior's spread, trace within a fifth, each in one seed."""
+    prior = smooth_gaussian(gaussian_motion)
+    truth = prior.sample(np.random.default_rng(1), 1)[0]
+    rng = np.random.default_rng(2)
+    shown = np.ones(truth.shape[:2])
+    if evidence == "hidden":
+        shown[1:5, 1] = 0
+    if evidence == "none":
+        likelihood = None
+        mean, covariance = prior.mean, prior.covariance
+    else:
+        if evidence == "joints":
+            likelihood = Joints3D(truth, 0.1).simulate(rng, truth)
+        else:
+            blank = np.zeros((1, *truth.shape[:2], 2))
+            camera = Cameras.around([0.4], [0.2])
+            likelihood = Keypoints2D(blank, camera, 0.1, shown[None]).simulate(rng, truth)
+        mean, covariance = prior.posterior(likelihood)
+    found = drawn(MotionPosterior(prior, likelihood)).reshape(2000, -1)
+    exact = np.random.default_rng(5).multivariate_normal(mean.ravel(), covariance, 4000)
+    assert mean_error(found, exact) < 0.2
+    assert 0.8 < trace_ratio(found, exact) < 1.25
+    # The largest directions by themselves, whose shares the trace would hide.
+    variance, axes = np.linalg.eigh(covariance)
+    ratio = (found @ axes).var(axis=0) / variance
+    assert np.all(ratio[-3:] > 0.6)
+    assert np.all(ratio[-3:] < 1.6)
+
+
+@pytest.mark.slow
+def test_both_modes_are_drawn_as_often_as_they_are_likely():
+    prior = TwoHeights()
+    likelihood = Keypoints2D(np.zeros((1, 3, 1, 2)), front(), 0.1)
+    fitted = replace(SMALL, steps=1600)
+    depth = drawn(MotionPosterior(prior, likelihood), fitted)[..., 0, 2].mean(axis=1)
+    assert abs((depth > 0).mean() - 0.7) < 0.1
+    between = np.abs(depth) < 0.5
+    assert between.mean() < 0.05
+    for sign in (-1, 1):
+        mode = depth[np.sign(depth) == sign]
+        assert abs(np.median(mode) - sign) < 0.1
+        assert 0.06 < np.std(mode[np.abs(mode) > 0.5]) < 0.16
+
+
+def test_small_noise_off_the_principal_coordinates_is_drawn_too(gaussian_motion):
+    """With few coordinates most of it is the remainder's, which is given the evidence.
+
+    Few coordinates of the evidence tell the network less: a quarter too much is allowed, where
+    the prior's small noise would be twice too much.
+    """
+    prior = smooth_gaussian(gaussian_motion)
+    truth = prior.sample(np.random.default_rng(1), 1)[0]
+    likelihood = Joints3D(truth, 0.05).simulate(np.random.default_rng(2), truth)
+    mean, covariance = prior.posterior(likelihood)
+    found = drawn(MotionPosterior(prior, likelihood), replace(SMALL, coordinates=3))
+    basis = np.linalg.eigh(prior.covariance)[1][:, :-3]
+    off = (found - found.mean(axis=0)).reshape(2000, -1) @ basis
+    wanted = np.trace(basis.T @ covariance @ basis)
+    assert np.sum(off**2) / 2000 == pytest.approx(wanted, rel=0.25)
+    missed, moved = ((middle - mean).ravel() @ basis for middle in (found.mean(axis=0), prior.mean))
+    assert np.linalg.norm(missed) < 0.7 * np.linalg.norm(moved)
+
+
+# --- repeatability
+
+
+def test_a_draw_depends_on_its_own_stream_alone(gaussian_motion):
+    prior = smooth_gaussian(gaussian_motion)
+    fitted = AmortisedPosterior.fit(MotionPosterior(prior), BRIEF, 0, False)
+    together = fitted.draw(streams(7))
+    alone = fitted.draw(NormalStreams.of_draws(0, [(0, 5)]))
+    np.testing.assert_allclose(together[5], alone[0], rtol=0, atol=1e-12)
+    assert not np.allclose(together[4], together[5])
+
+
+def test_the_same_seed_learns_the_same_and_no_global_state_is_touched(gaussian_motion):
+    posterior = MotionPosterior(smooth_gaussian(gaussian_motion))
+    numpy_state = np.random.get_state()[1].copy()  # noqa: NPY002 (it must not move)
+    torch.manual_seed(5)
+    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    first = drawn(posterior, BRIEF, n=4)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert torch.get_num_threads() == threads
+    assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
+    torch.manual_seed(6)
+    np.testing.assert_array_equal(drawn(posterior, BRIEF, n=4), first)
+    assert not np.allclose(drawn(posterior, BRIEF, n=4, seed=1), first)
+
+
+def test_the_network_computes_on_one_thread(gaussian_motion, monkeypatch):
+    """How sums are split over threads would change what is learnt."""
+    used = set()
+
+    def spied(name):
+        was = getattr(ConditionalVAE, name)
+
+        def spy(*arguments):
+            used.add((name, torch.get_num_threads()))
+            return was(*arguments)
+
+        monkeypatch.setattr(ConditionalVAE, name, spy)
+
+    for name in ("loss", "misfits", "decode"):
+        spied(name)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        drawn(MotionPosterior(smooth_gaussian(gaussian_motion)), BRIEF, n=3)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert used == {("loss", 1), ("misfits", 1), ("decode", 1)}
+
+
+# --- parts
+
+
+def test_pairs_are_the_likelihoods_own(gaussian_motion):
+    prior = smooth_gaussian(gaussian_motion)
+    shown = np.ones((6, 2))
+    shown[2, 1] = 0
+    blank = np.zeros((2, 6, 2, 2))
+    cameras = Cameras.ring(2)
+    likelihood = Keypoints2D(blank, cameras, 0.03, np.stack([shown, np.ones((6, 2))]))
+    pairs = list(simulate_pairs(MotionPosterior(prior, likelihood), 0, 2500))
+    assert [len(some.positions) for some in pairs] == [2000, 500]
+    observed = np.concatenate([some.observed for some in pairs])
+    positions = np.concatenate([some.positions for some in pairs])
+    assert observed.shape == (2500, 6, 8)
+    seen = observed.reshape(2500, 6, 2, 2, 2)
+    assert np.all(seen[:, 2, 0, 1] == 0)
+    noise = np.moveaxis(seen, 2, 1) - cameras.project(positions)
+    noise[:, 0, 2, 1] = np.nan
+    assert np.nanstd(noise) == pytest.approx(0.03, rel=0.02)
+    apart = np.moveaxis(observed_entries(likelihood, 6).reshape(6, 2, 2, 2), 1, 0)
+    np.testing.assert_array_equal(apart, likelihood.keypoints)
+
+
+def test_principal_coordinates_and_the_rest_make_the_whole():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((50, 4, 2, 3)) @ rng.standard_normal((3, 3))
+    basis = PrincipalCoordinates.of(values, 5)
+    x = basis.coordinates(values)
+    np.testing.assert_allclose(x.T @ x / 50, np.eye(5), atol=1e-9)
+    flat = values.reshape(50, -1)
+    rest = basis.without(flat - basis.mean)
+    np.testing.assert_allclose(basis.values(x) + rest, flat, atol=1e-12)
+    np.testing.assert_allclose(basis.coordinates(basis.values(x) + rest), x, atol=1e-9)
+    constant = np.concatenate([values[..., :2], np.zeros((50, 4, 2, 1))], axis=-1)
+    assert len(PrincipalCoordinates.of(constant, 100).deviation) == 16
+
+
+def test_the_remainder_is_the_gaussian_conditional():
+    """X = c a + e with e ~ N(0, δ²), y = X + noise: E[e | y, c] = δ²/(δ² + σ²) (y − c a)."""
+    rng = np.random.default_rng(0)
+    n, delta, sigma = 40_000, 0.1, 0.2
+    axis = rng.standard_normal((5, 2, 3))
+    axis /= np.linalg.norm(axis)
+    positions = 3 * rng.standard_normal((n, 1, 1, 1)) * axis
+    positions += delta * rng.standard_normal(positions.shape)
+    observed = (positions + sigma * rng.standard_normal(positions.shape)).reshape(n, 5, 6)
+    nothing = np.zeros((n, 0))
+    motions = MotionCoordinates.learn(SimulatedPairs(positions, observed), nothing, 1)
+    wanted = delta**2 / (delta**2 + sigma**2)
+    np.testing.assert_allclose(motions.gain, wanted * np.eye(6)[None].repeat(5, 0), atol=0.05)
+    nothing = nothing[:4000]
+    x = motions.coordinates(positions[:1], nothing[:1]).repeat(4000, 0)
+    flat = motions.motions(x, nothing, observed[0], rng.standard_normal((4000, 5, 6)))
+    np.testing.assert_allclose(motions.coordinates(flat, nothing), x, atol=1e-9)
+    spread = np.sum(flat.var(axis=0)) / 29
+    assert spread == pytest.approx(delta**2 * sigma**2 / (delta**2 + sigma**2), rel=0.05)
+
+
+def test_the_loss_is_the_bound_of_its_three_densities():
+    """Against torch's own distributions, up to the constants that it leaves out."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = ConditionalVAE(4, 3, 2, 5, 3, 8)
+        for weights in network.parameters():
+            weights.data += 0.3 * torch.randn_like(weights)
+        x, y, noise = torch.randn(6, 4), torch.randn(6, 3), torch.randn(6, 2)
+    normal, halves = torch.distributions.Normal, 0.5 * math.log(2 * math.pi)
+    mean, log_scale = network.encode(x, y)
+    r = normal(mean, log_scale.exp())
+    z = mean + log_scale.exp() * noise
+    log_weight, means, log_scales = network.prior(y)
+    p = torch.distributions.MixtureSameFamily(
+        torch.distributions.Categorical(logits=log_weight),
+        torch.distributions.Independent(normal(means, log_scales.exp()), 1),
+    )
+    d = normal(network.decode(z, y), network.log_scale.exp()).log_prob(x).sum(1) + 4 * halves
+    kl = r.log_prob(z).sum(1) - p.log_prob(z)
+    for weight in (0.1, 1.0):
+        wanted = (-d + weight * kl).mean()
+        torch.testing.assert_close(network.loss(x, y, noise, weight), wanted)
+
+
+# --- refusals
+
+
+def test_what_cannot_be_simulated_or_shown_is_refused(gaussian_motion):
+    class Unseen:
+        def log_density(self, positions):
+            return 0.0
+
+        def simulate(self, rng, positions):
+            return self
+
+    prior = smooth_gaussian(gaussian_motion)
+    with pytest.raises(UnsupportedPosterior, match=r"keypoints or joints.*Unseen") as refused:
+        drawn(MotionPosterior(prior, Unseen()), BRIEF)
+    assert refused.value.word == "evidence"
+
+    class Unsampled:
+        skeleton, frames, fps, dim = prior.skeleton, prior.frames, prior.fps, prior.dim
+        motion = staticmethod(prior.motion)
+
+    with pytest.raises(UnsupportedPosterior, match="Samplable, which Unsampled is not"):
+        drawn(MotionPosterior(Unsampled()), BRIEF)
+
+
+def test_divergence_is_one_sentence(gaussian_motion):
+    posterior = MotionPosterior(smooth_gaussian(gaussian_motion))
+    with pytest.raises(ValueError, match=r"learning_rate is 1e\+30.*diverged at step"):
+        drawn(posterior, replace(BRIEF, learning_rate=1e30))
+
+
+def test_an_interrupt_is_an_interrupt(gaussian_motion, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ConditionalVAE, "loss", stopped)
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        drawn(MotionPosterior(smooth_gaussian(gaussian_motion)), BRIEF)
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("steps", 0), ("batch", 1.5), ("pairs", 99), ("latent", 0), ("learning_rate", 0.0)],
+)
+def test_settings_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        replace(BRIEF, **{name: value})
+
+
+# --- an exact problem
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gait", "gait-monocular"])
+def test_an_exact_problem_is_closer_than_one_gaussian(name):
+    problem = load_problem(name)
+    exact = problem.reference(1, 1000)
+    found = drawn(problem.posterior, AmortisedSettings(), n=1000)
+    off = problem.posterior.prior.off_manifold
+    # What linear regression on the evidence would draw: a Gaussian.
+    pairs = next(simulate_pairs(problem.posterior, 9, 2000))
+    flat, seen = pairs.positions.reshape(2000, -1), pairs.observed.reshape(2000, -1)
+    known = PrincipalCoordinates.of(pairs.observed, 96)
+    inputs = np.concatenate([np.ones((2000, 1)), known.coordinates(seen)], axis=1)
+    map_, *_ = np.linalg.lstsq(inputs, flat, rcond=None)
+    rest = flat - inputs @ map_
+    here = observed_entries(problem.posterior.likelihood, problem.posterior.frames)[None]
+    middle = np.concatenate([np.ones((1, 1)), known.coordinates(here)], axis=1) @ map_
+    normal = seeds.generator(0, "gaussian").standard_normal((1000, 2000))
+    gaussian = (middle + normal @ rest / math.sqrt(2000)).reshape(exact.shape)
+
+    def gap(draws):
+        return abs(math.log(off(draws).mean() / off(exact).mean()))
+
+    assert gap(found) < 0.5 * gap(gaussian)

@@ -1,0 +1,474 @@
+"""`DVAEInference` on a tiny Motion-DVAE: draws, the bound that a fit raises, any length, runs."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from probmotion import Cameras, Joints3D, Keypoints2D, MotionDraws, MotionPosterior, seeds
+from probmotion.comparison import compare
+from probmotion.data.synthetic.walks import made_walks
+from probmotion.models.bodies.body_states import BodyStates, rest_pose
+from probmotion.models.dvae.denoiser_training import DenoiserTrainee
+from probmotion.models.dvae.motion_denoiser import MotionDenoiser
+from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.network import DVAESettings
+from probmotion.models.dvae.training import DVAETrainee
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import Interrupted, load_sampler
+from probmotion.samplers import DVAEInference
+from probmotion.samplers.variational.amortised import AmortisedPosterior
+from probmotion.seeds import NormalStreams
+from probmotion.threads import one_thread
+
+FIT = DVAEInference(mode="optimization", iterations=25, learning_rate=3e-3)
+BRIEF = DVAEInference(training_steps=20, training_pairs=150)
+BODY = Skeleton.preset("person14")
+WINDOW = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    """Two of them wait for each other more than they work on nets this small."""
+    with one_thread():
+        yield
+
+
+def learnt(trainee, steps):
+    network = trainee.network.train()
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    for step in range(steps):
+        rng = seeds.generator(0, "step", step)
+        loss = trainee.training_loss(network, rng, 16, torch.device("cpu"))
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+    return network
+
+
+@pytest.fixture(scope="module")
+def walks():
+    return [clip.retarget(BODY) for clip in made_walks(8, BODY, seconds=3.0)]
+
+
+@pytest.fixture(scope="module")
+def bare(walks):
+    """A prior that has hardly learnt, with no network beside it."""
+    states = BodyStates(BODY, rest_pose(BODY, [clip.positions for clip in walks]))
+    trainee = DVAETrainee(walks[2:], walks[:2], DVAESettings.tiny(), states)
+    return MotionDVAE(
+        learnt(trainee, 40), trainee.size, states, 30.0, card={"network": trainee.settings}
+    )
+
+
+@pytest.fixture(scope="module")
+def denoiser(bare, walks):
+    trainee = DenoiserTrainee(walks[2:], walks[:2], bare)
+    return MotionDenoiser(learnt(trainee, 40), bare, {"network": trainee.settings})
+
+
+@pytest.fixture(scope="module")
+def prior(bare, denoiser):
+    return bare.of(inference_network=denoiser)
+
+
+def observed(prior, walks, frames=WINDOW, freedom=None, noise=0.04):
+    truth = walks[0].window(10, frames)
+    hidden = np.zeros((frames, BODY.n_joints), dtype=bool)
+    hidden[3:8, BODY.index("left_knee")] = True
+    evidence = Joints3D.observe(truth, noise, 0, hidden=hidden, degrees_of_freedom=freedom)
+    return MotionPosterior(prior.of(frames=frames), evidence)
+
+
+@pytest.fixture(scope="module")
+def posterior(prior, walks):
+    return observed(prior, walks)
+
+
+def run(sampler, posterior, draws=3, chains=2, seed=9, **options):
+    return sampler.sample(
+        posterior, draws=draws, chains=chains, seed=seed, progress=False, **options
+    )
+
+
+class Watched:
+    """A network that remembers every inference it began, and may stop one."""
+
+    def __init__(self, network, stop_at=10**9):
+        self.network, self.stop_at, self.begun, self.options = network, stop_at, [], []
+
+    def reads(self, likelihood):
+        return self.network.reads(likelihood)
+
+    def on(self, prior, likelihood, **options):
+        inference = self.network.on(prior, likelihood, **options)
+        draw, calls = inference.draw, []
+
+        def counted(streams, n):
+            calls.append(n)
+            if len(calls) > self.stop_at:
+                raise KeyboardInterrupt
+            return draw(streams, n)
+
+        inference.draw = counted
+        self.begun.append(inference)
+        self.options.append(options)
+        return inference
+
+
+def fitted(posterior, denoiser, sampler=FIT):
+    """Return the networks as the sampler left them, and its draws."""
+    watched = Watched(denoiser)
+    draws = run(replace(sampler, network=watched), posterior, draws=40, chains=1)
+    return watched.begun[0], draws
+
+
+def parts(inference, name, n=30):
+    """Return a part of the bound, summed over windows, averaged over noise."""
+    with torch.no_grad():
+        bounds = [inference.bound(np.random.default_rng(seed)) for seed in range(n)]
+    return float(np.mean([float(getattr(bound, name).sum()) for bound in bounds]))
+
+
+# --- regression
+
+
+def test_draws_have_theta_and_its_log_density(posterior, prior):
+    draws = run(DVAEInference(), posterior, draws=5)
+    assert draws.positions.shape == (2, 5, WINDOW, 14, 3)
+    theta = draws.dataset["theta"].values
+    assert theta.shape == (2, 5, prior.dim)
+    np.testing.assert_allclose(prior.motion(theta), draws.positions.values, atol=1e-4)
+    np.testing.assert_allclose(
+        draws.dataset["log_density"].values, posterior.log_density(theta), rtol=1e-9
+    )
+    assert draws.independent
+    assert draws.counts == {"gradient": 0}
+    assert len(np.unique(theta[..., 0])) == 10
+
+
+def test_draws_are_nearer_the_truth_than_what_was_seen(posterior, walks):
+    """The tiny networks learnt little, but they learnt."""
+    truth = walks[0].window(10, WINDOW).positions
+    seen = posterior.likelihood.entries.visible
+    noisy = np.linalg.norm(posterior.likelihood.joints - truth, axis=-1)[seen].mean()
+    for sampler in (DVAEInference(), FIT):
+        found = run(sampler, posterior, draws=20).flat().mean(axis=0)
+        assert np.linalg.norm(found - truth, axis=-1)[seen].mean() < 0.9 * noisy
+
+
+@pytest.mark.parametrize("sampler", [DVAEInference(), replace(FIT, iterations=3)])
+@pytest.mark.parametrize("frames", [WINDOW, 20])
+def test_draw_i_of_chain_k_is_the_same_in_any_company(prior, walks, sampler, frames):
+    posterior = observed(prior, walks, frames)
+    sampler = replace(sampler, overlap=3)
+    whole = run(sampler, posterior, draws=7, chains=3)
+    names = [name for name in ("theta", "log_density") if name in whole.dataset]
+    assert bool(names) == (frames == WINDOW)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        for other, draws, chains in (
+            (sampler, 7, 3),
+            (sampler, 4, 1),
+            (replace(sampler, batch=2), 3, 2),
+        ):
+            some = run(other, posterior, draws=draws, chains=chains)
+            assert some.counts == whole.counts
+            for name in ("positions", *names):
+                np.testing.assert_array_equal(
+                    some.dataset[name].values, whole.dataset[name].values[:chains, :draws]
+                )
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    bars = sampler.sample(posterior, draws=7, chains=3, seed=9, progress=True)
+    np.testing.assert_array_equal(bars.positions, whole.positions)
+    assert (run(sampler, posterior, seed=10).positions != whole.positions[:2, :3]).any()
+
+
+# --- optimisation
+
+
+def test_a_fit_raises_the_bound_and_changes_no_one_else_s_network(posterior, denoiser):
+    before = {name: value.clone() for name, value in denoiser.networks.state_dict().items()}
+    inference, draws = fitted(posterior, denoiser)
+    assert draws.counts == {"gradient": FIT.iterations}
+    begun = parts(denoiser.on(posterior.prior, posterior.likelihood), "data")
+    options = {"initial_entropy": True, "latent_weight": 1.0}
+
+    def loss_of(some):
+        rngs = [np.random.default_rng(seed) for seed in range(30)]
+        with torch.no_grad():
+            return np.array([float(some.loss(rng, **options)) for rng in rngs])
+
+    fresh = loss_of(denoiser.on(posterior.prior, posterior.likelihood))
+    gain = fresh - loss_of(inference)
+    assert gain.mean() > 5 * gain.std() / math.sqrt(30)
+    assert parts(inference, "data") > begun
+    for name, value in denoiser.networks.state_dict().items():
+        assert torch.equal(value, before[name])
+        assert not value.requires_grad
+    assert not any(value.requires_grad for value in posterior.prior.model.parameters())
+    assert any(
+        not torch.equal(value, before[name])
+        for name, value in inference.denoiser.networks.state_dict().items()
+    )
+
+
+@pytest.mark.parametrize("rate", [0.3, 1e30])
+def test_a_fit_that_diverges_is_one_sentence(posterior, rate):
+    sampler = replace(FIT, iterations=5, learning_rate=rate)
+    sentence = r"^learning_rate is \S+, with which the fit diverged: .*; expected a smaller one$"
+    with pytest.raises(ValueError, match=sentence):
+        run(sampler, posterior)
+    with pytest.raises(ValueError, match=sentence):
+        sampler.predict(posterior, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("own", "given"), [(None, 4.0), (4.0, math.inf), (4.0, None), (None, None)]
+)
+def test_degrees_of_freedom_are_the_caller_s_or_the_evidence_s(prior, walks, denoiser, own, given):
+    posterior = observed(prior, walks, freedom=own)
+    sampler = replace(FIT, iterations=2, degrees_of_freedom=given)
+    inference, _ = fitted(posterior, denoiser, sampler)
+    heavy = (own if given is None else given) == 4.0
+    assert (parts(inference, "noise", 2) > 0) == heavy
+    assert float(inference.windows.tails[0]) == (0.25 if heavy else 0.0)
+
+
+@pytest.mark.slow
+def test_without_the_first_entropy_first_frames_are_narrow(posterior, denoiser):
+    sampler = replace(FIT, iterations=40, learning_rate=0.01)
+    spread = {}
+    for entropy in (True, False):
+        _, draws = fitted(posterior, denoiser, replace(sampler, initial_entropy=entropy))
+        spread[entropy] = draws.flat()[:, 0].std(axis=0).mean()
+    assert spread[False] < 0.8 * spread[True]
+
+
+@pytest.mark.slow
+def test_without_the_motion_prior_latents_go_where_they_like(posterior, denoiser):
+    kl = {}
+    for weight in (0.0, 1.0, 30.0):
+        inference, _ = fitted(posterior, denoiser, replace(FIT, latent_weight=weight))
+        kl[weight] = parts(inference, "latents")
+    assert kl[30.0] < 0.9 * kl[1.0]
+    assert kl[1.0] < 0.95 * kl[0.0]
+
+
+def test_the_published_settings(posterior):
+    paper = DVAEInference.paper()
+    assert paper == DVAEInference(
+        mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
+    )
+    assert run(replace(paper, iterations=2), posterior).counts == {"gradient": 2}
+
+
+# --- one motion
+
+
+@pytest.mark.parametrize("sampler", [DVAEInference(), replace(FIT, iterations=4)])
+def test_one_motion_is_predicted(posterior, denoiser, sampler):
+    found = {
+        average: sampler.predict(posterior, seed=3, average=average, progress=False)
+        for average in (True, False)
+    }
+    again = sampler.predict(posterior, seed=3, progress=True)
+    np.testing.assert_array_equal(again.positions, found[True].positions)
+    for motion in found.values():
+        assert motion.positions.shape == (WINDOW, 14, 3)
+        assert motion.skeleton == BODY
+        assert motion.fps == 30.0
+    # Means of q are decoded: bones are the body's. Averages lie between, and bones do not.
+    child, parent = BODY.bones[0]
+    length = np.linalg.norm(posterior.prior.body[child])
+    bones = [
+        np.linalg.norm(motion.positions[:, child] - motion.positions[:, parent], axis=-1)
+        for motion in (found[False], found[True])
+    ]
+    np.testing.assert_allclose(bones[0], length, rtol=1e-4)
+    assert abs(bones[1][1:] - length).max() > 1e-3
+    if sampler.mode == "regression":
+        inference = denoiser.on(posterior.prior, posterior.likelihood)
+        wanted = inference.predict(seeds.generator(3, "predict"), average=True)
+        np.testing.assert_allclose(found[True].positions, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [2, 7, 12, 13, 75])
+def test_motions_of_any_length(prior, walks, frames):
+    truth = walks[0].window(3, frames)
+    evidence = Joints3D.observe(truth, 0.02, 0)
+    posterior = MotionPosterior(prior.of(frames=frames), evidence)
+    draws = run(replace(DVAEInference(), overlap=4), posterior)
+    assert draws.positions.shape == (2, 3, frames, 14, 3)
+    assert ("theta" in draws.dataset) == (frames <= WINDOW)
+    predicted = DVAEInference(overlap=4).predict(posterior, progress=False)
+    assert predicted.frames == frames
+    error = np.linalg.norm(draws.flat() - truth.positions, axis=-1).mean()
+    assert error < 0.15
+
+
+@pytest.mark.parametrize("overlap", [5, 0])
+def test_windows_join_without_jumps(prior, walks, overlap):
+    """Accelerations where windows meet are like those inside windows; with no overlap they jump."""
+    posterior = observed(prior, walks, 75)
+    sampler = DVAEInference(overlap=1)
+    object.__setattr__(sampler, "overlap", overlap)  # no overlap is refused, and this is why
+    draws = run(sampler, posterior, draws=20).flat()
+    predicted = sampler.predict(posterior, average=False, progress=False).positions
+    starts = range(WINDOW - overlap, 75 - WINDOW, WINDOW - overlap)
+    # The frames before and after the edges of what windows share.
+    edges = {edge for start in starts for edge in (start, start + overlap)}
+    at = np.array([edge + step for edge in sorted(edges) for step in (-1, 0)]) - 1
+    for motions in (draws, predicted[None]):
+        size = np.linalg.norm(np.diff(motions, 2, axis=1), axis=-1).mean(axis=(0, 2))
+        elsewhere = np.delete(size, at)
+        smooth = size[at].max() < 1.5 * elsewhere.max()
+        smooth &= np.median(size[at]) < 1.5 * np.median(elsewhere)
+        assert smooth == (overlap > 0)
+
+
+# --- other routes
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    """Settings that networks were trained with here."""
+    used, fit = [], AmortisedPosterior.fit
+
+    def spy(posterior, settings, *rest):
+        used.append(settings)
+        return fit(posterior, settings, *rest)
+
+    monkeypatch.setattr(AmortisedPosterior, "fit", spy)
+    return used
+
+
+@pytest.mark.parametrize("networked", [True, False])
+def test_without_evidence_draws_are_the_prior_s_own(prior, bare, trainings, networked):
+    some = prior if networked else bare
+    draws = run(replace(FIT, batch=4), MotionPosterior(some), draws=3, chains=2)
+    for chain in range(2):
+        for draw in range(3):
+            rng = NormalStreams.of_draws(9, [(chain, draw)]).generators[0]
+            wanted = prior.sample(rng, 1)[0]
+            np.testing.assert_allclose(draws.positions.values[chain, draw], wanted, atol=1e-9)
+    assert draws.counts == {"gradient": 0}
+    assert trainings == []
+
+
+@pytest.mark.parametrize("shown", ["keypoints", "joints, without a network"])
+def test_what_no_network_reads_is_learnt_from_simulations(prior, bare, walks, trainings, shown):
+    posterior = observed(bare, walks)
+    if shown == "keypoints":
+        camera = Cameras.ring(1, elevation=0.3)
+        evidence = Keypoints2D.observe(walks[0].window(0, WINDOW), camera, 0.05, seed=0)
+        posterior = MotionPosterior(prior, evidence)
+    draws = run(BRIEF, posterior)
+    assert draws.positions.shape == (2, 3, WINDOW, 14, 3)
+    assert "theta" not in draws.dataset
+    [settings] = trainings
+    assert (settings.steps, settings.pairs) == (20, 150)
+
+
+# --- refusals
+
+
+def test_networks_are_of_one_prior(two_bumps, posterior, denoiser):
+    with pytest.raises(ValueError, match="prior is TwoBumps, expected the Motion-DVAE that the de"):
+        denoiser.on(two_bumps, posterior.likelihood)
+
+
+def test_a_window_with_nothing_in_it_is_one_sentence(prior, walks):
+    truth = walks[0].window(0, 40)
+    hidden = np.zeros((40, 14), dtype=bool)
+    hidden[8:34] = True
+    evidence = Joints3D.observe(truth, 0.04, 0, hidden=hidden)
+    posterior = MotionPosterior(prior.of(frames=40), evidence)
+    with pytest.raises(
+        ValueError, match=r"^joints has window \d of \d with every joint hidden, expected at least"
+    ):
+        run(DVAEInference(overlap=4), posterior)
+
+
+def test_windows_cannot_share_all_their_frames(posterior):
+    run(DVAEInference(overlap=WINDOW - 1), posterior)
+    with pytest.raises(ValueError, match=r"^overlap is 12, expected less than the 12 frames of a"):
+        run(DVAEInference(overlap=WINDOW), posterior)
+
+
+# --- a run and what is kept of it
+
+
+def test_ctrl_c_keeps_the_finished_draws(posterior, denoiser):
+    whole = run(DVAEInference(batch=4), posterior, draws=6, chains=3)
+    stopping = DVAEInference(batch=4, network=Watched(denoiser, stop_at=2))
+    with pytest.raises(Interrupted, match="interrupted after 2 draws per chain") as stopped:
+        run(stopping, posterior, draws=6, chains=3)
+    kept = stopped.value.draws
+    # Two batches of four are two whole draws of three chains.
+    for name in ("positions", "theta", "log_density"):
+        np.testing.assert_array_equal(kept.dataset[name].values, whole.dataset[name].values[:, :2])
+    none = DVAEInference(batch=2, network=Watched(denoiser, stop_at=1))
+    with pytest.raises(KeyboardInterrupt) as at_once:
+        run(none, posterior, draws=6, chains=3)
+    assert not isinstance(at_once.value, Interrupted)
+
+
+def test_draws_say_how_they_were_made(posterior, denoiser, tmp_path):
+    for network, wanted in ((None, None), (denoiser, repr(denoiser))):
+        sampler = replace(FIT, iterations=2, network=network)
+        draws = run(sampler, posterior)
+        settings = json.loads(draws.dataset.attrs["settings"])
+        assert settings["network"] == wanted
+        assert settings["mode"] == "optimization"
+        draws.save(tmp_path / "draws.nc")
+        loaded = MotionDraws.load(tmp_path / "draws.nc")
+        for name in ("positions", "theta", "log_density"):
+            np.testing.assert_array_equal(loaded.dataset[name], draws.dataset[name])
+        assert loaded.dataset.attrs["settings"] == draws.dataset.attrs["settings"]
+        assert loaded.counts == {"gradient": 2}
+        again = copy.deepcopy(sampler)
+        np.testing.assert_array_equal(run(again, posterior).positions, draws.positions)
+    assert repr(denoiser).startswith("MotionDenoiser(14 joints, ")
+    assert " at 0x" not in repr(denoiser)
+    assert load_sampler("dvae") is DVAEInference
+    assert replace(sampler) == sampler
+    assert hash(replace(sampler)) == hash(sampler)
+
+
+@pytest.mark.slow
+def test_compare_runs_it_in_two_processes(posterior, walks, denoiser, tmp_path):
+    truth = walks[0].window(10, WINDOW).positions
+    problem = Problem("walk", "noisy joints of a made walk", posterior, truth)
+    samplers = {"answered": DVAEInference(network=denoiser), "fitted": replace(FIT, iterations=3)}
+    tables = []
+    for workers in (2, 0):
+        found = compare(
+            problem,
+            samplers,
+            draws=12,
+            chains=2,
+            workers=workers,
+            out=tmp_path / str(workers),
+            progress=False,
+        )
+        assert found.failures == []
+        table = found.table()
+        assert not table["value"].isna().any()
+        cost = table["metric"].isin(["seconds", "peak_memory_mib"])
+        tables.append(table[~cost].reset_index(drop=True))
+    assert str(tables[0].to_csv()) == str(tables[1].to_csv())
+    assert {"g_mpjpe_hidden_mm", "mpjpe_visible_mm", "acceleration_ratio"} <= set(
+        tables[0]["metric"]
+    )

@@ -1,0 +1,188 @@
+"""Every notebook runs from top to bottom, and what its prose claims is what it measures."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probmotion import Comparison
+from probmotion.comparison import advise
+
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
+
+
+def run(name: str, folder: Path, pictures: int, monkeypatch) -> str:
+    """Execute a notebook in ``folder``; return all that it printed."""
+    import jupytext
+    from nbclient import NotebookClient
+
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(variable, "1")
+    # A kernel of the running interpreter, whatever kernels the machine has.
+    monkeypatch.setenv("JUPYTER_PATH", str(Path(sys.prefix) / "share" / "jupyter"))
+    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
+    notebook = jupytext.read(NOTEBOOKS / name)
+    client = NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    )
+    client.execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == pictures
+    return "".join(
+        output.get("text", output.get("data", {}).get("text/plain", "")) for output in outputs
+    )
+
+
+def played(page: Path) -> dict[str, np.ndarray]:
+    """Return the motions that a page plays, by label, (n, L, J, 3), metres; it fetches nothing."""
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|src=|href=|@import", text)
+    (given,) = re.findall(r"parentElement, (\{.*\})\);</script>", text)
+    data = json.loads(given)
+    shape = (-1, data["frames"], data["joints"], 3)
+    return {row["label"][0]: np.reshape(row["motions"], shape) / 1000 for row in data["rows"]}
+
+
+# Jupyter's own libraries warn about themselves.
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_one_posterior_many_samplers(tmp_path, monkeypatch):
+    printed = run("01_one_posterior_many_samplers.py", tmp_path, 5, monkeypatch)
+    assert "120 clips" in printed
+    assert len(list((tmp_path / "walks").glob("*.bvh"))) == 120
+    assert (tmp_path / "take3.bvh").exists()
+
+    table = Comparison.load(tmp_path / "comparison").table()
+    assert "swd" in printed
+    wide = table.pivot_table(index="sampler", columns="metric", values="value")
+    assert set(wide.index) == {"exact", "ancestral3d", "mas", "mvpc", "mh"}
+    assert wide.loc["ancestral3d", "off"] < 0.6
+    assert wide.loc["mas", "tr"] > 1.5
+    assert wide.loc["mvpc", "swd"] < wide.loc["mas", "swd"]
+    evaluations = wide["denoiser_evaluations"]
+    assert evaluations["mvpc"] == pytest.approx(evaluations["mas"], rel=0.1)
+    assert wide.loc["mh", "swd"] < 1.5
+    assert wide.loc["mh", "rhat"] > 1.05
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_pose_pairs(tmp_path, monkeypatch):
+    from probmotion.io.files import load_motion
+
+    printed = run("02_pose_pairs.py", tmp_path, 5, monkeypatch)
+    assert "90 of 90 frames are the dance" in printed
+    assert "108 dimensions" in printed
+    assert "200 annotations" in printed
+    walk = load_motion(tmp_path / "walk.bvh")
+    assert walk.frames == 150
+    assert len(walk.skeleton.roots) == 2
+    accepted = float(printed.split("accepted: ")[1].split()[0])
+    assert 0.15 < accepted < 0.35
+    drawn, seed = re.search(r"coverage: ([\d.]+) m, by the seed alone ([\d.]+) m", printed).groups()
+    assert float(drawn) < float(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_motion_from_2d(tmp_path, monkeypatch):
+    printed = run("03_motion_from_2d.py", tmp_path, 5, monkeypatch)
+    assert "centre     640 → 640" in printed
+    assert "train: 511 tracks of 32 clips" in printed
+    assert (tmp_path / "walks.html").exists()
+    losses = (tmp_path / "diffusion" / "losses.csv").read_text().splitlines()
+    assert len(losses) == 7
+
+    def numbers(words: str) -> list[float]:
+        """Return the numbers that follow in the same line."""
+        line = printed.split(words, 1)[1].splitlines()[0]
+        return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line)]
+
+    # FID, diversity, precision, recall.
+    real, flat, mas = (numbers(row) for row in ("\nreal ", "\n2D model ", "\nmas "))
+    assert real[0] < mas[0] < 1.2 * flat[0]
+    assert mas[2] > 0.9 * flat[2]
+    assert numbers("\nmas, no 3D noise ")[3] > 0.5
+    # To real motion, from it, mirrored.
+    assert numbers("\nmas: ")[0] < 1.3 * numbers("\nreal: ")[0]
+    assert numbers("\nmas: ")[2] < 0.1
+    for kind in ("found joints: ", "lost joints: "):
+        detected, cleaned = numbers(kind)
+        assert cleaned < 0.6 * detected
+    # A draw may be caught in something else, as the prose says; the others answer.
+    misses = np.array(numbers("misses what was seen by, mm: "))
+    caught = misses > 80
+    assert caught.sum() <= 3
+    wrong = np.array(numbers("misses the truth by, mm: "))
+    assert wrong[~caught].max() < 0.5 * numbers("without evidence: ")[0]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_denoising(tmp_path, monkeypatch):
+    monkeypatch.delenv("PROBMOTION_DATA", raising=False)
+    printed = run("04_denoising.py", tmp_path, 1, monkeypatch)
+    assert "walk-0: 75 frames at 30 fps, 14 joints" in printed
+    numbers = r"\s+([\d.]+)" * 4
+    rows = {
+        name: [float(number) for number in re.search(re.escape(name) + numbers, printed).groups()]
+        for name in (
+            "Savitzky-Golay filter",
+            "Kalman smoother",
+            "Motion-DVAE, regression",
+            "Motion-DVAE, optimization",
+        )
+    }
+    for name in ("Savitzky-Golay filter", "Kalman smoother"):
+        assert rows["Motion-DVAE, optimization"][2] < rows[name][2]  # hidden joints
+    assert rows["Motion-DVAE, optimization"][0] < rows["Motion-DVAE, regression"][0]
+    assert "denoised.html" in {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_animals(tmp_path, monkeypatch):
+    printed = run("05_animals.py", tmp_path, 1, monkeypatch)
+    assert "21 joints, 10 frames at 10.0 a second" in printed
+
+    def number(pattern: str) -> float:
+        return float(re.search(pattern, printed)[1])
+
+    assert number(r"bones are ([\d.]+) % off") < 10
+    assert number(r"depth is not mirrored in (\d+)%") > 95
+    assert number(r"joints are (\d+) mm from the truth") < 80
+    # As the prose says: at a seam no more than within the pieces.
+    assert number(r"greatest acceleration is ([\d.]+) of that within") <= 1
+    rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
+    assert rows["optimization"] < rows["regression"]
+    assert 0.2 < number(r"new motions are ([\d.]+) as fast") < 1
+    for name, labels in {
+        "long": ["several codes"],
+        "animals": ["drawn", "seen by one camera", "the truth"],
+        "own": ["of the prior that ships", "of these animals"],
+    }.items():
+        shown = played(tmp_path / f"{name}.html")
+        assert list(shown) == labels
+        for motions in shown.values():
+            # In every skeleton some joint goes somewhere.
+            assert (np.ptp(motions, axis=1).max(axis=(1, 2)) > 0.02).all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_compare_and_calibrate(tmp_path, monkeypatch):
+    printed = run("06_compare_and_calibrate.py", tmp_path, 3, monkeypatch)
+    assert "every sampler had 20 000 evaluations" in printed
+    table = Comparison.load(tmp_path / "comparison").table()
+    used = table[table["metric"] == "budget_used"].groupby("sampler")["value"].max()
+    assert (used[["mh", "mas"]] <= 20_000).all()
+    assert 1e4 < (tmp_path / "report.html").stat().st_size < 15e6
+    assert str(advise("gait-monocular")) in printed
+    right, wrong = (line for line in printed.splitlines() if " on gait-monocular(" in line)
+    assert "no deviation found" in right
+    assert "too sure: 90 % intervals hold" in wrong
