@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from probmotion.data.synthetic.walks import made_walks
+from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.models.bodies.body_states import BodyStates, rest_pose
 from probmotion.models.dvae.inference import DenoisingNetworks
 from probmotion.models.dvae.motion_denoiser import MotionDenoiser, NoisyMotion
@@ -32,7 +32,7 @@ FRAMES, WINDOW, ITERATIONS, SEQUENCES = 300, 30, 50, 64
 def main() -> None:
     """Print every measurement."""
     skeleton = Skeleton.preset("person14")
-    walks = [clip.retarget(skeleton) for clip in made_walks(3, skeleton, seconds=10.0)]
+    walks = [clip.retarget(skeleton) for clip in synthetic_walks(3, skeleton, seconds=10.0)]
     prior, denoiser = fresh_networks(walks)
     whole = observed(walks[0], FRAMES)
     posterior = MotionPosterior(prior.of(frames=FRAMES, inference_network=denoiser), whole)

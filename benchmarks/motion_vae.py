@@ -29,7 +29,7 @@ from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.network import MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
-from probmotion.models.vae.teacher_forcing import TaughtPoses
+from probmotion.models.vae.teacher_forcing import TeacherForcedPoses
 from probmotion.models.vae.training import MotionVAETrainee
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
@@ -114,7 +114,7 @@ def training(
 
     begun = time.perf_counter()
     rest = torch.as_tensor(body.rest_positions, dtype=torch.float32)
-    TaughtPoses(teacher, trainee.batches, rest)
+    TeacherForcedPoses(teacher, trainee.batches, rest)
     asked = len(trainee.batches.all_frames()[0])
     return step, 1000 * (time.perf_counter() - begun) / asked
 

@@ -23,8 +23,10 @@ from pathlib import Path
 import emcee
 import jax
 import numpy as np
-from numpyro.infer import MCMC
-from numpyro.infer import NUTS as Kernel  # noqa: N811
+from numpyro.infer import (
+    MCMC,
+    NUTS as Kernel,  # noqa: N811
+)
 
 from probmotion import MotionPosterior, seeds
 from probmotion.problems import load_problem

@@ -24,7 +24,7 @@ import numpy as np
 
 from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import SALSA_HELD_OUT
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.geometry.delaunay import delaunay_into, most_edges
 from probmotion.interaction.geometry.graphs import joggle_offsets
@@ -50,7 +50,7 @@ def problem(folder: str | None) -> Problem:
     """Return the problem with 6000 annotations."""
     if folder is not None:
         return pairs_problem(salsa_pairs(folder), SALSA_HELD_OUT, n_annotations=6000)
-    return pairs_problem(make_dances(80), ["dance-78", "dance-79"], n_annotations=6000)
+    return pairs_problem(synthetic_dances(80), ["dance-78", "dance-79"], n_annotations=6000)
 
 
 def triangulation_share(given: Problem, theta: np.ndarray) -> float:

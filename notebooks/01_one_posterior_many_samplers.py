@@ -152,9 +152,10 @@ comparison.table()
 # %% [markdown]
 # ## 5. What is wrong with each
 #
-# `swd` is the distance from the exact posterior in units of the distance between two sets of
-# exact draws: 1 cannot be told from right. `tr` compares the spread: below 1 a sampler claims to
-# know more than it can, above 1 less. `off` compares the part that no style explains: below 1 the
+# `swd_ratio` is the distance from the exact posterior in units of the distance between two sets of
+# exact draws: at 1 the two cannot be told apart. `variance_ratio` compares the spread: below 1 a
+# sampler is overconfident, above 1 underconfident. `off_manifold_ratio` compares the part that no
+# style explains: below 1 the
 # motions are too smooth. Read them together with the cost: that is the picture to look at first.
 
 # %%
@@ -163,7 +164,7 @@ Image("quality.png")
 
 # %% [markdown]
 # - `ancestral3d` finds the right region, but its motions are too smooth: with 50 steps the
-#   smallest variance is never reached (`off` far below 1). More steps mend that.
+#   smallest variance is never reached (`off_manifold_ratio` far below 1). More steps mend that.
 # - `mas` spreads about twice too wide. It corrects each of its views on its own, so that what the
 #   camera saw reaches the others weakened.
 # - `mvpc` is nearer at the same number of denoiser evaluations, and still too wide.

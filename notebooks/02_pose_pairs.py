@@ -28,7 +28,7 @@ from IPython.display import Image
 
 from probmotion.data.pair_sets import choose_seed, dance_frames, describe_dance_frames, ground_truth
 from probmotion.data.pairs import load_pairs
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.geometry.coordinates import align_rigidly
@@ -52,7 +52,7 @@ from probmotion.samplers.mcmc.proposals import Isotropic
 folder = Path("dances")
 if not list(folder.glob("*.npz")):
     folder.mkdir(exist_ok=True)
-    for clip in make_dances(6):
+    for clip in synthetic_dances(6):
         save_motion(clip, folder / f"{clip.name}.npz")
 
 *shown, hidden = load_pairs(sorted(folder.glob("*.npz")))

@@ -30,7 +30,7 @@ from IPython.display import Image
 
 import probmotion as pm
 from probmotion.data.projections import DetectorNoise, centre_motion, project_clips
-from probmotion.data.synthetic.walks import made_walks
+from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.data.tracks.learning import film_clips, film_windows, read_tracks, split_tracks
 from probmotion.metrics.generation import GenerationReference
 from probmotion.models.diffusion.motion_diffusion import DiffusionSettings, MotionDiffusion
@@ -40,7 +40,7 @@ from probmotion.models.evaluation.evaluator import TrackEvaluator
 from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
 from probmotion.models.training.trainer import TrainingSettings, train
-from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.plots.animation import play_skeletons
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import MultiViewAncestral
@@ -56,7 +56,7 @@ from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 
 # %%
 person = pm.Skeleton.preset("person14")
-walks = made_walks(40, seconds=4)
+walks = synthetic_walks(40, seconds=4)
 files = sorted(Path("tracks").glob("*.*"))
 if files:
     prepared = read_tracks(files, person, fps=20)
@@ -176,7 +176,8 @@ for name, some in motions.items():
     near = nearest_distances(some, real)
     print(
         f"{name + ':':18} {1000 * near.of_draws:3.0f} mm to real motion, "
-        f"{1000 * near.of_real:3.0f} mm from real motion, mirrored {mirror_share(some, real):.2f}"
+        f"{1000 * near.of_real:3.0f} mm from real motion, "
+        f"mirrored {mirrored_fraction(some, real):.2f}"
     )
 
 # %% [markdown]

@@ -33,7 +33,7 @@ from IPython.display import Image
 import probmotion as pm
 from probmotion.data.cmu_clips import cmu_clip
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
-from probmotion.data.synthetic.walks import made_walks
+from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.metrics import accuracy
 from probmotion.plots.animation import play_skeletons
 from probmotion.plots.skeletons import draw_skeletons
@@ -49,7 +49,7 @@ else:
     try:
         clip = cmu_clip("cmu_02_02")
     except FileNotFoundError:
-        clip = made_walks(1, prior.skeleton, seconds=4)[0]
+        clip = synthetic_walks(1, prior.skeleton, seconds=4)[0]
 clip = clip.retarget(prior.skeleton).resample(prior.fps)
 truth = clip.window(0, min(75, clip.frames))
 print(truth)

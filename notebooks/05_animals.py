@@ -27,7 +27,7 @@ import pandas as pd
 from IPython.display import Image
 
 import probmotion as pm
-from probmotion.data.synthetic.animals import made_animals
+from probmotion.data.synthetic.animals import synthetic_animals
 from probmotion.data.tracks.learning import film_clips
 from probmotion.metrics import accuracy
 from probmotion.models import MotionVAE
@@ -54,7 +54,7 @@ print(skeleton.n_joints, "joints,", prior.frames, "frames at", prior.fps, "a sec
 # `probmotion.io.read_keypoints` reads what DeepLabCut and other detectors write.
 
 # %%
-animals = made_animals(8, seed=3)
+animals = synthetic_animals(8, seed=3)
 tracks = film_clips(animals, skeleton, prior.fps, views=40).tracks
 print(len(tracks), "tracks of", tracks[0].frames, "frames")
 

@@ -25,7 +25,7 @@ from IPython.display import Image
 
 import probmotion as pm
 from probmotion.calibration import Overconfident, calibrate
-from probmotion.calibration.error_decomposition import bias_budget
+from probmotion.calibration.error_decomposition import decompose_error
 from probmotion.comparison import Budget, advise
 from probmotion.problems import load_problem
 from probmotion.samplers import ExactSampler, MetropolisHastings, MultiViewAncestral
@@ -107,7 +107,9 @@ Image("calibration.png")
 # thing; the differences add up to the whole.
 
 # %%
-budget = bias_budget(load_problem("gait", frames=8), steps=50, seeds=3, draws=60, progress=False)
+budget = decompose_error(
+    load_problem("gait", frames=8), steps=50, seeds=3, draws=60, progress=False
+)
 found = budget.table()
 print(found[found["measure"] == "spread"].drop(columns="measure").round(2).to_string(index=False))
 for sentence in budget.notes:

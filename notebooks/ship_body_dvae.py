@@ -136,10 +136,10 @@ def _measured(table: Path | None) -> str:
     if table is None:
         return ""
     rows = pd.read_csv(table)
-    shown = rows[["kind", "estimate", "g_mpjpe", "g_mpjpe_hidden", "acceleration_ratio"]]
+    shown = rows[["kind", "estimate", "g_mpjpe", "g_mpjpe_occluded", "acceleration_ratio"]]
     lines = [
         f"| {row.kind} | {row.estimate} | {row.g_mpjpe:.1f} | "
-        + ("" if pd.isna(row.g_mpjpe_hidden) else f"{row.g_mpjpe_hidden:.1f}")
+        + ("" if pd.isna(row.g_mpjpe_occluded) else f"{row.g_mpjpe_occluded:.1f}")
         + f" | {row.acceleration_ratio:.2f} |"
         for row in shown.itertuples()
     ]

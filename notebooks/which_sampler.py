@@ -18,7 +18,7 @@ from readme_figures import replace_block
 from probmotion import Comparison
 from probmotion.comparison import advise
 from probmotion.comparison.advice import Advice, Standing
-from probmotion.comparison.measurements import keep_measured
+from probmotion.comparison.measurements import save_measurements
 
 ROOT = Path(__file__).parents[1]
 SHOWN = ("gait", "gait-monocular", "gait-sparse", "cmu-monocular")
@@ -43,7 +43,9 @@ def main() -> None:
     """Rewrite what was measured."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     found = Comparison.load(ROOT / "grid")
-    keep_measured(found, f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}")
+    save_measurements(
+        found, f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}"
+    )
     advices = {name: advise(name) for name in found.plan.problems}
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")

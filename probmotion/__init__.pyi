@@ -1,20 +1,18 @@
-from . import models as models
-from . import samplers as samplers
+from . import models as models, samplers as samplers
 from .comparison.comparison import Comparison as Comparison
 from .comparison.grid import compare as compare
 from .geometry.cameras import Cameras as Cameras
 from .geometry.triangulation import triangulate as triangulate
-from .io.files import load_motion as load_motion
-from .io.files import load_motions as load_motions
-from .io.files import read_keypoints as read_keypoints
-from .io.files import save_motion as save_motion
-from .motion.motion import KeypointTrack as KeypointTrack
-from .motion.motion import Motion as Motion
+from .io.files import (
+    load_motion as load_motion,
+    load_motions as load_motions,
+    read_keypoints as read_keypoints,
+    save_motion as save_motion,
+)
+from .motion.motion import KeypointTrack as KeypointTrack, Motion as Motion
 from .motion.skeleton import Skeleton as Skeleton
 from .posteriors.draws import MotionDraws as MotionDraws
-from .posteriors.likelihoods import Joints3D as Joints3D
-from .posteriors.likelihoods import Keypoints2D as Keypoints2D
+from .posteriors.likelihoods import Joints3D as Joints3D, Keypoints2D as Keypoints2D
 from .posteriors.noise_schedule import NoiseSchedule as NoiseSchedule
 from .posteriors.posterior import MotionPosterior as MotionPosterior
-from .posteriors.sampling import Sampler as Sampler
-from .posteriors.sampling import UnsupportedPosterior as UnsupportedPosterior
+from .posteriors.sampling import Sampler as Sampler, UnsupportedPosterior as UnsupportedPosterior

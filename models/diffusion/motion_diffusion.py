@@ -270,7 +270,7 @@ class MotionDiffusion:
             product[rows] = factor * _numbers(pulled, vectors)[: len(product[rows])]
         return product
 
-    def check_evidence(self, likelihood: Likelihood) -> None:
+    def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if evidence is of a motion that the prior cannot have.
 
         A prior of pictures that were centred on the root in every frame has its root at the origin.

@@ -17,7 +17,7 @@ from probmotion import seeds
 from probmotion.arrays import Array, constant
 from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import ChecksEvidence, Likelihood
+from probmotion.posteriors.protocols import ChecksObservations, Likelihood
 from probmotion.validation import check_count, check_shape
 
 __all__ = ["ReducedLatent"]
@@ -96,10 +96,10 @@ class ReducedLatent(StandardNormalPrior):
         """Length k of θ."""
         return self.directions.shape[1]
 
-    def check_evidence(self, likelihood: Likelihood) -> None:
+    def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if the prior does."""
-        if isinstance(self.prior, ChecksEvidence):
-            self.prior.check_evidence(likelihood)
+        if isinstance(self.prior, ChecksObservations):
+            self.prior.check_observations(likelihood)
 
     def latent(self, theta: Array) -> Array:
         """Return z = U θ, ``(…, k) → (…, Z)``."""

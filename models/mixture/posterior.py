@@ -105,14 +105,14 @@ class MixturePosterior:
         return self._offset + 0.5 * ((self._slope * self._latent_mean).sum(axis=-1) - log_det)
 
     @property
-    def log_evidence(self) -> float:
+    def log_marginal_likelihood(self) -> float:
         """log p(y)."""
         return float(logsumexp(self._log_joint.reshape(-1)))
 
     @property
     def component_probabilities(self) -> np.ndarray:
         """p(style k, azimuth a | y), (K, A)."""
-        return np.exp(self._log_joint - self.log_evidence)
+        return np.exp(self._log_joint - self.log_marginal_likelihood)
 
     def mean(self) -> np.ndarray:
         """Return E[X | y], (L, J, 3), metres."""
@@ -168,7 +168,7 @@ class MixturePosterior:
         half = constant(np.linalg.inv(np.linalg.cholesky(total)), flat)
         latent = xp.sum(half * slope[..., None, :], axis=-1)
         log_det = np.linalg.slogdet(total)[1]
-        offset = self._offset - self.log_evidence - 0.5 * (log_det + gram[..., 0, 0])
+        offset = self._offset - self.log_marginal_likelihood - 0.5 * (log_det + gram[..., 0, 0])
         logits = turned[..., 0] + 0.5 * xp.sum(latent**2, axis=-1) + constant(offset, flat)
         norm = F * 3 * math.log(2 * math.pi) - np.linalg.slogdet(precision)[1].sum()
         value = logsumexp(xp.reshape(logits, (n, K * A))) - 0.5 * (square + float(norm))

@@ -28,7 +28,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["HELD_OUT", "clips_of_people", "learn_limits", "main", "rejected_shares"]
+__all__ = ["HELD_OUT", "clips_of_people", "learn_limits", "main", "rejected_fractions"]
 
 HELD_OUT = (
     "cmu_01_07", "cmu_02_05", "cmu_02_09", "cmu_131_02",
@@ -112,7 +112,7 @@ def clips_of_people(path: Path) -> list[np.ndarray]:
     return people
 
 
-def rejected_shares(limits: JointLimits, poses: np.ndarray) -> dict[str, dict[str, float]]:
+def rejected_fractions(limits: JointLimits, poses: np.ndarray) -> dict[str, dict[str, float]]:
     """Return how much of what is real, of what is random and of what is bent backwards is invalid.
 
     Parameters
@@ -197,7 +197,7 @@ def main(data: Path, out: Path, dilation: float = 10.0, bin_dilation: float = 20
         overall = 1.0 - limits.is_valid(poses).mean()
         rejected[name] = round(float(overall), 5)
         print(f"{name}: {len(poses)} unseen poses, {overall:.2%} of their bones rejected")
-        _print_table(rejected_shares(limits, poses))
+        _print_table(rejected_fractions(limits, poses))
     provenance["rejected_of_held_out"] = rejected
     replace(limits, provenance=provenance).save(out)
     print(f"{out}: {out.stat().st_size} bytes")

@@ -204,7 +204,7 @@ class MotionVAE(StandardNormalPrior):
         seen = see_body(self.model.pose, self.settings, self.body, likelihood)
         return self.placed(seen.path, seen.log_lengths)
 
-    def check_evidence(self, likelihood: Likelihood) -> None:
+    def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if no one has said where the body is that the evidence is of.
 
         No code can move or turn the body: of one that stands elsewhere, codes would be bent to

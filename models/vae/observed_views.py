@@ -16,14 +16,14 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.validation import check_positive, check_shape
 
-__all__ = ["EvidencePicture", "picture_of"]
+__all__ = ["ObservedView", "picture_of"]
 
 _TO_OPENCV = np.array([1.0, -1.0, -1.0])
 """From a frame with y up and z towards the camera to the cameras' own, and back."""
 
 
 @dataclass(frozen=True, eq=False)
-class EvidencePicture:
+class ObservedView:
     """Keypoints of one view as a network sees them.
 
     Parameters
@@ -47,7 +47,7 @@ class EvidencePicture:
     camera: Cameras
     distance: float | None
 
-    def at(self, distance: float) -> EvidencePicture:
+    def at(self, distance: float) -> ObservedView:
         """Return what a perspective camera's picture is where the subject is at another distance.
 
         Raises
@@ -59,7 +59,7 @@ class EvidencePicture:
             raise ValueError("camera is orthographic, expected a perspective one: it has no scale")
         check_positive("distance", distance)
         grown = distance / self.distance
-        return EvidencePicture(
+        return ObservedView(
             grown * self.keypoints, self.confidence, grown * self.root, self.camera, distance
         )
 
@@ -109,7 +109,7 @@ class EvidencePicture:
 
 def picture_of(
     likelihood: Keypoints2D, skeleton: Skeleton, *, distance: float | None = None
-) -> EvidencePicture:
+) -> ObservedView:
     """Return the evidence as a network's picture.
 
     Joints of less than three tenths of the greatest confidence are hidden, as in training by
@@ -131,7 +131,7 @@ def picture_of(
     ValueError
         If there are several views or other joints, a frame shows no joint, or no frame the root.
     """
-    _check_evidence(likelihood, skeleton)
+    _check_observations(likelihood, skeleton)
     camera, root = likelihood.cameras, skeleton.roots[0]
     assert camera.centre is not None
     shown = _shown(likelihood)
@@ -142,10 +142,10 @@ def picture_of(
     plane = slopes if length is None else length * slopes
     middle = _interpolated(plane[:, root], shown[:, root])
     about = np.where(shown[..., None], plane - middle[:, None], 0.0)
-    return EvidencePicture(about, shown.astype(np.float64), middle, camera, length)
+    return ObservedView(about, shown.astype(np.float64), middle, camera, length)
 
 
-def _check_evidence(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
+def _check_observations(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
     if likelihood.cameras.n_views != 1:
         raise ValueError(
             f"likelihood has {likelihood.cameras.n_views} views, expected one, as the network has "

@@ -14,7 +14,7 @@ import torch
 
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.losses import best_guess, guess_terms, weighted_sum
-from probmotion.models.vae.observed_views import EvidencePicture, picture_of
+from probmotion.models.vae.observed_views import ObservedView, picture_of
 from probmotion.models.vae.pose_network import PoseGuesses, PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.posteriors.likelihoods import Keypoints2D
@@ -161,7 +161,7 @@ def _best_guess(
     network: PoseNetwork,
     settings: MotionVAESettings,
     body: ArticulatedBody,
-    picture: EvidencePicture,
+    picture: ObservedView,
 ) -> tuple[PoseGuesses, np.ndarray]:
     """Return the best hypothesis of one track, and all hypotheses' losses (H,)."""
 
@@ -176,7 +176,7 @@ def _best_guess(
     return best_guess(guesses, losses), losses[0].double().numpy()
 
 
-def _first_distance(picture: EvidencePicture, body: ArticulatedBody) -> float:
+def _first_distance(picture: ObservedView, body: ArticulatedBody) -> float:
     """Return a distance from bones' lengths: seen from anywhere they show π/4 of them on average.
 
     Raises
@@ -195,7 +195,7 @@ def _first_distance(picture: EvidencePicture, body: ArticulatedBody) -> float:
     return float(math.pi / 4 * (shown * lengths).sum() / seen * picture.distance)
 
 
-def _size_ratio(best: PoseGuesses, body: ArticulatedBody, picture: EvidencePicture) -> float:
+def _size_ratio(best: PoseGuesses, body: ArticulatedBody, picture: ObservedView) -> float:
     """Return how much larger the rest pose's body, posed as it is seen, is than the picture."""
     place = torch.nn.functional.pad(best.translation, (0, 1))
     # Of its own lengths a body would fit whatever distance they were guessed at.

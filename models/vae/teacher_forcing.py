@@ -8,10 +8,10 @@ from probmotion.models.training.track_batches import Batch, TrackBatches
 from probmotion.models.vae.layers import FRAMES_AT_ONCE
 from probmotion.models.vae.pose_network import PoseGuesses, PoseNetwork
 
-__all__ = ["TaughtPoses", "scaled"]
+__all__ = ["TeacherForcedPoses", "scaled"]
 
 
-class TaughtPoses:
+class TeacherForcedPoses:
     """The poses of all frames of tracks, and of their mirror images, under every view.
 
     Frames do not look at each other and a teacher does not learn: what it says of a frame is the

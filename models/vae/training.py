@@ -39,7 +39,7 @@ from probmotion.models.vae.model import KIND, MotionVAEModel, description_of
 from probmotion.models.vae.network import MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseGuesses, PoseNetwork
 from probmotion.models.vae.settings import USUAL_THRESHOLD, MotionVAESettings
-from probmotion.models.vae.teacher_forcing import TaughtPoses, scaled
+from probmotion.models.vae.teacher_forcing import TeacherForcedPoses, scaled
 from probmotion.motion.motion import KeypointTrack
 from probmotion.validation import check_positive
 
@@ -339,7 +339,7 @@ class MotionVAETrainee(_LearnsFromTracks):
             vae.bone_decoder.load_state_dict(teacher.bone_decoder.state_dict())
         self.network = MotionVAEModel(vae, teacher)
         self._teacher = teacher
-        self._poses: dict[TrackBatches, TaughtPoses] = {}
+        self._poses: dict[TrackBatches, TeacherForcedPoses] = {}
 
     def _loss(
         self,
@@ -383,7 +383,7 @@ class MotionVAETrainee(_LearnsFromTracks):
     ) -> PoseGuesses:
         """Return the best view hypothesis of the first phase, (B, L, …)."""
         if batches not in self._poses:
-            self._poses[batches] = TaughtPoses(self._teacher, batches, rest)
+            self._poses[batches] = TeacherForcedPoses(self._teacher, batches, rest)
         guesses = self._poses[batches].of(drawn)
         scale = torch.as_tensor(drawn.scale, device=keypoints.device)
         # Which view is best does not depend on how a window is scaled.

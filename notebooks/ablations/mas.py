@@ -28,7 +28,7 @@ from probmotion.comparison import Comparison, compare
 from probmotion.comparison.results.cell_results import CellResult
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
-from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import LearningTracks, film_clips, film_windows, split_tracks
 from probmotion.files import written_whole
 from probmotion.geometry.cameras import Cameras
@@ -48,7 +48,7 @@ from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.track_batches import Augmentation
 from probmotion.models.training.trainer import train
-from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.plots.generation import draw_generation
@@ -90,7 +90,7 @@ class Study:
     def clips(self) -> dict[str, list[Motion]]:
         """3D clips by part; of those to learn from only pictures are used."""
         if self.quick:
-            walks = made_walks(24, seconds=4)
+            walks = synthetic_walks(24, seconds=4)
             return {"train": walks[:16], "validation": walks[16:18], "test": walks[18:]}
         return walk_clips(self.data)
 
@@ -302,7 +302,7 @@ def score(
         row |= {
             "to_real_mm": 1000 * near.of_draws,
             "of_real_mm": 1000 * near.of_real,
-            "mirrored": mirror_share(motions, real),
+            "mirrored": mirrored_fraction(motions, real),
             "bones_mm": 1000 * bone_changes(motions),
         }
     for where, scores in found.items():
@@ -427,7 +427,15 @@ def exact(study: Study) -> pd.DataFrame:
             "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
         },
     )
-    kept = ("swd", "tr", "mean_error", "off", "share_error", "precision", "recall")
+    kept = (
+        "swd_ratio",
+        "variance_ratio",
+        "mean_error_sd",
+        "off_manifold_ratio",
+        "mode_proportions_tv",
+        "precision",
+        "recall",
+    )
     rows = []
     # The two rows of a sampler one below the other.
     for cell in sorted(found.results, key=lambda cell: cell.sampler):

@@ -29,7 +29,7 @@ from matplotlib.ticker import NullFormatter
 
 from probmotion import seeds
 from probmotion.comparison import compare
-from probmotion.data.denoising_clips import denoising_clips, made_denoising_clips
+from probmotion.data.denoising_clips import denoising_clips, synthetic_denoising_clips
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
 from probmotion.files import written_whole
 from probmotion.io.recordings import read_recording
@@ -90,7 +90,7 @@ class Study:
     @cached_property
     def clips(self) -> dict[str, list[Motion]]:
         """3D clips by part."""
-        return made_denoising_clips(24) if self.quick else denoising_clips(self.data)
+        return synthetic_denoising_clips(24) if self.quick else denoising_clips(self.data)
 
     @cached_property
     def prior(self) -> MotionDVAE:
@@ -353,7 +353,7 @@ def speed(study: Study) -> pd.DataFrame:
         print(rows[-1], flush=True)
     made = pd.DataFrame(rows)
     figure, left = plt.subplots(figsize=(6, 4), layout="constrained")
-    for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_hidden", "hidden joints")):
+    for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_occluded", "hidden joints")):
         left.plot(made["seconds_per_frame"], made[name], "o-", label=label)
     for _, row in made.iterrows():
         left.annotate(f"{row['iterations']:.0f}", (row["seconds_per_frame"], row["g_mpjpe"]))

@@ -30,13 +30,13 @@ import torch
 from probmotion import seeds
 from probmotion.comparison import compare
 from probmotion.data.projections import Filming, centre_motion
-from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import certain, film_clips
 from probmotion.files import written_whole
 from probmotion.metrics.filming import film_motions
 from probmotion.metrics.keypoints import (
+    image_extent,
     percentage_of_correct_keypoints,
-    picture_size,
     velocity_error,
 )
 from probmotion.metrics.motion_chamfer import motion_chamfer_distance
@@ -48,7 +48,7 @@ from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
 from probmotion.models.vae.view_hypotheses import judge_hypotheses
-from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.rest_poses import estimate_rest_pose
 from probmotion.motion.skeleton import Skeleton
@@ -99,7 +99,7 @@ class Study:
         """3D clips by part."""
         if not self.quick:
             return walk_clips(self.data)
-        made = made_walks(18, PERSON)
+        made = synthetic_walks(18, PERSON)
         return {"train": made[:12], "validation": made[12:15], "test": made[15:]}
 
     @cached_property
@@ -221,7 +221,7 @@ def reconstructed(
         place = torch.nn.functional.pad(guess.translation, (0, 1))
         joints = study.body.positions(turns, guess.rotation, place, guess.log_lengths)
         found = pictured(joints, distance).numpy()
-    sizes = picture_size(shown, visible)
+    sizes = image_extent(shown, visible)
     return {
         "pck": percentage_of_correct_keypoints(found, shown, sizes, visible=visible),
         "pck_0.05": percentage_of_correct_keypoints(
@@ -354,7 +354,7 @@ def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
     for part, real in truth.items():
         near = nearest_distances(centred, real)
         row |= {f"to_{part}_mm": 1000 * near.of_draws, f"of_{part}_mm": 1000 * near.of_real}
-    return row | {"mirrored": mirror_share(centred, truth["test"])}
+    return row | {"mirrored": mirrored_fraction(centred, truth["test"])}
 
 
 PARTS = {"views": views, "table": table, "data": data, "generation": generation}

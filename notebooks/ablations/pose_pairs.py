@@ -33,15 +33,15 @@ from probmotion.data.pair_sets import (
     ground_truth,
     hold_out,
 )
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.files import written_whole
 from probmotion.interaction.annotations.backbones import annotation_views
 from probmotion.interaction.annotations.sources import DrawnAnnotations, draw_annotations
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.completion import (
     complete_keypoints,
-    hidden_joint_error,
     nearest_annotation_completion,
+    occluded_joint_error,
 )
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.geometry.pose_distances import MEASURES, pose_distances
@@ -100,7 +100,7 @@ class Study:
         What is chosen is chosen on clips that are held out of those that are shown.
         """
         if self.quick:
-            shown, hidden = hold_out(make_dances(8), ["dance-6", "dance-7"])
+            shown, hidden = hold_out(synthetic_dances(8), ["dance-6", "dance-7"])
         else:
             shown, hidden = hold_out(salsa_pairs(), SALSA_HELD_OUT)
         if self.validating:
@@ -436,7 +436,7 @@ def completion(study: Study) -> pd.DataFrame:
                 keypoints, visible, states, skeleton, views=views_around(view)
             ).positions
         for name, positions in completed.items():
-            error = hidden_joint_error(truth, positions, ~visible)
+            error = occluded_joint_error(truth, positions, ~visible)
             rows.append({"method": name, "pair": index, "error": error})
     return pd.DataFrame(rows)
 

@@ -1,4 +1,4 @@
-"""`bias_budget`: what a multi-view sampler's error is made of, on a problem that is known exactly.
+"""Decomposition of a multi-view sampler's error on a problem with known exact draws.
 
 A chain of samplers leads from exact draws to the sampler in question. Each differs from the one
 before in one thing, whose part of the error is the difference of what is measured of the two:
@@ -28,7 +28,7 @@ import numpy as np
 
 from probmotion import seeds as seeding
 from probmotion.calibration.error_measures import BiasMeasures, require_exact
-from probmotion.calibration.error_result import BiasBudget, KeptValues
+from probmotion.calibration.error_result import ErrorDecomposition, StoredValues
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import MotionPrior
@@ -36,7 +36,7 @@ from probmotion.posteriors.sampling import Sampler, load_sampler, progress_bar, 
 from probmotion.problems.conditioned import conditioned
 from probmotion.validation import check_count
 
-__all__ = ["bias_budget"]
+__all__ = ["decompose_error"]
 
 _MORE = 10
 # Settings in which `mas` and the samplers before it in the chain may be told apart by one thing.
@@ -44,7 +44,7 @@ _SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance
 _SHARED = ("schedule_power", "batch")
 
 
-def bias_budget(
+def decompose_error(
     problem: Problem,
     *,
     steps: int = 100,
@@ -55,7 +55,7 @@ def bias_budget(
     learnt: MotionPrior | None = None,
     out: str | Path | None = None,
     progress: bool = True,
-) -> BiasBudget:
+) -> ErrorDecomposition:
     """Split the error of `mas` on a problem into parts.
 
     Parameters
@@ -81,7 +81,7 @@ def bias_budget(
         is no part. What its normalisation and its training views change is its part, too.
     out : str or Path, optional
         Folder that keeps what is measured of every sampler and seed, so that the same call goes on
-        where it was stopped, and ``bias_budget.csv``.
+        where it was stopped, and ``decompose_error.csv``.
     progress : bool
         Show a bar.
 
@@ -99,7 +99,7 @@ def bias_budget(
     check_count("steps", steps, least=2)
     links, notes = _chain(problem, steps, dict(settings or {}), shared_noise, learnt)
     title = _title(problem, links, steps)
-    kept = KeptValues(None if out is None else Path(out), [[*links], draws])
+    kept = StoredValues(None if out is None else Path(out), [[*links], draws])
     measures: BiasMeasures | None = None
     with progress_bar(seeds * len(links), "bias budget", progress) as bar:
         for seed, link in itertools.product(range(seeds), links):
@@ -114,9 +114,9 @@ def bias_budget(
     values = {
         link.name: [kept.get(link.name, seed) or {} for seed in range(seeds)] for link in links
     }
-    budget = BiasBudget(title, values, notes)
+    budget = ErrorDecomposition(title, values, notes)
     if out is not None:
-        budget.write(Path(out) / "bias_budget.csv")
+        budget.write(Path(out) / "decompose_error.csv")
     return budget
 
 

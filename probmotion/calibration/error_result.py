@@ -1,4 +1,4 @@
-"""`BiasBudget`: the parts of a sampler's error, with their intervals."""
+"""`ErrorDecomposition`: the parts of a sampler's error, with their intervals."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from probmotion.metrics.intervals import t_interval
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["BiasBudget", "KeptValues"]
+__all__ = ["ErrorDecomposition", "StoredValues"]
 
 _FLOOR, _WHOLE = "floor", "whole"
 
 
-class BiasBudget:
+class ErrorDecomposition:
     """The parts of a sampler's error on one problem at one setting.
 
     Parameters
@@ -123,9 +123,9 @@ class BiasBudget:
         ValueError
             If the path does not end in ``.png``.
         """
-        from probmotion.plots.error_plots import draw_budget
+        from probmotion.plots.error_plots import draw_error_decomposition
 
-        draw_budget(self.table(), path, words=MEASURES, notes=self.notes)
+        draw_error_decomposition(self.table(), path, words=MEASURES, notes=self.notes)
         return Path(path)
 
     def write(self, path: str | Path) -> None:
@@ -134,13 +134,13 @@ class BiasBudget:
             self.table().to_csv(unfinished, index=False)
 
 
-class KeptValues:
+class StoredValues:
     """What was measured of each sampler and seed, kept in a folder if there is one.
 
     Parameters
     ----------
     folder : Path or None
-        Where ``bias_budget.json`` is; it is made.
+        Where ``decompose_error.json`` is; it is made.
     question : object
         What was asked for: what is kept answers no other question.
 
@@ -153,7 +153,7 @@ class KeptValues:
     """
 
     def __init__(self, folder: Path | None, question: Any) -> None:
-        self.path = None if folder is None else folder / "bias_budget.json"
+        self.path = None if folder is None else folder / "decompose_error.json"
         self.question = fingerprint(question)
         self._values: dict[str, dict[str, float]] = {}
         if self.path is None:

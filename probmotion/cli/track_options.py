@@ -73,7 +73,7 @@ def learning_tracks(
         Seconds of the shortest track that is kept.
     """
     from probmotion.data.projections import Filming
-    from probmotion.data.synthetic.walks import made_walks
+    from probmotion.data.synthetic.walks import synthetic_walks
     from probmotion.data.tracks.learning import film_clips, read_tracks, split_tracks
     from probmotion.io.files import files_named, load_motion
     from probmotion.motion.skeleton import Skeleton
@@ -106,7 +106,7 @@ def learning_tracks(
         # A file may hold another name; options name clips by their files.
         clips = [replace(load_motion(path), name=path.stem) for path in files_named(data.clips)]
         prepared = film_clips(
-            clips or made_walks(skeleton=skeleton),
+            clips or synthetic_walks(skeleton=skeleton),
             skeleton,
             data.fps,
             views=64 if data.views is None else data.views,

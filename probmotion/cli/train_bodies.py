@@ -180,7 +180,7 @@ def learning_clips(
     frames : int
         Of a window: shorter clips are left out.
     """
-    from probmotion.data.denoising_clips import made_denoising_clips
+    from probmotion.data.denoising_clips import synthetic_denoising_clips
     from probmotion.validation import check_count
 
     check_count("data_seed", data.data_seed, least=0)
@@ -195,7 +195,7 @@ def learning_clips(
         for name in ("validation", "test"):
             if getattr(data, name):
                 raise ValueError(f"{name} is given without clips, expected --clips FILE… beside it")
-        made = made_denoising_clips(seed=data.data_seed)
+        made = synthetic_denoising_clips(seed=data.data_seed)
         every = [clip for clips in made.values() for clip in clips]
         long = {clip.name: clip for clip in _long_clips(every, skeleton, fps, frames)}
         parts = {part: [long[clip.name] for clip in clips] for part, clips in made.items()}

@@ -166,7 +166,7 @@ def _taken(alike: Sequence[Standing]) -> Standing:
 
 def _wrong(quality: str, value: float) -> float:
     """Return how far a value is from the right one, in the order that :func:`best_of` has."""
-    if quality != "swd":
+    if quality != "swd_ratio":
         return value
     return abs(math.log(value)) if value > 0 else math.inf
 
@@ -208,11 +208,16 @@ def _apart(rhat: pd.Series, at_most: float) -> list[str]:
 _BY_CHANCE = 0.05
 
 _WARNINGS: Sequence[tuple[str, float, float, str]] = (
-    ("swd", 1 / 1.5, 1.5, "far from reference draws: swd {:.3g}"),
-    ("tr", 1 / 1.5, 1.5, "spread wrong: trace of covariance {:.2g} of the references'"),
-    ("off", 1 / 1.5, 1.5, "variance off the prior's manifold {:.2g} of the references'"),
+    ("swd_ratio", 1 / 1.5, 1.5, "far from reference draws: swd {:.3g}"),
+    ("variance_ratio", 1 / 1.5, 1.5, "spread wrong: trace of covariance {:.2g} of the references'"),
+    (
+        "off_manifold_ratio",
+        1 / 1.5,
+        1.5,
+        "variance off the prior's manifold {:.2g} of the references'",
+    ),
     ("c2st", 0.0, 0.75, "a classifier tells its draws from reference ones: C2ST {:.2g}"),
-    ("share_error", 0.0, 0.3, "styles' shares wrong by {:.2g}"),
+    ("mode_proportions_tv", 0.0, 0.3, "styles' shares wrong by {:.2g}"),
 )
 """What tells against a sampler: a measure, within what it is right enough, and the words."""
 

@@ -17,7 +17,7 @@ from probmotion.comparison.results.naming import (
     named_samplers,
 )
 from probmotion.comparison.results.plan import Plan
-from probmotion.comparison.results.stored_problems import keep_problem
+from probmotion.comparison.results.stored_problems import store_problem
 from probmotion.comparison.run.locks import locked
 from probmotion.comparison.run.tasks import Grid, refuse_taken, run_grid
 from probmotion.files import writable_folder
@@ -119,7 +119,7 @@ def compare(
             # Pictures show reference draws that the first seed is measured against.
             seed = addressed.integer(0, "exact", name)
             try:
-                keep_problem(problem, folder / "problems" / name, seed=seed)
+                store_problem(problem, folder / "problems" / name, seed=seed)
             except OSError:
                 raise
             except Exception:

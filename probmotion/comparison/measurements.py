@@ -21,11 +21,19 @@ if TYPE_CHECKING:
 
     from probmotion.comparison.comparison import Comparison
 
-__all__ = ["Measured", "keep_measured", "measured"]
+__all__ = ["Measured", "measured", "save_measurements"]
 
 _FOLDER = Path(__file__).parent
 _ROWS, _ABOUT = "measured.csv", "measured.json"
-_KEPT = (*QUALITIES, "seconds", "tr", "off", "share_error", "c2st", "rhat")
+_KEPT = (
+    *QUALITIES,
+    "seconds",
+    "variance_ratio",
+    "off_manifold_ratio",
+    "mode_proportions_tv",
+    "c2st",
+    "rhat",
+)
 _DIGITS = 5
 
 
@@ -64,7 +72,7 @@ class Measured:
     words: dict[str, str]
 
 
-def keep_measured(comparison: Comparison, command: str, folder: str | Path = _FOLDER) -> None:
+def save_measurements(comparison: Comparison, command: str, folder: str | Path = _FOLDER) -> None:
     """Write what advice needs of a comparison; by default in the place of what is shipped.
 
     Parameters

@@ -14,7 +14,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["DENOISING_CLIPS", "denoising_clips", "made_denoising_clips"]
+__all__ = ["DENOISING_CLIPS", "denoising_clips", "synthetic_denoising_clips"]
 
 _FPS = 30.0
 _FRAMES = 30
@@ -95,7 +95,7 @@ def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
     }
 
 
-def made_denoising_clips(
+def synthetic_denoising_clips(
     n: int = 60, *, seconds: float = 4.0, seed: int = 0
 ) -> dict[str, list[Motion]]:
     """Return people who walk, run and march, made by the project, for where there are no clips.

@@ -11,7 +11,13 @@ from scipy.signal import savgol_filter
 
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
-__all__ = ["filled_between", "fit_acceleration", "kalman_smooth", "log_evidence", "savitzky_golay"]
+__all__ = [
+    "filled_between",
+    "fit_acceleration",
+    "kalman_smooth",
+    "log_marginal_likelihood",
+    "savitzky_golay",
+]
 
 _FIRST_POSITION = 10.0
 """Standard deviation of a joint's first position about the mean of its seen entries, metres."""
@@ -149,7 +155,7 @@ def kalman_smooth(
     return means + problem.centre, np.broadcast_to(deviation, means.shape).copy()
 
 
-def log_evidence(
+def log_marginal_likelihood(
     joints: np.ndarray,
     confidence: np.ndarray,
     *,
@@ -158,7 +164,9 @@ def log_evidence(
     acceleration: float | np.ndarray,
 ) -> np.ndarray:
     """Return log p(seen entries) of each joint, (J,), given what :func:`kalman_smooth` is."""
-    return _forward(_Problem.of(joints, confidence, noise, fps, acceleration)).log_evidence
+    return _forward(
+        _Problem.of(joints, confidence, noise, fps, acceleration)
+    ).log_marginal_likelihood
 
 
 def fit_acceleration(
@@ -166,15 +174,17 @@ def fit_acceleration(
 ) -> np.ndarray:
     """Return the accelerations under which each joint's seen entries are most probable, (J,).
 
-    For each joint the maximum of :func:`log_evidence` between 0.001 and 1000 m/s^1.5, found by
+    For each joint the maximum of :func:`log_marginal_likelihood` between 0.001 and 1000 m/s^1.5, found by
     Brent's method on the logarithm. A joint that does not move is taken to the lower end.
     """
     joints, confidence = np.asarray(joints), np.asarray(confidence)
-    log_evidence(joints, confidence, noise=noise, fps=fps, acceleration=1.0)  # refuses bad input
+    log_marginal_likelihood(
+        joints, confidence, noise=noise, fps=fps, acceleration=1.0
+    )  # refuses bad input
 
     def cost(exponent: float, one: slice) -> float:
         given = {"noise": noise, "fps": fps, "acceleration": 10.0**exponent}
-        return -float(log_evidence(joints[:, one], confidence[:, one], **given)[0])
+        return -float(log_marginal_likelihood(joints[:, one], confidence[:, one], **given)[0])
 
     bounds = (math.log10(_LEAST), math.log10(_MOST))
     found = []
@@ -236,7 +246,7 @@ class _Passes(NamedTuple):
     covariance: np.ndarray  # (L, J, 2, 2)
     predicted: np.ndarray  # (L, J, 2, 3)
     predicted_covariance: np.ndarray  # (L, J, 2, 2)
-    log_evidence: np.ndarray  # (J,)
+    log_marginal_likelihood: np.ndarray  # (J,)
 
 
 def _forward(problem: _Problem) -> _Passes:
@@ -245,7 +255,7 @@ def _forward(problem: _Problem) -> _Passes:
     means, covariances = np.empty((2, L, J, 2, 3)), np.empty((2, L, J, 2, 2))
     mean = np.zeros((J, 2, 3))
     covariance = np.tile(np.diag([_FIRST_POSITION**2, _FIRST_SPEED**2]), (J, 1, 1))
-    log_evidence = np.zeros(J)
+    log_marginal_likelihood = np.zeros(J)
     for frame in range(L):
         if frame > 0:
             mean = problem.step @ mean
@@ -264,8 +274,8 @@ def _forward(problem: _Problem) -> _Passes:
         covariance = kept @ covariance @ np.swapaxes(kept, -1, -2) + added
         means[0, frame], covariances[0, frame] = mean, covariance
         square = (innovation[seen] ** 2).sum(axis=-1) / total[seen]
-        log_evidence[seen] -= 0.5 * (square + 3 * np.log(2 * math.pi * total[seen]))
-    return _Passes(means[0], covariances[0], means[1], covariances[1], log_evidence)
+        log_marginal_likelihood[seen] -= 0.5 * (square + 3 * np.log(2 * math.pi * total[seen]))
+    return _Passes(means[0], covariances[0], means[1], covariances[1], log_marginal_likelihood)
 
 
 def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:

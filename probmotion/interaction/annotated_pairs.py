@@ -199,7 +199,7 @@ class AnnotatedPairs:
         log_density = logsumexp(log_terms, axis=-1) - math.log(self.n_views)
         return log_density.reshape(batch), closest.reshape(*batch, self.n_views)
 
-    def degenerate_share(self, positions: np.ndarray) -> float:
+    def degenerate_fraction(self, positions: np.ndarray) -> float:
         """Return the share of pictures of poses (n, 1, J, 3) whose joints had to be joggled."""
         check_shape("positions", positions, ("n", 1, self.n_joints, 3))
         pictures = project_to_views(positions[:, 0], self.views, self.skeleton)

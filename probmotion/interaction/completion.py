@@ -24,8 +24,8 @@ __all__ = [
     "blend",
     "complete",
     "complete_keypoints",
-    "hidden_joint_error",
     "nearest_annotation_completion",
+    "occluded_joint_error",
 ]
 
 BANDWIDTH = 0.3
@@ -224,7 +224,7 @@ def blend(
     return blended
 
 
-def hidden_joint_error(truth: np.ndarray, estimate: np.ndarray, hidden: np.ndarray) -> float:
+def occluded_joint_error(truth: np.ndarray, estimate: np.ndarray, hidden: np.ndarray) -> float:
     """Return the mean distance of estimated from true hidden joints, metres.
 
     Parameters

@@ -12,8 +12,8 @@ from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = [
     "fit_linear_map",
+    "image_extent",
     "percentage_of_correct_keypoints",
-    "picture_size",
     "velocity_error",
 ]
 
@@ -34,7 +34,7 @@ def percentage_of_correct_keypoints(
         Keypoints; what is not visible may be NaN in the truth.
     size : float or ndarray
         max(h, w) of the picture in the keypoints' unit: one number, or one for each sequence (…)
-        or frame (…, L). See :func:`picture_size` for tracks without a picture.
+        or frame (…, L). See :func:`image_extent` for tracks without a picture.
     visible : ndarray of bool, (…, L, J), optional
         Keypoints that count; all by default.
     share : float
@@ -68,7 +68,7 @@ def percentage_of_correct_keypoints(
     return 100 * float((errors < share * sizes)[seen].mean())
 
 
-def picture_size(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
+def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
     """Return the larger side of the box around each sequence, for tracks without a picture.
 
     ``(…, L, J, 2) → (…)``: one box around all visible keypoints of all its frames, as a camera

@@ -52,12 +52,13 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     Against reference draws, exact ones or those that a long run left, where the problem has them
     (aligned to one motion where the problem says so, but for densities, styles and the manifold):
 
-    - ``swd``: sliced Wasserstein distance over that of two exact sets; 1 is right
-    - ``tr``: trace of covariance over the exact one; < 1 is over-confident
-    - ``mean_error``: distance of means over √tr of the exact covariance; 0 is right
-    - ``off``: variance off the prior's manifold over exact draws'; 1 is right
+    - ``swd_ratio``: sliced Wasserstein distance over that of two exact sets; 1 is right
+    - ``variance_ratio``: trace of covariance over the exact one; < 1 is over-confident
+    - ``mean_error_sd``: distance of means over √tr of the exact covariance; 0 is right
+    - ``off_manifold_ratio``: variance off the prior's manifold over exact draws'; 1 is right
     - ``log_density_gap``: mean log density less exact draws', nats; 0 is right
-    - ``share_<style>`` and ``share_error``: styles, and their total variation from exact draws'
+    - ``mode_proportion_<style>`` and ``mode_proportions_tv``: proportion of each style, and total
+      variation distance of the proportions from those of exact draws
     - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
     - ``mmd``: squared maximum mean discrepancy; 0 is right, and may be missed to either side
     - ``c2st``: how often a classifier tells draws from reference draws; .5 is right
@@ -152,21 +153,21 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
     exact = _exact_draws(problem, seed, n)
     prior = problem.posterior.prior
     found = {
-        "swd": distribution.sliced_wasserstein_ratio(some, exact.sets, exact.directions),
-        "tr": float(distribution.trace_ratio(flat, exact.flat)),
-        "mean_error": float(distribution.mean_error(flat, exact.flat)),
+        "swd_ratio": distribution.sliced_wasserstein_ratio(some, exact.sets, exact.directions),
+        "variance_ratio": float(distribution.trace_ratio(flat, exact.flat)),
+        "mean_error_sd": float(distribution.mean_error(flat, exact.flat)),
     }
     off = _off_manifold(prior, positions)
     if off is not None and exact.off is not None:
-        found["off"] = off / exact.off
+        found["off_manifold_ratio"] = off / exact.off
     log_density = _log_density(problem, positions)
     if log_density is not None and exact.log_density is not None:
         found["log_density_gap"] = log_density - exact.log_density
     shares = _shares(prior, positions)
     if shares:
-        found |= {f"share_{style}": share for style, share in shares.items()}
+        found |= {f"mode_proportion_{style}": share for style, share in shares.items()}
         apart = [abs(share - exact.shares[style]) for style, share in shares.items()]
-        found["share_error"] = 0.5 * sum(apart)
+        found["mode_proportions_tv"] = 0.5 * sum(apart)
     found["precision"], found["recall"] = distribution.precision_recall(some, exact.sets[0])
     found["mmd"] = maximum_mean_discrepancy(some, exact.sets[0])
     found["c2st"] = classifier_two_sample(some, exact.sets[0], seed)
@@ -252,7 +253,7 @@ def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float
 
 def _degenerate(problem: Problem, positions: np.ndarray) -> dict[str, float]:
     likelihood = problem.posterior.likelihood
-    counted = getattr(likelihood, "degenerate_share", None)
+    counted = getattr(likelihood, "degenerate_fraction", None)
     if counted is None:
         return {}
     return {"degenerate": float(counted(positions[:: max(1, len(positions) // _LOOKED_AT)]))}
@@ -265,7 +266,7 @@ def accuracy_of(
 
     - ``mpjpe``: after aligning the root in every frame, mean over draws: what to expect of one
     - ``mpjpe_mean``: of the mean of all draws; ``mpjpe_best``: of the best draw
-    - ``mpjpe_visible``, ``mpjpe_hidden``: like ``mpjpe``, where the evidence saw the joint or not
+    - ``mpjpe_visible``, ``mpjpe_occluded``: like ``mpjpe``, where the evidence saw the joint or not
     - ``g_mpjpe``, ``g_mpjpe_mean`` and each with ``_visible``, ``_hidden``: without alignment
     - ``pa_mpjpe``: after the best similarity per frame
     - ``acceleration_error``: mean over draws; ``acceleration_ratio``: mean size of a draw's over
@@ -286,7 +287,7 @@ def accuracy_of(
     metres |= {"g_mpjpe": far.mean(), "g_mpjpe_mean": far_mean.mean()}
     seen = _visible(posterior)
     if seen is not None and not seen.all() and seen.any():
-        for where, mask in (("visible", seen), ("hidden", ~seen)):
+        for where, mask in (("visible", seen), ("occluded", ~seen)):
             metres[f"mpjpe_{where}"] = accuracy.mean_over(errors, mask).mean()
             metres[f"g_mpjpe_{where}"] = accuracy.mean_over(far, mask).mean()
             metres[f"g_mpjpe_mean_{where}"] = accuracy.mean_over(far_mean, mask)
@@ -318,7 +319,7 @@ def _in_pictures(
     found = {}
     # One joint in one frame has no size to compare errors with.
     if np.ptp(true, axis=(-3, -2)).any(axis=-1).all():
-        size = keypoints.picture_size(true)
+        size = keypoints.image_extent(true)
         found["pck"] = keypoints.percentage_of_correct_keypoints(shown, true, size)
     if np.diff(true, axis=-3).any():
         found["velocity_error"] = keypoints.velocity_error(shown, true)

@@ -16,7 +16,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = [
     "NearestDistances",
-    "mirror_share",
+    "mirrored_fraction",
     "nearest_distances",
     "windows",
     "yaw_aligned_distances",
@@ -93,7 +93,7 @@ def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
     return NearestDistances(float(of_draws.mean()), float(of_real.mean()))
 
 
-def mirror_share(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> float:
+def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> float:
     """Return the share of draws whose mirror image in depth is nearer to real motion than they are.
 
     The image exchanges near and far, and no names: knees bend backwards. Orthographic cameras at

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_budget"]
+__all__ = ["draw_error_decomposition"]
 
 _COLUMNS = ("setting", "measure", "part", "mean", "low", "high")
 _FLOOR, _WHOLE = "floor", "whole"
@@ -30,7 +30,7 @@ _WIDTH = 0.8
 _LETTERS = 26
 
 
-def draw_budget(
+def draw_error_decomposition(
     table: pd.DataFrame,
     path: str | Path | None = None,
     *,
@@ -46,7 +46,7 @@ def draw_budget(
     Parameters
     ----------
     table : DataFrame
-        As :meth:`~probmotion.calibration.error_result.BiasBudget.table` of one setting.
+        As :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table` of one setting.
     path : str or Path, optional
         Where to write, ``.png``; nowhere by default.
     words : mapping of str to str, optional

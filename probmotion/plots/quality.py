@@ -54,7 +54,7 @@ def plot_quality_against_cost(
     from matplotlib.figure import Figure
 
     if quality is None:
-        quality = first_quality(table) or "swd"
+        quality = first_quality(table) or "swd_ratio"
     problems = [str(name) for name in dict.fromkeys(table["problem"])]
     points = {problem: _points(table, problem, quality, cost) for problem in problems}
     if not any(points.values()):
@@ -71,7 +71,7 @@ def plot_quality_against_cost(
         _draw_panel(
             panel, problem, points[problem], styles, _absent(table, problem, points[problem])
         )
-        if quality == "swd" and points[problem]:
+        if quality == "swd_ratio" and points[problem]:
             panel.axhline(1.0, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
         panel.set_xlabel(cost, color=INK)
     for panel in panels[len(problems) :]:

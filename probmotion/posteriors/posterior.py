@@ -10,7 +10,7 @@ import numpy as np
 from probmotion.arrays import Array, to_numpy
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import (
-    ChecksEvidence,
+    ChecksObservations,
     ComparesViews,
     HasCoordinateSpeeds,
     HasLogDensity,
@@ -68,8 +68,8 @@ class MotionPosterior:
                 f"likelihood is of the joints {', '.join(seen.joint_names)}, expected the prior's, "
                 f"{', '.join(self.skeleton.joint_names)}; retarget one to the other"
             )
-        if isinstance(self.prior, ChecksEvidence):
-            self.prior.check_evidence(self.likelihood)
+        if isinstance(self.prior, ChecksObservations):
+            self.prior.check_observations(self.likelihood)
         fps = getattr(self.likelihood, "fps", None)
         if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
             raise ValueError(
@@ -127,7 +127,7 @@ class MotionPosterior:
         def evidence(asked: np.ndarray) -> tuple[np.ndarray, ...]:
             return (self.log_likelihood(theta[asked]),)
 
-        return self._with_evidence(theta, np.asarray(log_prior), evidence)[0]
+        return self._with_observations(theta, np.asarray(log_prior), evidence)[0]
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None = None
@@ -164,7 +164,7 @@ class MotionPosterior:
             own = None if generators is None else [generators[i] for i in np.flatnonzero(asked)]
             return likelihood.evaluate(to_numpy(self.prior.motion(theta[asked])), own)
 
-        log_density, closest = self._with_evidence(theta, log_prior, evidence)
+        log_density, closest = self._with_observations(theta, log_prior, evidence)
         return log_density, closest
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
@@ -188,7 +188,7 @@ class MotionPosterior:
             )
         return self.prior.coordinate_speeds(self.likelihood.joint_speeds(closest))
 
-    def _with_evidence(
+    def _with_observations(
         self,
         theta: np.ndarray,
         log_prior: np.ndarray,

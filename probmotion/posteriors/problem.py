@@ -18,7 +18,7 @@ from probmotion.posteriors.protocols import (
     NotConjugate,
     Samplable,
 )
-from probmotion.posteriors.reference import HasPositionDensity, KeptReference, log_density_at
+from probmotion.posteriors.reference import HasPositionDensity, StoredReference, log_density_at
 from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Problem", "ScoresGeneration", "simulated"]
@@ -72,7 +72,7 @@ class Problem:
         Real motions of the kind, metres, that draws are to cover; nobody has learnt from them.
     generation : ScoresGeneration, optional
         Real 2D motion of the kind that draws, filmed, are to be like.
-    kept : KeptReference, optional
+    kept : StoredReference, optional
         Draws of a long run, where nothing is exact.
     aligned_to : ndarray, (L, J, 3), optional
         Motion to which draws and reference draws are aligned, each moved and turned as a whole,
@@ -94,7 +94,7 @@ class Problem:
     truth: np.ndarray | None = None
     held_out: np.ndarray | None = None
     generation: ScoresGeneration | None = None
-    kept: KeptReference | None = None
+    kept: StoredReference | None = None
     aligned_to: np.ndarray | None = None
     simulate: Callable[[int], Problem] | None = None
 

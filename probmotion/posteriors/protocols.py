@@ -17,7 +17,7 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.seeds import RandomNumbers
 
 __all__ = [
-    "ChecksEvidence",
+    "ChecksObservations",
     "ComparesViews",
     "DenoiserCovariance2D",
     "DenoiserCovariance3D",
@@ -141,10 +141,10 @@ class HasCoordinateSpeeds(Protocol):
 
 
 @runtime_checkable
-class ChecksEvidence(Protocol):
+class ChecksObservations(Protocol):
     """A prior that knows of evidence it cannot have."""
 
-    def check_evidence(self, likelihood: Likelihood) -> None:
+    def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if no motion of the prior can have made the evidence."""
 
 

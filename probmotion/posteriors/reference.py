@@ -1,4 +1,4 @@
-"""`KeptReference`: reference draws of a long run, with a certificate of what they are.
+"""`StoredReference`: reference draws of a long run, with a certificate of what they are.
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
 ``certificate.json``. It is known to be of a posterior by that posterior's density at some of the
@@ -29,7 +29,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = [
     "HasPositionDensity",
-    "KeptReference",
+    "StoredReference",
     "fingerprint_of",
     "log_density_at",
 ]
@@ -49,7 +49,7 @@ class HasPositionDensity(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class KeptReference:
+class StoredReference:
     """Draws that were made once, and how they are known to be right.
 
     Parameters
@@ -144,7 +144,7 @@ class KeptReference:
         return folder
 
     @classmethod
-    def load(cls, folder: str | Path) -> KeptReference:
+    def load(cls, folder: str | Path) -> StoredReference:
         """Read what :meth:`save` wrote.
 
         Raises

@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from probmotion.posteriors.problem import Problem
-from probmotion.posteriors.reference import KeptReference
+from probmotion.posteriors.reference import StoredReference
 from probmotion.problems.clips import CLIP_PROBLEMS, clips_problem
 from probmotion.problems.denoising import DENOISING_PROBLEMS
 from probmotion.problems.gait import GAIT_OUTLIER_PROBLEMS, GAIT_PROBLEMS
@@ -20,8 +20,8 @@ from probmotion.problems.references.store import find_reference
 from probmotion.threads import one_thread
 
 __all__ = [
-    "KeptReference",
     "Problem",
+    "StoredReference",
     "clips_problem",
     "load_problem",
     "pairs_problem",

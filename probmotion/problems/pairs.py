@@ -79,11 +79,11 @@ _SALSA = "salsa (CMU 60 and 61), 5599 annotated 2D pairs of 7 clips and one 3D s
 
 
 def _made() -> Problem:
-    from probmotion.data.synthetic.dances import make_dances
+    from probmotion.data.synthetic.dances import synthetic_dances
     from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
     return pairs_problem(
-        make_dances(8, seed=0),
+        synthetic_dances(8, seed=0),
         ["dance-6", "dance-7"],
         n_annotations=300,
         n_held_out=60,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.results.stored_problems import KeptProblem, read_kept
+from probmotion.comparison.results.stored_problems import StoredProblem, read_stored
 from probmotion.report.motions import Shown, choose_draws, motion_numbers
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _shown(comparison: GridResults, name: str) -> Shown | None:
     if kept is None:
         if skeleton is None:
             return None
-        kept = KeptProblem(skeleton, fps)
+        kept = StoredProblem(skeleton, fps)
     rows: dict[str, np.ndarray] = {}
     if kept.held_out is not None:
         rows[_HELD_OUT] = choose_draws(kept.held_out, _MOST_POSES)
@@ -79,9 +79,9 @@ def _shown(comparison: GridResults, name: str) -> Shown | None:
     return Shown(kept, rows) if rows else None
 
 
-def _kept(comparison: GridResults, name: str) -> KeptProblem | None:
+def _kept(comparison: GridResults, name: str) -> StoredProblem | None:
     """What the comparison kept of a problem; of one that is registered, what it has."""
-    kept = read_kept(comparison.folder / "problems" / name)
+    kept = read_stored(comparison.folder / "problems" / name)
     if kept is not None:
         return kept
     from probmotion.problems.catalogue import load_problem, problem_descriptions
@@ -89,7 +89,7 @@ def _kept(comparison: GridResults, name: str) -> KeptProblem | None:
     if problem_descriptions().get(name) != comparison.plan.problems[name]:
         return None
     try:
-        return KeptProblem.of(load_problem(name))
+        return StoredProblem.of(load_problem(name))
     except FileNotFoundError:
         return None
 
@@ -156,7 +156,7 @@ def _hidden(hidden: bool) -> str:
     return " hidden" if hidden else ""
 
 
-def _counted(label: str, n: int, problem: KeptProblem) -> str:
+def _counted(label: str, n: int, problem: StoredProblem) -> str:
     if label == _HELD_OUT and problem.held_out is not None:
         return f"{n} held-out pose{'s' * (n != 1)}"
     if label == _REFERENCE and problem.reference is not None:
@@ -168,7 +168,7 @@ def _kind(shown: Shown) -> str:
     return "skeletons" if shown.frames == 1 else "moving skeletons"
 
 
-def _key(problem: KeptProblem) -> str:
+def _key(problem: StoredProblem) -> str:
     entries = []
     if problem.skeleton.mirrored_pairs:
         entries += [("left", "left side"), ("right", "right side")]
@@ -202,7 +202,7 @@ def _sentence(shown: Shown) -> str:
         parts.append(text + ".")
     if problem.keypoints is not None:
         parts.append("The views start beside the first camera, where what it cannot see is seen.")
-    if problem.has_evidence and problem.keypoints is None and problem.joints is None:
+    if problem.has_observations and problem.keypoints is None and problem.joints is None:
         parts.append("The evidence is of a kind that is not drawn.")
     if problem.reference is None and problem.held_out is None:
         parts.append("There are no reference draws.")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.comparison.results.stored_problems import KeptProblem
+from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.plots.skeletons import _facing, _sides
 
@@ -28,7 +28,7 @@ class Shown:
 
     Parameters
     ----------
-    problem : KeptProblem
+    problem : StoredProblem
         The skeleton, truth and evidence.
     rows : mapping of str to ndarray, (n, L, J, 3)
         Motions by label, metres; the first row sets the scale.
@@ -36,7 +36,7 @@ class Shown:
         Every so many frames are shown.
     """
 
-    problem: KeptProblem
+    problem: StoredProblem
     rows: Mapping[str, np.ndarray]
     step: int = 1
 
@@ -99,7 +99,7 @@ _SIDES = {"middle": "ink", "left": "left", "right": "right"}
 """The colour of a side, as page.css calls it."""
 
 
-def _sided(problem: KeptProblem) -> list[tuple[tuple[int, int], str]]:
+def _sided(problem: StoredProblem) -> list[tuple[tuple[int, int], str]]:
     sides = _sides(problem.skeleton)
     return [(bone, sides[bone[0]]) for bone in problem.skeleton.bones]
 
@@ -133,7 +133,7 @@ def _extent(first: np.ndarray) -> dict[str, float]:
     }
 
 
-def _filmed(problem: KeptProblem, step: int) -> dict[str, Any]:
+def _filmed(problem: StoredProblem, step: int) -> dict[str, Any]:
     camera = problem.camera
     assert camera is not None
     assert camera.centre is not None

@@ -69,7 +69,9 @@ def quality_against_cost(
     points = _points(rows, quality, list(samplers)) if quality else {}
     if quality is None or not points:
         return ""
-    drawing = _drawn(points, list(samplers), problem, QUALITIES[quality], quality == "swd", place)
+    drawing = _drawn(
+        points, list(samplers), problem, QUALITIES[quality], quality == "swd_ratio", place
+    )
     return f'<figure class="plot">{drawing}{_absent(points, samplers)}</figure>'
 
 

@@ -134,7 +134,7 @@ class Ancestral2D:
             raise UnsupportedPosterior(
                 self.name,
                 "draws single views of a prior and has no place for evidence",
-                word="evidence",
+                word="observations",
                 others=suited(posterior),
             )
         return prior

@@ -82,7 +82,7 @@ class Evidence:
             raise UnsupportedPosterior(
                 sampler.name,
                 f"is guided by linear evidence with Gaussian noise, but {error}",
-                word="evidence",
+                word="observations",
                 others=suited(posterior),
             ) from error
         scale = posterior.prior.scale  # type: ignore[attr-defined]

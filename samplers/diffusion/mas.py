@@ -234,7 +234,7 @@ class MultiViewAncestral:
                 self.name,
                 "is guided by evidence only where the views are orthographic and share their "
                 f"noise, and perspective is {self.perspective}, shared_noise {self.shared_noise}",
-                word="evidence",
+                word="observations",
             )
         return SeparateViews(prior, self.cameras, views, self.schedule, shape, self.shared_noise)
 

@@ -164,7 +164,7 @@ class ScoreDistillation:
             raise UnsupportedPosterior(
                 self.name,
                 "optimises towards the modes of the prior and has no place for evidence",
-                word="evidence",
+                word="observations",
                 others=suited(posterior),
             )
         counts = {"denoiser": 0}

@@ -267,7 +267,7 @@ class DVAEInference:
             raise UnsupportedPosterior(
                 self.name,
                 f"was given a network that does not read {type(likelihood).__name__}",
-                word="evidence",
+                word="observations",
             )
         network = self.network
         if network is None and isinstance(prior, HasInferenceNetwork):

@@ -88,7 +88,7 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
         _SAMPLER,
         f"needs evidence of keypoints or joints to show its network, which "
         f"{type(likelihood).__name__} is not",
-        word="evidence",
+        word="observations",
     )
 
 

@@ -92,7 +92,7 @@ class Unfit(Batch):
     name: ClassVar[str] = "unfit"
 
     def sample(self, posterior, **settings):
-        raise UnsupportedPosterior("unfit", "takes no evidence", "evidence", ["exact"])
+        raise UnsupportedPosterior("unfit", "takes no evidence", "observations", ["exact"])
 
 
 SMALL = {"draws": 30, "chains": 2, "workers": 0, "progress": False}

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from probmotion import Keypoints2D, Motion, MotionPosterior, NoiseSchedule, UnsupportedPosterior
-from probmotion.calibration.error_decomposition import bias_budget
+from probmotion.calibration.error_decomposition import decompose_error
 from probmotion.calibration.error_measures import BiasMeasures
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
@@ -23,7 +23,7 @@ from probmotion.problems import load_problem
 from probmotion.samplers.diffusion.guidance import WeightedTriangulation
 
 JOINTS = 60
-budget_of = partial(bias_budget, progress=False)
+budget_of = partial(decompose_error, progress=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +306,7 @@ def test_what_is_stopped_goes_on(tmp_path):
         again = run(out=tmp_path / "parts")
     assert len(calls) == 6 + 10 - 5
     assert again.table().equals(whole.table())
-    csv = [(tmp_path / name / "bias_budget.csv").read_text() for name in ("whole", "parts")]
+    csv = [(tmp_path / name / "decompose_error.csv").read_text() for name in ("whole", "parts")]
     assert csv[0] == csv[1]
     with pytest.raises(ValueError, match="holds another budget, expected a new folder"):
         budget_of(problem_of(prior), steps=5, seeds=2, draws=12, out=tmp_path / "parts")

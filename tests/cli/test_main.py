@@ -104,10 +104,10 @@ def test_compare_writes_the_table(tmp_path, capsys):
     assert list(table.columns) == ["problem", "sampler", "seed", "metric", "value"]
     assert set(table["sampler"]) == {"exact", "mas"}
     assert set(table["seed"]) == {0, 1}
-    assert {"swd", "seconds"} <= set(table["metric"])
+    assert {"swd_ratio", "seconds"} <= set(table["metric"])
     printed = capsys.readouterr().out
     assert "exact" in printed
-    assert "swd" in printed
+    assert "swd_ratio" in printed
     # 20 draws of 3 views in 5 steps: the settings arrived.
     calls = table[(table["sampler"] == "mas") & (table["metric"] == "denoiser_evaluations")]
     assert set(calls["value"]) == {20 * 3 * 5}
@@ -171,7 +171,7 @@ def test_own_clips_of_two_formats_make_a_problem(tmp_path):
     pattern = str(tmp_path / "walk*")
     assert main(["compare", "--clips", pattern, *words.split(), str(tmp_path / "out")]) == 0
     table = pd.read_csv(tmp_path / "out" / "table.csv")
-    assert {"swd", "mpjpe_mm"} <= set(table["metric"])
+    assert {"swd_ratio", "mpjpe_mm"} <= set(table["metric"])
 
 
 # Showing and converting.

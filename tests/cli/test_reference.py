@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probmotion.cli.main import main
-from probmotion.posteriors.reference import KeptReference
+from probmotion.posteriors.reference import StoredReference
 from probmotion.problems import load_problem
 from probmotion.problems.references import making as references
 
@@ -19,7 +19,7 @@ def test_it_writes_draws_and_their_certificate(tmp_path, capsys):
     words = ["reference", "gait-sparse(components=6,frames=2)", "--draws", "80"]
     assert main([*words, "--out", str(tmp_path)]) == 0
     assert "two runs apart: sliced Wasserstein ratio" in capsys.readouterr().out
-    kept = KeptReference.load(tmp_path / SMALL)
+    kept = StoredReference.load(tmp_path / SMALL)
     assert (kept.n, kept.certificate["exact"]) == (80, True)
     assert json.loads((tmp_path / SMALL / "certificate.json").read_text())["problem"] == SMALL
     kept.check(SMALL, load_problem(SMALL).posterior)

@@ -21,10 +21,8 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import save_motion
 from probmotion.models.dvae.denoiser_training import usual_denoiser_training
 from probmotion.models.dvae.joint_noise import JointNoise
-from probmotion.models.dvae.motion_denoiser import KIND as DENOISER
-from probmotion.models.dvae.motion_denoiser import MotionDenoiser
-from probmotion.models.dvae.motion_dvae import KIND as DVAE
-from probmotion.models.dvae.motion_dvae import MotionDVAE
+from probmotion.models.dvae.motion_denoiser import KIND as DENOISER, MotionDenoiser
+from probmotion.models.dvae.motion_dvae import KIND as DVAE, MotionDVAE
 from probmotion.models.dvae.training import usual_dvae_training
 from probmotion.models.training.checkpoints import WEIGHTS, load_checkpoint
 

@@ -12,7 +12,7 @@ import pytest
 from probmotion import Skeleton
 from probmotion.cli.main import main
 from probmotion.data.projections import DetectorNoise, project_clips
-from probmotion.data.synthetic.animals import ANIMAL_SKELETON, made_animals
+from probmotion.data.synthetic.animals import ANIMAL_SKELETON, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.io.files import read_keypoints, save_motion
 from probmotion.models.vae.motion_vae import MotionVAE
@@ -104,7 +104,7 @@ def table_of(track: KeypointTrack, path: Path) -> None:
 def test_an_animal_of_one_s_own_comes_from_a_detector_s_tables(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clips = [clip.retarget(ANIMAL_SKELETON) for clip in made_animals(4, seed=1)]
+    clips = [clip.retarget(ANIMAL_SKELETON) for clip in synthetic_animals(4, seed=1)]
     for track in project_clips(clips, views=3):
         table_of(track, tmp_path / f"{track.name.replace('/', '-')}.csv")
     names = sorted(path.stem for path in tmp_path.glob("*.csv"))

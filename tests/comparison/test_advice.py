@@ -9,13 +9,13 @@ import pytest
 
 from probmotion.cli.main import main
 from probmotion.comparison import advise, compare, measured
-from probmotion.comparison.measurements import Measured, keep_measured
+from probmotion.comparison.measurements import Measured, save_measurements
 from probmotion.posteriors.sampling import sampler_names
 from probmotion.problems import load_problem, problem_names
 from probmotion.samplers import ExactSampler, ScoreDistillation
 
 
-def made(measure="swd", seconds=None, more=(), **values):
+def made(measure="swd_ratio", seconds=None, more=(), **values):
     """Measurements of one problem, three seeds."""
     seconds = {name: 6.0 for name in values} | (seconds or {})
     rows = [
@@ -34,7 +34,7 @@ def made(measure="swd", seconds=None, more=(), **values):
         ["all had 6 seconds"],
         {"p": "a problem"},
         [*values, "sds"],
-        {"p/sds": "evidence"},
+        {"p/sds": "observations"},
     )
 
 
@@ -47,7 +47,7 @@ def test_the_best_is_taken_and_the_others_are_told_from_it_or_not():
     assert found.take.value == pytest.approx(sum(NEAR) / 3)
     assert [each.sampler for each in found.alike] == ["alike"]
     assert [each.sampler for each in found.worse] == ["far", "farther"]
-    assert found.without == {"sds": "evidence"}
+    assert found.without == {"sds": "observations"}
     text = str(found)
     assert "take: near 0.997 ± 0.025 in 6 s" in text
     assert "worse: far 2.05 ± 0.05 in 6 s (far from reference draws: swd 2.05); farther" in text
@@ -73,16 +73,16 @@ def test_a_ratio_of_half_is_as_wrong_as_of_double():
 @pytest.mark.parametrize(
     ("metric", "value", "said"),
     [
-        ("tr", 0.5, "spread wrong: trace of covariance 0.5 of the references'"),
-        ("tr", 1.6, "spread wrong: trace of covariance 1.6 of the references'"),
-        ("off", 3.0, "variance off the prior's manifold 3 of the references'"),
+        ("variance_ratio", 0.5, "spread wrong: trace of covariance 0.5 of the references'"),
+        ("variance_ratio", 1.6, "spread wrong: trace of covariance 1.6 of the references'"),
+        ("off_manifold_ratio", 3.0, "variance off the prior's manifold 3 of the references'"),
         ("c2st", 0.9, "a classifier tells its draws from reference ones: C2ST 0.9"),
-        ("share_error", 0.4, "styles' shares wrong by 0.4"),
+        ("mode_proportions_tv", 0.4, "styles' shares wrong by 0.4"),
         ("rhat", 1.4, "chains do not agree: R-hat 1.4"),
     ],
 )
 def test_what_tells_against_a_sampler_is_said_with_its_figure(metric, value, said):
-    usual = [("a", metric, {"share_error": 0.0, "c2st": 0.5}.get(metric, 1.0))]
+    usual = [("a", metric, {"mode_proportions_tv": 0.0, "c2st": 0.5}.get(metric, 1.0))]
     slightly = [1.2, 1.21, 1.19]
     found = advise("p", made(a=NEAR, b=slightly, more=[*usual, ("b", metric, value)]))
     assert found.take.warnings == ()
@@ -142,14 +142,14 @@ def test_what_a_comparison_finds_is_kept_and_read(tmp_path):
     problem = load_problem("gait", frames=4)
     asked = {"exact": ExactSampler(), "sds": ScoreDistillation(iterations=3)}
     comparison = compare(problem, asked, draws=12, chains=2, seeds=2, workers=0, progress=False)
-    keep_measured(comparison, "a test", tmp_path)
+    save_measurements(comparison, "a test", tmp_path)
     found = measured(tmp_path)
     assert (found.command, found.draws, found.seeds) == ("a test", 12, 2)
     assert found.rhat_at_most > 1.1
     assert found.samplers == ["exact", "sds"]
     table = comparison.table()
-    swd = table[table["metric"] == "swd"]["value"].mean()
-    kept = found.rows[found.rows["metric"] == "swd"]["value"].mean()
+    swd = table[table["metric"] == "swd_ratio"]["value"].mean()
+    kept = found.rows[found.rows["metric"] == "swd_ratio"]["value"].mean()
     assert kept == pytest.approx(swd, rel=1e-4)
     assert advise(problem.name, found).take.sampler == "exact"
 

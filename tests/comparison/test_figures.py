@@ -23,13 +23,13 @@ class Measured:
 @pytest.mark.parametrize(
     ("values", "plotted"),
     [
-        ({"swd": 1.2, "coverage_interaction": 0.1, "fid": 30.0}, "swd"),
+        ({"swd_ratio": 1.2, "coverage_interaction": 0.1, "fid": 30.0}, "swd_ratio"),
         ({"coverage_interaction": 0.1, "fid": 30.0}, "coverage_interaction"),
         ({"fid": 30.0}, "fid"),
         # What has no logarithm has no place.
-        ({"swd": np.inf, "fid": 30.0}, "fid"),
-        ({"swd": 0.0, "fid": 30.0}, "fid"),
-        ({"swd": np.nan}, None),
+        ({"swd_ratio": np.inf, "fid": 30.0}, "fid"),
+        ({"swd_ratio": 0.0, "fid": 30.0}, "fid"),
+        ({"swd_ratio": np.nan}, None),
         ({"diversity": 0.7}, None),
         ({}, None),
     ],

@@ -53,7 +53,7 @@ def test_the_table_is_tidy(grid):
     assert not table.duplicated(["problem", "sampler", "seed", "metric"]).any()
     wide = table[(table["sampler"] == "wide") & (table["problem"] == "generation")]
     values = wide.set_index(["metric", "seed"])["value"]
-    assert values["tr", 0] == pytest.approx(4, rel=0.5)
+    assert values["variance_ratio", 0] == pytest.approx(4, rel=0.5)
     assert values["denoiser_evaluations", 1] == 100
 
 
@@ -155,9 +155,9 @@ def test_failures_are_recorded_and_stop_nothing(tmp_path):
     table = comparison.table()
     rows = {(row.problem, row.sampler, row.metric): row.value for row in table.itertuples()}
     assert rows["generation", "crashing", "failed"] == 1
-    assert rows["generation", "prior-draws", "swd"] > 0
+    assert rows["generation", "prior-draws", "swd_ratio"] > 0
     assert rows["monocular", "prior-draws", "unsupported"] == 1
-    assert ("generation", "crashing", "swd") not in rows
+    assert ("generation", "crashing", "swd_ratio") not in rows
     kept = json.loads((tmp_path / "failures.json").read_text())
     said = {(entry["problem"], entry["sampler"]): entry for entry in kept}
     assert len(said) == len(kept) == 5

@@ -78,7 +78,7 @@ if __name__ == "__main__":
         "module": load_sampler("importance").__module__,
         "words": table.attrs["words"],
         "failures": [result.failure.message for result in found.failures],
-        "swd": dict(table[table["metric"] == "swd"].set_index("sampler")["value"]),
+        "swd_ratio": dict(table[table["metric"] == "swd_ratio"].set_index("sampler")["value"]),
         "settings": {r.sampler: r.budget["settings"] for r in found.results},
         "suited": suited(posterior),
     }))
@@ -161,8 +161,8 @@ def test_its_sampler_runs_beside_ours_on_a_posterior_of_one_s_own(package, tmp_p
     assert found["listed"]
     assert found["module"] == "walkers_of_ours"
     assert found["failures"] == []
-    assert set(found["swd"]) == {"importance", "exact"}
-    assert found["swd"]["importance"] < 3
+    assert set(found["swd_ratio"]) == {"importance", "exact"}
+    assert found["swd_ratio"]["importance"] < 3
     # Its effort is spent like that of our own samplers.
     assert found["settings"] == {"importance": {"candidates": 1500}, "exact": {}}
     assert "importance" in found["suited"]

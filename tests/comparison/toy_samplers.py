@@ -75,7 +75,7 @@ class PriorDraws:
             with open(self.diary, "a") as file:
                 file.write(f"{seed}\n")
         if posterior.likelihood is not None:
-            raise UnsupportedPosterior(self.name, "takes no evidence", "evidence", ["exact"])
+            raise UnsupportedPosterior(self.name, "takes no evidence", "observations", ["exact"])
         time.sleep(self.nap)
         rng = seeds.generator(seed, "toy")
         x = self.spread * posterior.prior.sample(rng, draws * chains)

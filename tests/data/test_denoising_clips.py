@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from probmotion import Motion, Skeleton
-from probmotion.data.denoising_clips import DENOISING_CLIPS, denoising_clips, made_denoising_clips
+from probmotion.data.denoising_clips import (
+    DENOISING_CLIPS,
+    denoising_clips,
+    synthetic_denoising_clips,
+)
 from probmotion.io.files import load_motion
 from probmotion.motion.distances import windows, yaw_aligned_distances
 
@@ -121,7 +125,7 @@ def test_a_missing_clip_is_named(tmp_path: Path) -> None:
 
 
 def test_pieces_between_suspect_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (made,) = made_denoising_clips(1, seconds=4)["train"]
+    (made,) = synthetic_denoising_clips(1, seconds=4)["train"]
     suspect = np.zeros(made.frames, bool)
     suspect[[0, 40, 41, 60]] = True  # 1-39, 42-59 (too short), 61-119
 
@@ -147,7 +151,7 @@ def test_pieces_between_suspect_frames(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_made_clips_have_every_style_in_every_part() -> None:
-    parts = made_denoising_clips(15, seconds=2)
+    parts = synthetic_denoising_clips(15, seconds=2)
     assert {part: len(made) for part, made in parts.items()} == {
         "train": 15,
         "validation": 3,
@@ -159,8 +163,8 @@ def test_made_clips_have_every_style_in_every_part() -> None:
         assert {clip.name.partition("-")[0] for clip in made} == {"walk", "run", "march"}
         for clip in made:
             assert (clip.frames, clip.fps, clip.skeleton) == (60, 30.0, PERSON)
-    again = made_denoising_clips(15, seconds=2)
+    again = synthetic_denoising_clips(15, seconds=2)
     np.testing.assert_array_equal(again["test"][0].positions, parts["test"][0].positions)
-    other = made_denoising_clips(15, seconds=2, seed=1)
+    other = synthetic_denoising_clips(15, seconds=2, seed=1)
     assert abs(other["test"][0].positions - parts["test"][0].positions).max() > 0.01
     assert nearest(parts["test"], parts["train"], 10, 1).min() > 0.01

@@ -15,7 +15,7 @@ import pytest
 
 from probmotion.data import downloads
 from probmotion.data.downloads import DownloadError, download, salsa_pairs
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.io.files import save_motion
 
 COMMIT = "0" * 40
@@ -210,7 +210,9 @@ def nowhere(tmp_path, monkeypatch):
 
 def put_archives(folder, frames=3):
     folder.mkdir(parents=True)
-    for trial, dance in zip(downloads.SALSA_TRIALS, make_dances(10, frames=frames), strict=True):
+    for trial, dance in zip(
+        downloads.SALSA_TRIALS, synthetic_dances(10, frames=frames), strict=True
+    ):
         dance = type(dance)(dance.positions, dance.skeleton, 30.0)
         save_motion(dance, folder / f"cmu_60_61_{trial}.npz")
 

@@ -10,7 +10,7 @@ from probmotion.data.joint_filters import (
     filled_between,
     fit_acceleration,
     kalman_smooth,
-    log_evidence,
+    log_marginal_likelihood,
     savitzky_golay,
 )
 
@@ -68,7 +68,9 @@ def dense(joints, confidence, acceleration):
 def test_the_smoother_is_the_exact_posterior(track, acceleration):
     joints, confidence = track
     found = kalman_smooth(joints, confidence, noise=NOISE, fps=FPS, acceleration=acceleration)
-    evidence = log_evidence(joints, confidence, noise=NOISE, fps=FPS, acceleration=acceleration)
+    evidence = log_marginal_likelihood(
+        joints, confidence, noise=NOISE, fps=FPS, acceleration=acceleration
+    )
     for joint, each in enumerate(np.broadcast_to(acceleration, J)):
         one = slice(joint, joint + 1)
         mean, deviation, exact = dense(joints[:, one], confidence[:, one], each)
@@ -156,9 +158,11 @@ def test_the_fit_is_the_maximum_of_the_evidence(track):
     joints, confidence = track
     best = fit_acceleration(joints, confidence, noise=NOISE, fps=FPS)
     given = {"noise": NOISE, "fps": FPS}
-    top = log_evidence(joints, confidence, acceleration=best, **given)
+    top = log_marginal_likelihood(joints, confidence, acceleration=best, **given)
     for factor in (0.5, 0.9, 1.1, 2.0):
-        assert (log_evidence(joints, confidence, acceleration=best * factor, **given) < top).all()
+        assert (
+            log_marginal_likelihood(joints, confidence, acceleration=best * factor, **given) < top
+        ).all()
     by_default = kalman_smooth(joints, confidence, **given)
     with_it = kalman_smooth(joints, confidence, acceleration=best, **given)
     np.testing.assert_array_equal(by_default, with_it)

@@ -21,7 +21,7 @@ from probmotion.data.pairs import (
     read_salsa_bvh,
     scaled_to_height,
 )
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.io.files import load_motion, save_motion
 from probmotion.motion.motion import Motion
@@ -33,7 +33,7 @@ ONE = Skeleton.preset("person17")
 
 @pytest.fixture(scope="module")
 def dances():
-    return make_dances(4, frames=45)
+    return synthetic_dances(4, frames=45)
 
 
 @pytest.fixture(scope="module")

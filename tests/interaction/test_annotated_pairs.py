@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
 from probmotion import MotionPosterior
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.interaction.annotations.views import project_to_views
@@ -20,7 +20,7 @@ from probmotion.posteriors.protocols import ComparesViews, Likelihood
 
 @pytest.fixture(scope="module")
 def drawn():
-    return draw_annotations(make_dances(4), 60, seed=0, known_views=True)
+    return draw_annotations(synthetic_dances(4), 60, seed=0, known_views=True)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def likelihood(drawn) -> AnnotatedPairs:
 @pytest.fixture(scope="module")
 def poses() -> np.ndarray:
     """Pairs of another dance, (4, 1, J, 3)."""
-    return make_dances(5)[4].positions[[0, 20, 50, 80], None]
+    return synthetic_dances(5)[4].positions[[0, 20, 50, 80], None]
 
 
 def test_the_density_is_equations_6_and_9(likelihood, poses, drawn):
@@ -114,7 +114,7 @@ def test_speeds_are_means_over_the_closest_annotations(likelihood, drawn):
 
 
 def test_views_are_estimated_where_they_are_not_known(drawn):
-    unknown = draw_annotations(make_dances(4), 60, seed=0).annotations
+    unknown = draw_annotations(synthetic_dances(4), 60, seed=0).annotations
     with pytest.raises(ValueError, match="annotations has no views"):
         AnnotatedPairs(unknown)
     estimated = AnnotatedPairs.estimated(unknown, drawn.positions[0], n_views=4)
@@ -142,11 +142,11 @@ def test_people_far_apart_have_a_density(likelihood, poses):
 
 
 def test_hidden_joints_are_not_read(poses):
-    hidden = draw_annotations(make_dances(4), 60, seed=0, known_views=True, hidden=0.3)
+    hidden = draw_annotations(synthetic_dances(4), 60, seed=0, known_views=True, hidden=0.3)
     likelihood = AnnotatedPairs(hidden.annotations, n_near=60)
     assert not hidden.annotations.visible.all()
     whole = AnnotatedPairs(
-        draw_annotations(make_dances(4), 60, seed=0, known_views=True).annotations, n_near=60
+        draw_annotations(synthetic_dances(4), 60, seed=0, known_views=True).annotations, n_near=60
     )
     found, expected = likelihood.log_density(poses), whole.log_density(poses)
     assert np.isfinite(found).all()
@@ -173,7 +173,7 @@ def test_a_posterior_of_other_joints_is_refused(likelihood):
 
 
 def test_pictures_whose_view_cannot_be_estimated_are_counted(drawn):
-    hidden = draw_annotations(make_dances(4), 60, seed=0, hidden=0.7).annotations
+    hidden = draw_annotations(synthetic_dances(4), 60, seed=0, hidden=0.7).annotations
     estimated = AnnotatedPairs.estimated(hidden, drawn.positions[0], n_views=4)
     left_out = estimated.annotations.dropped["view not to be estimated"]
     assert left_out > 0
@@ -202,12 +202,12 @@ def test_what_is_not_in_metres_or_of_other_people_is_refused(drawn):
 
 
 def test_pictures_that_had_to_be_joggled_are_counted(likelihood, poses):
-    assert likelihood.degenerate_share(poses) == 0
+    assert likelihood.degenerate_fraction(poses) == 0
     flat = poses.copy()
     flat[0] = flat[0, :, :1]
     flat[0, :, [0, 17]] += np.array([[[0.0, 0, 0]], [[0.3, 0, 0]]])
     flat[0, :, [2, 19]] += np.array([0.0, 0.3, 0.0])
-    assert 0 < likelihood.degenerate_share(flat) <= 1 / 4
+    assert 0 < likelihood.degenerate_fraction(flat) <= 1 / 4
 
 
 def test_the_shortest_edge_is_the_densitys(drawn, poses):
@@ -221,7 +221,7 @@ def test_the_shortest_edge_is_the_densitys(drawn, poses):
 def test_views_are_estimated_from_the_first_seed(drawn):
     from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
 
-    unknown = draw_annotations(make_dances(4), 60, seed=0).annotations
+    unknown = draw_annotations(synthetic_dances(4), 60, seed=0).annotations
     seeds = drawn.positions[[0, 30]]
     several = pair_posterior(seeds, unknown, PairSettings(n_views=4))
     first = AnnotatedPairs.estimated(unknown, seeds[0], n_views=4)

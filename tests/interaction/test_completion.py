@@ -7,20 +7,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from probmotion import Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.completion import (
     blend,
     complete,
     complete_keypoints,
-    hidden_joint_error,
     nearest_annotation_completion,
+    occluded_joint_error,
 )
 from probmotion.interaction.retrieval import view_grid
 
 PAIR = Skeleton.preset("pair17")
-DRAWS = np.concatenate([dance.positions[::5] for dance in make_dances(8)])
-TRUTH = make_dances(9)[8].positions[40]
+DRAWS = np.concatenate([dance.positions[::5] for dance in synthetic_dances(8)])
+TRUTH = synthetic_dances(9)[8].positions[40]
 VIEWS = view_grid(6, 1)
 HIDDEN = np.isin(np.arange(34), [6, 7, 12, 13, 26, 27])
 
@@ -63,14 +63,14 @@ def test_one_wild_draw_does_not_move_the_median():
     wild = near[0].copy()
     wild[HIDDEN] += 5.0
     done = complete(without(TRUTH), ~HIDDEN, np.stack([*near[1:], wild]), PAIR, n_nearest=9)
-    assert hidden_joint_error(TRUTH, done.positions, HIDDEN) < 0.02
+    assert occluded_joint_error(TRUTH, done.positions, HIDDEN) < 0.02
 
 
 def test_dances_of_the_same_kind_tell_hidden_joints_better_than_the_mean_pose():
     done = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=10)
-    error = hidden_joint_error(TRUTH, done.positions, HIDDEN)
+    error = occluded_joint_error(TRUTH, done.positions, HIDDEN)
     everything = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=len(DRAWS))
-    assert error < 0.8 * hidden_joint_error(TRUTH, everything.positions, HIDDEN)
+    assert error < 0.8 * occluded_joint_error(TRUTH, everything.positions, HIDDEN)
 
 
 def test_blending_moves_hidden_joints_by_the_gaussian_weighted_mean():
@@ -102,7 +102,7 @@ def test_visible_keypoints_stay_exactly_as_they_were():
     picture = project_to_views(TRUTH[None], VIEWS[[3]], PAIR)[0, 0]
     done = complete_keypoints(without(picture), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=5)
     np.testing.assert_array_equal(done.positions[~HIDDEN], picture[~HIDDEN])
-    assert hidden_joint_error(picture, done.positions, HIDDEN) < 0.3
+    assert occluded_joint_error(picture, done.positions, HIDDEN) < 0.3
 
 
 def test_the_nearest_annotation_lends_its_hidden_joints():
@@ -127,9 +127,9 @@ def test_the_error_is_the_mean_distance_of_hidden_joints():
     estimate = TRUTH.copy()
     estimate[6] += [0.3, 0.0, 0.4]
     estimate[0] += 9.0
-    assert hidden_joint_error(TRUTH, estimate, HIDDEN) == pytest.approx(0.5 / 6)
+    assert occluded_joint_error(TRUTH, estimate, HIDDEN) == pytest.approx(0.5 / 6)
     with pytest.raises(ValueError, match="hidden has no joint, expected at least one"):
-        hidden_joint_error(TRUTH, estimate, ~HIDDEN & HIDDEN)
+        occluded_joint_error(TRUTH, estimate, ~HIDDEN & HIDDEN)
 
 
 def test_bad_input_is_refused_in_a_sentence():

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from probmotion import Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.geometry.coordinates import interaction_distance
 from probmotion.interaction.retrieval import retrieve, view_grid, views_around
 
 PAIR = Skeleton.preset("pair17")
-DRAWS = np.concatenate([dance.positions[::9] for dance in make_dances(4)])
+DRAWS = np.concatenate([dance.positions[::9] for dance in synthetic_dances(4)])
 VIEWS = view_grid(6, 1)
 
 

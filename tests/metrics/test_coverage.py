@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.geometry.pose_distances import MEASURES
 from probmotion.interaction.geometry.rigid_kernels import align, residual
 from probmotion.interaction.geometry.shape_context import shape_context_distance, shape_contexts
 from probmotion.metrics.coverage import coverage, nearest_draw_distances, pose_distances
 
-PAIRS = np.concatenate([dance.positions[::9] for dance in make_dances(6)])
+PAIRS = np.concatenate([dance.positions[::9] for dance in synthetic_dances(6)])
 TRUTHS, DRAWS = PAIRS[:12], PAIRS[20:50]
 
 

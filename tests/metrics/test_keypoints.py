@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from probmotion.metrics.keypoints import (
     fit_linear_map,
+    image_extent,
     percentage_of_correct_keypoints,
-    picture_size,
     velocity_error,
 )
 
@@ -70,7 +70,7 @@ class TestCorrectKeypoints:
     def test_a_plain_loop_says_the_same(
         self, predicted: np.ndarray, truth: np.ndarray, visible: np.ndarray
     ) -> None:
-        size = picture_size(truth)
+        size = image_extent(truth)
         right = total = 0
         for n in range(N):
             for t in range(L):
@@ -121,15 +121,15 @@ class TestPictureSize:
     def test_by_hand(self) -> None:
         # x from 0 to 4, y from -1 to 2 over both frames; without the last keypoint x ends at 1.
         keypoints = np.array([[[0, 0], [1, 2]], [[0.5, -1], [4, 0]]])
-        assert picture_size(keypoints) == 4
+        assert image_extent(keypoints) == 4
         seen = np.array([[True, True], [True, False]])
-        assert picture_size(hidden(keypoints, seen), seen) == 3
-        np.testing.assert_array_equal(picture_size(np.stack([keypoints, 2 * keypoints])), [4, 8])
+        assert image_extent(hidden(keypoints, seen), seen) == 3
+        np.testing.assert_array_equal(image_extent(np.stack([keypoints, 2 * keypoints])), [4, 8])
 
     def test_a_point_has_no_size(self) -> None:
         for seen in (np.eye(2, dtype=bool)[:1], np.zeros((1, 2), bool)):
             with pytest.raises(ValueError, match="keypoints has a sequence whose visible ones are"):
-                picture_size(np.array([[[0.0, 1.0], [2.0, 3.0]]]), seen)
+                image_extent(np.array([[[0.0, 1.0], [2.0, 3.0]]]), seen)
 
 
 class TestVelocityError:

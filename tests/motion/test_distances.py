@@ -4,7 +4,7 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.motion import distances as motion_distances
 from probmotion.motion.distances import (
-    mirror_share,
+    mirrored_fraction,
     nearest_distances,
     windows,
     yaw_aligned_distances,
@@ -110,15 +110,17 @@ def test_draws_may_be_near_and_cover_little(rng):
 def test_draws_with_exchanged_depth_are_found(rng):
     real = gaits("walk", range(40))
     draws = turned(gaits("walk", range(40, 60)), rng.uniform(0, 7, 20))
-    assert mirror_share(draws, real) < 0.1
+    assert mirrored_fraction(draws, real) < 0.1
     draws[:5] *= IN_DEPTH
     draws[:5] = turned(draws[:5], rng.uniform(0, 7, 5))
-    assert mirror_share(draws, real) == pytest.approx(mirror_share(draws[5:], real) * 0.75 + 0.25)
+    assert mirrored_fraction(draws, real) == pytest.approx(
+        mirrored_fraction(draws[5:], real) * 0.75 + 0.25
+    )
 
 
 def test_flat_motions_are_their_own_mirror_images(rng):
     flat = rng.normal(size=(6, 4, 5, 3)) * [1, 1, 0]
-    assert mirror_share(flat, rng.normal(size=(6, 4, 5, 3)) * [1, 1, 0]) == 0
+    assert mirrored_fraction(flat, rng.normal(size=(6, 4, 5, 3)) * [1, 1, 0]) == 0
 
 
 def test_windows_of_a_clip():
@@ -141,6 +143,6 @@ def test_bad_input():
     broken = motions.copy()
     broken[1, 0, 0, 0] = np.nan
     with pytest.raises(ValueError, match="draws has 1 values that are NaN"):
-        mirror_share(broken, motions)
+        mirrored_fraction(broken, motions)
     with pytest.raises(ValueError, match=r"real has shape \(0, 3, 4, 3\), expected at least one"):
         nearest_distances(motions, motions[:0])

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from probmotion.motion.joint_names import canonical_name, canonical_names, mirrored_name
 from probmotion.motion.presets import PRESETS

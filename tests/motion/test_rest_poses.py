@@ -8,7 +8,7 @@ import pytest
 from probmotion import KeypointTrack, Motion, Skeleton
 from probmotion.data.projections import DetectorNoise, Filming, project_clips
 from probmotion.data.synthetic.gaits import make_gaits
-from probmotion.data.synthetic.walks import made_walks
+from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.geometry.cameras import Cameras
 from probmotion.io.files import load_motion
 from probmotion.models.bodies.articulated_body import ArticulatedBody
@@ -169,7 +169,7 @@ def test_elevation_shortens_by_a_cosine_and_no_more():
 
 
 def test_left_is_left_and_the_front_is_ahead():
-    for clips in (made_walks(12, seconds=2), made_walks(12, QUADRUPED, seconds=2)):
+    for clips in (synthetic_walks(12, seconds=2), synthetic_walks(12, QUADRUPED, seconds=2)):
         skeleton = clips[0].skeleton
         found, _ = estimate_and_truth(clips, 10)
         place = joints_of(skeleton, found)

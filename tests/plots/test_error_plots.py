@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probmotion.plots.error_plots import draw_budget
+from probmotion.plots.error_plots import draw_error_decomposition
 
 COLUMNS = ["setting", "measure", "part", "mean", "low", "high"]
 TABLE = pd.DataFrame(
@@ -28,7 +28,7 @@ TABLE = pd.DataFrame(
 
 def test_parts_are_stacked_from_the_floor_and_negative_ones_hang_below(tmp_path):
     path = tmp_path / "budget.png"
-    figure = draw_budget(TABLE, path, words={"off": "off the manifold"})
+    figure = draw_error_decomposition(TABLE, path, words={"off": "off the manifold"})
     assert path.read_bytes().startswith(b"\x89PNG")
     spread, off = figure.axes
     assert (spread.get_title(loc="left"), off.get_title(loc="left")) == (
@@ -44,7 +44,7 @@ def test_parts_are_stacked_from_the_floor_and_negative_ones_hang_below(tmp_path)
 
 
 def test_the_whole_and_every_interval_are_drawn():
-    axes = draw_budget(TABLE).axes[0]
+    axes = draw_error_decomposition(TABLE).axes[0]
     across = [line for line in axes.lines if len(set(line.get_ydata())) == 1]
     assert any(np.allclose(line.get_ydata(), 0.6) and len(line.get_xdata()) == 2 for line in across)
     spans = [tuple(line.get_ydata()) for line in axes.lines if len(set(line.get_ydata())) == 2]
@@ -52,20 +52,22 @@ def test_the_whole_and_every_interval_are_drawn():
 
 
 def test_what_is_not_told_from_chance_is_pale():
-    figure = draw_budget(TABLE)
+    figure = draw_error_decomposition(TABLE)
     opaque = [[bar.get_alpha() > 0.5 for bar in axes.patches] for axes in figure.axes]
     assert opaque == [[True, True, False], [True, True, True]]
 
 
 def test_a_part_has_one_colour_whatever_others_there_are():
     some = TABLE[TABLE["part"] != "discretisation"]
-    one, other = (draw_budget(table).axes[0].patches for table in (TABLE, some))
+    one, other = (draw_error_decomposition(table).axes[0].patches for table in (TABLE, some))
     assert [bar.get_facecolor() for bar in one[1:]] == [bar.get_facecolor() for bar in other]
     assert len({bar.get_facecolor()[:3] for bar in one}) == 3
 
 
 def test_notes_and_the_setting_can_be_read():
-    figure = draw_budget(TABLE, notes=["network is no part: no learnt denoiser was given"])
+    figure = draw_error_decomposition(
+        TABLE, notes=["network is no part: no learnt denoiser was given"]
+    )
     assert figure.get_suptitle() == "V = 5"
     (key,) = figure.legends
     assert key.get_title().get_text() == "network is no part: no learnt denoiser was given"
@@ -75,7 +77,7 @@ def test_notes_and_the_setting_can_be_read():
 
 def test_tables_that_are_no_budget_are_refused():
     with pytest.raises(ValueError, match="table lacks the columns low, high"):
-        draw_budget(TABLE.drop(columns=["low", "high"]))
+        draw_error_decomposition(TABLE.drop(columns=["low", "high"]))
     two = pd.concat([TABLE, TABLE.assign(setting="V = 12")])
     with pytest.raises(ValueError, match="table is of 2 settings, expected one"):
-        draw_budget(two)
+        draw_error_decomposition(two)

@@ -7,12 +7,12 @@ import pytest
 from matplotlib.colors import to_hex
 
 from probmotion import Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.plots.colours import LEFT, RIGHT
 from probmotion.plots.pairs import draw_pairs
 
 PAIR = Skeleton.preset("pair17")
-POSES = make_dances(1)[0].positions[::20]
+POSES = synthetic_dances(1)[0].positions[::20]
 
 
 def bones(figure, colour, picture=0):

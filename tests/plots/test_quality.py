@@ -24,7 +24,7 @@ def table(problems=("gait",), seeds=3, spread=0.1):
                 rows.append(
                     (problem, name, seed, "seconds", seconds * np.exp(spread * rng.normal()))
                 )
-                rows.append((problem, name, seed, "swd", swd * np.exp(spread * rng.normal())))
+                rows.append((problem, name, seed, "swd_ratio", swd * np.exp(spread * rng.normal())))
     return pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"])
 
 
@@ -45,13 +45,13 @@ def test_points_are_means_over_seeds():
         if line.get_marker() not in ("None", "", None)
     )
     means = data.pivot_table(index="sampler", columns="metric", values="value")
-    np.testing.assert_allclose(drawn, sorted(means[["seconds", "swd"]].to_numpy().tolist()))
+    np.testing.assert_allclose(drawn, sorted(means[["seconds", "swd_ratio"]].to_numpy().tolist()))
 
 
 def test_bars_span_the_seeds():
     data = table()
     axes = plot_quality_against_cost(data).axes[0]
-    mas = data[(data["sampler"] == "mas") & (data["metric"] == "swd")]["value"]
+    mas = data[(data["sampler"] == "mas") & (data["metric"] == "swd_ratio")]["value"]
     spans = [tuple(line.get_ydata()) for line in axes.lines]
     assert (mas.min(), mas.max()) in spans
 
@@ -75,7 +75,7 @@ def test_samplers_without_a_point_are_listed_with_the_reason(tmp_path):
     data = data[~data["sampler"].isin(["sds", "nuts"])]
     data.loc[len(data) + 100] = ("gait", "sds", 0, "unsupported", 1.0)
     data.loc[len(data) + 100] = ("gait", "nuts", 0, "failed", 1.0)
-    data.attrs["words"] = {"gait/sds": "evidence"}
+    data.attrs["words"] = {"gait/sds": "observations"}
     path = tmp_path / "plot.png"
     figure = plot_quality_against_cost(data, path)
     listed = figure.axes[0].get_title("right")
@@ -85,7 +85,7 @@ def test_samplers_without_a_point_are_listed_with_the_reason(tmp_path):
 
 def test_a_number_that_has_no_logarithm_is_no_point():
     data = table(seeds=1)
-    data.loc[(data["sampler"] == "mas") & (data["metric"] == "swd"), "value"] = np.inf
+    data.loc[(data["sampler"] == "mas") & (data["metric"] == "swd_ratio"), "value"] = np.inf
     data.loc[(data["sampler"] == "nuts") & (data["metric"] == "seconds"), "value"] = 0.0
     axes = plot_quality_against_cost(data).axes[0]
     assert set(words(axes)) == set(SAMPLERS) - {"mas", "nuts"}

@@ -11,9 +11,9 @@ import pytest
 from probmotion import Cameras, Keypoints2D, MotionPosterior, compare, models
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.data.projections import centre_motion
-from probmotion.data.synthetic.walks import made_walks, walk_clips
+from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.metrics.measures import measure
-from probmotion.motion.distances import mirror_share, nearest_distances, windows
+from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.problems import load_problem
 from probmotion.samplers import NUTS, MultiViewAncestral, ScoreDistillation
 
@@ -81,7 +81,7 @@ def test_draws_are_as_near_to_held_out_motion_as_real_motion_is(problem, draws, 
     assert near.of_draws < 1.15 * nearest_distances(learnt, real).of_draws
     reflected = draws.flat() * np.array([1.0, 1.0, -1.0])
     assert near.of_draws < 0.9 * nearest_distances(reflected, real).of_draws
-    assert mirror_share(draws.flat(), real) < 0.1
+    assert mirrored_fraction(draws.flat(), real) < 0.1
 
 
 def test_measures_tell_draws_from_noise_and_from_one_motion(problem, draws):
@@ -143,4 +143,6 @@ def test_evidence_of_a_motion_that_travels_is_refused(problem):
 
 def make_walks_on(prior):
     """Return a made walk on the prior's joints, as long as its motions."""
-    return made_walks(1)[0].retarget(prior.skeleton).resample(prior.fps).window(0, prior.frames)
+    return (
+        synthetic_walks(1)[0].retarget(prior.skeleton).resample(prior.fps).window(0, prior.frames)
+    )

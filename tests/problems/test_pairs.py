@@ -8,7 +8,7 @@ import pytest
 import probmotion as pm
 from probmotion import MotionDraws
 from probmotion.data.pair_sets import SALSA_HELD_OUT
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.metrics.coverage import coverage
 from probmotion.metrics.measures import measure
 from probmotion.models.pose_pairs.pair_posterior import PairSettings
@@ -37,8 +37,8 @@ def test_a_description_is_that_of_the_problem(problem):
 
 def test_clips_are_held_out_whole(problem):
     """No annotation, and not the seed, is of a clip that is to be covered."""
-    shown = np.concatenate([dance.positions for dance in make_dances(6)])
-    hidden = np.concatenate([dance.positions for dance in make_dances(8)[6:]])
+    shown = np.concatenate([dance.positions for dance in synthetic_dances(6)])
+    hidden = np.concatenate([dance.positions for dance in synthetic_dances(8)[6:]])
     assert problem.held_out.shape == (60, 1, 34, 3)
     for pose in problem.held_out[:, 0]:
         assert np.abs(hidden - pose).max(axis=(1, 2)).min() == 0
@@ -63,8 +63,8 @@ def test_runs_are_measured_by_coverage_and_wherever_pairs_stand(problem):
     moved = draws.dataset["positions"].values + np.array([50.0, 0.0, -50.0])
     elsewhere = MotionDraws.of(problem.posterior, sampler, moved, seed=0, seconds=1.0)
     again = measure(problem, elsewhere, seed=0)
-    assert again["swd"] == pytest.approx(found["swd"], rel=1e-6)
-    assert found["swd"] > 1.5
+    assert again["swd_ratio"] == pytest.approx(found["swd_ratio"], rel=1e-6)
+    assert found["swd_ratio"] > 1.5
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_compare_says_who_can_and_why_others_cannot(problem, tmp_path):
 
 
 def test_wrong_input_is_named():
-    dances = make_dances(2)
+    dances = synthetic_dances(2)
     with pytest.raises(ValueError, match="dance-9"):
         pairs_problem(dances, ["dance-9"])
     with pytest.raises(ValueError, match="held_out has shape"):
@@ -151,7 +151,7 @@ def test_salsa_without_data_says_how_to_get_it(monkeypatch, tmp_path):
 
 def test_a_small_problem_of_ones_own():
     problem = pairs_problem(
-        make_dances(3),
+        synthetic_dances(3),
         ["dance-2"],
         n_annotations=20,
         n_held_out=5,

@@ -19,7 +19,7 @@ from probmotion.calibration import calibrate
 from probmotion.comparison.comparison import Comparison
 from probmotion.comparison.results.cell_results import CellResult
 from probmotion.comparison.results.failures import Failure
-from probmotion.comparison.results.stored_problems import KeptProblem, keep_problem, read_kept
+from probmotion.comparison.results.stored_problems import StoredProblem, read_stored, store_problem
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.models import GaussianMixtureMotion
@@ -71,7 +71,7 @@ class Made(Comparison):
         self.plan = self._plan(numbers)
         self.results = [self._result(*address) for address in self.plan.cells()]
         for p in problems:
-            keep_problem(p, folder / "problems" / p.name, draws=2)
+            store_problem(p, folder / "problems" / p.name, draws=2)
 
     def _plan(self, numbers: int):
         from probmotion.comparison.results.plan import Plan
@@ -87,7 +87,7 @@ class Made(Comparison):
         elif sampler == "b<i>ad" and seed == 1:
             failure = Failure("crashed", "the floor gave way", unsupported=False)
         value = 1.25 if sampler == "good" else 5.5
-        metrics = {"swd": value + seed, "seconds": 3 * value, "odd_one": 7.0, "rhat": np.nan}
+        metrics = {"swd_ratio": value + seed, "seconds": 3 * value, "odd_one": 7.0, "rhat": np.nan}
         return CellResult(name, sampler, seed, "", {} if failure else metrics, failure)
 
     def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
@@ -198,7 +198,7 @@ def test_every_cell_of_the_grid_is_there(page, made):
     assert [row for row in rows if row[0] == "none"] == 9 * [["none", "evid<u>ence"]]
     assert ["sampler", "odd_one"] in rows
     overview = [row for row in rows if row[0] in made.plan.problems]
-    assert [row[1] for row in overview] == 3 * ["swd"]
+    assert [row[1] for row in overview] == 3 * ["swd_ratio"]
     assert all("evid<u>ence" in row[4] for row in overview)
 
 
@@ -255,7 +255,7 @@ def test_what_16_bits_do_not_hold_has_a_coarser_unit():
     far = np.array([[[[0.0, 0.0, 0.0], [0.0, 1.0, 70.0]]]]) + np.zeros((1, 3, 1, 1))
     skeleton = make_gait("walk", frames=2).skeleton
     body = type(skeleton)(["root", "head"], [-1, 0])
-    (motion,) = motion_numbers(Shown(KeptProblem(body, 30.0), {"far": far}))["rows"][0]
+    (motion,) = motion_numbers(Shown(StoredProblem(body, 30.0), {"far": far}))["rows"][0]
     assert motion["unit"] == 3
     np.testing.assert_allclose(numbers_of(motion, 2)[0], far[0, 0], atol=2e-3)
 
@@ -275,12 +275,12 @@ def test_a_large_grid_shows_fewer_draws_then_fewer_frames(made):
 @pytest.mark.parametrize("kind", ["pinhole", "joints", "generation"])
 def test_kept_problems_come_back(kind, tmp_path):
     given = problem(kind)
-    assert read_kept(tmp_path / "there") is None
-    keep_problem(given, tmp_path / "there", draws=3)
-    kept = read_kept(tmp_path / "there")
-    wanted = KeptProblem.of(given, 3)
+    assert read_stored(tmp_path / "there") is None
+    store_problem(given, tmp_path / "there", draws=3)
+    kept = read_stored(tmp_path / "there")
+    wanted = StoredProblem.of(given, 3)
     assert (kept.skeleton, kept.fps) == (wanted.skeleton, wanted.fps)
-    assert kept.has_evidence == (kind != "generation")
+    assert kept.has_observations == (kind != "generation")
     assert given.has_reference == (kind != "pinhole")
     for name in ("truth", "reference", "keypoints", "joints"):
         want = getattr(wanted, name)
@@ -296,7 +296,7 @@ def test_kept_problems_come_back(kind, tmp_path):
         np.testing.assert_allclose(kept.keypoints[there], seen[there], atol=1e-4)
     (tmp_path / "there" / "problem.npz").write_bytes(b"half")
     with pytest.raises(ValueError, match="is damaged"):
-        read_kept(tmp_path / "there")
+        read_stored(tmp_path / "there")
 
 
 def test_labels_do_not_cover_each_other():

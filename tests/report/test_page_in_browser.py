@@ -17,7 +17,7 @@ from probmotion.comparison.comparison import Comparison
 from probmotion.comparison.results.cell_results import CellResult
 from probmotion.comparison.results.failures import Failure
 from probmotion.comparison.results.plan import Plan
-from probmotion.comparison.results.stored_problems import KeptProblem, keep_problem
+from probmotion.comparison.results.stored_problems import StoredProblem, store_problem
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.models import GaussianMixtureMotion
 from probmotion.posteriors.problem import Problem
@@ -52,12 +52,12 @@ class Filmed(Comparison):
         samplers: dict[str, dict[str, str]] = {name: {} for name in ("b", "c", "a", "none")}
         self.plan = Plan({"filmed": "a walk"}, samplers, draws=4, chains=1, seeds=1)
         self.results = [
-            CellResult("filmed", name, 0, "", {"swd": swd, "seconds": 1.0})
+            CellResult("filmed", name, 0, "", {"swd_ratio": swd, "seconds": 1.0})
             for name, swd in (("b", 30.0), ("c", 4.0), ("a", 200.0))
         ]
         failed = Failure("memory", "there was too little memory", unsupported=False)
         self.results.append(CellResult("filmed", "none", 0, "", {}, failed))
-        keep_problem(self.problem, folder / "problems" / "filmed")
+        store_problem(self.problem, folder / "problems" / "filmed")
 
     def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
         rng = seeds.generator(seed, sampler)
@@ -190,7 +190,7 @@ def watched(folder: Path, *words: str) -> dict:
     path = write_report(comparison, folder / "report.html")
     data = motion_numbers(shown_problems(comparison)["filmed"])
     known = {name: data[name] for name in ("columns", "across", "up")}
-    seen = places(KeptProblem.of(comparison.problem).camera, data["middle"])
+    seen = places(StoredProblem.of(comparison.problem).camera, data["middle"])
     script = f"const DATA = {json.dumps(known)}; const PLACES = {json.dumps(seen)};{WATCH}"
     page = path.read_text(encoding="utf-8")
     page = page.replace("<body>", f"<body><script>{script}</script>", 1)

@@ -58,15 +58,15 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     assert (tmp_path / "take3.bvh").exists()
 
     table = Comparison.load(tmp_path / "comparison").table()
-    assert "swd" in printed
+    assert "swd_ratio" in printed
     wide = table.pivot_table(index="sampler", columns="metric", values="value")
     assert set(wide.index) == {"exact", "ancestral3d", "mas", "mvpc", "mh"}
-    assert wide.loc["ancestral3d", "off"] < 0.6
-    assert wide.loc["mas", "tr"] > 1.5
-    assert wide.loc["mvpc", "swd"] < wide.loc["mas", "swd"]
+    assert wide.loc["ancestral3d", "off_manifold_ratio"] < 0.6
+    assert wide.loc["mas", "variance_ratio"] > 1.5
+    assert wide.loc["mvpc", "swd_ratio"] < wide.loc["mas", "swd_ratio"]
     evaluations = wide["denoiser_evaluations"]
     assert evaluations["mvpc"] == pytest.approx(evaluations["mas"], rel=0.1)
-    assert wide.loc["mh", "swd"] < 1.5
+    assert wide.loc["mh", "swd_ratio"] < 1.5
     assert wide.loc["mh", "rhat"] > 1.05
 
 

@@ -68,7 +68,7 @@ def test_the_library_example_runs(tmp_path, monkeypatch, capsys):
         code = code.replace(printed, run)
     exec(code, {})
     printed = capsys.readouterr().out
-    for name in ("exact", "mas", "nuts", "swd"):
+    for name in ("exact", "mas", "nuts", "swd_ratio"):
         assert name in printed
     assert Path("take3.bvh").exists()
 
@@ -139,7 +139,7 @@ def test_the_commands_on_real_clips_run(command, tmp_path, monkeypatch, capsys):
     assert main([*expanded, "--samplers", "exact", "--draws", "12", "--out", str(tmp_path)]) == 0
     assert "against the truth, mm" in capsys.readouterr().out
     table = Comparison.load(tmp_path).table()
-    assert {"swd", "mpjpe_mm"} <= set(table["metric"])
+    assert {"swd_ratio", "mpjpe_mm"} <= set(table["metric"])
 
 
 def _expand(word: str) -> list[str]:

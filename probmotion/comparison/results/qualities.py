@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["QUALITIES", "best_of", "first_quality"]
 
 QUALITIES: Mapping[str, str] = {
-    "swd": "sliced Wasserstein distance to reference draws (1: as far as others of them)",
+    "swd_ratio": "sliced Wasserstein distance to reference draws (1: as far as others of them)",
     "coverage_interaction": "mean distance of a held-out pose to its nearest draw (D_IC, m)",
     "fid": "Fréchet distance to held-out real views (FID)",
     "g_mpjpe_mm": "mean distance of a joint from the truth (G-MPJPE, mm)",
@@ -27,15 +27,15 @@ _LESS: Mapping[str, Any] = {"target": None}
 _MORE: Mapping[str, Any] = {"target": None, "lower_is_better": False}
 
 _RIGHT: Mapping[str, Mapping[str, Any]] = {
-    "swd": _RATIO,
-    "tr": _RATIO,
-    "off": _RATIO,
+    "swd_ratio": _RATIO,
+    "variance_ratio": _RATIO,
+    "off_manifold_ratio": _RATIO,
     "acceleration_ratio": _RATIO,
     "diversity_ratio": _RATIO,
     "log_density_gap": {"target": 0.0},
     "c2st": {"target": 0.5},
-    "mean_error": _LESS,
-    "share_error": _LESS,
+    "mean_error_sd": _LESS,
+    "mode_proportions_tv": _LESS,
     "mmd": {"target": 0.0},
     "ksd": {"target": 0.0},
     "acceleration_error": _LESS,
@@ -51,7 +51,7 @@ _RIGHT: Mapping[str, Mapping[str, Any]] = {
 _LESS_BEGIN = ("coverage_", "fid")
 _LESS_END = ("_mm", "_cm2")
 # Of how many sets of draws a value is a share, and so moves by steps.
-_SHARES = {"precision": 1, "recall": 1, "share_error": 1, "c2st": 2}
+_SHARES = {"precision": 1, "recall": 1, "mode_proportions_tv": 1, "c2st": 2}
 _NEAR_THE_TRUTH = ("acceleration_error", "velocity_error", "pck")
 
 
@@ -92,7 +92,7 @@ def best_of(
     rule = _RIGHT.get(metric)
     if rule is None and (metric.startswith(_LESS_BEGIN) or metric.endswith(_LESS_END)):
         rule = _LESS
-    if rule is None or ("swd" in beside and _is_nearness(metric)):
+    if rule is None or ("swd_ratio" in beside and _is_nearness(metric)):
         return None, set()
     rows = {name: row.reindex(list(seeds)).to_numpy(float) for name, row in values.items()}
     # A ratio of 0 is infinitely wrong, and an infinite value as well.

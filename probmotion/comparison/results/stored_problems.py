@@ -19,7 +19,7 @@ from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
 from probmotion.posteriors.problem import Problem
 from probmotion.validation import check_count
 
-__all__ = ["KeptProblem", "keep_problem", "read_kept"]
+__all__ = ["StoredProblem", "read_stored", "store_problem"]
 
 _FILE = "problem.npz"
 _ARRAYS = ("truth", "reference", "held_out", "keypoints", "joints")
@@ -27,7 +27,7 @@ _CAMERA = ("rotation", "translation", "focal", "centre", "orthographic")
 
 
 @dataclass(frozen=True, eq=False)
-class KeptProblem:
+class StoredProblem:
     """What there is to be seen of a problem.
 
     Parameters
@@ -36,7 +36,7 @@ class KeptProblem:
         Of its motions.
     fps : float
         Frames per second.
-    has_evidence : bool
+    has_observations : bool
         Whether its posterior has any, of whatever kind.
     truth : ndarray, (L, J, 3), optional
         Metres.
@@ -54,7 +54,7 @@ class KeptProblem:
 
     skeleton: Skeleton
     fps: float
-    has_evidence: bool = False
+    has_observations: bool = False
     truth: np.ndarray | None = None
     reference: np.ndarray | None = None
     held_out: np.ndarray | None = None
@@ -63,7 +63,7 @@ class KeptProblem:
     joints: np.ndarray | None = None
 
     @classmethod
-    def of(cls, problem: Problem, draws: int = 8, seed: int = 0) -> KeptProblem:
+    def of(cls, problem: Problem, draws: int = 8, seed: int = 0) -> StoredProblem:
         """Return what is to be seen of a problem, with so many reference draws where it has any."""
         check_count("draws", draws)
         posterior, likelihood = problem.posterior, problem.posterior.likelihood
@@ -79,7 +79,7 @@ class KeptProblem:
         return cls(
             skeleton=posterior.skeleton,
             fps=float(posterior.fps),
-            has_evidence=likelihood is not None,
+            has_observations=likelihood is not None,
             truth=problem.truth,
             reference=problem.reference(seed, draws) if problem.has_reference else None,
             held_out=held_out,
@@ -89,7 +89,7 @@ class KeptProblem:
         )
 
 
-def keep_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int = 0) -> None:
+def store_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int = 0) -> None:
     """Write what is to be seen of a problem into ``folder``, which is made where it is missing.
 
     ``seed`` is that of the reference draws.
@@ -99,12 +99,12 @@ def keep_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int
     OSError
         If the folder cannot be written to.
     """
-    kept = KeptProblem.of(problem, draws, seed)
+    kept = StoredProblem.of(problem, draws, seed)
     arrays: dict[str, np.ndarray] = {
         "joint_names": np.array(kept.skeleton.joint_names),
         "parents": np.array(kept.skeleton.parents),
         "fps": np.array(kept.fps),
-        "has_evidence": np.array(kept.has_evidence),
+        "has_observations": np.array(kept.has_observations),
     }
     for name in _ARRAYS:
         if (held := getattr(kept, name)) is not None:
@@ -117,8 +117,8 @@ def keep_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def read_kept(folder: str | Path) -> KeptProblem | None:
-    """Return what :func:`keep_problem` wrote into ``folder``, or None where it wrote nothing.
+def read_stored(folder: str | Path) -> StoredProblem | None:
+    """Return what :func:`store_problem` wrote into ``folder``, or None where it wrote nothing.
 
     Raises
     ------
@@ -136,14 +136,14 @@ def read_kept(folder: str | Path) -> KeptProblem | None:
             numbers = {name: arrays[f"camera_{name}"] for name in _CAMERA}
             camera = Cameras(**numbers | {"orthographic": bool(numbers["orthographic"])})
         skeleton = Skeleton(arrays["joint_names"].tolist(), arrays["parents"].tolist())
-        return KeptProblem(
+        return StoredProblem(
             skeleton,
             float(arrays["fps"]),
-            bool(arrays["has_evidence"]),
+            bool(arrays["has_observations"]),
             camera=camera,
             **{name: arrays[name].astype(np.float64) for name in _ARRAYS if name in arrays},
         )
     except (OSError, BadZipFile, KeyError, ValueError, EOFError) as error:
         raise ValueError(
-            f"{path} is damaged ({error}), expected a file that keep_problem() wrote"
+            f"{path} is damaged ({error}), expected a file that store_problem() wrote"
         ) from error

@@ -17,12 +17,12 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         "against references",
         {
             "seconds": "seconds",
-            "swd": "swd",
-            "tr": "tr",
-            "mean_error": "mean",
-            "off": "off",
+            "swd_ratio": "swd_ratio",
+            "variance_ratio": "variance_ratio",
+            "mean_error_sd": "mean",
+            "off_manifold_ratio": "off_manifold_ratio",
             "log_density_gap": "log p",
-            "share_error": "shares",
+            "mode_proportions_tv": "shares",
             "precision": "P",
             "recall": "R",
         },
@@ -39,7 +39,7 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
             "mpjpe_mean_mm": "of mean",
             "mpjpe_best_mm": "of best",
             "mpjpe_visible_mm": "visible",
-            "mpjpe_hidden_mm": "hidden",
+            "mpjpe_occluded_mm": "hidden",
             "g_mpjpe_mm": "G-MPJPE",
             "pa_mpjpe_mm": "PA-MPJPE",
         },
@@ -49,10 +49,10 @@ _BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
         {
             "seconds": "seconds",
             "g_mpjpe_visible_mm": "visible",
-            "g_mpjpe_hidden_mm": "hidden",
+            "g_mpjpe_occluded_mm": "hidden",
             "g_mpjpe_mean_mm": "of mean",
             "g_mpjpe_mean_visible_mm": "its visible",
-            "g_mpjpe_mean_hidden_mm": "its hidden",
+            "g_mpjpe_mean_occluded_mm": "its hidden",
             "acceleration_ratio": "acceleration",
         },
     ),
@@ -166,7 +166,7 @@ class ComparisonTable(pd.DataFrame):
         return [
             legend
             for metric, legend in (
-                ("swd", _LEGEND),
+                ("swd_ratio", _LEGEND),
                 ("c2st|ksd", _TESTS_LEGEND),
                 ("g_mpjpe_mean_mm", _WORLD_LEGEND),
                 ("coverage_cartesian", _COVERAGE_LEGEND),
@@ -178,7 +178,7 @@ class ComparisonTable(pd.DataFrame):
     def _leaves_nearness_unmarked(self) -> bool:
         """Whether some problem has references beside a truth, and seeds enough for marks."""
         return self["seed"].nunique() > 1 and any(
-            {"swd", "mpjpe_mm"} <= set(rows) for _, rows in self.groupby("problem")["metric"]
+            {"swd_ratio", "mpjpe_mm"} <= set(rows) for _, rows in self.groupby("problem")["metric"]
         )
 
     def _problem(self, problem: str) -> str:

@@ -20,7 +20,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["ANIMAL_SKELETON", "DOG_CLIPS", "animal_clips", "dog_clips", "made_animals"]
+__all__ = ["ANIMAL_SKELETON", "DOG_CLIPS", "animal_clips", "dog_clips", "synthetic_animals"]
 
 _FPS = 30.0
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "quadruped")
@@ -64,12 +64,12 @@ def animal_clips(
     FileNotFoundError
         If the folder lacks one of the cycles.
     ValueError
-        As :func:`dog_clips` and :func:`made_animals`.
+        As :func:`dog_clips` and :func:`synthetic_animals`.
     """
     check_count("n", n)
     frames = _frames(seconds)
     held_out = max(n // 5, len(_STYLES))
-    made = made_animals(n + 2 * held_out, frames, _FPS, seed)
+    made = synthetic_animals(n + 2 * held_out, frames, _FPS, seed)
     parts = {
         "train": made[:n],
         "validation": made[n : n + held_out],
@@ -105,7 +105,9 @@ def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Mot
     }
 
 
-def made_animals(n: int = 60, frames: int = 180, fps: float = _FPS, seed: int = 0) -> list[Motion]:
+def synthetic_animals(
+    n: int = 60, frames: int = 180, fps: float = _FPS, seed: int = 0
+) -> list[Motion]:
     """Return procedural quadrupeds that walk and trot in turn, called ``quadruped-walk-0``, ….
 
     They are those of :mod:`probmotion.data.synthetic.gaits`, their trunk and their paws where those

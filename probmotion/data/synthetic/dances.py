@@ -18,7 +18,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["make_dances"]
+__all__ = ["synthetic_dances"]
 
 # Offsets from the parent in the body's frame (left, up, forward), shares of the height.
 _SPINE, _CHEST, _NECK = (0.0, 0.10, 0.0), (0.0, 0.09, 0.0), (0.0, 0.10, -0.008)
@@ -33,7 +33,9 @@ Joints = dict[str, np.ndarray]
 """Positions (L, 3) by joint, and the chest's frame (L, 3, 3) as ``frame``."""
 
 
-def make_dances(n: int = 20, *, frames: int = 90, fps: float = 30.0, seed: int = 0) -> list[Motion]:
+def synthetic_dances(
+    n: int = 20, *, frames: int = 90, fps: float = 30.0, seed: int = 0
+) -> list[Motion]:
     """Return ``n`` dances of two people on ``pair17``, named ``dance-0``, ``dance-1``, …
 
     ``person0`` leads and is about 1.7 m tall, ``person1`` about 1.6 m. Everything that varies from

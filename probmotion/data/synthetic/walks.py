@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from probmotion.data.synthetic.animals import ANIMAL_SKELETON, made_animals
+from probmotion.data.synthetic.animals import ANIMAL_SKELETON, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gait, make_gaits
 from probmotion.io.files import load_motion
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["WALK_CLIPS", "made_walks", "shared_skeleton", "walk_clips"]
+__all__ = ["WALK_CLIPS", "shared_skeleton", "synthetic_walks", "walk_clips"]
 
 _STYLES = ("walk", "quadruped-walk")
 
@@ -47,7 +47,7 @@ def walk_clips(folder: str | Path) -> dict[str, list[Motion]]:
     }
 
 
-def made_walks(
+def synthetic_walks(
     n: int = 60,
     skeleton: Skeleton | None = None,
     *,
@@ -76,7 +76,7 @@ def made_walks(
         if wanted <= set(make_gait(style).skeleton.canonical_names):
             return make_gaits(n, styles={style: 1.0}, frames=round(seconds * fps), fps=fps)
     if wanted <= set(ANIMAL_SKELETON.canonical_names):
-        return made_animals(n, round(seconds * fps), fps)
+        return synthetic_animals(n, round(seconds * fps), fps)
     raise ValueError(
         f"skeleton has the joints {', '.join(sorted(wanted))}, expected those of a person or a "
         "quadruped: bodies are made of no others"
@@ -84,7 +84,7 @@ def made_walks(
 
 
 def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
-    """Return the joints, by canonical names, that a body of :func:`made_walks` has too.
+    """Return the joints, by canonical names, that a body of :func:`synthetic_walks` has too.
 
     Of people and quadrupeds, it is the body that has both ends of more of the skeleton's bones;
     people where that is the same. A joint whose parent is left out becomes a root. None where no

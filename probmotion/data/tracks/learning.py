@@ -11,9 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from probmotion import seeds
 from probmotion.data.projections import Centre, DetectorNoise, Filming, project_clips
-from probmotion.data.synthetic.walks import made_walks, shared_skeleton
+from probmotion.data.synthetic.walks import shared_skeleton, synthetic_walks
 from probmotion.data.tracks.preparation import PreparedTracks, prepare_tracks
-from probmotion.data.tracks.scale_reports import own_sizes
+from probmotion.data.tracks.scale_reports import per_track_scales
 from probmotion.data.tracks.scales import bone_sizes, scale_to_bones
 from probmotion.io.files import files_named, read_keypoints
 from probmotion.motion.motion import KeypointTrack, Motion
@@ -25,9 +25,9 @@ __all__ = [
     "certain",
     "film_clips",
     "film_windows",
-    "made_walks",
     "read_tracks",
     "split_tracks",
+    "synthetic_walks",
 ]
 
 
@@ -150,7 +150,7 @@ def read_tracks(
 
     Where no size of a bone is known (:func:`body_sizes` knows none, and ``sizes`` says none), the
     unit is the body's length instead: the median over tracks of the diagonal of the body's box is
-    1 (:func:`~probmotion.data.tracks.scale_reports.own_sizes`).
+    1 (:func:`~probmotion.data.tracks.scale_reports.per_track_scales`).
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def read_tracks(
     )  # fmt: skip
     if known is not None:
         return prepared
-    scaled, report = scale_to_bones(prepared.tracks, own_sizes(prepared.tracks))
+    scaled, report = scale_to_bones(prepared.tracks, per_track_scales(prepared.tracks))
     return PreparedTracks(tuple(scaled), (*prepared.reports, report))
 
 
@@ -231,7 +231,9 @@ def body_sizes(skeleton: Skeleton) -> dict[str, float]:
     shared = shared_skeleton(skeleton)
     if shared is None:
         return {}
-    filmed = film_clips(made_walks(8, shared), shared, 20.0, views=16, noise=DetectorNoise.none())
+    filmed = film_clips(
+        synthetic_walks(8, shared), shared, 20.0, views=16, noise=DetectorNoise.none()
+    )
     return bone_sizes(filmed.tracks)
 
 

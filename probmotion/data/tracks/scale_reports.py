@@ -10,7 +10,7 @@ from probmotion.data.tracks.scales import bone_sizes, scale_to_bones
 from probmotion.data.tracks.step_reports import seen
 from probmotion.motion.motion import KeypointTrack
 
-__all__ = ["body_extent", "own_sizes"]
+__all__ = ["body_extent", "per_track_scales"]
 
 
 def body_extent(track: KeypointTrack) -> float:
@@ -30,7 +30,7 @@ def body_extent(track: KeypointTrack) -> float:
     return float(np.median(np.linalg.norm(most - least, axis=-1)))
 
 
-def own_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
+def per_track_scales(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     """Return sizes to scale a data set by that is of no known body, each track in its own unit.
 
     Proportions are the median over tracks of each bone's size (:func:`bone_sizes`) in units of its

@@ -1,4 +1,4 @@
-"""`KeptChain`: where a chain that takes hours is, in a file, so that it goes on if stopped."""
+"""`StoredChain`: where a chain that takes hours is, in a file, so that it goes on if stopped."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 
 from probmotion.files import written_whole
 
-__all__ = ["KeptChain"]
+__all__ = ["StoredChain"]
 
 _SECONDS = 30.0
 
 
-class KeptChain:
+class StoredChain:
     """Arrays that say where a chain is, written from time to time and whole.
 
     When they are written changes no draw: a chain goes on from them with the same bits.

@@ -31,7 +31,7 @@ from probmotion.metrics.distribution import random_directions
 from probmotion.posteriors.draws import MotionDraws, library_versions, settings_of
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import HasSeeds, Samplable
-from probmotion.posteriors.reference import KeptReference, fingerprint_of
+from probmotion.posteriors.reference import StoredReference, fingerprint_of
 from probmotion.posteriors.sampling import Sampler, load_sampler
 from probmotion.problems.references.outlier_gibbs import OutlierGibbs
 from probmotion.problems.references.tempered_pairs import TemperedPairs
@@ -61,7 +61,7 @@ def make_reference(
     progress: bool = True,
     sampler: Sampler | None = None,
     unfinished: str | Path | None = None,
-) -> KeptReference:
+) -> StoredReference:
     """Return reference draws of a problem with their certificate.
 
     Parameters
@@ -174,7 +174,7 @@ def _kept_or_made(
 
 def certify(
     problem: Problem, runs: list[MotionDraws], seed: int, draws: int | None = None
-) -> KeptReference:
+) -> StoredReference:
     """Return the draws of two runs as a reference, if both have mixed and they agree.
 
     ``draws`` of them are kept, evenly apart in every chain; all by default.
@@ -228,7 +228,7 @@ def certify(
         "versions": library_versions(),
         "fingerprint": fingerprint_of(problem.posterior, positions),
     }
-    return KeptReference(positions, certificate)
+    return StoredReference(positions, certificate)
 
 
 def _agreed(name: str, runs: list[np.ndarray], seed: int, where: str) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from probmotion.posteriors.reference import KeptReference
+from probmotion.posteriors.reference import StoredReference
 
 __all__ = ["find_reference", "references_folder"]
 
@@ -18,9 +18,9 @@ def references_folder() -> Path:
     return data_folder() / "references"
 
 
-def find_reference(name: str) -> KeptReference | None:
+def find_reference(name: str) -> StoredReference | None:
     """Return the reference kept of a problem: the user's own, else the package's, else None."""
     for place in (references_folder(), _SHIPPED):
         if (place / name / "certificate.json").is_file():
-            return KeptReference.load(place / name)
+            return StoredReference.load(place / name)
     return None

@@ -38,7 +38,7 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.posteriors.truncation import TruncatedPosterior
-from probmotion.problems.references.chains import KeptChain
+from probmotion.problems.references.chains import StoredChain
 from probmotion.validation import check_count
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class TemperedPairs:
                 for chain in range(chains)
             ]
             kept = [
-                KeptChain(unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz"))
+                StoredChain(unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz"))
                 for chain in range(chains)
             ]
             try:
@@ -223,7 +223,7 @@ class _Ladder:
         """Sum over neighbours of how often an exchange is rejected: Λ of Syed et al."""
         return float(self.rejected.sum() / max(self.asked, 1))
 
-    def draw(self, draws: int, bar: Any, stop: Event, kept: KeptChain) -> np.ndarray:
+    def draw(self, draws: int, bar: Any, stop: Event, kept: StoredChain) -> np.ndarray:
         """Return the states at the top after a warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
         found, done, held = np.empty((draws, *self.poses.shape[1:])), 0, kept.load()
         if held is None:

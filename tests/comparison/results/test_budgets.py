@@ -275,7 +275,7 @@ def test_what_a_sampler_cannot_do_and_cannot_afford_are_rows(tmp_path):
         ("generation", "rich"): "budget",
         ("generation", "poor"): None,
         ("generation", "prior"): None,
-        **{("monocular", name): "evidence" for name in samplers},
+        **{("monocular", name): "observations" for name in samplers},
     }
     assert "rich on generation: walking needs" in str(found.table())
 
@@ -290,4 +290,4 @@ def test_the_library_s_own_samplers_spend_what_they_may():
         assert result.failure is None
         assert 0.8 * 6000 <= result.budget["used"] <= 6000
     table = found.table()
-    assert np.isfinite(table[table["metric"] == "swd"]["value"]).all()
+    assert np.isfinite(table[table["metric"] == "swd_ratio"]["value"]).all()

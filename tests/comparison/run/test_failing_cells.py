@@ -367,7 +367,7 @@ def test_a_problem_whose_references_fail_stops_no_other(evidence):
     problems = {"broken": MotionPosterior(prior, likelihood), "whole": generation()}
     found = compare(problems, PriorDraws(), **SMALL)
     words = {result.problem: result.failure and result.failure.word for result in found.results}
-    assert words == {"broken": "evidence" if evidence else "NotImplementedError", "whole": None}
+    assert words == {"broken": "observations" if evidence else "NotImplementedError", "whole": None}
 
 
 class InOneChain(PriorDraws):

@@ -163,12 +163,12 @@ def test_failures_are_tried_again_and_unfit_samplers_are_not(tmp_path):
 
     first = run()
     assert first["generation", "crashing-once"].word == "RuntimeError"
-    assert first["monocular", "prior-draws"].word == "evidence"
+    assert first["monocular", "prior-draws"].word == "observations"
     assert runs(diary) == 2
     mended.touch()
     second = run()
     assert second["generation", "crashing-once"] is None
-    assert second["monocular", "prior-draws"].word == "evidence"
+    assert second["monocular", "prior-draws"].word == "observations"
     assert runs(diary) == 2
 
 

@@ -15,7 +15,7 @@ from probmotion.data.synthetic.animals import (
     DOG_CLIPS,
     animal_clips,
     dog_clips,
-    made_animals,
+    synthetic_animals,
 )
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import load_motion
@@ -50,7 +50,7 @@ def dogs(real_data: Path) -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def made() -> list[Motion]:
-    return made_animals(12, frames=120)
+    return synthetic_animals(12, frames=120)
 
 
 def assert_is_an_animal(clip: Motion) -> None:
@@ -130,9 +130,9 @@ def test_made_animals_have_the_gaits_trunk_and_paws(made: list[Motion]) -> None:
 
 
 def test_an_animal_is_the_same_whatever_else_is_made(made: list[Motion]) -> None:
-    for clip, again in zip(made_animals(3, frames=60), made, strict=False):
+    for clip, again in zip(synthetic_animals(3, frames=60), made, strict=False):
         np.testing.assert_allclose(clip.positions[:, 0], again.positions[:60, 0])
-    other = made_animals(1, frames=120, seed=1)[0]
+    other = synthetic_animals(1, frames=120, seed=1)[0]
     assert not np.array_equal(other.positions, made[0].positions)
 
 
@@ -232,4 +232,4 @@ def test_a_folder_without_dogs_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="seconds is 0, expected a finite number above 0"):
         animal_clips(seconds=0)
     with pytest.raises(ValueError, match="n is 0, expected an integer of at least 1"):
-        made_animals(0)
+        synthetic_animals(0)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from probmotion import Motion, Skeleton
-from probmotion.data.synthetic.animals import made_animals
+from probmotion.data.synthetic.animals import synthetic_animals
 from probmotion.data.synthetic.cycles import repeated_cycle
 
 
@@ -74,7 +74,7 @@ def test_every_cycle_is_the_first_moved_and_turned() -> None:
 
 
 def test_a_closed_cycle_stays_what_it_is() -> None:
-    walk = made_animals(1, frames=31)[0]
+    walk = synthetic_animals(1, frames=31)[0]
     frame = walk.positions[:1]
     bob = 0.05 * np.sin(2 * np.pi * np.arange(11) / 10)
     move = np.stack([0 * bob, bob, 0.1 * np.arange(11)], axis=-1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion.data.pairs import dance_frames, person_height
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.data.synthetic.limbs import bent_limb
 from probmotion.motion.skeleton import Skeleton
 
@@ -16,7 +16,7 @@ PAIR = Skeleton.preset("pair17")
 @pytest.fixture(scope="module")
 def positions():
     """(dance, frame, joint, axis)"""
-    return np.stack([dance.positions for dance in make_dances(30, frames=120)])
+    return np.stack([dance.positions for dance in synthetic_dances(30, frames=120)])
 
 
 def joint(positions, name):
@@ -66,7 +66,7 @@ def test_they_move_as_people_can(positions):
     speed = 30 * length(np.diff(positions, axis=1))
     assert speed.max() < 7
     assert 0.1 < np.median(speed) < 1
-    assert all(dance_frames(dance).all() for dance in make_dances(5))
+    assert all(dance_frames(dance).all() for dance in synthetic_dances(5))
     # Feet come down to the floor, never below, and nobody flies.
     for person in range(2):
         ankles = np.stack(
@@ -133,15 +133,15 @@ def test_elbows_bend_the_natural_way(positions):
 
 
 def test_a_dance_is_the_same_whatever_else_is_made():
-    few, many = make_dances(2, seed=3), make_dances(5, seed=3)
+    few, many = synthetic_dances(2, seed=3), synthetic_dances(5, seed=3)
     np.testing.assert_array_equal(few[1].positions, many[1].positions)
     assert [dance.name for dance in many] == [f"dance-{k}" for k in range(5)]
     assert not np.array_equal(few[1].positions, many[2].positions)
-    assert not np.array_equal(few[1].positions, make_dances(2, seed=4)[1].positions)
+    assert not np.array_equal(few[1].positions, synthetic_dances(2, seed=4)[1].positions)
     # A longer clip begins with the shorter one; a finer one passes through its frames.
-    longer = make_dances(2, frames=700, seed=3)[1]
+    longer = synthetic_dances(2, frames=700, seed=3)[1]
     np.testing.assert_allclose(longer.positions[:90], few[1].positions, atol=1e-12)
-    finer = make_dances(2, frames=179, fps=60.0, seed=3)[1]
+    finer = synthetic_dances(2, frames=179, fps=60.0, seed=3)[1]
     np.testing.assert_allclose(finer.positions[::2], few[1].positions, atol=1e-12)
     assert np.isfinite(longer.positions).all()
 
@@ -169,8 +169,8 @@ def test_a_limb_reaches_where_it_can():
 
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="n is 0, expected an integer of at least 1"):
-        make_dances(0)
+        synthetic_dances(0)
     with pytest.raises(ValueError, match="frames is 0, expected an integer of at least 1"):
-        make_dances(1, frames=0)
+        synthetic_dances(1, frames=0)
     with pytest.raises(ValueError, match=r"fps is -30\.0, expected a finite number above 0"):
-        make_dances(1, fps=-30.0)
+        synthetic_dances(1, fps=-30.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probmotion import Motion, Skeleton
-from probmotion.data.synthetic.walks import WALK_CLIPS, made_walks, walk_clips
+from probmotion.data.synthetic.walks import WALK_CLIPS, synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import body_sizes, film_clips
 from probmotion.io.files import load_motion
 from probmotion.motion.splits import clip_of
@@ -148,11 +148,11 @@ def test_a_missing_clip_is_named(tmp_path: Path) -> None:
 
 
 def test_made_walks_are_the_same_for_all() -> None:
-    walks = made_walks(3, seconds=2.5, fps=20.0)
+    walks = synthetic_walks(3, seconds=2.5, fps=20.0)
     assert [(clip.name, clip.frames, clip.fps) for clip in walks] == [
         (f"walk-{number}", 50, 20.0) for number in range(3)
     ]
-    for clip, again in zip(walks, made_walks(5, seconds=2.5, fps=20.0), strict=False):
+    for clip, again in zip(walks, synthetic_walks(5, seconds=2.5, fps=20.0), strict=False):
         np.testing.assert_array_equal(clip.positions, again.positions)
     bodies = [poses(clip) for clip in walks]
     # No two are one: half a walk is more than a centimetre from all of another.
@@ -163,10 +163,10 @@ def test_made_walks_are_the_same_for_all() -> None:
 
 def test_quadrupeds_walk_where_their_joints_are_asked_for() -> None:
     horse = Skeleton.preset("apt36k17")
-    (clip,) = made_walks(1, horse, seconds=1)
+    (clip,) = synthetic_walks(1, horse, seconds=1)
     assert clip.name.startswith("quadruped-walk")
     assert set(body_sizes(horse)) == {
         horse.joint_names[joint] for joint, parent in enumerate(horse.parents) if parent >= 0
     }
     with pytest.raises(ValueError, match="expected those of a person or a quadruped"):
-        made_walks(1, Skeleton(["hub", "rim"], [-1, 0]))
+        synthetic_walks(1, Skeleton(["hub", "rim"], [-1, 0]))

@@ -19,9 +19,9 @@ from probmotion.data.tracks.learning import (
     certain,
     film_clips,
     film_windows,
-    made_walks,
     read_tracks,
     split_tracks,
+    synthetic_walks,
 )
 from probmotion.io.keypoint_layouts import keypoint_skeleton
 from probmotion.motion.motion import KeypointTrack
@@ -42,7 +42,7 @@ def clips() -> list[Motion]:
             rotations=None,
             rest_offsets=None,
         )
-        for number, clip in enumerate(made_walks(4, seconds=2.0))
+        for number, clip in enumerate(synthetic_walks(4, seconds=2.0))
     ]
 
 
@@ -338,7 +338,7 @@ def test_made_people_come_back_in_their_size(tmp_path: Path, sizes: dict[str, fl
 
 def test_sizes_of_people_are_those_of_bones(sizes: dict[str, float]) -> None:
     assert set(sizes) == set(PERSON.joint_names) - {"pelvis"}
-    (walker,) = made_walks(1)
+    (walker,) = synthetic_walks(1)
     body = walker.retarget(PERSON)
     for joint, parent in PERSON.bones:
         length = np.linalg.norm(body.positions[0, joint] - body.positions[0, parent])

@@ -12,7 +12,7 @@ from probmotion import Cameras, Skeleton
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.synthetic.walks import shared_skeleton
 from probmotion.data.tracks.learning import body_sizes, read_tracks
-from probmotion.data.tracks.scale_reports import body_extent, own_sizes
+from probmotion.data.tracks.scale_reports import body_extent, per_track_scales
 from probmotion.data.tracks.scales import bone_sizes, scale_to_bones
 from probmotion.motion.motion import KeypointTrack
 
@@ -157,7 +157,7 @@ def test_own_sizes_are_the_median_track_s_proportions() -> None:
         KeypointTrack(np.tile(scale * straight, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
         for scale in (1.0, 1.0, 70.0)
     ]
-    sizes = own_sizes(tracks)
+    sizes = per_track_scales(tracks)
     assert sizes == pytest.approx({"back": 0.3, "rump": 0.5, "tail_tip": 0.2})
     # Of two bodies each counts alike, however large its pictures are. By hand: 0.3, 0.5, 0.2 and
     # 0.1, 0.8, 0.1 have the median 0.2, 0.65, 0.15, and scaled to it extents of 0.75 and 1.5.
@@ -165,8 +165,8 @@ def test_own_sizes_are_the_median_track_s_proportions() -> None:
     other = KeypointTrack(np.tile(20 * thick, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
     pair = [tracks[0], other]
     wanted = {"back": 0.2 / 1.125, "rump": 0.65 / 1.125, "tail_tip": 0.15 / 1.125}
-    assert own_sizes(pair) == pytest.approx(wanted)
-    both, _ = scale_to_bones(pair, own_sizes(pair))
+    assert per_track_scales(pair) == pytest.approx(wanted)
+    both, _ = scale_to_bones(pair, per_track_scales(pair))
     assert np.median([body_extent(track) for track in both]) == pytest.approx(1)
     # One whose tail is lost in every frame is a worm all the same.
     confidence = np.ones((5, 4))
@@ -175,7 +175,7 @@ def test_own_sizes_are_the_median_track_s_proportions() -> None:
         np.where(confidence[..., None] > 0, 4 * straight, np.nan), confidence, WORM, 30.0
     )
     assert body_extent(docked) == pytest.approx(32)
-    sizes = own_sizes([*tracks, docked])
+    sizes = per_track_scales([*tracks, docked])
     (scaled,), _ = scale_to_bones([docked], sizes)
     assert bone_sizes([scaled])["back"] == pytest.approx(sizes["back"], rel=0.05)
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from probmotion import Motion, Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.local_frames import chests, pair_frames
 from probmotion.interaction.annotations.sources import ELEVATIONS, draw_annotations, world_axes
 from probmotion.interaction.annotations.views import view_angles
 
 PAIR = Skeleton.preset("pair17")
-DANCES = make_dances(3, frames=40)
+DANCES = synthetic_dances(3, frames=40)
 
 
 def walk(frames: int = 12, seed: int = 0) -> Motion:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from probmotion import KeypointTrack, Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.tracks import annotations_of_tracks
 from probmotion.io.files import read_keypoints
 from probmotion.io.keypoint_layouts import keypoint_skeleton
 
 PAIR = Skeleton.preset("pair17")
-DANCES = make_dances(3, frames=40)
+DANCES = synthetic_dances(3, frames=40)
 
 
 def detections(layout: str, scale: float = 300.0) -> list[KeypointTrack]:

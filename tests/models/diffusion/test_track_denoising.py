@@ -13,7 +13,7 @@ import torch
 from probmotion import Skeleton, seeds
 from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.data.tracks.learning import film_clips, made_walks, read_tracks
+from probmotion.data.tracks.learning import film_clips, read_tracks, synthetic_walks
 from probmotion.data.tracks.preparation import prepare_tracks
 from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
 from probmotion.models.diffusion.settings import DiffusionSettings
@@ -33,7 +33,7 @@ NOISE = 0.03  # metres, along each axis
 def prior(tmp_path_factory: pytest.TempPathFactory) -> MotionDiffusion:
     """A tiny network that saw walks of 36 people for some six seconds."""
     exact = DetectorNoise.none()
-    tracks = film_clips(made_walks(40, seconds=3.0), PERSON, 20.0, views=6, noise=exact).tracks
+    tracks = film_clips(synthetic_walks(40, seconds=3.0), PERSON, 20.0, views=6, noise=exact).tracks
     trainee = DiffusionTrainee(
         tracks[:-24],
         tracks[-24:],

@@ -84,7 +84,7 @@ def joint():
     return mean, covariance, observe
 
 
-def log_evidence():
+def log_marginal_likelihood():
     mean, covariance, observe = joint()
     spread = observe @ covariance @ observe.T + NOISE**2 * np.eye(3 * T)
     return stats.multivariate_normal.logpdf(Y.ravel(), observe @ mean, spread)
@@ -104,7 +104,9 @@ def standard(n=N, seed=1):
 
 def test_the_bound_at_the_exact_posterior_is_the_log_evidence():
     found = bounds(exact(), standard()).numpy()
-    assert found.mean() == pytest.approx(log_evidence(), abs=5 * found.std() / math.sqrt(N))
+    assert found.mean() == pytest.approx(
+        log_marginal_likelihood(), abs=5 * found.std() / math.sqrt(N)
+    )
     assert found.std() / math.sqrt(N) < 0.03
 
 
@@ -158,8 +160,10 @@ def test_gradient_ascent_on_the_bound_finds_log_evidence_and_posterior():
     with torch.no_grad():
         begun = bounds(Linear(*torch.zeros(3, T, 2, dtype=torch.float64)), standard()).mean()
         found = bounds(Linear(*numbers), standard()).numpy()
-    assert begun < log_evidence() - 10
-    assert found.mean() == pytest.approx(log_evidence(), abs=0.02 + 5 * found.std() / math.sqrt(N))
+    assert begun < log_marginal_likelihood() - 10
+    assert found.mean() == pytest.approx(
+        log_marginal_likelihood(), abs=0.02 + 5 * found.std() / math.sqrt(N)
+    )
     wanted = exact()
     gain, offset, log_scale = (value.detach() for value in numbers)
     np.testing.assert_allclose(log_scale, wanted.log_scale, atol=0.05)

@@ -127,7 +127,7 @@ def test_log_density_is_the_dense_mixtures(prior, motions):
     np.testing.assert_allclose(prior.log_prior(motions), expected, rtol=0, atol=1e-10)
     posterior = prior.exact_posterior(None)
     np.testing.assert_allclose(posterior.log_density(motions), expected, rtol=0, atol=1e-10)
-    assert posterior.log_evidence == pytest.approx(0, abs=1e-12)
+    assert posterior.log_marginal_likelihood == pytest.approx(0, abs=1e-12)
     whole = small_prior("positions")
     np.testing.assert_allclose(
         whole.log_density(motions.reshape(4, -1)), expected, rtol=0, atol=1e-10
@@ -237,7 +237,7 @@ def test_posterior_density_is_bayes(prior, motions, kind):
     posterior = prior.exact_posterior(evidence)
     X = np.concatenate([motions, posterior.sample(np.random.default_rng(8), 4)])
     bayes = prior.log_prior(X) + evidence.log_density(X) - posterior.log_density(X)
-    np.testing.assert_allclose(bayes, posterior.log_evidence, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(bayes, posterior.log_marginal_likelihood, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["keypoints", "joints"])
@@ -247,7 +247,7 @@ def test_latent_likelihood_integrates_to_the_evidence(prior, motions, kind):
     node, step = np.linspace(-8, 8, 401, retstep=True)
     grid = np.stack(np.meshgrid(node, node), axis=-1).reshape(-1, 2)
     total = logsumexp(prior.log_density(grid) + posterior.log_likelihood(grid)) + 2 * np.log(step)
-    assert total == pytest.approx(posterior.log_evidence, abs=1e-6)
+    assert total == pytest.approx(posterior.log_marginal_likelihood, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["keypoints", "joints"])
@@ -335,7 +335,7 @@ def test_component_probabilities_are_the_dense_ones(prior, motions):
         for lw, mean, C in Dense(prior).components
     ]
     posterior = prior.exact_posterior(evidence)
-    assert posterior.log_evidence == pytest.approx(logsumexp(logs), abs=1e-9)
+    assert posterior.log_marginal_likelihood == pytest.approx(logsumexp(logs), abs=1e-9)
     np.testing.assert_allclose(
         posterior.component_probabilities.ravel(), np.exp(logs - logsumexp(logs)), atol=1e-10
     )

@@ -16,7 +16,7 @@ from probmotion.models.pose_pairs.joint_limits_learning import (
     clips_of_people,
     learn_limits,
     main,
-    rejected_shares,
+    rejected_fractions,
 )
 
 PERSON = Skeleton.preset("person17")
@@ -323,7 +323,7 @@ def test_learning_and_saving_give_the_same_bytes(tmp_path, limits):
 
 
 def test_shares_tell_real_random_and_backwards_apart(limits):
-    shares = rejected_shares(limits, swings(1000, seed=13))
+    shares = rejected_fractions(limits, swings(1000, seed=13))
     assert all(row["real"] < 0.02 for row in shares.values())
     assert all(row["random"] > 0.3 for row in shares.values())
     assert shares["ankle"]["backwards"] > 0.95

@@ -10,7 +10,7 @@ import pytest
 
 from probmotion.data.pair_sets import choose_seed
 from probmotion.data.pairs import pair_motion
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.interaction.annotations.tracks import annotations_of_tracks
 from probmotion.io.files import load_motion, read_keypoints, save_motion
@@ -24,7 +24,7 @@ from probmotion.samplers.mcmc.proposals import Isotropic, VelocityBiased
 
 ONE = Skeleton.preset("person17")
 FEW = PairSettings(n_views=4, n_near=8)
-DANCE = make_dances(1)[0]
+DANCE = synthetic_dances(1)[0]
 SEED = DANCE.positions[choose_seed(DANCE.positions)]
 
 

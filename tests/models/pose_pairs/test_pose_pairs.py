@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from probmotion import MotionPosterior, UnsupportedPosterior
 from probmotion.data.pair_sets import choose_seed
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
@@ -31,7 +31,7 @@ PAIR = Skeleton.preset("pair17")
 
 @pytest.fixture(scope="module")
 def poses() -> np.ndarray:
-    return np.concatenate([dance.positions[::10] for dance in make_dances(3)])
+    return np.concatenate([dance.positions[::10] for dance in synthetic_dances(3)])
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_a_chain_keeps_to_the_support(prior):
 
 
 def test_every_setting_reaches_the_posterior(poses):
-    drawn = draw_annotations([make_dances(1)[0]], 30, seed=0, known_views=True)
+    drawn = draw_annotations([synthetic_dances(1)[0]], 30, seed=0, known_views=True)
     settings = PairSettings(
         penetration_weight=3.0,
         position_noise=0.07,

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from probmotion import Skeleton
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.views import image_axes, pair_frames, project_to_views
-from probmotion.interaction.completion import hidden_joint_error
+from probmotion.interaction.completion import occluded_joint_error
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.pose_pairs.single_pose_lifting import lift_people
 
 PAIR = Skeleton.preset("pair17")
-DANCE = make_dances(1)[0].positions
+DANCE = synthetic_dances(1)[0].positions
 SEED, VIEW = DANCE[10], np.array([0.7, 1.5])
 ALL = np.ones(34, dtype=bool)
 HIDDEN = np.isin(np.arange(34), [7, 13, 26])
@@ -86,8 +86,8 @@ def test_hidden_joints_are_not_read_and_stay_as_the_seed_has_them():
         for wrong in (np.nan, 3.0)
     ]
     np.testing.assert_array_equal(*lifted)
-    error = hidden_joint_error(near, lifted[0][:, :2], HIDDEN)
-    assert error < 0.1 < hidden_joint_error(near, picture(SEED) + 0.5, HIDDEN)
+    error = occluded_joint_error(near, lifted[0][:, :2], HIDDEN)
+    assert error < 0.1 < occluded_joint_error(near, picture(SEED) + 0.5, HIDDEN)
 
 
 def test_a_person_does_not_depend_on_the_other_ones_keypoints():

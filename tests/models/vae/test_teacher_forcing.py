@@ -16,7 +16,7 @@ from probmotion.models.training.track_batches import Augmentation, TrackBatches
 from probmotion.models.vae.losses import pictured
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
-from probmotion.models.vae.teacher_forcing import TaughtPoses, scaled
+from probmotion.models.vae.teacher_forcing import TeacherForcedPoses, scaled
 from probmotion.models.vae.training import MotionVAETrainee
 from probmotion.motion.rest_poses import estimate_rest_pose
 from probmotion.motion.skeleton import Skeleton
@@ -62,7 +62,7 @@ def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest,
     batches = batches_of(tracks, mirror=mirror)
     drawn = batches.draw(np.random.default_rng(0), 12)
     # A trainer has set it to train; what it says is not of the half precision it would train in.
-    found = TaughtPoses(network.train(), batches, rest).of(drawn)
+    found = TeacherForcedPoses(network.train(), batches, rest).of(drawn)
     seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
     with torch.no_grad():
         asked = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
@@ -77,7 +77,7 @@ def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest,
 def test_of_a_scaled_window_the_picture_is_scaled(tracks, network, rest, body, distance, off):
     batches = batches_of(tracks, scale=0.4)
     drawn = batches.draw(np.random.default_rng(0), 12)
-    every = TaughtPoses(network, batches, rest).of(drawn)
+    every = TeacherForcedPoses(network, batches, rest).of(drawn)
     scale = torch.as_tensor(drawn.scale)
     assert scale.std() > 0.1
     pictures = []
@@ -144,6 +144,6 @@ def test_frames_are_mirrored_only_where_windows_are(tracks):
 def test_windows_that_are_moved_or_padded_are_refused(tracks, network, rest):
     long = TrackBatches(tracks, 99, 0.3, Augmentation.none())
     with pytest.raises(ValueError, match="drawn has windows that are padded"):
-        TaughtPoses(network, long, rest).of(long.draw(np.random.default_rng(0), 2))
+        TeacherForcedPoses(network, long, rest).of(long.draw(np.random.default_rng(0), 2))
     with pytest.raises(ValueError, match=r"batches has shift=0\.1, expected 0"):
-        TaughtPoses(network, batches_of(tracks, shift=0.1), rest)
+        TeacherForcedPoses(network, batches_of(tracks, shift=0.1), rest)

@@ -14,12 +14,11 @@ from probmotion.models import GaussianMixtureMotion
 from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.problem import Problem
-from probmotion.posteriors.reference import KeptReference
+from probmotion.posteriors.reference import StoredReference
 from probmotion.posteriors.sampling import load_sampler
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem
-from probmotion.problems.references import making as references
-from probmotion.problems.references import store as kept_references
+from probmotion.problems.references import making as references, store as kept_references
 from probmotion.problems.references.making import (
     ReferenceRefused,
     agreement,
@@ -216,7 +215,7 @@ def test_what_was_saved_is_read_and_served(tmp_path, heavy, made):
     assert sorted(path.name for path in tmp_path.rglob("*")) == [
         "certificate.json", "draws.npz", "toy",
     ]  # fmt: skip
-    kept = replace(problem, kept=KeptReference.load(folder))
+    kept = replace(problem, kept=StoredReference.load(folder))
     assert kept.has_reference
     assert not problem.has_reference
     assert (kept.most_reference, problem.most_reference) == (480, None)
@@ -264,7 +263,7 @@ def test_broken_files_are_told(tmp_path, exact, name, content, sentence):
     folder = make_reference(exact, draws=80, progress=False).save(tmp_path / "toy")
     (folder / name).write_bytes(content)
     with pytest.raises(ValueError, match=sentence):
-        KeptReference.load(folder)
+        StoredReference.load(folder)
 
 
 def kept_by(problem, folder, draws=480, seed=1, thin=1):

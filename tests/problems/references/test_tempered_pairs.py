@@ -14,15 +14,14 @@ from arviz_stats.base import array_stats
 from scipy.special import logsumexp
 
 from probmotion import MotionPosterior
-from probmotion.data.synthetic.dances import make_dances
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem
-from probmotion.problems.references import chains as kept_chains
-from probmotion.problems.references import tempered_pairs
-from probmotion.problems.references.chains import KeptChain
+from probmotion.problems.references import chains as kept_chains, tempered_pairs
+from probmotion.problems.references.chains import StoredChain
 from probmotion.problems.references.pair_densities import (
     log_annotations,
     log_prior,
@@ -41,7 +40,7 @@ _APART = 4.4
 
 @pytest.fixture(scope="module")
 def dances():
-    return make_dances(4)
+    return synthetic_dances(4)
 
 
 @pytest.fixture(scope="module")
@@ -307,7 +306,7 @@ def test_a_run_that_was_stopped_goes_on_with_the_same_bits(
     asked = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
     whole = sampler.sample(posterior, **asked)
     monkeypatch.setattr(kept_chains, "_SECONDS", 0.0)
-    save = KeptChain.save
+    save = StoredChain.save
 
     def stopping(kept, held):
         save(kept, held)
@@ -315,7 +314,7 @@ def test_a_run_that_was_stopped_goes_on_with_the_same_bits(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(KeptChain, "save", stopping)
+        patch.setattr(StoredChain, "save", stopping)
         with pytest.raises(KeyboardInterrupt):
             sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
     kept = sorted(tmp_path.iterdir())

@@ -366,7 +366,7 @@ def test_evidence_that_is_not_linear_is_refused(lively):
         for sampler in (Ancestral3D(), MultiViewAncestral(), MultiViewPredictorCorrector()):
             with pytest.raises(UnsupportedPosterior, match=reason) as refused:
                 sampler.sample(MotionPosterior(lively, likelihood), draws=1, progress=False)
-            assert refused.value.word == "evidence"
+            assert refused.value.word == "observations"
 
 
 def test_settings_out_of_range():

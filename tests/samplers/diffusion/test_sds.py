@@ -119,7 +119,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively):
         UnsupportedPosterior, match=r"place for evidence; .*mas, .*mvpc.* would do"
     ) as no:
         ScoreDistillation().sample(MotionPosterior(lively, seen), progress=False)
-    assert no.value.word == "evidence"
+    assert no.value.word == "observations"
     with pytest.raises(ValueError, match="initial is int, expected None: sds starts every draw"):
         ScoreDistillation().sample(MotionPosterior(lively), initial=3, progress=False)
     for wrong, message in (

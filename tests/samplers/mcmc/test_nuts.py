@@ -38,8 +38,10 @@ def long(posterior):
 
 
 def test_the_draws_are_numpyros_own(posterior, two_bumps, long):
-    from numpyro.infer import MCMC
-    from numpyro.infer import NUTS as Kernel  # noqa: N811
+    from numpyro.infer import (
+        MCMC,
+        NUTS as Kernel,  # noqa: N811
+    )
 
     start = posterior.initial(seeds.generator(3, "initial", 1), 1)[0]
     with jax.enable_x64(True):

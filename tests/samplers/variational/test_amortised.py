@@ -78,7 +78,7 @@ def front():
 
 
 @pytest.mark.parametrize(
-    "evidence",
+    "observations",
     [
         "none",
         "joints",
@@ -298,7 +298,7 @@ def test_what_cannot_be_simulated_or_shown_is_refused(gaussian_motion):
     prior = smooth_gaussian(gaussian_motion)
     with pytest.raises(UnsupportedPosterior, match=r"keypoints or joints.*Unseen") as refused:
         drawn(MotionPosterior(prior, Unseen()), BRIEF)
-    assert refused.value.word == "evidence"
+    assert refused.value.word == "observations"
 
     class Unsampled:
         skeleton, frames, fps, dim = prior.skeleton, prior.frames, prior.fps, prior.dim

@@ -123,7 +123,7 @@ def test_where_q_holds_the_posterior_a_fit_finds_it(theta):
     """And its bound is log p(y): the optimum of the ELBO is the exact evidence and posterior."""
     network = GaussianNetwork()
     posterior = one_direction(network, theta)
-    mean, deviation, log_evidence = posterior.prior.exact(posterior.likelihood)
+    mean, deviation, log_marginal_likelihood = posterior.prior.exact(posterior.likelihood)
     draws = run(FIT, posterior, draws=1000)
     found = draws.dataset["theta"].values.ravel()
     # Adam's noise, and that of 2000 draws.
@@ -138,7 +138,9 @@ def test_where_q_holds_the_posterior_a_fit_finds_it(theta):
         float(network.begun[0].loss(rng, initial_entropy=True, latent_weight=1.0).detach())
         for rng in rngs
     ]
-    assert -np.mean(losses) == pytest.approx(log_evidence, abs=5 * np.std(losses) / 20 + 0.02)
+    assert -np.mean(losses) == pytest.approx(
+        log_marginal_likelihood, abs=5 * np.std(losses) / 20 + 0.02
+    )
     # Log densities at the draws are those of the posterior: prior times likelihood.
     np.testing.assert_allclose(
         draws.dataset["log_density"].values.ravel(), posterior.log_density(found[:, None])
@@ -352,7 +354,7 @@ def test_a_network_that_cannot_read_the_evidence_is_not_passed_over():
             UnsupportedPosterior, match=r"^dvae was given a network that does not read Keypoints2D$"
         ) as refused:
             draw(replace(BRIEF, network=GaussianNetwork()), posterior)
-        assert refused.value.word == "evidence"
+        assert refused.value.word == "observations"
 
 
 def test_a_prior_that_cannot_be_sampled_is_refused(two_bumps):

@@ -1,7 +1,7 @@
 """What the error of MAS is made of where the truth is known: a table and a picture per setting.
 
-    python notebooks/ablations/bias_budget.py --out budgets
-    python notebooks/ablations/bias_budget.py --quick --out quick     (short motions, two minutes)
+    python notebooks/ablations/error_decomposition.py --out budgets
+    python notebooks/ablations/error_decomposition.py --quick --out quick  (short motions, 2 min)
 
 ``--settings`` chooses among those below. What is measured is kept in ``--out``, so that what is
 interrupted goes on. The network of the setting ``network`` is trained here, on pictures of the
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from probmotion.calibration.error_decomposition import bias_budget
-from probmotion.calibration.error_result import BiasBudget
+from probmotion.calibration.error_decomposition import decompose_error
+from probmotion.calibration.error_result import ErrorDecomposition
 from probmotion.data.projections import Filming
 from probmotion.files import written_whole
 from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
@@ -58,13 +58,13 @@ class Study:
     out: Path
     quick: bool
 
-    def budget(self, name: str) -> BiasBudget:
+    def budget(self, name: str) -> ErrorDecomposition:
         """Return a setting's budget; write its table and picture."""
         asked = SETTINGS[name]
         scale = {"frames": 6, "components": 12} if self.quick else {}
         problem = load_problem(asked.problem, **scale)
         folder = self.out / name.replace(" ", "-")
-        budget = bias_budget(
+        budget = decompose_error(
             problem,
             steps=asked.steps // (10 if self.quick else 1),
             seeds=2 if self.quick else 5,
@@ -74,7 +74,7 @@ class Study:
             learnt=self.network(problem, folder / "network") if asked.network else None,
             out=folder,
         )
-        budget.plot(folder / "bias_budget.png")
+        budget.plot(folder / "decompose_error.png")
         return budget
 
     def network(self, problem: Problem, folder: Path) -> MotionDiffusion:
