@@ -60,7 +60,7 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
         If ``seed`` is not an integer of at least 0.
     """
     if isinstance(seed, bool) or not isinstance(seed, _INTEGERS) or seed < 0:
-        raise ValueError(f"seed is {seed!r}, expected an integer of at least 0")
+        raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
     # A string and an integer must never address the same node: each carries a tag of its kind.
     key: tuple[int, ...] = ()
     for name in path:
@@ -166,6 +166,6 @@ class NormalStreams:
     def _row(self, size: tuple[int, ...]) -> tuple[int, ...]:
         if size[:1] != (len(self.generators),):
             raise ValueError(
-                f"size is {size}, expected {len(self.generators)} first, one row per draw"
+                f"size must be {len(self.generators)} first, one row per draw, got {size}"
             )
         return size[1:]

@@ -1,4 +1,4 @@
-"""Checks of what a caller hands in: each failure is one sentence with the argument's name."""
+"""Validation of arguments. Each error names the argument, the requirement and the value."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
         isinstance(want, int) and want != got for want, got in zip(axes, trailing, strict=True)
     ):
         wanted = ", ".join(str(axis) for axis in expected)
-        raise ValueError(f"{name} has shape {shape}, expected ({wanted})")
+        raise ValueError(f"{name} must have shape ({wanted}), got {shape}")
 
 
 def check_finite(name: str, value: Any) -> None:
@@ -43,8 +43,8 @@ def check_finite(name: str, value: Any) -> None:
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name} has {bad.sum()} values that are NaN or infinite, the first at index {where}, "
-            "expected finite numbers"
+            f"{name} must be finite, got {bad.sum()} values that are NaN or infinite, "
+            f"the first at index {where}"
         )
 
 
@@ -52,10 +52,10 @@ def check_positive(name: str, value: float) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} is {value!r}, expected a finite number above 0")
+        raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:
     """Raise ``ValueError`` unless ``value`` is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name} is {value!r}, expected an integer of at least {least}")
+        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")

@@ -29,11 +29,11 @@ def test_shapes_that_fit(shape: tuple[int, ...], expected: tuple[Any, ...]) -> N
 @pytest.mark.parametrize(
     ("shape", "expected", "message"),
     [
-        ((4, 2), ("L", 3), r"x has shape \(4, 2\), expected \(L, 3\)"),
-        ((2, 4, 3), ("L", 3), r"x has shape \(2, 4, 3\), expected \(L, 3\)"),
-        ((3,), ("…", "L", 3), r"x has shape \(3,\), expected \(…, L, 3\)"),
-        ((), ("…", 3), r"x has shape \(\), expected \(…, 3\)"),
-        ((2, 2), ("…", 2, 3), r"x has shape \(2, 2\), expected \(…, 2, 3\)"),
+        ((4, 2), ("L", 3), r"x must have shape \(L, 3\), got \(4, 2\)"),
+        ((2, 4, 3), ("L", 3), r"x must have shape \(L, 3\), got \(2, 4, 3\)"),
+        ((3,), ("…", "L", 3), r"x must have shape \(…, L, 3\), got \(3,\)"),
+        ((), ("…", 3), r"x must have shape \(…, 3\), got \(\)"),
+        ((2, 2), ("…", 2, 3), r"x must have shape \(…, 2, 3\), got \(2, 2\)"),
     ],
 )
 def test_shapes_that_do_not_fit(
@@ -48,9 +48,7 @@ def test_numbers_that_are_not_finite_are_counted_and_found(library: Any) -> None
     check_finite("x", library.array(np.zeros((0, 3))))
     values = np.zeros((2, 3))
     values[1, 1:] = [np.nan, -np.inf]
-    wanted = (
-        r"x has 2 values that are NaN or infinite, the first at index \(1, 1\), expected finite"
-    )
+    wanted = r"x must be finite, got 2 values that are NaN or infinite, the first at index \(1, 1\), expected finite"
     with pytest.raises(ValueError, match=wanted):
         check_finite("x", library.array(values))
 
@@ -58,7 +56,7 @@ def test_numbers_that_are_not_finite_are_counted_and_found(library: Any) -> None
 def test_positive_numbers() -> None:
     check_positive("x", 1e-300)
     for bad in (0, -1, np.nan, np.inf, -np.inf):
-        with pytest.raises(ValueError, match=r"x is .*, expected a finite number above 0"):
+        with pytest.raises(ValueError, match=r"x must be a finite number above 0, got .*"):
             check_positive("x", bad)
 
 
@@ -67,7 +65,7 @@ def test_counts() -> None:
     check_count("n", np.int64(3), least=3)
     check_count("n", 0, least=0)
     for bad in (0, -1, 1.0, True, "3", None):
-        with pytest.raises(ValueError, match=r"n is .*, expected an integer of at least 1"):
+        with pytest.raises(ValueError, match=r"n must be an integer of at least 1, got .*"):
             check_count("n", bad)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="n is 2, expected an integer of at least 3"):
+    with pytest.raises(ValueError, match="n must be an integer of at least 3, got 2"):
         check_count("n", 2, least=3)

@@ -69,7 +69,7 @@ def test_an_address_does_not_depend_on_who_asked_before() -> None:
 
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "0", None, np.float64(2)])
 def test_what_is_no_seed_is_refused(seed: Any) -> None:
-    with pytest.raises(ValueError, match=r"seed is .*, expected an integer of at least 0"):
+    with pytest.raises(ValueError, match=r"seed must be an integer of at least 0, got .*"):
         seeds.generator(seed)
 
 

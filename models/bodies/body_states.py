@@ -315,7 +315,7 @@ def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
         If there is no motion, or the skeleton has no left-right pairs: no side, no heading.
     """
     if not motions:
-        raise ValueError("motions is empty, expected at least one")
+        raise ValueError("motions must contain at least one, got none")
     pairs = skeleton.mirrored_pairs
     if not pairs:
         raise ValueError("skeleton has no left-right pairs, expected some, to tell where it looks")

@@ -71,7 +71,7 @@ def denoiser_of(
         If training does.
     """
     if not isinstance(prior, Samplable):
-        raise ValueError(f"prior is {type(prior).__name__}, expected one that can be sampled")
+        raise ValueError(f"prior must be one that can be sampled, got {type(prior).__name__}")
     check_count("motions", motions, least=2)
     sizes = {
         "tiny": DiffusionSettings.tiny,
@@ -79,7 +79,7 @@ def denoiser_of(
         "paper": DiffusionSettings.paper,
     }
     if size not in sizes:
-        raise ValueError(f"size is {size!r}, expected one of {', '.join(sizes)}")
+        raise ValueError(f"size must be one of {', '.join(sizes)}, got {size!r}")
     usual = usual_training(size)
     tracks = _filmed(prior, motions, views, filming, seed)
     held_out = views * max(1, motions // _HELD_OUT)

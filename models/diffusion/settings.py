@@ -54,10 +54,10 @@ class DiffusionSettings:
         for name in ("frames", "steps"):
             check_count(name, getattr(self, name), least=2)
         if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout is {self.dropout}, expected at least 0 and below 1")
+            raise ValueError(f"dropout must be at least 0 and below 1, got {self.dropout}")
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width is {self.width}, expected an even multiple of heads, {self.heads}"
+                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
             )
 
     @classmethod
@@ -111,7 +111,7 @@ class DiffusionSettings:
             If ᾱ is not above 0 and at most 1.
         """
         if not 0 < alpha_bar <= 1:
-            raise ValueError(f"alpha_bar is {alpha_bar:.3g}, expected above 0 and at most 1")
+            raise ValueError(f"alpha_bar must be above 0 and at most 1, got {alpha_bar:.3g}")
         levels = self.schedule.alpha_bar
         # Level 0 has no noise; a hundredth of the first level's stands for it.
         noise = np.sqrt((1 - levels) / levels)

@@ -157,5 +157,5 @@ def usual_training(size: str) -> TrainingSettings:
         ),
     }
     if size not in known:
-        raise ValueError(f"size is {size!r}, expected one of {', '.join(known)}")
+        raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
     return known[size]

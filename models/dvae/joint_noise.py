@@ -52,10 +52,10 @@ class JointNoise:
         check_positive("least", self.least)
         check_positive("most", self.most)
         if not self.least <= self.most:
-            raise ValueError(f"most is {self.most}, expected at least least={self.least}")
+            raise ValueError(f"most must be at least least={self.least}, got {self.most}")
         for name in ("outliers", "hidden"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected a share, 0 to 1")
+                raise ValueError(f"{name} must be a share, 0 to 1, got {getattr(self, name)}")
 
     @classmethod
     def hardly_any(cls) -> JointNoise:

@@ -54,7 +54,7 @@ class DVAESettings:
             check_count(name, getattr(self, name))
         if self.hidden % self.groups:
             raise ValueError(
-                f"hidden is {self.hidden}, expected a multiple of groups={self.groups}"
+                f"hidden must be a multiple of groups={self.groups}, got {self.hidden}"
             )
         for name, known in (("decoder", Decoder), ("decoder_scale", DecoderScale)):
             if getattr(self, name) not in get_args(known):

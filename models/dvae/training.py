@@ -247,7 +247,7 @@ def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
         ),
     }
     if size not in known:
-        raise ValueError(f"size is {size!r}, expected one of {', '.join(known)}")
+        raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
     return known[size]
 
 

@@ -222,5 +222,5 @@ def _valid_frames(lengths: np.ndarray | None, N: int, L: int) -> np.ndarray:
     counts = np.asarray(lengths)
     check_shape("lengths", counts, (N,))
     if counts.dtype.kind not in "iu" or ((counts < 1) | (counts > L)).any():
-        raise ValueError(f"lengths is {counts}, expected integers from 1 to {L}")
+        raise ValueError(f"lengths must be integers from 1 to {L}, got {counts}")
     return np.arange(L) < counts[:, None]

@@ -73,9 +73,9 @@ class LifterSettings:
         for name in ("deepest", "steepest", "distance"):
             check_positive(name, getattr(self, name))
         if not self.deepest < self.distance:
-            raise ValueError(f"deepest is {self.deepest}, expected below distance, {self.distance}")
+            raise ValueError(f"deepest must be below distance, {self.distance}, got {self.deepest}")
         if not self.steepest < math.pi / 2:
-            raise ValueError(f"steepest is {self.steepest}, expected below pi/2")
+            raise ValueError(f"steepest must be below pi/2, got {self.steepest}")
 
     @classmethod
     def tiny(cls) -> LifterSettings:
@@ -276,7 +276,7 @@ class PoseLifter:
         check_shape("views", views, ("N", "L", J, 2))
         check_finite("views", views)
         if 0 in views.shape:
-            raise ValueError(f"views has shape {views.shape}, expected a motion and a frame")
+            raise ValueError(f"views must have shape a motion and a frame, got {views.shape}")
         root = self.skeleton.roots[0]
         poses = np.asarray(views, np.float64).reshape(-1, J, 2)
         poses = poses - poses[:, root : root + 1]

@@ -66,7 +66,7 @@ class LossWeights:
     def __post_init__(self) -> None:
         for name, weight in asdict(self).items():
             if not 0 <= weight < float("inf"):
-                raise ValueError(f"{name} is {weight}, expected a number of at least 0")
+                raise ValueError(f"{name} must be a number of at least 0, got {weight}")
 
 
 def bone_sizes(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:

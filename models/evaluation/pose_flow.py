@@ -62,9 +62,9 @@ class FlowSettings:
         for name in ("couplings", "width"):
             check_count(name, getattr(self, name))
         if not 0 < self.share <= 1:
-            raise ValueError(f"share is {self.share}, expected above 0 and at most 1")
+            raise ValueError(f"share must be above 0 and at most 1, got {self.share}")
         if not 0 <= self.blur < math.inf:
-            raise ValueError(f"blur is {self.blur}, expected a number of at least 0")
+            raise ValueError(f"blur must be a number of at least 0, got {self.blur}")
 
     @classmethod
     def tiny(cls) -> FlowSettings:
@@ -169,7 +169,7 @@ class PoseFlow(nn.Module):
         self.joints = [joint for joint in range(skeleton.n_joints) if joint != root]
         D = 2 * len(self.joints)
         if not components <= D:
-            raise ValueError(f"components is {components}, expected at most {D}")
+            raise ValueError(f"components must be at most {D}, got {components}")
         self.register_buffer("mean", torch.zeros(D))
         self.register_buffer("basis", torch.eye(D))
         self.register_buffer("deviation", torch.ones(D))

@@ -40,7 +40,7 @@ def whole_poses(
         If there is no track, the skeletons differ, or no frame is seen whole.
     """
     if not tracks:
-        raise ValueError("tracks is empty, expected at least one track")
+        raise ValueError("tracks must contain at least one track, got none")
     skeleton = tracks[0].skeleton
     found = []
     for track in tracks:

@@ -60,7 +60,7 @@ class EvaluatorSettings:
         check_positive("kl_weight", self.kl_weight)
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width is {self.width}, expected an even multiple of heads, {self.heads}"
+                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
             )
 
     @classmethod

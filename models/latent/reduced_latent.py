@@ -50,7 +50,7 @@ class ReducedLatent(StandardNormalPrior):
     def __init__(self, prior: Any, k: int, seed: int = 0) -> None:
         check_count("k", k)
         if k > prior.dim:
-            raise ValueError(f"k is {k}, expected at most the prior's {prior.dim} dimensions")
+            raise ValueError(f"k must be at most the prior's {prior.dim} dimensions, got {k}")
         self.prior = prior
         self.seed = seed
         values, vectors = np.linalg.eigh(_mean_square(prior, seeds.generator(seed, "directions")))

@@ -115,7 +115,7 @@ class ConditionedMixture:
             If a camera is perspective.
         """
         if not cameras.orthographic:
-            raise ValueError("cameras is perspective, expected orthographic cameras")
+            raise ValueError("cameras must be orthographic cameras, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.prior.means.shape[1:3], 2))
         out = np.empty_like(x_t)
         for view, axes in enumerate(cameras.image_axes):
@@ -127,7 +127,7 @@ class ConditionedMixture:
         """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``; P is ``axes``, (M, 3)."""
         prior, scale, variance = self.prior, self.prior.scale, self.prior.noise**2
         if not 0 < alpha_bar < 1:
-            raise ValueError(f"alpha_bar is {alpha_bar!r}, expected a number between 0 and 1")
+            raise ValueError(f"alpha_bar must be a number between 0 and 1, got {alpha_bar!r}")
         precision = alpha_bar / ((1 - alpha_bar) * scale**2)
         information = self._information + precision * axes.T @ axes
         shrink = np.linalg.inv(np.eye(3) + variance * information)

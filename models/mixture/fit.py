@@ -126,7 +126,7 @@ def cut_windows(
     step = max(1, frames // 4) if stride is None else stride
     check_count("stride", step)
     if not motions:
-        raise ValueError("motions is empty, expected at least one clip")
+        raise ValueError("motions must contain at least one clip, got none")
     first = motions[0]
     for motion in motions:
         if motion.skeleton != first.skeleton:

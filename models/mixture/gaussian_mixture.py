@@ -87,13 +87,13 @@ class GaussianMixtureMotion:
         check_positive("fps", self.fps)
         check_count("azimuths", self.azimuths)
         if self.weights.min() <= 0 or abs(self.weights.sum() - 1) > 1e-9:
-            raise ValueError(f"weights is {self.weights}, expected numbers above 0 that sum to 1")
+            raise ValueError(f"weights must be numbers above 0 that sum to 1, got {self.weights}")
         names = tuple(self.styles) or tuple(f"style-{k}" for k in range(K))
         if len(names) != K:
             raise ValueError(f"styles has {len(names)} names, expected {K}, one per mean")
         if self.coordinates not in ("latent", "positions"):
             raise ValueError(
-                f"coordinates is {self.coordinates!r}, expected 'latent' or 'positions'"
+                f"coordinates must be 'latent' or 'positions', got {self.coordinates!r}"
             )
         object.__setattr__(self, "styles", names)
 
@@ -381,7 +381,7 @@ class GaussianMixtureMotion:
     def _seen_by(self, cameras: Cameras, x_t: np.ndarray) -> list[TurnedMixture]:
         """The 2D marginals of the V views, which are mixtures with the same weights."""
         if not cameras.orthographic:
-            raise ValueError("cameras is perspective, expected orthographic cameras")
+            raise ValueError("cameras must be orthographic cameras, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.means.shape[1:3], 2))
         return [self._view(axes) for axes in cameras.image_axes]
 

@@ -82,7 +82,7 @@ class JointLimits:
         if not np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max() < 1e-9:
             raise ValueError("rest has vectors of another length than 1, expected unit vectors")
         if not 0 < self.tilt < np.pi / 2:
-            raise ValueError(f"tilt is {self.tilt!r}, expected an angle between 0 and π/2")
+            raise ValueError(f"tilt must be an angle between 0 and π/2, got {self.tilt!r}")
         empty = np.argwhere(~self.allowed.any(axis=-1))
         if len(empty):
             part, row = empty[0]

@@ -73,7 +73,7 @@ def learn_limits(
     """
     for name, angle in (("dilation", dilation), ("bin_dilation", bin_dilation)):
         if not 0 <= angle < np.pi / 2:
-            raise ValueError(f"{name} is {angle!r}, expected an angle from 0 to below π/2 radians")
+            raise ValueError(f"{name} must be an angle from 0 to below π/2 radians, got {angle!r}")
     poses = _poses(motions)
     rest = _mean_directions(poses, bin_rings, cell_rings)
     local = _local(poses, rest, bin_rings, cell_rings)

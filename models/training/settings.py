@@ -66,19 +66,19 @@ class TrainingSettings:
         for name in ("steps", "batch", "checkpoint_every"):
             check_count(name, getattr(self, name))
         if self.optimiser not in ("adamw", "adamax"):
-            raise ValueError(f"optimiser is {self.optimiser!r}, expected adamw or adamax")
+            raise ValueError(f"optimiser must be adamw or adamax, got {self.optimiser!r}")
         for step in self.halve_at:
             check_count("halve_at", step)
         for name in ("warmup", "seed", "patience"):
             check_count(name, getattr(self, name), least=0)
         check_positive("learning_rate", self.learning_rate)
         if not 0 <= self.ema < 1:
-            raise ValueError(f"ema is {self.ema}, expected a decay of at least 0 and below 1")
+            raise ValueError(f"ema must be a decay of at least 0 and below 1, got {self.ema}")
         if not self.clip > 0:
-            raise ValueError(f"clip is {self.clip}, expected a number above 0, or inf for none")
+            raise ValueError(f"clip must be a number above 0, or inf for none, got {self.clip}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(
-                f"weight_decay is {self.weight_decay}, expected a finite number of at least 0"
+                f"weight_decay must be a finite number of at least 0, got {self.weight_decay}"
             )
 
     def rate(self, step: int) -> float:

@@ -45,11 +45,11 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         if not 0 < self.shortest <= 1:
-            raise ValueError(f"shortest is {self.shortest}, expected above 0 and at most 1")
+            raise ValueError(f"shortest must be above 0 and at most 1, got {self.shortest}")
         if not 0 <= self.scale < 1:
-            raise ValueError(f"scale is {self.scale}, expected at least 0 and below 1")
+            raise ValueError(f"scale must be at least 0 and below 1, got {self.scale}")
         if not 0 <= self.shift < np.inf:
-            raise ValueError(f"shift is {self.shift}, expected a number of at least 0")
+            raise ValueError(f"shift must be a number of at least 0, got {self.shift}")
 
     @classmethod
     def none(cls) -> Augmentation:
@@ -110,7 +110,7 @@ class TrackBatches:
     ) -> None:
         check_count("frames", frames, least=2)
         if not 0 <= threshold < np.inf:
-            raise ValueError(f"threshold is {threshold}, expected a number of at least 0")
+            raise ValueError(f"threshold must be a number of at least 0, got {threshold}")
         _check_alike(tracks)
         self.skeleton: Skeleton = tracks[0].skeleton
         self.fps = tracks[0].fps
@@ -295,7 +295,7 @@ def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
 
 def _check_alike(tracks: Sequence[KeypointTrack]) -> None:
     if not tracks:
-        raise ValueError("tracks is empty, expected at least one track")
+        raise ValueError("tracks must contain at least one track, got none")
     first = tracks[0]
     for track in tracks:
         if track.skeleton != first.skeleton:

@@ -102,7 +102,7 @@ def check_device(device: str) -> torch.device:
         If it is another one, or there is no CUDA.
     """
     if device not in ("cpu", "cuda"):
-        raise ValueError(f"device is {device!r}, expected cpu or cuda")
+        raise ValueError(f"device must be cpu or cuda, got {device!r}")
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda', but this machine has no CUDA; expected 'cpu'")
     return torch.device(device)

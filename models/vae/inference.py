@@ -86,7 +86,7 @@ class VAEEncoder:
         """
         if not isinstance(prior, EncodesKeypoints):
             raise ValueError(
-                f"prior is {type(prior).__name__}, expected the MotionVAE whose encoder this is"
+                f"prior must be the MotionVAE whose encoder this is, got {type(prior).__name__}"
             )
         if degrees_of_freedom is not None:
             freedom = None if math.isinf(degrees_of_freedom) else degrees_of_freedom

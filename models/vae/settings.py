@@ -92,7 +92,7 @@ class MotionVAESettings:
         check_count("image_features", self.image_features, least=0)
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width is {self.width}, expected an even multiple of heads, {self.heads}"
+                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
             )
         if self.hypotheses > 4:
             raise ValueError(
@@ -100,7 +100,7 @@ class MotionVAESettings:
             )
         for name in ("spatial", "mixed_precision"):
             if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} is {getattr(self, name)!r}, expected True or False")
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         for name in _WEIGHTS:
             _check_weight(name, getattr(self, name))
 
@@ -148,4 +148,4 @@ def _check_weight(name: str, value: float) -> None:
     """Raise ``ValueError`` unless a loss's weight is a finite number of at least 0."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} is {value!r}, expected a finite number of at least 0")
+        raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")

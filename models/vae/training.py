@@ -417,7 +417,7 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
         ),
     }
     if size not in known:
-        raise ValueError(f"size is {size!r}, expected one of {', '.join(known)}")
+        raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
     return known[size]
 
 

@@ -111,7 +111,7 @@ def _check(
     if transitions is not None:
         check_count("transitions", transitions)
     if not 0 <= weight < np.inf:
-        raise ValueError(f"prior_weight is {weight}, expected a finite number of at least 0")
+        raise ValueError(f"prior_weight must be a finite number of at least 0, got {weight}")
     if prior.frames <= 2 * _SHARED:
         raise ValueError(
             f"prior has motions of {prior.frames} frames, expected at least {2 * _SHARED + 1}: "

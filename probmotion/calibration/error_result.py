@@ -65,7 +65,7 @@ class ErrorDecomposition:
             If it was not measured; the message lists what was.
         """
         if measure not in self.values:
-            raise ValueError(f"measure is {measure!r}, expected one of {', '.join(self.values)}")
+            raise ValueError(f"measure must be one of {', '.join(self.values)}, got {measure!r}")
         links = list(self.values[measure].items())
         return {part: after - before for (_, before), (part, after) in itertools.pairwise(links)}
 

@@ -97,7 +97,7 @@ def calibrate(
     check_count("chains", chains)
     check_count("workers", workers, least=0)
     if draws % chains:
-        raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
+        raise ValueError(f"draws must be a multiple of chains, {chains}, got {draws}")
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     check_budget(budget)

@@ -43,7 +43,7 @@ class Overconfident:
     def __post_init__(self) -> None:
         check_positive("factor", self.factor)
         if self.factor >= 1:
-            raise ValueError(f"factor is {self.factor!r}, expected a number between 0 and 1")
+            raise ValueError(f"factor must be a number between 0 and 1, got {self.factor!r}")
 
     def sample(
         self,

@@ -82,7 +82,7 @@ class Calibration:
             ("sampler", sampler, self.plan.samplers),
         ):
             if name not in known:
-                raise ValueError(f"{what} is {name!r}, expected one of {', '.join(known)}")
+                raise ValueError(f"{what} must be one of {', '.join(known)}, got {name!r}")
         return [
             result
             for result in self.results

@@ -179,7 +179,7 @@ class Compare:
             return
         if self.calibrate < FEWEST_SIMULATIONS:
             raise ValueError(
-                f"calibrate is {self.calibrate}, expected {FEWEST_SIMULATIONS} simulations or more"
+                f"calibrate must be {FEWEST_SIMULATIONS} simulations or more, got {self.calibrate}"
             )
         if all(problem.simulate is None for problem in problems):
             raise ValueError("calibrate is given, but none of the problems can be simulated")
@@ -190,7 +190,7 @@ class Compare:
 
         names = self.samplers or tuple(importable_samplers())
         if len(set(names)) < len(names):
-            raise ValueError(f"samplers is {' '.join(names)}, expected each once")
+            raise ValueError(f"samplers must be each once, got {' '.join(names)}")
         return {name: sampler_called(name, self.settings) for name in names}
 
     def _problems(self) -> list[Problem]:
@@ -219,7 +219,7 @@ class Compare:
         if "all" not in self.problems:
             return self.problems
         if len(self.problems) > 1:
-            raise ValueError(f"problems is {' '.join(self.problems)}, expected all, or some names")
+            raise ValueError(f"problems must be all, or some names, got {' '.join(self.problems)}")
         found, left_out = problems_at_hand()
         for name, reason in left_out.items():
             print(f"left out: {name}: {reason}")

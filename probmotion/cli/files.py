@@ -101,5 +101,5 @@ class Convert:
         count = draws.dataset.sizes["draw"]
         draw = 0 if self.draw is None else self.draw
         if not 0 <= draw < count:
-            raise ValueError(f"draw is {draw}, expected 0 to {count - 1}")
+            raise ValueError(f"draw must be 0 to {count - 1}, got {draw}")
         return draws.motion(draw)

@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if words else 2
     commands = [*_COMMANDS, "train"]
     if words[0] not in commands:
-        return _complain(f"command is {words[0]!r}, expected one of {', '.join(commands)}", 2)
+        return _complain(f"command must be one of {', '.join(commands)}, got {words[0]!r}", 2)
     with warnings.catch_warnings():
         warnings.showwarning = _note
         try:
@@ -130,7 +130,7 @@ def _parse(name: str, words: Sequence[str]) -> Any:
         known = ", ".join(TRAINABLE)
         if not words or words[0] not in TRAINABLE:
             got = repr(words[0]) if words else "missing"
-            raise ValueError(f"what to train is {got}, expected one of {known}")
+            raise ValueError(f"what to train must be one of {known}, got {got}")
         return tyro.cli(TRAINABLE[words[0]], prog=f"{prog} {words[0]}", args=words[1:])
     kind = _COMMANDS[name]
     if kind is not Compare:

@@ -111,7 +111,7 @@ def sampler_called(name: str, settings: Any) -> Any:
     known = presets_of(kind)
     if preset not in known:
         names = ", ".join(f"{base}.{one}" for one in known) or f"{base} alone, which has no presets"
-        raise ValueError(f"sampler is {name!r}, expected {names}")
+        raise ValueError(f"sampler must be {names}, got {name!r}")
     return getattr(kind, preset)()
 
 
@@ -180,7 +180,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     if not isinstance(name, ast.Name):
         return ast.literal_eval(tree)
     if name.id not in known:
-        raise ValueError(f"{name.id!r} is unknown, expected one of {', '.join(known)}")
+        raise ValueError(f"{name.id!r} must be one of {', '.join(known)}, got unknown")
     kind: Any = known[name.id]
     if not isinstance(tree, ast.Call):
         return kind()

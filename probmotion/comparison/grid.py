@@ -97,13 +97,13 @@ def compare(
     check_count("seeds", seeds)
     check_count("workers", workers, least=0)
     if draws % chains:
-        raise ValueError(f"draws is {draws}, expected a multiple of chains, {chains}")
+        raise ValueError(f"draws must be a multiple of chains, {chains}, got {draws}")
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     check_budget(budget)
     submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
     if executor is not None and not submits:
-        raise ValueError(f"executor is {executor!r}, expected one that has submit(), or None")
+        raise ValueError(f"executor must be one that has submit(), or None, got {executor!r}")
     chosen = named_problems(problems)
     used = named_samplers(samplers)
     given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out)

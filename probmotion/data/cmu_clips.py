@@ -57,7 +57,7 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     """
     match = _NAME.fullmatch(name) if isinstance(name, str) else None
     if match is None:
-        raise ValueError(f"name is {name!r}, expected a subject and a trial, such as 'cmu_02_02'")
+        raise ValueError(f"name must be a subject and a trial, such as 'cmu_02_02', got {name!r}")
     subject, trial = match["subject"], match["trial"]
     places = data_places(folder)
     for place in places:

@@ -198,12 +198,12 @@ def _chosen(dataset: str, names: Sequence[str] | None) -> list[_Entry]:
     """Return the registry's entries of a data set, all or those named."""
     known = list(dict.fromkeys(entry.dataset for entry in _registry()))
     if dataset not in known:
-        raise ValueError(f"dataset is {dataset!r}, expected one of {', '.join(known)}")
+        raise ValueError(f"dataset must be one of {', '.join(known)}, got {dataset!r}")
     entries = {entry.name: entry for entry in _registry() if entry.dataset == dataset}
     if names is None:
         return list(entries.values())
     if isinstance(names, str):
-        raise ValueError(f"names is {names!r}, expected a list of names")
+        raise ValueError(f"names must be a list of names, got {names!r}")
     for name in names:
         if name not in entries:
             raise ValueError(

@@ -107,7 +107,7 @@ def ground_truth(
         If there is no motion, skeletons differ, or fewer than ``n`` frames are the dance.
     """
     if not motions:
-        raise ValueError("motions is empty, expected at least one")
+        raise ValueError("motions must contain at least one, got none")
     for motion in motions:
         if motion.skeleton != motions[0].skeleton:
             raise ValueError(
@@ -128,7 +128,7 @@ def ground_truth(
         n = total
     check_count("n", n)
     if n > total:
-        raise ValueError(f"n is {n}, expected at most the {total} frames of the dance")
+        raise ValueError(f"n must be at most the {total} frames of the dance, got {n}")
     chosen = (2 * np.arange(n) + 1) * total // (2 * n)  # the middles of n equal stretches
     every = np.concatenate([m.positions[kept] for m, kept in zip(motions, frames, strict=True)])
     return every[chosen], clip[chosen], frame[chosen]
@@ -145,7 +145,7 @@ def hold_out(
         If a name is not that of exactly one motion, or no motion would be left in or out.
     """
     if isinstance(names, str):
-        raise ValueError(f"names is {names!r}, expected a list of names")
+        raise ValueError(f"names must be a list of names, got {names!r}")
     known = [motion.name for motion in motions]
     for name in names:
         if known.count(name) != 1:

@@ -58,13 +58,13 @@ class DetectorNoise:
         for name in ("found", "lost"):
             value = getattr(self, name)
             if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, expected a finite number of at least 0")
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
         if not 0 <= self.share < 1:
-            raise ValueError(f"share is {self.share}, expected at least 0 and below 1")
+            raise ValueError(f"share must be at least 0 and below 1, got {self.share}")
         if not 0 <= self.silent <= 1:
-            raise ValueError(f"silent is {self.silent}, expected 0 to 1")
+            raise ValueError(f"silent must be 0 to 1, got {self.silent}")
         if not 1 <= self.frames < math.inf:
-            raise ValueError(f"frames is {self.frames}, expected a finite number of at least 1")
+            raise ValueError(f"frames must be a finite number of at least 1, got {self.frames}")
         if self._begin > 1:
             raise ValueError(
                 f"share is {self.share} with frames {self.frames}, expected a joint to be found "
@@ -150,7 +150,7 @@ class Filming:
                 "-pi/2 and pi/2"
             )
         if self.centre not in get_args(Centre):
-            raise ValueError(f"centre is {self.centre!r}, expected frame or sequence")
+            raise ValueError(f"centre must be frame or sequence, got {self.centre!r}")
 
     def cameras(self, rng: np.random.Generator, n: int) -> Cameras:
         """Return n cameras at random azimuths."""
@@ -198,7 +198,7 @@ def project_clips(
     """
     check_count("views", views)
     if not motions:
-        raise ValueError("motions is empty, expected at least one clip")
+        raise ValueError("motions must contain at least one clip, got none")
     names = [motion.name for motion in motions]
     if len(set(names)) < len(names) or "" in names:
         raise ValueError(f"motions has the names {', '.join(names)}, expected one of its own each")

@@ -276,4 +276,4 @@ def _checked(
 def _check_nearest(n_nearest: int, n_draws: int) -> None:
     check_count("n_nearest", n_nearest)
     if n_nearest > n_draws:
-        raise ValueError(f"n_nearest is {n_nearest}, expected at most {n_draws}, the draws")
+        raise ValueError(f"n_nearest must be at most {n_draws}, the draws, got {n_nearest}")

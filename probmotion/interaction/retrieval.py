@@ -108,13 +108,13 @@ def retrieve(
     check_shape("views", views, ("V", 2))
     check_count("n", n)
     if len(views) == 0:
-        raise ValueError("views is empty, expected at least one")
+        raise ValueError("views must contain at least one, got none")
     batch = keypoints.shape[:-2]
     seen = np.ones(keypoints.shape[:-1], dtype=bool) if visible is None else np.asarray(visible)
     check_shape("visible", seen, keypoints.shape[:-1])
     first = np.sort(np.unique(draws, axis=0, return_index=True)[1])
     if n > len(first):
-        raise ValueError(f"n is {n}, expected at most {len(first)}, the different draws")
+        raise ValueError(f"n must be at most {len(first)}, the different draws, got {n}")
     comparer = PairComparer(
         keypoints.reshape(-1, *keypoints.shape[-2:]),
         seen.reshape(-1, skeleton.n_joints),

@@ -133,7 +133,7 @@ def _unit(text: AcclaimText, lines: list[Line]) -> float:
             text.fail(lines[-1][0] if lines else text.length, f":units has no {name}, expected one")
     number, words = entries["angle"]
     if [word.lower() for word in words] not in (["deg"], ["degrees"]):
-        text.fail(number, f"angle is {shortened(' '.join(words))}, expected deg")
+        text.fail(number, f"angle must be deg, got {shortened(' '.join(words))}")
     number, words = entries["length"]
     (length,) = text.numbers(number, "length", words, 1)
     least, most = _LENGTHS
@@ -151,7 +151,7 @@ def _root(text: AcclaimText, lines: list[Line]) -> _Bone:
         # Readers differ in whether a motion counts from there.
         number, words = entries.get(name, (0, ["0"] * 3))
         if any(text.numbers(number, name, words, 3)):
-            text.fail(number, f"{name} is {' '.join(words)[:60]}, expected 0 0 0")
+            text.fail(number, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
     number, words = entries["order"]
     channels = _channels(text, number, words, _SHIFTS + _TURNS)
     return _Bone(number, np.zeros(3), np.eye(3), channels)
@@ -171,7 +171,7 @@ def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) ->
                     text.fail(number, f"the bone of line {begun} has no {needed}, expected one")
             name = " ".join(entries["name"][1])
             if not name or name in bones:
-                text.fail(entries["name"][0], f"name is {shortened(name)}, expected a new one")
+                text.fail(entries["name"][0], f"name must be a new one, got {shortened(name)}")
             bones[name] = _bone(text, begun, entries)
             begun = None
         elif begun is None or not (keyword in _ENTRIES or keyword.startswith("(")):
@@ -191,12 +191,12 @@ def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
     direction = np.array(text.numbers(number, "direction", words, 3))
     (length,) = text.numbers(entries["length"][0], "length", entries["length"][1], 1)
     if length < 0:
-        text.fail(entries["length"][0], f"length is {length:g}, expected 0 or more")
+        text.fail(entries["length"][0], f"length must be 0 or more, got {length:g}")
     if length > 0 and abs(np.linalg.norm(direction) - 1) > 1e-3:
-        text.fail(number, f"direction is {' '.join(words)[:60]}, expected a vector of length 1")
+        text.fail(number, f"direction must be a vector of length 1, got {' '.join(words)[:60]}")
     number, words = entries["axis"]
     if [word.upper() for word in words[3:]] != ["XYZ"]:
-        text.fail(number, f"axis is {shortened(' '.join(words))}, expected three angles and XYZ")
+        text.fail(number, f"axis must be three angles and XYZ, got {shortened(' '.join(words))}")
     angles = np.deg2rad(text.numbers(number, "axis", words[:3], 3))
     number, words = entries.get("dof", (begun, []))
     channels = _channels(text, number, words, _TURNS)

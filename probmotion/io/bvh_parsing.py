@@ -174,7 +174,9 @@ class _Parser:
                 "expected its closing brace",
             )
         if not joints:
-            self.fail(min(motion_line, len(self.lines)), "the hierarchy is empty, expected ROOT")
+            self.fail(
+                min(motion_line, len(self.lines)), "the hierarchy must contain ROOT, got none"
+            )
 
     def declare(self, number: int, words: list[str], open_blocks: list[int]) -> BVHJoint:
         """Return the joint that a line ``ROOT``, ``JOINT`` or ``End Site`` begins."""
@@ -277,7 +279,7 @@ class _Parser:
             header[key] = (number, value.strip())
         number, frames = header["Frames"]
         if re.fullmatch(r"[0-9]{1,9}", frames) is None or int(frames) == 0:
-            self.fail(number, f"Frames is {shortened(frames)}, expected an integer of at least 1")
+            self.fail(number, f"Frames must be an integer of at least 1, got {shortened(frames)}")
         self.content.fps = self.frame_rate(*header["Frame Time"])
         self.content.values = self.table(rows[2:], int(frames), number)
 

@@ -255,7 +255,7 @@ def _load(path: Path) -> Any:
 
 def _dicts(value: Any, where: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise MotionFileError(f"{where} is {shortened(value)}, expected a list of objects")
+        raise MotionFileError(f"{where} must be a list of objects, got {shortened(value)}")
     return value
 
 
@@ -275,7 +275,7 @@ def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | 
     if value is None or value == [] or value == -1:
         return None
     if not isinstance(value, int | str):
-        raise MotionFileError(f"{where}: {keys[0]} is {shortened(value)}, expected a number")
+        raise MotionFileError(f"{where}: {keys[0]} must be a number, got {shortened(value)}")
     return str(value)
 
 
@@ -309,7 +309,7 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
 
 def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"keypoints is {shortened(names)}, expected a list of names")
+        raise ValueError(f"keypoints must be a list of names, got {shortened(names)}")
     rootless = Skeleton(names, [-1] * len(names))
     for preset in map(Skeleton.preset, PRESETS):
         if preset.canonical_names == rootless.canonical_names:

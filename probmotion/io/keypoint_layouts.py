@@ -54,7 +54,7 @@ def keypoint_skeleton(name: str) -> Skeleton:
         return Skeleton.preset(name)
     if name not in LAYOUTS:
         known = ", ".join(sorted([*LAYOUTS, *PRESETS]))
-        raise ValueError(f"skeleton is {name!r}, expected a Skeleton or one of {known}")
+        raise ValueError(f"skeleton must be a Skeleton or one of {known}, got {name!r}")
     joints = [entry.partition(":") for entry in LAYOUTS[name].split()]
     names = [joint for joint, _, _ in joints]
     return Skeleton(names, [names.index(parent) if parent else -1 for _, _, parent in joints])

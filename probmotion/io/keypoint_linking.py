@@ -47,7 +47,7 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
         full = [number for number in order if len(frames[number]) >= people]
         if not full:
             most = max(len(found) for found in frames.values())
-            raise ValueError(f"people is {people}, expected at most the {most} of one image")
+            raise ValueError(f"people must be at most the {most} of one image, got {people}")
         sure = sorted(frames[full[0]], key=lambda found: -found.values[:, 2].mean())[:people]
         first = sorted(sure, key=lambda found: float(_middle(found.values)[0]))
         named = {full[0]: dict(enumerate(first))}

@@ -154,7 +154,7 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
             "least one of each"
         )
     if confidence.shape != keypoints.shape[:-1]:
-        archive.fail(f"confidence has shape {confidence.shape}, expected {keypoints.shape[:-1]}")
+        archive.fail(f"confidence must have shape {keypoints.shape[:-1]}, got {confidence.shape}")
     skeleton = archive.skeleton(keypoints.shape[-2])
     rate = archive.frame_rate() if fps is None else fps
     names = [archive.path.stem]
@@ -244,7 +244,7 @@ class Archive:
     def frame_rate(self) -> float:
         fps = self.numbers("fps")
         if fps.size != 1 or not fps.item() > 0:
-            self.fail(f"fps is {shortened(fps.tolist())}, expected one number above 0")
+            self.fail(f"fps must be one number above 0, got {shortened(fps.tolist())}")
         return fps.item()
 
     def skeleton(self, n_joints: int) -> Skeleton:
@@ -252,12 +252,12 @@ class Archive:
         names = self.names("joint_names", "joint", n_joints)
         parents = self.numbers("parents")
         if parents.shape != (n_joints,) or (parents != np.round(parents)).any():
-            self.fail(f"parents has shape {parents.shape}, expected {n_joints} integers")
+            self.fail(f"parents must have shape {n_joints} integers, got {parents.shape}")
         sizes = None
         if "radii" in self.keys:
             radii = self.numbers("radii")
             if radii.shape != (n_joints,) or not (radii >= 0).all():
-                self.fail(f"radii has shape {radii.shape}, expected {n_joints} numbers, 0 or more")
+                self.fail(f"radii must have shape {n_joints} numbers, 0 or more, got {radii.shape}")
             sizes = radii.tolist()
         try:
             return Skeleton(names, [int(parent) for parent in parents], sizes)
@@ -268,7 +268,7 @@ class Archive:
         """Return the rotation from the file's world to Y up, None where that is the same."""
         up = self.word("up_axis", "y").lower()
         if up not in ("y", "z"):
-            self.fail(f"up_axis is {shortened(up)}, expected 'y' or 'z'")
+            self.fail(f"up_axis must be 'y' or 'z', got {shortened(up)}")
         if up == "z" and "rotations" in self.keys:
             self.fail("up_axis is 'z' and rotations came, expected 'y' where there are rotations")
         return _Z_UP_TO_Y_UP if up == "z" else None
@@ -283,7 +283,7 @@ class Archive:
             ("rest_offsets", rest_offsets, (n_joints, 3)),
         ):
             if array.shape != expected:
-                self.fail(f"{key} has shape {array.shape}, expected {expected}")
+                self.fail(f"{key} must have shape {expected}, got {array.shape}")
         return rotations, rest_offsets
 
 

@@ -97,7 +97,7 @@ def _motions(archive: Archive) -> list[Motion]:
     if missing.any():
         where = tuple(int(index) for index in np.argwhere(missing)[0])
         archive.fail(
-            f"positions has {missing.sum()} values that are NaN, the first at index {where}, "
+            f"positions must be finite, got {missing.sum()} values that are NaN, the first at index {where}, "
             "expected a position for every joint and frame"
         )
     n_joints = positions.shape[-2]

@@ -89,7 +89,7 @@ def read_recording(
         If a joint of ``skeleton`` cannot be had, the threshold is no share, or shapes do not fit.
     """
     if not (isinstance(threshold, Real) and 0 <= threshold <= 1):
-        raise ValueError(f"threshold is {threshold!r}, expected a confidence, 0 to 1")
+        raise ValueError(f"threshold must be a confidence, 0 to 1, got {threshold!r}")
     archive = Archive(Path(path))
     keypoints, confidence = archive.numbers("keypoints"), archive.numbers("confidence")
     check_shape("keypoints", keypoints, ("V", "L", "J", 2))

@@ -68,9 +68,9 @@ def nearest_draw_distances(
     check_shape("draws", draws, ("S", ground_truth.shape[1], 3))
     for name, poses in (("ground_truth", ground_truth), ("draws", draws)):
         if len(poses) == 0:
-            raise ValueError(f"{name} is empty, expected at least one pose")
+            raise ValueError(f"{name} must contain at least one pose, got none")
     if len(counts) == 0:
-        raise ValueError("counts is empty, expected at least one number of draws")
+        raise ValueError("counts must contain at least one number of draws, got none")
     for count in counts:
         check_count("counts", count)
         if count > len(draws):

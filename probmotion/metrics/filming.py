@@ -34,7 +34,7 @@ def random_azimuths(rng: np.random.Generator, n: int, angles: Angles = "all") ->
         return rng.uniform(math.pi / 4, 3 * math.pi / 4, n)
     if angles == "reference-code-side":
         return np.full(n, math.pi / 2)
-    raise ValueError(f"angles is {angles!r}, expected one of {', '.join(get_args(Angles))}")
+    raise ValueError(f"angles must be one of {', '.join(get_args(Angles))}, got {angles!r}")
 
 
 def film_motions(

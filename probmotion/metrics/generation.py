@@ -259,7 +259,7 @@ class GenerationReference:
             If their features are not known.
         """
         if self.learnt_features is None:
-            raise ValueError("learnt_features is missing, expected features of learnt motions")
+            raise ValueError("learnt_features must be features of learnt motions, got missing")
         return replace(self, held_out_features=self.learnt_features)
 
     def score_motions(
@@ -298,7 +298,7 @@ class GenerationReference:
             If no motions were held out, but features alone.
         """
         if self.held_out_views is None:
-            raise ValueError("held_out_views is missing, expected 2D motions to compare with")
+            raise ValueError("held_out_views must be 2D motions to compare with, got missing")
         views = self._film(positions, seeds.generator(seed, "chamfer"), "all")
         frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
         shown, real = (

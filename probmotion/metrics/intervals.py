@@ -39,9 +39,9 @@ def t_interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tup
     values = np.asarray(values, np.float64)
     check_shape("values", values, ("n",))
     if not len(values) or not np.isfinite(values).all():
-        raise ValueError(f"values is {values.tolist()}, expected at least one, all finite")
+        raise ValueError(f"values must be at least one, all finite, got {values.tolist()}")
     if not 0 < level < 1:
-        raise ValueError(f"level is {level!r}, expected a number between 0 and 1")
+        raise ValueError(f"level must be a number between 0 and 1, got {level!r}")
     n = len(values)
     if n == 1:
         return -math.inf, math.inf
@@ -123,7 +123,7 @@ def _errors(
 ) -> dict[str, np.ndarray]:
     """Return by sampler how wrong it is, one number per seed; lower is better."""
     if ratio and (target is None or target <= 0):
-        raise ValueError(f"target is {target!r}, expected a number above 0 for a ratio")
+        raise ValueError(f"target must be a number above 0 for a ratio, got {target!r}")
     rows = {name: np.asarray(row, np.float64) for name, row in values.items()}
     if len({row.shape for row in rows.values()}) > 1:
         lengths = ", ".join(f"{name} {len(row)}" for name, row in rows.items())

@@ -94,7 +94,7 @@ def motion_chamfer_distance(
 
 def _check_length(name: str, sequences: np.ndarray, frames: int) -> None:
     if sequences.size == 0:
-        raise ValueError(f"{name} has shape {sequences.shape}, expected at least one sequence")
+        raise ValueError(f"{name} must have shape at least one sequence, got {sequences.shape}")
     if sequences.shape[1] % frames:
         raise ValueError(
             f"{name} has sequences of {sequences.shape[1]} frames, expected a multiple of "

@@ -85,7 +85,7 @@ def ecdf_band(n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     """
     check_count("n", n, least=2)
     if not 0 < level < 1:
-        raise ValueError(f"level is {level!r}, expected a number between 0 and 1")
+        raise ValueError(f"level must be a number between 0 and 1, got {level!r}")
     inside = _tails(n) > _EQUAL * _gamma(n, level)
     lowest = inside.argmax(axis=1)
     highest = n - inside[:, ::-1].argmax(axis=1)

@@ -142,7 +142,7 @@ class _Flat:
         check_shape(name, motions, ("N", "L", "J", 3))
         check_finite(name, motions)
         if motions.size == 0:
-            raise ValueError(f"{name} has shape {motions.shape}, expected at least one motion")
+            raise ValueError(f"{name} must have shape at least one motion, got {motions.shape}")
         centred = np.asarray(motions, np.float64)
         centred = centred - centred[:, :, root : root + 1]
         flat = centred.reshape(len(motions), -1, 3)

@@ -41,7 +41,7 @@ def resample(
     """
     check_positive("fps", fps)
     if fps > _HIGHEST_FPS:
-        raise ValueError(f"fps is {fps:g}, expected at most {_HIGHEST_FPS} frames per second")
+        raise ValueError(f"fps must be at most {_HIGHEST_FPS} frames per second, got {fps:g}")
     if fps == old_fps:
         return positions, rotations
     last = len(positions) - 1

@@ -110,7 +110,7 @@ def is_four_legged(skeleton: Skeleton) -> bool:
 
 def _shared_skeleton(tracks: Sequence[KeypointTrack]) -> Skeleton:
     if not tracks:
-        raise ValueError("tracks is empty, expected at least one")
+        raise ValueError("tracks must contain at least one, got none")
     skeleton = tracks[0].skeleton
     for track in tracks:
         if track.skeleton != skeleton:
@@ -261,7 +261,7 @@ def _ahead(place: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
     if front is not None:
         if front not in {*skeleton.joint_names, *names}:
             raise ValueError(
-                f"front is {front!r}, expected one of {', '.join(skeleton.joint_names)}"
+                f"front must be one of {', '.join(skeleton.joint_names)}, got {front!r}"
             )
         return flat[skeleton.index(front)] - flat[skeleton.roots[0]]
     if is_four_legged(skeleton):

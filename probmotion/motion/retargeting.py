@@ -42,7 +42,7 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
     """
     skeletons = list(dict.fromkeys(skeletons))
     if not skeletons:
-        raise ValueError("skeletons is empty, expected at least one")
+        raise ValueError("skeletons must contain at least one, got none")
     if len(skeletons) == 1:
         return skeletons[0]
     first, *others = skeletons

@@ -51,11 +51,11 @@ class Skeleton:
         for joint, parent in enumerate(parents):
             if isinstance(parent, bool) or not isinstance(parent, int | np.integer):
                 raise ValueError(
-                    f"parents[{joint}] is {parent!r}, expected an integer, -1 for a root"
+                    f"parents[{joint}] must be an integer, -1 for a root, got {parent!r}"
                 )
         links = tuple(int(parent) for parent in parents)
         if not names:
-            raise ValueError("joint_names is empty, expected at least one joint")
+            raise ValueError("joint_names must contain at least one joint, got none")
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"joint_names repeats {repeated}, expected every name once")
@@ -90,7 +90,7 @@ class Skeleton:
             If the name is unknown; the message lists the known ones.
         """
         if name not in PRESETS:
-            raise ValueError(f"name is {name!r}, expected one of {', '.join(sorted(PRESETS))}")
+            raise ValueError(f"name must be one of {', '.join(sorted(PRESETS))}, got {name!r}")
         return cls(*PRESETS[name]())
 
     @property

@@ -70,7 +70,7 @@ def split_clips(
             f"validation and test are {validation:g} and {test:g}, expected a sum below 1"
         )
     if isinstance(names, str):
-        raise ValueError(f"names is {names!r}, expected several names")
+        raise ValueError(f"names must be several names, got {names!r}")
     clips = sorted({clip_of(name) for name in names})
     held, tried = round(validation * len(clips)), round(test * len(clips))
     counts = (len(clips) - held - tried, held, tried)

@@ -105,7 +105,7 @@ def play_skeletons(
     if path is not None:
         path = Path(path)
         if path.suffix.lower() != ".html":
-            raise ValueError(f"path is {str(path)!r}, expected a name that ends in .html")
+            raise ValueError(f"path must be a name that ends in .html, got {str(path)!r}")
         with written_whole(path) as unfinished:
             unfinished.write_text(page, encoding="utf-8")
     layout = _layout(_shown(rows, skeleton, draws))
@@ -171,7 +171,7 @@ def _shown(rows: Mapping[str, np.ndarray], skeleton: Skeleton, draws: int) -> di
     """The first motions of each row, the body's middle at the horizontal origin."""
     check_count("draws", draws)
     if not rows:
-        raise ValueError("rows is empty, expected at least one label with motions")
+        raise ValueError("rows must contain at least one label with motions, got none")
     shown: dict[str, np.ndarray] = {}
     frames: int | str = "L"
     for label, motions in rows.items():

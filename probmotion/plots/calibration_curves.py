@@ -40,7 +40,7 @@ def draw_calibration(
     from matplotlib.figure import Figure
 
     if not levels:
-        raise ValueError("levels is empty, expected at least one kind of pose")
+        raise ValueError("levels must contain at least one kind of pose, got none")
     parts = list(next(iter(levels.values())))
     for kind, found in levels.items():
         if list(found) != parts:

@@ -48,7 +48,7 @@ def save_figure(figure: Figure, path: str | Path, dots_per_inch: int = 150) -> N
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
-        raise ValueError(f"path is {str(path)!r}, expected a name that ends in .png")
+        raise ValueError(f"path must be a name that ends in .png, got {str(path)!r}")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     with written_whole(path) as unfinished:

@@ -65,7 +65,7 @@ def draw_pairs(
     """
     check_count("columns", columns)
     if not rows:
-        raise ValueError("rows is empty, expected at least one label with pose-pairs")
+        raise ValueError("rows must contain at least one label with pose-pairs, got none")
     camera = Cameras.around(np.array([azimuth]), np.array([elevation]))
     lines = [
         _Line(label, *_seen(camera, f"rows[{label!r}]", np.asarray(poses)[:columns], skeleton))
@@ -99,7 +99,7 @@ def _seen(
     in_space = poses.shape[-1:] == (3,)
     check_shape(name, poses, ("n", skeleton.n_joints, 3 if in_space else 2))
     if len(poses) == 0:
-        raise ValueError(f"{name} is empty, expected at least one pose-pair")
+        raise ValueError(f"{name} must contain at least one pose-pair, got none")
     pictures = np.asarray(poses, dtype=np.float64)
     if in_space:
         check_finite(name, pictures)

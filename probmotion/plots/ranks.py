@@ -58,10 +58,10 @@ def draw_ranks(
     from matplotlib.figure import Figure
 
     if not blocks:
-        raise ValueError("blocks is empty, expected at least one sampler with ranks")
+        raise ValueError("blocks must contain at least one sampler with ranks, got none")
     for title, ranks in blocks.items():
         if not ranks:
-            raise ValueError(f"blocks[{title!r}] is empty, expected at least one quantity")
+            raise ValueError(f"blocks[{title!r}] must contain at least one quantity, got none")
         for name, values in ranks.items():
             check_shape(f"blocks[{title!r}][{name!r}]", values, ("n",))
     titles = [textwrap.fill(title, _LETTERS) for title in blocks]

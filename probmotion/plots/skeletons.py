@@ -70,7 +70,7 @@ def draw_skeletons(
     check_count("draws", draws)
     check_count("moments", moments)
     if not rows:
-        raise ValueError("rows is empty, expected at least one label with motions")
+        raise ValueError("rows must contain at least one label with motions, got none")
     shown = {}
     for label, motions in rows.items():
         check_shape(f"rows[{label!r}]", motions, ("n", "L", skeleton.n_joints, 3))

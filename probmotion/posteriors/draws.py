@@ -210,7 +210,7 @@ class MotionDraws:
         """
         chains = self.positions.sizes["chain"]
         if not 0 <= chain < chains:
-            raise ValueError(f"chain is {chain!r}, expected a number from 0 to {chains - 1}")
+            raise ValueError(f"chain must be a number from 0 to {chains - 1}, got {chain!r}")
         positions = self.positions.isel(chain=chain).values
         name = f"{self.dataset.attrs['sampler']}-{chain}"
         return Motion(
@@ -255,7 +255,7 @@ class MotionDraws:
             If ``path`` has another ending.
         """
         if Path(path).suffix != ".nc":
-            raise ValueError(f"path is {str(path)!r}, expected a name that ends in .nc")
+            raise ValueError(f"path must be a name that ends in .nc, got {str(path)!r}")
         # netCDF's integers have 32 bits; seeds and counts may need more.
         wide = {
             str(name): str(value)

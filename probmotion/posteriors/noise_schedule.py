@@ -43,7 +43,7 @@ class NoiseSchedule:
         levels = np.asarray(self.alpha_bar, dtype=np.float64)
         if levels.ndim != 1 or len(levels) < 2 or levels[0] != 1.0 or levels[-1] <= 0:
             raise ValueError(
-                f"alpha_bar has shape {levels.shape}, expected (T + 1,) numbers falling from 1"
+                f"alpha_bar must have shape (T + 1,) numbers falling from 1, got {levels.shape}"
             )
         if (np.diff(levels) >= 0).any():
             raise ValueError("alpha_bar does not fall at every level, expected it to")
@@ -89,7 +89,7 @@ class NoiseSchedule:
         """
         check_count("steps", steps)
         if steps > self.steps:
-            raise ValueError(f"steps is {steps}, expected at most the schedule's {self.steps}")
+            raise ValueError(f"steps must be at most the schedule's {self.steps}, got {steps}")
         assert self.times is not None
         kept = np.round(np.linspace(0, self.steps, steps + 1)).astype(int)
         return NoiseSchedule(self.alpha_bar[kept], self.times[kept])
@@ -100,7 +100,7 @@ class NoiseSchedule:
         ``deviation`` is √β̃_t, β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t), and 0 at the last step.
         """
         if not 1 <= t <= self.steps:
-            raise ValueError(f"t is {t}, expected a level from 1 to {self.steps}")
+            raise ValueError(f"t must be a level from 1 to {self.steps}, got {t}")
         now, after = self.alpha_bar[t], self.alpha_bar[t - 1]
         alpha = now / after
         beta = 1 - alpha

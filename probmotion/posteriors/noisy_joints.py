@@ -91,7 +91,7 @@ def noisy_joints(
     """
     for name, value, kind in (("skeleton", skeleton, Skeleton), ("prior", prior, MotionPrior)):
         if not isinstance(value, kind):
-            raise ValueError(f"{name} is {type(value).__name__}, expected a {kind.__name__}")
+            raise ValueError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
     check_positive("noise", noise)
     joints = np.asarray(joints, dtype=np.float64)
     check_shape("joints", joints, ("L", skeleton.n_joints, 3))

@@ -232,7 +232,7 @@ class MotionPosterior:
         """
         check_shape("theta", theta, ("…", self.dim))
         if self.likelihood is None:
-            raise ValueError("likelihood is None, expected evidence to have a density")
+            raise ValueError("likelihood must be evidence to have a density, got None")
         if isinstance(self.prior, Marginalises):
             return self.prior.log_likelihood(theta, self.likelihood)
         return self.likelihood.log_density(self.prior.motion(theta))

@@ -216,7 +216,7 @@ def load_sampler(name: str) -> type[Any]:
     """
     known = _registered()
     if name not in known:
-        raise ValueError(f"sampler is {name!r}, expected one of {', '.join(sorted(known))}")
+        raise ValueError(f"sampler must be one of {', '.join(sorted(known))}, got {name!r}")
     point = known[name]
     try:
         return point.load()

@@ -48,7 +48,7 @@ class TruncatedPosterior(MotionPosterior):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (isinstance(self.limit, int | float) and self.limit > 1):
-            raise ValueError(f"limit is {self.limit!r}, expected c above 1, or infinity")
+            raise ValueError(f"limit must be c above 1, or infinity, got {self.limit!r}")
         theta = np.zeros(self.dim) if self.seed is None else np.asarray(self.seed, np.float64)
         check_shape("seed", theta, (self.dim,))
         check_finite("seed", theta)

@@ -97,7 +97,7 @@ def _asked(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
     if scaled := _SCALED.fullmatch(name):
         name, scale = scaled["name"], _read(name, scaled["scale"]) | scale
     if name not in problem_names():
-        raise ValueError(f"problem is {name!r}, expected one of {', '.join(problem_names())}")
+        raise ValueError(f"problem must be one of {', '.join(problem_names())}, got {name!r}")
     known = _GAITS[name].defaults if name in _GAITS else {}
     for number in scale:
         if number not in known:
@@ -107,7 +107,7 @@ def _asked(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
             )
         if not isinstance(scale[number], Hashable):
             raise ValueError(
-                f"{number} is {scale[number]!r}, expected a number such as {known[number]!r}"
+                f"{number} must be a number such as {known[number]!r}, got {scale[number]!r}"
             )
     return name, tuple((n, scale[n]) for n in known if n in scale and scale[n] != known[n])
 
@@ -120,7 +120,7 @@ def _read(name: str, words: str) -> dict[str, Any]:
         return {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise ValueError(
-            f"problem is {name!r}, expected numbers such as (frames=20, noise=0.05)"
+            f"problem must be numbers such as (frames=20, noise=0.05), got {name!r}"
         ) from error
 
 

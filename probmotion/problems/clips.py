@@ -74,7 +74,7 @@ def clips_problem(
     check_count("frames", frames, least=2)
     check_positive("noise", noise)
     if observe not in OBSERVATIONS:
-        raise ValueError(f"observe is {observe!r}, expected one of {', '.join(OBSERVATIONS)}")
+        raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {observe!r}")
     if len(motions) < 2:
         raise ValueError(
             f"motions has {len(motions)} clip{'s' * (len(motions) != 1)}, expected at least 2: one "
@@ -142,7 +142,7 @@ def _index(motions: Sequence[Motion], held_out: int | str) -> int:
             )
         return names.index(held_out)
     if not -len(motions) <= held_out < len(motions):
-        raise ValueError(f"held_out is {held_out}, expected an index into the {len(motions)} clips")
+        raise ValueError(f"held_out must be an index into the {len(motions)} clips, got {held_out}")
     return held_out % len(motions)
 
 

@@ -46,7 +46,7 @@ def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | 
         If ``how`` is unknown; the message lists the known names.
     """
     if how not in OBSERVATIONS:
-        raise ValueError(f"observe is {how!r}, expected one of {', '.join(OBSERVATIONS)}")
+        raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {how!r}")
     hides = OBSERVATIONS[how]
     if hides is None:
         return None
@@ -68,7 +68,7 @@ def limb_hidden(motion: Motion, share: float) -> np.ndarray:
         If the share is not between 0 and 1.
     """
     if not 0 <= share <= 1:
-        raise ValueError(f"hidden is {share!r}, expected a share of the frames between 0 and 1")
+        raise ValueError(f"hidden must be a share of the frames between 0 and 1, got {share!r}")
     hidden = _nothing(motion)
     # As many as the share has, counted in whole frames; the start likewise.
     start = int((1 - share) / 2 * motion.frames + 1e-9)
@@ -88,7 +88,7 @@ def nearest_joints(skeleton: Skeleton, n: int) -> list[int]:
     """
     check_count("joints", n)
     if n > skeleton.n_joints:
-        raise ValueError(f"joints is {n}, expected at most the {skeleton.n_joints} there are")
+        raise ValueError(f"joints must be at most the {skeleton.n_joints} there are, got {n}")
     order = sorted(range(skeleton.n_joints), key=lambda joint: len(skeleton.ancestors(joint)))
     return order[:n]
 

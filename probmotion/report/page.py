@@ -63,7 +63,7 @@ def write_report(
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
-        raise ValueError(f"path is {str(path)!r}, expected a name that ends in .html")
+        raise ValueError(f"path must be a name that ends in .html, got {str(path)!r}")
     page = _page(comparison, calibration)
     with written_whole(path) as unfinished:
         unfinished.write_text(page, encoding="utf-8")

@@ -117,7 +117,7 @@ class MultiViewAncestral:
         check_positive("distance", self.distance)
         if self.stop_level > self.schedule.steps:
             raise ValueError(
-                f"stop_level is {self.stop_level}, expected at most steps, {self.steps}"
+                f"stop_level must be at most steps, {self.steps}, got {self.stop_level}"
             )
         if self.view_weights is not None:
             check_shape("view_weights", np.asarray(self.view_weights), (self.n_views,))
@@ -284,7 +284,7 @@ class MultiViewTrace:
         reached = [0, *range(sampler.stop_level, schedule.steps + 1)]
         if level not in reached:
             raise ValueError(
-                f"level is {level}, expected 0 or one from {sampler.stop_level} to {schedule.steps}"
+                f"level must be 0 or one from {sampler.stop_level} to {schedule.steps}, got {level}"
             )
         if level == 0:
             return self._see(cameras, self.estimates[-1])

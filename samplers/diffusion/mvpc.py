@@ -121,11 +121,11 @@ class MultiViewPredictorCorrector:
         check_count("batch", self.batch)
         check_positive("corrector_size", self.corrector_size)
         if self.corrector_size > 1:
-            raise ValueError(f"corrector_size is {self.corrector_size}, expected at most 1")
+            raise ValueError(f"corrector_size must be at most 1, got {self.corrector_size}")
         for name in ("gamma", "gamma_from", "corrected_from"):
             value = getattr(self, name)
             if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, expected a finite number of at least 0")
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
         cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
 
     @classmethod

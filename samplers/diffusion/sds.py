@@ -109,7 +109,7 @@ class ScoreDistillation:
         check_positive("learning_rate", self.learning_rate)
         check_positive("arc", self.arc)
         if self.arc > 2 * math.pi:
-            raise ValueError(f"arc is {self.arc}, expected at most the circle, 2 pi")
+            raise ValueError(f"arc must be at most the circle, 2 pi, got {self.arc}")
         for name, known in (("levels", Levels), ("weighting", Weighting)):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(

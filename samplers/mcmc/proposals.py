@@ -335,4 +335,4 @@ def _normal(generators: Sequence[np.random.Generator], dim: int) -> np.ndarray:
 
 def _check_target(target: float) -> None:
     if not (isinstance(target, int | float) and 0 < target < 1):
-        raise ValueError(f"target is {target!r}, expected an acceptance between 0 and 1")
+        raise ValueError(f"target must be an acceptance between 0 and 1, got {target!r}")

@@ -109,18 +109,18 @@ class DVAEInference:
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
-            raise ValueError(f"mode is {self.mode!r}, expected one of {', '.join(get_args(Mode))}")
+            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}")
         for name in ("iterations", "batch", "training_steps", "overlap"):
             check_count(name, getattr(self, name))
         check_count("training_pairs", self.training_pairs, least=100)
         check_positive("learning_rate", self.learning_rate)
         freedom = self.degrees_of_freedom
         if freedom is not None and not (isinstance(freedom, Real) and freedom > 0):
-            raise ValueError(f"degrees_of_freedom is {freedom!r}, expected a number above 0 or inf")
+            raise ValueError(f"degrees_of_freedom must be a number above 0 or inf, got {freedom!r}")
         if not (isinstance(weight := self.latent_weight, Real) and 0 <= weight < math.inf):
-            raise ValueError(f"latent_weight is {weight!r}, expected a finite number of at least 0")
+            raise ValueError(f"latent_weight must be a finite number of at least 0, got {weight!r}")
         if self.network is not None and not isinstance(self.network, InferenceNetwork):
-            raise ValueError(f"network is {self.network!r}, expected an InferenceNetwork")
+            raise ValueError(f"network must be an InferenceNetwork, got {self.network!r}")
 
     @classmethod
     def paper(cls) -> DVAEInference:

@@ -324,9 +324,9 @@ def test_it_is_read_again_and_plotted(calibration, monkeypatch, tmp_path):
     assert calibration.plot(tmp_path / "a.png", problem="toy") == tmp_path / "a.png"
     for blocks in drawn.values():
         assert list(blocks) == [again.verdict("toy", name) for name in ("batch", "overconfident")]
-    with pytest.raises(ValueError, match="sampler is 'mas', expected one of batch, over"):
+    with pytest.raises(ValueError, match="sampler must be one of batch, over, got 'mas'"):
         calibration.ranks("toy", "mas")
-    with pytest.raises(ValueError, match="problem is 'gait', expected one of toy"):
+    with pytest.raises(ValueError, match="problem must be one of toy, got 'gait'"):
         calibration.plot(tmp_path / "a.png", problem="gait")
     with pytest.raises(ValueError, match=r"which holds no comparison\.json"):
         Calibration.load(tmp_path)
@@ -366,7 +366,7 @@ def test_what_a_budget_buys_is_found_once_and_all_simulations_have_it(tmp_path):
         np.testing.assert_array_equal(held.ranks("toy", "batch")[name], ranks)
     with pytest.raises(ValueError, match="made with other settings"):
         asked(simulations=12, budget=Budget(evaluations=700))
-    with pytest.raises(ValueError, match="budget is 350, expected a Budget"):
+    with pytest.raises(ValueError, match="budget must be a Budget, got 350"):
         asked(simulations=12, budget=350)
 
 
@@ -383,9 +383,9 @@ def test_no_draws_are_kept_and_a_temporary_folder_goes(tmp_path):
 def test_wrong_input_is_named():
     with pytest.raises(ValueError, match="problems has 'toy', which cannot be simulated"):
         calibrate(plain(), Batch(), simulations=10, **SMALL)
-    with pytest.raises(ValueError, match="simulations is 3, expected an integer of at least 10"):
+    with pytest.raises(ValueError, match="simulations must be an integer of at least 10, got 3"):
         calibrate(toy(), Batch(), simulations=3, **SMALL)
-    with pytest.raises(ValueError, match="draws is 41, expected a multiple of chains, 2"):
+    with pytest.raises(ValueError, match="draws must be a multiple of chains, 2, got 41"):
         calibrate(toy(), Batch(), simulations=10, draws=41, chains=2)
     no_truth = replace(plain(), simulate=lambda number: replace(plain(), truth=None))
     held = calibrate(no_truth, Batch(), simulations=10, **SMALL)

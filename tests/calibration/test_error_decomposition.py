@@ -343,8 +343,8 @@ def test_gaits_given_evidence_have_exact_denoisers():
 def test_what_does_not_fit_is_refused_in_a_sentence():
     problem = problem_of(centred(1, 1, 1))
     for wrong, words in (
-        ({"seeds": 1}, "seeds is 1, expected an integer of at least 2"),
-        ({"draws": 3}, "draws is 3, expected an integer of at least 10"),
+        ({"seeds": 1}, "seeds must be an integer of at least 2, got 1"),
+        ({"draws": 3}, "draws must be an integer of at least 10, got 3"),
         ({"settings": {"perspective": True}}, "settings has 'perspective', expected some of n_vie"),
         ({"learnt": Points(np.zeros((3, 3)), np.eye(3))}, "learnt is of 1 frames of 3 joints"),
     ):
@@ -354,7 +354,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="problem is 'points', which nobody knows exactly"):
         budget_of(problem_of(Flat()))
     seen = problem_of(centred(1, 1, 1), evidence(centred(1, 1, 1), 0.1))
-    with pytest.raises(ValueError, match="shared_noise is False, expected True where there is"):
+    with pytest.raises(ValueError, match="shared_noise must be True where there is, got False"):
         budget_of(seen, shared_noise=False)
 
     class Blind(Flat):

@@ -440,7 +440,7 @@ def test_objects_are_written_as_in_python(text, value):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("Leap", "'Leap' is unknown, expected one of Plain, Step"),
+        ("Leap", "'Leap' must be one of Plain, Step, got unknown"),
         ("Step(length=1)", "no setting 'length', expected one of size, inner"),
         ("Plain(kind='x')", "no setting 'kind'"),
         ("Step(", "is not an object"),

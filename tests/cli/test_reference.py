@@ -74,8 +74,8 @@ def test_stopped_in_its_second_run_it_goes_on_there(tmp_path, capsys, monkeypatc
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["gate"], "problem is 'gate', expected one of"),
-        ([SMALL, "--draws", "81"], "draws is 81, expected a multiple of 8"),
+        (["gate"], "problem must be one of, got 'gate'"),
+        ([SMALL, "--draws", "81"], "draws must be a multiple of 8, got 81"),
         (["walk2d"], "MotionDiffusion has no density, expected one of positions"),
     ],
 )

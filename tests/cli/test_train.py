@@ -321,8 +321,8 @@ def test_wrong_words_are_one_sentence(
     filmed_or_not = ["train", "diffusion", "--size", "tiny", "--out", str(out)]
     made = [*filmed_or_not, "--views", "1"]
     cases = {
-        ("train",): f"what to train is missing, expected one of {', '.join(KINDS)}",
-        ("train", "vae"): f"what to train is 'vae', expected one of {', '.join(KINDS)}",
+        ("train",): f"what to train must be one of {', '.join(KINDS)}, got missing",
+        ("train", "vae"): f"what to train must be one of {', '.join(KINDS)}, got 'vae'",
         (*made, "--clips", walks, "--tracks", "a.json"): "clips and tracks are both given, "
         "expected one of them",
         (*made, "--clips", str(tmp_path / "no.bvh")): f"{tmp_path / 'no.bvh'}: No such file or "
@@ -350,20 +350,20 @@ def test_wrong_words_are_one_sentence(
         (*made, "--clips", walks, "--validation", "walk1", "--test", "walk9"): "clips has "
         "'walk9', which names no clip of the 5 tracks, expected only clips that have tracks, of "
         "those that preparation has kept",
-        (*made, "--clips", walks, "--views", "0"): "views is 0, expected an integer of at least 1",
-        (*made, "--clips", walks, "--fps", "0"): "fps is 0.0, expected a finite number above 0",
+        (*made, "--clips", walks, "--views", "0"): "views must be an integer of at least 1, got 0",
+        (*made, "--clips", walks, "--fps", "0"): "fps must be a finite number above 0, got 0.0",
         (*made, "--device", "cuda"): "device is 'cuda', but this machine has no CUDA; expected "
         "'cpu'",
-        (*made, "--steps", "0"): "steps is 0, expected an integer of at least 1",
-        (*made, "--frames", "1"): "frames is 1, expected an integer of at least 2",
-        (*made, "--seed", "-1"): "seed is -1, expected an integer of at least 0",
+        (*made, "--steps", "0"): "steps must be an integer of at least 1, got 0",
+        (*made, "--frames", "1"): "frames must be an integer of at least 2, got 1",
+        (*made, "--seed", "-1"): "seed must be an integer of at least 0, got -1",
     }
     for given, wanted in cases.items():
         assert main(list(given)) == 2, given
         assert sentence(capsys) == wanted
         assert not out.exists()
     for given, named in {
-        (*made, "--skeleton", "cat"): "name is 'cat', expected one of ",
+        (*made, "--skeleton", "cat"): "name must be one of , got 'cat'",
         (*made, "--clips", walks, *PARTS, "--threshold", "1.5"): "tracks has no joint of ",
     }.items():
         assert main(list(given)) == 2, given

@@ -385,8 +385,8 @@ def test_wrong_words_are_one_sentence(
         ("--clips", str(tmp_path / "no.npz")): f"{tmp_path / 'no.npz'}: No such file or directory",
         ("--clips", clips, str(large)): "large has a bone of length 500, to neck, expected "
         "metres, at most 3",
-        ("--steps", "0"): "steps is 0, expected an integer of at least 1",
-        ("--data-seed", "-1"): "data_seed is -1, expected an integer of at least 0",
+        ("--steps", "0"): "steps must be an integer of at least 1, got 0",
+        ("--data-seed", "-1"): "data_seed must be an integer of at least 0, got -1",
     }
     for kind in (dvae, denoising):
         for given, wanted in cases.items():
@@ -419,9 +419,9 @@ def test_options_of_one_kind_that_are_wrong(
 ) -> None:
     out = tmp_path / "run"
     cases = {
-        ("dvae", "--fps", "0"): "fps is 0.0, expected a finite number above 0",
-        ("dvae", "--fps", "nan"): "fps is nan, expected a finite number above 0",
-        ("dvae", "--skeleton", "cat"): "name is 'cat', expected one of ",
+        ("dvae", "--fps", "0"): "fps must be a finite number above 0, got 0.0",
+        ("dvae", "--fps", "nan"): "fps must be a finite number above 0, got nan",
+        ("dvae", "--skeleton", "cat"): "name must be one of , got 'cat'",
         ("dvae", "--skeleton", "h36m17"): "clips has walk-0, which cannot be learnt from: ",
         ("denoiser", "--prior", "walk2d"): f"{WEIGHTS / 'walk2d.safetensors'} holds a "
         "motion-diffusion, expected a motion-dvae",
@@ -429,10 +429,10 @@ def test_options_of_one_kind_that_are_wrong(
         "motion-denoiser, expected a motion-dvae",
         ("denoiser", "--prior", "no/such"): "there is no checkpoint no/such, expected ",
         ("denoiser", "--prior", "x", "--least", "0"): "least is 0.0, expected ",
-        ("denoiser", "--prior", "x", "--least", "0.1"): "most is 0.08, expected at least least=0.1",
-        ("denoiser", "--prior", "x", "--most", "inf"): "most is inf, expected a finite number",
-        ("denoiser", "--prior", "x", "--outliers", "2"): "outliers is 2.0, expected a share",
-        ("denoiser", "--prior", "x", "--hidden", "-1"): "hidden is -1.0, expected a share",
+        ("denoiser", "--prior", "x", "--least", "0.1"): "most must be at least least=0.1, got 0.08",
+        ("denoiser", "--prior", "x", "--most", "inf"): "most must be a finite number, got inf",
+        ("denoiser", "--prior", "x", "--outliers", "2"): "outliers must be a share, got 2.0",
+        ("denoiser", "--prior", "x", "--hidden", "-1"): "hidden must be a share, got -1.0",
     }
     for given, wanted in cases.items():
         assert main(["train", *given, "--size", "tiny", "--out", str(out)]) == 2, given

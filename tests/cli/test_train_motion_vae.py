@@ -127,9 +127,9 @@ def test_an_animal_of_one_s_own_comes_from_a_detector_s_tables(
     ("more", "said"),
     [
         (["--frames", "80"], "tracks has at most "),
-        (["--centre", "sequence"], "centre is 'sequence', expected 'frame'"),
-        (["--distance", "0"], "distance is 0.0, expected a finite number above 0"),
-        (["--threshold", "0"], "threshold is 0.0, expected a finite number above 0"),
+        (["--centre", "sequence"], "centre must be 'frame', got 'sequence'"),
+        (["--distance", "0"], "distance must be a finite number above 0, got 0.0"),
+        (["--threshold", "0"], "threshold must be a finite number above 0, got 0.0"),
         (["--rest", "no.npz"], "no.npz"),
         (["--kl", "-1"], "kl is -1.0, expected"),
     ],

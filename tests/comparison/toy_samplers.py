@@ -266,7 +266,7 @@ class Walking(PriorDraws):
 
     def __post_init__(self):
         if self.stride > self.most:
-            raise ValueError(f"stride is {self.stride}, expected at most {self.most}")
+            raise ValueError(f"stride must be at most {self.most}, got {self.stride}")
 
     def sample(self, posterior, *, draws=1000, chains=1, **settings):
         found = super().sample(posterior, draws=draws, chains=chains, **settings)

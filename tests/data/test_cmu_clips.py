@@ -127,13 +127,13 @@ def test_a_clip_that_is_nowhere_is_one_sentence_with_the_way_to_it(nowhere: Path
 
 @pytest.mark.parametrize("name", ["02_02", "cmu_2_2", "cmu_02_02.npz", "../cmu_02_02", ""])
 def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"name is '.*', expected a subject and a trial, such as"):
+    with pytest.raises(ValueError, match=r"name must be a subject and a trial, such as, got '.*'"):
         cmu_clip(name)
 
 
 def test_a_name_is_text() -> None:
     number: Any = 3
-    with pytest.raises(ValueError, match=r"^name is 3, expected a subject and a trial, such as"):
+    with pytest.raises(ValueError, match=r"^name must be a subject and a trial, such as, got 3"):
         cmu_clip(number)
 
 

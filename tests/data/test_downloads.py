@@ -157,11 +157,11 @@ def test_a_folder_that_cannot_be_written_is_named(server, registry, tmp_path):
 
 
 def test_unknown_names_list_the_known_ones(registry):
-    with pytest.raises(ValueError, match="dataset is 'cmu', expected one of made"):
+    with pytest.raises(ValueError, match="dataset must be one of made, got 'cmu'"):
         download("cmu")
     with pytest.raises(ValueError, match=r"names has 'c\.bvh', expected files of made: a\.bvh, b"):
         download("made", ["c.bvh"])
-    with pytest.raises(ValueError, match=r"names is 'a\.bvh', expected a list of names"):
+    with pytest.raises(ValueError, match=r"names must be a list of names, got 'a\.bvh'"):
         download("made", "a.bvh")
 
 

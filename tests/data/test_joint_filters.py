@@ -218,11 +218,14 @@ def test_both_remove_noise_of_a_smooth_motion(rng):
         ({"confidence": -np.ones((L, J))}, "confidence is -1 at its least, expected 0 or more"),
         ({"confidence": np.ones((L, 2))}, r"confidence has shape \(24, 2\)"),
         ({"joints": np.zeros((L, J, 2))}, r"joints has shape \(24, 3, 2\)"),
-        ({"joints": np.full((L, J, 3), np.nan)}, "joints has 216 values that are NaN"),
-        ({"noise": 0.0}, "noise is 0.0, expected a finite number above 0"),
-        ({"fps": -30.0}, "fps is -30.0, expected a finite number above 0"),
-        ({"acceleration": 0.0}, "acceleration is 0.0, expected a finite number above 0"),
-        ({"acceleration": np.ones(2)}, r"acceleration has shape \(2,\), expected \(3\)"),
+        (
+            {"joints": np.full((L, J, 3), np.nan)},
+            "joints must be finite, got 216 values that are NaN",
+        ),
+        ({"noise": 0.0}, "noise must be a finite number above 0, got 0.0"),
+        ({"fps": -30.0}, "fps must be a finite number above 0, got -30.0"),
+        ({"acceleration": 0.0}, "acceleration must be a finite number above 0, got 0.0"),
+        ({"acceleration": np.ones(2)}, r"acceleration must have shape \(3\), got \(2,\)"),
     ],
 )
 def test_what_the_smoother_cannot_use_is_refused(change, message):
@@ -241,11 +244,11 @@ def test_what_the_smoother_cannot_use_is_refused(change, message):
     ("change", "message"),
     [
         ({"seen": np.arange(L * J).reshape(L, J) % J != 1}, "seen hides joint 1 in all 24 frames"),
-        ({"seen": np.ones((2, J))}, r"seen has shape \(2, 3\), expected \(24, 3\)"),
+        ({"seen": np.ones((2, J))}, r"seen must have shape \(24, 3\), got \(2, 3\)"),
         ({"window_seconds": 1.0}, "29 frames at 30 fps, expected at most the motion's 24 frames"),
-        ({"order": 15}, "order is 15, expected less than the 15 frames of a window of 0.5 s"),
-        ({"order": -1}, "order is -1, expected an integer of at least 0"),
-        ({"fps": 0.0}, "fps is 0.0, expected a finite number above 0"),
+        ({"order": 15}, "order must be less than the 15 frames of a window of 0.5 s, got 15"),
+        ({"order": -1}, "order must be an integer of at least 0, got -1"),
+        ({"fps": 0.0}, "fps must be a finite number above 0, got 0.0"),
     ],
 )
 def test_what_the_polynomial_cannot_use_is_refused(change, message):
@@ -264,5 +267,5 @@ def test_filling_needs_every_joint_once(rng):
     seen[0, 2] = False
     with pytest.raises(ValueError, match=r"^seen hides joint 2 in all 24 frames, expected"):
         filled_between(shown, seen)
-    with pytest.raises(ValueError, match=r"^seen has shape \(24,\), expected \(24, 3\)"):
+    with pytest.raises(ValueError, match=r"^seen must have shape \(24, 3\), got \(24,\)"):
         filled_between(shown, seen[:, 0])

@@ -95,7 +95,7 @@ def test_two_bvh_files_are_the_archive(real_data, salsa):
 
 def test_salsa_files_must_be_one_trial(real_data, tmp_path):
     lead, follow = (real_data / "originals" / f"{s}_10_scaled.bvh" for s in (60, 61))
-    with pytest.raises(ValueError, match=r"lead is '61_10_scaled\.bvh', expected '60_TT_sc"):
+    with pytest.raises(ValueError, match=r"lead must be '60_TT_sc, got '61_10_scaled\.bvh'"):
         read_salsa_bvh(follow, lead)
     with pytest.raises(ValueError, match="follow is of trial 11 and lead of 10, expected one"):
         read_salsa_bvh(lead, tmp_path / "61_11_scaled.bvh")
@@ -156,7 +156,7 @@ def test_ground_truth_is_evenly_apart(dances):
     positions, clip, frame = ground_truth(dances)
     assert len(positions) == 180
     np.testing.assert_array_equal(positions[50], dances[clip[50]].positions[frame[50]])
-    with pytest.raises(ValueError, match="n is 181, expected at most the 180 frames of the dance"):
+    with pytest.raises(ValueError, match="n must be at most the 180 frames of the dance, got 181"):
         ground_truth(dances, 181)
     with pytest.raises(ValueError, match="motions is empty"):
         ground_truth([])
@@ -179,7 +179,7 @@ def test_hold_out_is_by_whole_clips(dances):
         hold_out(dances, [m.name for m in dances])
     with pytest.raises(ValueError, match="names has 0 of the 4 motions"):
         hold_out(dances, [])
-    with pytest.raises(ValueError, match="names is 'dance-1', expected a list of names"):
+    with pytest.raises(ValueError, match="names must be a list of names, got 'dance-1'"):
         hold_out(dances, "dance-1")
 
 
@@ -214,7 +214,7 @@ def test_one_factor_for_both_people(dances):
     taller, smaller = person_height(scaled.positions[0], PAIR)
     assert taller > smaller
     assert scaled_to_height(dances[1]).positions.shape == (45, 34, 3)
-    with pytest.raises(ValueError, match="height is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="height must be a finite number above 0, got 0"):
         scaled_to_height(dances[1], 0)
 
 

@@ -159,12 +159,12 @@ def test_centring_moves_the_root_and_nothing_else(clips):
 
 
 def test_bad_input_is_refused_in_a_sentence(clips):
-    with pytest.raises(ValueError, match="motions is empty, expected at least one clip"):
+    with pytest.raises(ValueError, match="motions must contain at least one clip, got none"):
         project_clips([])
     for double in ([clips[0], clips[0]], [replace(clips[0], name="")]):
         with pytest.raises(ValueError, match=r"motions has the names .*, expected one of its own"):
             project_clips(double)
-    with pytest.raises(ValueError, match="views is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="views must be an integer of at least 1, got 0"):
         project_clips(clips, views=0)
     for kind, wrong in [
         (DetectorNoise, {"found": -1.0}),

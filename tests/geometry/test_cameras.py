@@ -208,15 +208,15 @@ def test_a_camera_inside_or_behind_the_motion_is_refused(library: Any) -> None:
 
 def test_wrong_cameras_are_refused_in_one_sentence() -> None:
     eye, zero, one = np.eye(3)[None], np.zeros((1, 3)), np.ones(1)
-    with pytest.raises(ValueError, match=r"rotation has shape \(3, 3\), expected \(V, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"rotation must have shape \(V, 3, 3\), got \(3, 3\)"):
         Cameras(np.eye(3), zero, one)
     with pytest.raises(ValueError, match="rotation has no camera, expected at least one"):
         Cameras(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
-    with pytest.raises(ValueError, match=r"translation has shape \(2, 3\), expected \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"translation must have shape \(1, 3\), got \(2, 3\)"):
         Cameras(eye, np.zeros((2, 3)), one)
-    with pytest.raises(ValueError, match=r"focal has shape \(2,\), expected \(1\)"):
+    with pytest.raises(ValueError, match=r"focal must have shape \(1\), got \(2,\)"):
         Cameras(eye, zero, np.ones(2))
-    with pytest.raises(ValueError, match=r"centre has shape \(1, 3\), expected \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"centre must have shape \(1, 2\), got \(1, 3\)"):
         Cameras(eye, zero, one, np.zeros((1, 3)))
     for focal in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match=r"focal is .*expected a finite number above 0"):

@@ -106,11 +106,11 @@ def test_orders_that_are_none_are_refused() -> None:
 
 
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"vector has shape \(4,\), expected \(…, 3\)"):
+    with pytest.raises(ValueError, match=r"vector must have shape \(…, 3\), got \(4,\)"):
         r.vector_to_matrix(np.zeros(4))
-    with pytest.raises(ValueError, match=r"matrix has shape \(3, 2\), expected \(…, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"matrix must have shape \(…, 3, 3\), got \(3, 2\)"):
         r.matrix_to_quaternion(np.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"second has shape \(3,\), expected \(…, 4\)"):
+    with pytest.raises(ValueError, match=r"second must have shape \(…, 4\), got \(3,\)"):
         r.quaternion_product(np.ones(4), np.ones(3))
 
 

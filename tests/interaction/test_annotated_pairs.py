@@ -193,7 +193,7 @@ def test_what_is_not_in_metres_or_of_other_people_is_refused(drawn):
     thousand = replace(drawn.annotations, keypoints=1000 * drawn.annotations.keypoints)
     with pytest.raises(ValueError, match=r"annotations has bones .* long .*keypoints are metres"):
         AnnotatedPairs(thousand)
-    with pytest.raises(ValueError, match=r"seed_pose has shape \(17, 3\), expected \(34, 3\)"):
+    with pytest.raises(ValueError, match=r"seed_pose must have shape \(34, 3\), got \(17, 3\)"):
         AnnotatedPairs.estimated(drawn.annotations, drawn.positions[0, :17])
     with pytest.raises(ValueError, match="shortest_edge is 0"):
         AnnotatedPairs(drawn.annotations, shortest_edge=0)

@@ -135,11 +135,13 @@ def test_the_error_is_the_mean_distance_of_hidden_joints():
 def test_bad_input_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="visible has 3 joints, expected at least 4"):
         complete(TRUTH, np.arange(34) < 3, DRAWS, PAIR)
-    with pytest.raises(ValueError, match="n_nearest is 100, expected at most 20, the draws"):
+    with pytest.raises(ValueError, match="n_nearest must be at most 20, the draws, got 100"):
         complete(TRUTH, ~HIDDEN, DRAWS[:20], PAIR)
-    with pytest.raises(ValueError, match="pose has 3 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="pose must be finite, got 3 values that are NaN or infinite"
+    ):
         complete(without(TRUTH, np.arange(34) == 0), ~HIDDEN, DRAWS, PAIR)
-    with pytest.raises(ValueError, match=r"draws has shape \(144, 17, 3\), expected \(S, 34, 3\)"):
+    with pytest.raises(ValueError, match=r"draws must have shape \(S, 34, 3\), got \(144, 17, 3\)"):
         complete(TRUTH, ~HIDDEN, DRAWS[:, :17], PAIR)
-    with pytest.raises(ValueError, match=r"bandwidth is 0\.0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match=r"bandwidth must be a finite number above 0, got 0\.0"):
         complete(TRUTH, ~HIDDEN, DRAWS, PAIR, bandwidth=0.0)

@@ -82,7 +82,7 @@ def test_a_repeated_pose_counts_once_by_its_first_index():
     found = retrieve(picture(9, 3), repeated, PAIR, views=VIEWS, n=3)
     assert found.indices[0] == 2
     assert sorted(found.indices) == [0, 2, 5]
-    with pytest.raises(ValueError, match="n is 4, expected at most 3, the different draws"):
+    with pytest.raises(ValueError, match="n must be at most 3, the different draws, got 4"):
         retrieve(picture(9, 3), repeated, PAIR, views=VIEWS, n=4)
 
 
@@ -100,15 +100,17 @@ def test_the_default_views_go_round_the_pair():
 
 def test_bad_input_is_refused_in_a_sentence():
     query = picture(0, 0)
-    with pytest.raises(ValueError, match=r"keypoints has shape \(33, 2\), expected \(…, 34, 2\)"):
+    with pytest.raises(ValueError, match=r"keypoints must have shape \(…, 34, 2\), got \(33, 2\)"):
         retrieve(query[:33], DRAWS, PAIR)
-    with pytest.raises(ValueError, match="views is empty, expected at least one"):
+    with pytest.raises(ValueError, match="views must contain at least one, got none"):
         retrieve(query, DRAWS, PAIR, views=np.empty((0, 2)))
     with pytest.raises(ValueError, match="visible shares no edge with 1 of the draws that were"):
         retrieve(query, DRAWS, PAIR, views=VIEWS, visible=np.arange(34) == 3)
     broken = DRAWS.copy()
     broken[0, 0, 0] = np.inf
-    with pytest.raises(ValueError, match="draws has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="draws must be finite, got 1 values that are NaN or infinite"
+    ):
         retrieve(query, broken, PAIR)
 
 
@@ -117,5 +119,5 @@ def test_views_around_an_estimate_hold_it_and_what_is_near():
     assert views.shape == (15, 2)
     assert np.abs(views - [0.3, 1.2]).sum(axis=1).min() < 1e-12
     assert np.degrees(np.abs(views - [0.3, 1.2]).max(axis=0)) == pytest.approx([30, 15])
-    with pytest.raises(ValueError, match="view has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="view must be finite, got 1 values that are NaN"):
         views_around(np.array([np.nan, 1.0]))

@@ -176,14 +176,14 @@ def test_the_skeleton_is_beside_the_motion_or_given(tmp_path: Path) -> None:
 def test_the_rate_is_given_or_assumed_aloud(tmp_path: Path) -> None:
     path = put(tmp_path)
     assert read_amc(path, fps=60.0).fps == 60.0
-    with pytest.raises(ValueError, match="fps is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="fps must be a finite number above 0, got 0"):
         read_amc(path, fps=0)
     for read in (read_motion, load_motion):
         with pytest.warns(MotionFileWarning, match=r"made\.amc is taken to have 120 frames per"):
             assert read(path).fps == 120.0
     path = put(tmp_path, motion=":SAMPLES-PER-SECOND 60\n" + AMC)
     assert read_amc(path, fps=60.0).fps == 60.0
-    with pytest.raises(MotionFileError, match="line 1: :SAMPLES-PER-SECOND is 60, expected 120 as"):
+    with pytest.raises(MotionFileError, match="line 1: :SAMPLES-PER-SECOND must be 120 as, got 60"):
         read_amc(path)
 
 
@@ -194,21 +194,21 @@ WRONG_SKELETONS = {
     ASF.partition("name shin")[0]: "the file ends without :hierarchy",
     ASF.rpartition("end")[0]: "line 53: end did not come, expected it around the hierarchy",
     ASF + ":root\n": "line 55: ':root' came again, expected it once",
-    ASF.replace("angle deg", "angle rad"): "line 7: angle is 'rad', expected deg",
+    ASF.replace("angle deg", "angle rad"): "line 7: angle must be deg, got 'rad'",
     ASF.replace("length 0.254", ""): "line 7: :units has no length, expected one",
-    ASF.replace("length 0.254", "length 0"): "line 6: length is 0, expected between 0.001 and 1000",
+    ASF.replace("length 0.254", "length 0"): "line 6: length must be between 0.001 and 1000, got 0",
     ASF.replace("length 0.254", "length 1 2"): "line 6: length has 2 values, expected 1",
     ASF.replace("order", "other"): ":root has no order, expected one",
     ASF.replace("TX TY", "TX L"): "line 11: channel 'L' came, expected each of TX, TY, TZ, RX, RY",
     ASF.replace("position 0 0", "position 0 1"): "line 13: position is 0 1 0, expected 0 0 0",
     ASF.replace("rx rz", "rx rx"): "line 22: channel 'rx' came, expected each of RX, RY, RZ once",
     ASF.replace("dof RX", "dof TX"): "channel 'TX' came, expected each of RX, RY, RZ once at most",
-    ASF.replace("name toe", "name thigh"): "line 28: name is 'thigh', expected a new one",
-    ASF.replace("name toe", "name root"): "line 28: name is 'root', expected a new one",
+    ASF.replace("name toe", "name thigh"): "line 28: name must be a new one, got 'thigh'",
+    ASF.replace("name toe", "name root"): "line 28: name must be a new one, got 'root'",
     ASF.replace("name toe\n", "\n"): "line 33: the bone of line 26 has no name, expected one",
     ASF.replace("direction 0 0 1", "direction 0 0 2"): "direction is 0 0 2, expected a vector of",
     ASF.replace("direction 0 0 1", "direction 0 0"): "line 29: direction has 2 values, expected 3",
-    ASF.replace("length 4", "length -4"): "line 20: length is -4, expected 0 or more",
+    ASF.replace("length 4", "length -4"): "line 20: length must be 0 or more, got -4",
     ASF.replace("length 4", "length nan"): "line 20: length has 'nan', expected a number between",
     ASF.replace("length 4", "length 4_0"): "line 20: length has '4_0', expected a number between",
     ASF.replace("90 0 90 XYZ", "90 0 90 ZYX"): "axis is '90 0 90 ZYX', expected three angles and",

@@ -264,7 +264,7 @@ def defect(old: str, new: str, message: str, line: int) -> Any:
 DEFECTS = [
     defect("Frames: 2", "Frames: 3", "after 2 lines of values, expected 3, the Frames of line", 20),
     defect("Frames: 2", "Frames: 1", "after 2 lines of values, expected 1", 20),
-    defect("Frames: 2", "Frames: 0", "Frames is '0', expected an integer of at least 1", 17),
+    defect("Frames: 2", "Frames: 0", "Frames must be an integer of at least 1, got '0'", 17),
     defect("Frames: 2", "Frames: -2", "Frames is '-2'", 17),
     defect("Frames: 2\n", "", "came, expected 'Frames: …'", 17),
     defect("Frame Time: 0.0333333\n", "", "came, expected 'Frame Time: …'", 18),

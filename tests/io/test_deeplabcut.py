@@ -155,7 +155,7 @@ def test_a_defect_is_one_sentence(tmp_path: Path, old: str, new: str, message: s
 
 def test_files_and_arguments_that_do_not_fit(tmp_path: Path) -> None:
     path = written(tmp_path, SINGLE)
-    with pytest.raises(ValueError, match=r"fps is missing, expected .* is a table"):
+    with pytest.raises(ValueError, match=r"fps must be .* is a table, got missing"):
         read_keypoints(path)
     with pytest.raises(ValueError, match="fps is 0, expected"):
         read_keypoints(path, fps=0)

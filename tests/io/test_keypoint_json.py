@@ -240,7 +240,7 @@ def changed(key: str, value: Any) -> dict[str, Any]:
         ([ONE, ONE], "frame 0 holds two people without a track id, expected track ids"),
         ([ONE, result(0, FIRST[0], idx=1)], "1 of 2 detections have no track id"),
         ([result(0, FIRST[0], idx=1)] * 2, "frame 0 holds person '1' twice"),
-        ([result(0, FIRST[0], idx={})], "track_id is {}, expected a number"),
+        ([result(0, FIRST[0], idx={})], "track_id must be a number, got {}"),
         ([ONE | {"image_id": "a.jpg"}], "called 'a.jpg', expected a name with the frame's number"),
         ([ONE | {"image_id": None}], "called None"),
         ([ONE | {"image_id": 10**30}], "at most 18 digits"),
@@ -257,9 +257,9 @@ def changed(key: str, value: Any) -> dict[str, Any]:
         ([ONE | {"keypoints": [1, 2, 1] * 5}], "5 keypoints of unknown names"),
         ([ONE, result(1, FIRST[0][:5])], r"people have \[5, 17\] keypoints, expected one number"),
         ({"people": []}, "no person in any frame"),
-        ({"people": 3}, "people is 3, expected a list of objects"),
+        ({"people": 3}, "people must be a list of objects, got 3"),
         ({"people": [{}]}, r"people\[0\] holds None"),
-        (coco(images=None), "images is None, expected a list of objects"),
+        (coco(images=None), "images must be a list of objects, got None"),
         (coco(images=[{"file_name": "1.jpg"}]), "id None came, expected an id for each image"),
         (coco(images=[{"id": 1}, {"id": 1}]), "id '1' came, expected .* all different"),
         (coco(annotations=[]), "no person in any frame"),
@@ -295,11 +295,11 @@ def test_what_cannot_be_printed_is_escaped(tmp_path: Path) -> None:
 
 def test_arguments_and_files_that_do_not_fit(tmp_path: Path) -> None:
     path = written(tmp_path, [ONE])
-    with pytest.raises(ValueError, match="fps is missing, expected frames per second"):
+    with pytest.raises(ValueError, match="fps must be frames per second, got missing"):
         read_keypoints(path)
     with pytest.raises(ValueError, match="fps is -1"):
         read_keypoints(path, fps=-1)
-    with pytest.raises(ValueError, match="skeleton is 'none', expected a Skeleton or one of"):
+    with pytest.raises(ValueError, match="skeleton must be a Skeleton or one of, got 'none'"):
         read_keypoints(path, fps=1, skeleton="none")
     with pytest.raises(MotionFileError, match="17 keypoints, expected 18"):
         read_keypoints(path, fps=1, skeleton="openpose18")

@@ -66,7 +66,7 @@ def test_a_file_without_ids_is_read_when_told_how_many(tmp_path):
     assert np.allclose(np.diff(second.keypoints[:, 0, 0]), -1)
     with pytest.raises(ValueError, match="two people without a track id"):
         read_keypoints(path, 30.0)
-    with pytest.raises(ValueError, match="people is 3, expected at most the 2 of one image"):
+    with pytest.raises(ValueError, match="people must be at most the 2 of one image, got 3"):
         read_keypoints(path, 30.0, people=3)
     with pytest.raises(ValueError, match="people is 0"):
         read_keypoints(path, 30.0, people=0)

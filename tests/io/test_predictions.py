@@ -65,7 +65,7 @@ def test_resampling_keeps_the_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"positions": None}, "key positions is missing, expected positions, joint_names and fps"),
+        ({"positions": None}, "key positions must be positions, joint_names and fps, got missing"),
         ({"joint_names": None}, "key joint_names is missing"),
         ({"fps": None}, "key fps is missing"),
         ({"positions": CLIPS[..., :2]}, r"positions has shape \(2, 7, 4, 2\)"),
@@ -77,7 +77,7 @@ def test_resampling_keeps_the_time(tmp_path: Path) -> None:
         ({"joint_names": np.array(["a", "a", "b", "c"])}, "joint_names"),
         ({"joint_names": np.array(["a", "b", "LeftKnee", "Hips"])}, "the joint 'right_knee'"),
         ({"fps": 0.0}, "fps is 0"),
-        ({"up_axis": "x"}, "up_axis is 'x', expected 'y' or 'z'"),
+        ({"up_axis": "x"}, "up_axis must be 'y' or 'z', got 'x'"),
     ],
 )
 def test_every_defect_is_one_sentence(

@@ -160,7 +160,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("threshold", [np.nan, -0.1, 1.5, "half", None])
 def test_thresholds_are_shares(tmp_path: Path, threshold: Any) -> None:
     film(tmp_path / "made.npz")
-    with pytest.raises(ValueError, match=r"^threshold is .*, expected a confidence, 0 to 1$"):
+    with pytest.raises(ValueError, match=r"^threshold must be a confidence, 0 to 1$, got .*"):
         read_recording(tmp_path / "made.npz", threshold=threshold)
 
 
@@ -171,18 +171,22 @@ def test_thresholds_are_shares(tmp_path: Path, threshold: Any) -> None:
         (
             "keypoints",
             lambda x: np.where(np.arange(21)[:, None, None] == 7, np.nan, x),
-            "keypoints is NaN at view 0, frame 7, joint 0, where confidence is 0.8, expected conf",
+            "keypoints is NaN at view 0, frame 7, joint 0, where confidence must be conf, got 0.8",
         ),
-        ("K", lambda x: x[0], r"K has shape \(3, 3\), expected \(4, 3, 3\)"),
-        ("K", lambda x: x * np.nan, "K has 36 values that are NaN"),
-        ("K", lambda x: -x, "focal is -1505.0, expected a finite number above 0"),
-        ("R", lambda x: x[:2], r"R has shape \(2, 3, 3\), expected \(4, 3, 3\)"),
-        ("R", lambda x: x * np.nan, "R has 36 values that are NaN"),
+        ("K", lambda x: x[0], r"K must have shape \(4, 3, 3\), got \(3, 3\)"),
+        ("K", lambda x: x * np.nan, "K must be finite, got 36 values that are NaN"),
+        ("K", lambda x: -x, "focal must be a finite number above 0, got -1505.0"),
+        ("R", lambda x: x[:2], r"R must have shape \(4, 3, 3\), got \(2, 3, 3\)"),
+        ("R", lambda x: x * np.nan, "R must be finite, got 36 values that are NaN"),
         ("R", lambda x: 2 * x, "rotation is off an orthonormal matrix by 3"),
-        ("t", lambda x: x[..., None], r"t has shape \(4, 3, 1\), expected \(4, 3\)"),
-        ("t", lambda x: x * np.nan, "t has 12 values that are NaN"),
-        ("distortion", lambda x: x[:, :2], r"distortion has shape \(4, 2\), expected \(4, 4\)"),
-        ("distortion", lambda x: x * np.nan, "distortion has 16 values that are NaN"),
+        ("t", lambda x: x[..., None], r"t must have shape \(4, 3\), got \(4, 3, 1\)"),
+        ("t", lambda x: x * np.nan, "t must be finite, got 12 values that are NaN"),
+        ("distortion", lambda x: x[:, :2], r"distortion must have shape \(4, 4\), got \(4, 2\)"),
+        (
+            "distortion",
+            lambda x: x * np.nan,
+            "distortion must be finite, got 16 values that are NaN",
+        ),
         ("K", None, "key K is missing"),
         ("R", None, "key R is missing"),
         ("t", None, "key t is missing"),

@@ -198,25 +198,27 @@ def test_degenerate_poses_are_measured():
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(ValueError, match="measure is 'euclid', expected one of interaction, carte"):
+    with pytest.raises(ValueError, match="measure must be one of interaction, carte, got 'euclid'"):
         coverage(TRUTHS, DRAWS, "euclid")
-    with pytest.raises(ValueError, match="draws is empty, expected at least one pose"):
+    with pytest.raises(ValueError, match="draws must contain at least one pose, got none"):
         coverage(TRUTHS, DRAWS[:0])
     with pytest.raises(ValueError, match="ground_truth is empty"):
         coverage(TRUTHS[:0], DRAWS)
     with pytest.raises(ValueError, match="counts has 31, expected at most 30, the draws"):
         coverage(TRUTHS, DRAWS, counts=[5, 31])
-    with pytest.raises(ValueError, match="counts is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="counts must be an integer of at least 1, got 0"):
         coverage(TRUTHS, DRAWS, counts=[0])
     with pytest.raises(ValueError, match="counts is empty"):
         coverage(TRUTHS, DRAWS, counts=[])
-    with pytest.raises(ValueError, match=r"draws has shape \(30, 33, 3\), expected \(S, 34, 3\)"):
+    with pytest.raises(ValueError, match=r"draws must have shape \(S, 34, 3\), got \(30, 33, 3\)"):
         coverage(TRUTHS, DRAWS[:, :33])
     broken = DRAWS.copy()
     broken[4, 2, 1] = np.nan
-    with pytest.raises(ValueError, match="draws has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="draws must be finite, got 1 values that are NaN or infinite"
+    ):
         coverage(TRUTHS, broken)
-    with pytest.raises(ValueError, match="second has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="second must be finite, got 1 values that are NaN"):
         pose_distances(TRUTHS, broken, "cartesian")
 
 

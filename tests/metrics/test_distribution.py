@@ -63,7 +63,7 @@ def test_sliced_wasserstein_of_a_shift_is_its_mean_projection(rng, directions):
 
 
 def test_sliced_wasserstein_refuses_other_sizes(rng, directions):
-    with pytest.raises(ValueError, match=r"y has shape \(30, 5\), expected \(40, 5\)"):
+    with pytest.raises(ValueError, match=r"y must have shape \(40, 5\), got \(30, 5\)"):
         sliced_wasserstein(np.zeros((40, 5)), np.zeros((30, 5)), directions)
     with pytest.raises(ValueError, match="references has 1 sets"):
         sliced_wasserstein_ratio(np.zeros((40, 5)), [np.zeros((40, 5))], directions)

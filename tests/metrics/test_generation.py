@@ -138,7 +138,7 @@ def test_azimuths_cover_what_they_should(rng):
     share = (side - math.pi / 4) / (math.pi / 2)
     assert np.abs(share - uniform).max() < 2.23 / math.sqrt(4000)
     assert (random_azimuths(rng, 3, "reference-code-side") == math.pi / 2).all()
-    with pytest.raises(ValueError, match="angles is 'front', expected one of all, side"):
+    with pytest.raises(ValueError, match="angles must be one of all, side, got 'front'"):
         random_azimuths(rng, 3, "front")
 
 
@@ -243,17 +243,17 @@ def test_the_chamfer_distance_is_of_whole_windows_of_pictures(rng, reference, fr
 
 
 def test_bad_input(rng):
-    with pytest.raises(ValueError, match=r"b has shape \(5, 3\), expected \(M, 2\)"):
+    with pytest.raises(ValueError, match=r"b must have shape \(M, 2\), got \(5, 3\)"):
         frechet_distance(np.zeros((5, 2)), np.zeros((5, 3)))
     with pytest.raises(ValueError, match="b has 1 motions, expected at least 2"):
         frechet_distance(np.zeros((5, 2)), np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="a has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="a must be finite, got 1 values that are NaN"):
         frechet_distance(np.array([[0.0], [np.nan]]), np.zeros((5, 1)))
     with pytest.raises(ValueError, match="features has 1 motions, expected at least 2"):
         diversity(np.zeros((1, 2)), rng)
-    with pytest.raises(ValueError, match=r"held_out_features has shape \(5,\), expected \(M, D\)"):
+    with pytest.raises(ValueError, match=r"held_out_features must have shape \(M, D\), got \(5,\)"):
         GenerationReference(Plain(), np.zeros(5))
-    with pytest.raises(ValueError, match="repeats is 1, expected an integer of at least 2"):
+    with pytest.raises(ValueError, match="repeats must be an integer of at least 2, got 1"):
         score_generation(np.negative, lambda g, n: np.zeros((9, 2)), np.zeros((9, 2)),
                          seed=0, repeats=1)  # fmt: skip
 
@@ -267,5 +267,7 @@ def test_the_learnt_clips_are_another_reference():
     assert again.elevation == 0.1
     with pytest.raises(ValueError, match="learnt_features is missing"):
         GenerationReference(Plain(), held_out).of_learnt()
-    with pytest.raises(ValueError, match=r"learnt_features has shape \(50, 2\), expected \(M, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"learnt_features must have shape \(M, 3\), got \(50, 2\)"
+    ):
         GenerationReference(Plain(), held_out, learnt[:, :2])

@@ -48,10 +48,10 @@ def test_one_value_has_no_spread_to_be_seen():
 @pytest.mark.parametrize(
     ("values", "level", "match"),
     [
-        ([], 0.95, r"values is \[\], expected at least one"),
+        ([], 0.95, r"values must be at least one, got \[\]"),
         ([1.0, math.nan], 0.95, r"values is \[1.0, nan\], expected at least one, all finite"),
-        ([1.0, 2.0], 1.0, "level is 1.0, expected a number between 0 and 1"),
-        ([[1.0, 2.0]], 0.95, r"values has shape \(1, 2\), expected \(n\)"),
+        ([1.0, 2.0], 1.0, "level must be a number between 0 and 1, got 1.0"),
+        ([[1.0, 2.0]], 0.95, r"values must have shape \(n\), got \(1, 2\)"),
     ],
 )
 def test_the_interval_says_what_is_wrong(values, level, match):
@@ -185,7 +185,7 @@ def test_an_infinite_error_is_neither_best_nor_tied():
         ({"a": [1.0], "b": [1.0, 2.0]}, {"target": None}, "different numbers of seeds: a 1, b 2"),
         ({"a": [math.nan]}, {"target": None}, "values has no sampler with a finite value"),
         ({}, {"target": None}, "values has no sampler with a finite value"),
-        ({"a": [1.0]}, {"target": 0, "ratio": True}, "target is 0, expected a number above 0"),
+        ({"a": [1.0]}, {"target": 0, "ratio": True}, "target must be a number above 0, got 0"),
         ({"a": [-1.0]}, {"target": 1, "ratio": True}, "values of a has -1.0, expected ratios"),
     ],
 )

@@ -100,7 +100,7 @@ class TestCorrectKeypoints:
         assert percentage_of_correct_keypoints(swapped, truth, 4.0) < good
 
     def test_bad_input(self, truth: np.ndarray) -> None:
-        with pytest.raises(ValueError, match=r"size has shape \(7,\), expected one number, or"):
+        with pytest.raises(ValueError, match=r"size must have shape one number, or, got \(7,\)"):
             percentage_of_correct_keypoints(truth, truth, np.ones(L))
         with pytest.raises(ValueError, match="size has entries that are not finite numbers above"):
             percentage_of_correct_keypoints(truth, truth, 0.0)
@@ -113,7 +113,9 @@ class TestCorrectKeypoints:
         with pytest.raises(ValueError, match="predicted has shape"):
             percentage_of_correct_keypoints(truth[:, :, 1:], truth, 1.0)
         unseen = hidden(truth, np.arange(N * L * J).reshape(N, L, J) > 0)
-        with pytest.raises(ValueError, match="truth has 2 values that are NaN or infinite"):
+        with pytest.raises(
+            ValueError, match="truth must be finite, got 2 values that are NaN or infinite"
+        ):
             percentage_of_correct_keypoints(truth, unseen, 1.0)
 
 

@@ -138,9 +138,13 @@ def test_the_share_of_distant_modes_is_not_seen(rng):
 @pytest.mark.parametrize(
     ("theta", "score", "match"),
     [
-        (np.zeros((3, 2)), np.zeros((3, 1)), r"score has shape \(3, 1\), expected \(3, 2\)"),
-        (np.zeros(3), np.zeros(3), r"points has shape \(3,\), expected \(n, D\)"),
-        (np.zeros((3, 2)), np.full((3, 2), np.inf), "score has 6 values that are NaN"),
+        (np.zeros((3, 2)), np.zeros((3, 1)), r"score must have shape \(3, 2\), got \(3, 1\)"),
+        (np.zeros(3), np.zeros(3), r"points must have shape \(n, D\), got \(3,\)"),
+        (
+            np.zeros((3, 2)),
+            np.full((3, 2), np.inf),
+            "score must be finite, got 6 values that are NaN",
+        ),
         (np.zeros((1, 2)), np.zeros((1, 2)), "points has 1 points, expected at least 2"),
         (np.zeros((3, 2)), np.zeros((3, 2)), "points have median distance 0"),
     ],
@@ -253,7 +257,9 @@ def test_draws_without_a_finite_slope_are_an_error():
 
     theta = np.ones((3, 12))
     theta[1] = 0
-    with pytest.raises(ValueError, match="score has 12 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="score must be finite, got 12 values that are NaN or infinite"
+    ):
         score_of(pm.MotionPosterior(Cornered()), theta)
-    with pytest.raises(ValueError, match=r"theta has shape \(3, 5\), expected \(n, 12\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(n, 12\), got \(3, 5\)"):
         score_of(pm.MotionPosterior(Bent()), theta[:, :5])

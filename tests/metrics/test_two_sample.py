@@ -206,9 +206,11 @@ def test_principal_coordinates_of_a_flat_set_have_nothing_left(rng):
 def test_sets_are_checked(rng, test):
     more = () if test is maximum_mean_discrepancy else (0,)
     good, hole = rng.normal(size=(8, 3)), np.full((8, 3), np.nan)
-    with pytest.raises(ValueError, match=r"reference has shape \(8, 2\), expected \(m, 3\)"):
+    with pytest.raises(ValueError, match=r"reference must have shape \(m, 3\), got \(8, 2\)"):
         test(good, good[:, :2], *more)
-    with pytest.raises(ValueError, match="draws has 24 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="draws must be finite, got 24 values that are NaN or infinite"
+    ):
         test(hole, good, *more)
     with pytest.raises(ValueError, match="reference has 1 points, expected at least 2"):
         test(good, good[:1], *more)
@@ -218,11 +220,11 @@ def test_sets_are_checked(rng, test):
 
 def test_a_classifier_checks_its_sets(rng):
     good = rng.normal(size=(8, 3))
-    with pytest.raises(ValueError, match=r"reference has shape \(7, 3\), expected \(8, 3\)"):
+    with pytest.raises(ValueError, match=r"reference must have shape \(8, 3\), got \(7, 3\)"):
         classifier_two_sample(good, good[:7], 0)
     with pytest.raises(ValueError, match="draws has 4 points, expected at least 5"):
         classifier_two_sample(good[:4], good[:4], 0)
     with pytest.raises(ValueError, match="points are 16 times the same"):
         classifier_two_sample(0 * good, 0 * good, 0)
-    with pytest.raises(ValueError, match="length_scale is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="length_scale must be a finite number above 0, got 0"):
         maximum_mean_discrepancy(good, good, length_scale=0)

@@ -109,9 +109,9 @@ def test_holm():
 def test_wrong_input_is_named():
     with pytest.raises(ValueError, match=r"values run from -0.5 to 0.5, expected numbers in \[0"):
         uniformity_p_value(np.array([-0.5, 0.5]))
-    with pytest.raises(ValueError, match="values has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="values must be finite, got 1 values that are NaN"):
         uniformity_p_value(np.array([np.nan, 0.5]))
-    with pytest.raises(ValueError, match="n is 1, expected an integer of at least 2"):
+    with pytest.raises(ValueError, match="n must be an integer of at least 2, got 1"):
         uniformity_p_value(np.array([0.5]))
-    with pytest.raises(ValueError, match="level is 1, expected a number between 0 and 1"):
+    with pytest.raises(ValueError, match="level must be a number between 0 and 1, got 1"):
         ecdf_band(10, 1)

@@ -255,14 +255,17 @@ def test_a_real_walk_is_found_again(real_data, camera, rng):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"local": np.zeros((L, J, 2))}, r"local has shape \(40, 9, 2\), expected \(40, 9, 3\)"),
-        ({"local": np.full((L, J, 3), np.inf)}, "local has 1080 values that are NaN or infinite"),
+        ({"local": np.zeros((L, J, 2))}, r"local must have shape \(40, 9, 3\), got \(40, 9, 2\)"),
+        (
+            {"local": np.full((L, J, 3), np.inf)},
+            "local must be finite, got 1080 values that are NaN or infinite",
+        ),
         ({"camera": Cameras.ring(1)}, "camera is orthographic, which shows the same picture"),
         ({"camera": Cameras.ring(2, perspective=True)}, "camera has 2 views, expected one"),
-        ({"scale": 0.0}, "scale is 0.0, expected a finite number above 0"),
-        ({"data_weight": -1.0}, "data_weight is -1.0, expected a finite number above 0"),
-        ({"smoothness_weight": 0.0}, "smoothness_weight is 0.0, expected a finite number above 0"),
-        ({"max_iterations": 0}, "max_iterations is 0, expected an integer of at least 1"),
+        ({"scale": 0.0}, "scale must be a finite number above 0, got 0.0"),
+        ({"data_weight": -1.0}, "data_weight must be a finite number above 0, got -1.0"),
+        ({"smoothness_weight": 0.0}, "smoothness_weight must be a finite number above 0, got 0.0"),
+        ({"max_iterations": 0}, "max_iterations must be an integer of at least 1, got 0"),
         (
             {"track": track_of(np.zeros((L, J, 2)), np.zeros((L, J)))},
             "track determines a place in front of the camera in none of its 40 frames",

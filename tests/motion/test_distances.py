@@ -138,11 +138,11 @@ def test_bad_input():
         yaw_aligned_distances(motions, np.zeros((2, 2, 4, 3)))
     with pytest.raises(ValueError, match=r"real has motions of shape \(3, 5, 3\), expected"):
         nearest_distances(motions, np.zeros((2, 3, 5, 3)))
-    with pytest.raises(ValueError, match=r"a has shape \(3, 4, 3\), expected \(N, L, J, 3\)"):
+    with pytest.raises(ValueError, match=r"a must have shape \(N, L, J, 3\), got \(3, 4, 3\)"):
         yaw_aligned_distances(motions[0], motions)
     broken = motions.copy()
     broken[1, 0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="draws has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="draws must be finite, got 1 values that are NaN"):
         mirrored_fraction(broken, motions)
-    with pytest.raises(ValueError, match=r"real has shape \(0, 3, 4, 3\), expected at least one"):
+    with pytest.raises(ValueError, match=r"real must have shape at least one, got \(0, 3, 4, 3\)"):
         nearest_distances(motions, motions[:0])

@@ -107,7 +107,9 @@ def test_wrong_shapes_are_refused() -> None:
         fit_rotations(TANGLED, np.zeros((2, 5, 3)))
     with pytest.raises(ValueError, match="positions has no frame, expected at least one"):
         fit_rotations(TANGLED, np.zeros((0, 6, 3)))
-    with pytest.raises(ValueError, match="positions has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="positions must be finite, got 1 values that are NaN or infinite"
+    ):
         fit_rotations(TANGLED, np.pad([[[np.nan]]], ((0, 0), (0, 5), (0, 2))))
 
 

@@ -28,16 +28,16 @@ def test_a_clip_knows_its_length() -> None:
 
 def test_bad_positions_are_refused_in_one_sentence() -> None:
     good = np.zeros((4, 3, 3))
-    with pytest.raises(ValueError, match=r"positions has shape \(4, 2, 3\), expected \(L, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"positions must have shape \(L, 3, 3\), got \(4, 2, 3\)"):
         Motion(good[:, :2], CHAIN, 30)
-    with pytest.raises(ValueError, match=r"positions has shape \(3, 3\), expected \(L, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"positions must have shape \(L, 3, 3\), got \(3, 3\)"):
         Motion(good[0], CHAIN, 30)
     with pytest.raises(ValueError, match="positions has no frame, expected at least one"):
         Motion(good[:0], CHAIN, 30)
     for bad in (np.nan, np.inf, -np.inf):
         broken = good.copy()
         broken[2, 1, 0] = bad
-        wanted = r"positions has 1 values that are NaN or infinite, the first at index \(2, 1, 0\)"
+        wanted = r"positions must be finite, got 1 values that are NaN or infinite, the first at index \(2, 1, 0\)"
         with pytest.raises(ValueError, match=wanted):
             Motion(broken, CHAIN, 30)
 
@@ -54,13 +54,17 @@ def test_rotations_come_with_their_rest_pose() -> None:
         ValueError, match="rotations and rest_offsets are given one without the oth"
     ):
         Motion(positions, CHAIN, 30, rotations=turns)
-    with pytest.raises(ValueError, match=r"rotations has shape \(1, 3, 3, 3\), expected \(2, 3, 3"):
+    with pytest.raises(
+        ValueError, match=r"rotations must have shape \(2, 3, 3, got \(1, 3, 3, 3\)"
+    ):
         Motion(positions, CHAIN, 30, rotations=turns[:1], rest_offsets=np.zeros((3, 3)))
-    with pytest.raises(ValueError, match=r"rest_offsets has shape \(2, 3\), expected \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"rest_offsets must have shape \(3, 3\), got \(2, 3\)"):
         Motion(positions, CHAIN, 30, rotations=turns, rest_offsets=np.zeros((2, 3)))
     broken = turns.copy()
     broken[1, 2] = np.nan
-    with pytest.raises(ValueError, match="rotations has 9 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="rotations must be finite, got 9 values that are NaN or infinite"
+    ):
         Motion(positions, CHAIN, 30, rotations=broken, rest_offsets=np.zeros((3, 3)))
 
 
@@ -72,7 +76,7 @@ def test_a_window_is_a_part_of_the_clip() -> None:
     for start, frames in ((-1, 4), (7, 4), (0, 11)):
         with pytest.raises(ValueError, match="expected a window inside the 10 frames of clip"):
             motion.window(start, frames)
-    with pytest.raises(ValueError, match="frames is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 1, got 0"):
         motion.window(0, 0)
 
 
@@ -94,15 +98,17 @@ def test_turning_is_about_the_vertical_axis_from_z_to_x() -> None:
 
 def test_bad_tracks_are_refused_in_one_sentence() -> None:
     points, shown = np.zeros((4, 3, 2)), np.ones((4, 3))
-    with pytest.raises(ValueError, match=r"keypoints has shape \(4, 3, 3\), expected \(L, 3, 2\)"):
+    with pytest.raises(ValueError, match=r"keypoints must have shape \(L, 3, 2\), got \(4, 3, 3\)"):
         KeypointTrack(np.zeros((4, 3, 3)), shown, CHAIN, 30)
-    with pytest.raises(ValueError, match=r"confidence has shape \(4, 2\), expected \(4, 3\)"):
+    with pytest.raises(ValueError, match=r"confidence must have shape \(4, 3\), got \(4, 2\)"):
         KeypointTrack(points, shown[:, :2], CHAIN, 30)
     with pytest.raises(ValueError, match="keypoints has no frame"):
         KeypointTrack(points[:0], shown[:0], CHAIN, 30)
     with pytest.raises(ValueError, match="confidence is -1 at its least, expected 0 or more"):
         KeypointTrack(points, -shown, CHAIN, 30)
-    with pytest.raises(ValueError, match="confidence has 12 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="confidence must be finite, got 12 values that are NaN or infinite"
+    ):
         KeypointTrack(points, np.nan * shown, CHAIN, 30)
     points[2, 1, 0] = np.nan
     with pytest.raises(ValueError, match="keypoints is not finite at frame 2, joint 1, where conf"):

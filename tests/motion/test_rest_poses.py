@@ -205,7 +205,7 @@ def test_what_shows_no_body_is_refused():
     rest = standing(PERSON)
     azimuths = np.arange(12) * np.pi / 6
     tracks = rigid_tracks(PERSON, rest, azimuths)
-    with pytest.raises(ValueError, match="tracks is empty, expected at least one"):
+    with pytest.raises(ValueError, match="tracks must contain at least one, got none"):
         estimate_rest_pose([])
     chain = rigid_tracks(CHAIN, np.ones((6, 3)), azimuths)
     with pytest.raises(ValueError, match="of other joints than the first, expected one skeleton"):
@@ -236,7 +236,7 @@ def test_what_shows_no_body_is_refused():
         flat[PERSON.index(f"{side}_wrist")] = 0
         with pytest.raises(ValueError, match=f"no length or direction of the bone to {side}_wrist"):
             estimate_rest_pose(rigid_tracks(PERSON, flat, azimuths))
-    with pytest.raises(ValueError, match="front is 'beak', expected one of pelvis"):
+    with pytest.raises(ValueError, match="front must be one of pelvis, got 'beak'"):
         estimate_rest_pose(rigid_tracks(PERSON, rest, azimuths), front="beak")
     narrow = rest * [0, 1, 1]
     with pytest.raises(ValueError, match="left and right in one place, expected hips"):

@@ -117,7 +117,7 @@ def test_mixed_skeletons_share_the_joints_that_all_have() -> None:
 
 
 def test_nothing_in_common_is_refused() -> None:
-    with pytest.raises(ValueError, match="skeletons is empty, expected at least one"):
+    with pytest.raises(ValueError, match="skeletons must contain at least one, got none"):
         common_skeleton([])
     one, other = Skeleton(["a"], [-1]), Skeleton(["b"], [-1])
     with pytest.raises(ValueError, match="skeletons have no joint in common: a, … and b, …"):

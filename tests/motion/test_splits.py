@@ -58,7 +58,7 @@ def test_tracks_are_chosen_by_clip_in_their_order() -> None:
 
 
 def test_bad_input_is_one_sentence() -> None:
-    with pytest.raises(ValueError, match="validation is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="validation must be a finite number above 0, got 0"):
         split_clips(VIEWS, validation=0, seed=0)
     with pytest.raises(ValueError, match=r"validation and test are 0.5 and 0.5, expected a sum"):
         split_clips(VIEWS, validation=0.5, test=0.5, seed=0)
@@ -68,7 +68,7 @@ def test_bad_input_is_one_sentence() -> None:
         split_clips(["a/1", "a/2", "b/1"], seed=0)
     with pytest.raises(ValueError, match="names has 0 clips"):
         split_clips([], seed=0)
-    with pytest.raises(ValueError, match="names is 'walk', expected several names"):
+    with pytest.raises(ValueError, match="names must be several names, got 'walk'"):
         split_clips("walk", seed=0)
     with pytest.raises(ValueError, match="seed is -1"):
         split_clips(VIEWS, seed=-1)

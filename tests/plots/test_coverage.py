@@ -89,13 +89,13 @@ def test_a_panel_per_measure_and_a_line_per_density(tmp_path):
 
 
 def test_bad_input_is_refused_in_a_sentence(points):
-    with pytest.raises(ValueError, match=r"distances has shape \(3, 4\), expected \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"distances must have shape \(3, 3\), got \(3, 4\)"):
         classical_scaling(np.zeros((3, 4)))
     with pytest.raises(ValueError, match="distances is of 1 points, expected at least dim=2"):
         classical_scaling(np.zeros((1, 1)))
     with pytest.raises(ValueError, match=r"kinds has \['truth'\], expected some of real, prior"):
         draw_embedding(points, ["truth", *KINDS[1:]])
-    with pytest.raises(ValueError, match=r"kinds has shape \(24,\), expected \(25\)"):
+    with pytest.raises(ValueError, match=r"kinds must have shape \(25\), got \(24,\)"):
         draw_embedding(points, KINDS[1:])
     with pytest.raises(ValueError, match=r"table lacks the columns \['coverage'\], expected"):
         draw_coverage(table().drop(columns="coverage"))

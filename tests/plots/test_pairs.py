@@ -78,7 +78,7 @@ def test_a_picture_is_written(tmp_path):
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(ValueError, match="rows is empty, expected at least one label"):
+    with pytest.raises(ValueError, match="rows must contain at least one label, got none"):
         draw_pairs({}, PAIR)
     with pytest.raises(ValueError, match=r"rows\['a'\] has shape \(5, 17, 3\), expected"):
         draw_pairs({"a": POSES[:, :17]}, PAIR)

@@ -90,7 +90,7 @@ def test_nothing_is_cut_off_or_drawn_over():
 
 
 def test_wrong_input_is_named():
-    with pytest.raises(ValueError, match="blocks is empty, expected at least one sampler"):
+    with pytest.raises(ValueError, match="blocks must contain at least one sampler, got none"):
         draw_ranks({})
     with pytest.raises(ValueError, match=r"blocks\['mas'\] is empty"):
         draw_ranks({"mas": {}})

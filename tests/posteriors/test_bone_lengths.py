@@ -158,7 +158,7 @@ def test_bad_input_is_one_sentence() -> None:
         bone_lengths(joints, None, PERSON, 0.0)
     with pytest.raises(ValueError, match="degrees_of_freedom is -1"):
         bone_lengths(joints, None, PERSON, 0.01, -1.0)
-    with pytest.raises(ValueError, match="joints has 42 values that are NaN"):
+    with pytest.raises(ValueError, match="joints must be finite, got 42 values that are NaN"):
         bone_lengths(np.where(np.arange(5)[:, None, None] == 2, np.nan, joints), None, PERSON, 0.01)
     with pytest.raises(ValueError, match="typical has shape"):
         bone_lengths(joints, None, PERSON, 0.01, typical=np.ones(3))

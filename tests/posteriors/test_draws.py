@@ -217,13 +217,15 @@ def test_wrong_shapes_and_values_are_refused() -> None:
         some_draws(positions=np.zeros((CHAINS, DRAWS, FRAMES, 3, 3)))
     broken = np.zeros((CHAINS, DRAWS, FRAMES, 2, 3))
     broken[1, 2, 0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="positions has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="positions must be finite, got 1 values that are NaN or infinite"
+    ):
         some_draws(positions=broken)
-    with pytest.raises(ValueError, match=r"theta has shape \(2, 5, 3\), expected \(2, 5, 4\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(2, 5, 4\), got \(2, 5, 3\)"):
         some_draws(theta=np.zeros((CHAINS, DRAWS, 3)))
-    with pytest.raises(ValueError, match=r"log_density has shape \(5, 2\), expected \(2, 5\)"):
+    with pytest.raises(ValueError, match=r"log_density must have shape \(2, 5\), got \(5, 2\)"):
         some_draws(log_density=np.zeros((DRAWS, CHAINS)))
-    with pytest.raises(ValueError, match=r"acceptance has shape \(3, 5\), expected \(2, 5\)"):
+    with pytest.raises(ValueError, match=r"acceptance must have shape \(2, 5\), got \(3, 5\)"):
         some_draws(statistics={"acceptance": np.zeros((3, DRAWS))})
 
 

@@ -236,11 +236,13 @@ def test_both_are_likelihoods() -> None:
 def test_bad_evidence_is_refused_in_one_sentence() -> None:
     cameras = Cameras.ring(2)
     blank = np.zeros((2, *SHAPE, 2))
-    with pytest.raises(ValueError, match=r"keypoints has shape \(1, 4, 3, 2\), expected \(2, L, J"):
+    with pytest.raises(
+        ValueError, match=r"keypoints must have shape \(2, L, J, got \(1, 4, 3, 2\)"
+    ):
         Keypoints2D(blank[:1], cameras, 0.1)
-    with pytest.raises(ValueError, match=r"joints has shape \(4, 3, 2\), expected \(L, J, 3\)"):
+    with pytest.raises(ValueError, match=r"joints must have shape \(L, J, 3\), got \(4, 3, 2\)"):
         Joints3D(blank[0], 0.1)
-    with pytest.raises(ValueError, match=r"confidence has shape \(4, 3\), expected \(2, 4, 3\)"):
+    with pytest.raises(ValueError, match=r"confidence must have shape \(2, 4, 3\), got \(4, 3\)"):
         Keypoints2D(blank, cameras, 0.1, np.ones(SHAPE))
     for noise in (0.0, -1.0, np.nan, np.inf, None, "0.1", np.ones(3)):
         for make in (joints, keypoints):
@@ -253,18 +255,24 @@ def test_bad_evidence_is_refused_in_one_sentence() -> None:
             joints(freedom)
     with pytest.raises(ValueError, match="confidence is -1 at its least, expected 0 or more"):
         joints(confidence=-np.ones(SHAPE))
-    with pytest.raises(ValueError, match="confidence has 12 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="confidence must be finite, got 12 values that are NaN or infinite"
+    ):
         joints(confidence=np.full(SHAPE, np.nan))
     for bad in (np.nan, np.inf):
         seen = np.zeros((*SHAPE, 3))
         seen[2, 1, 0] = bad
-        with pytest.raises(ValueError, match="joints has 1 values that are NaN or infinite"):
+        with pytest.raises(
+            ValueError, match="joints must be finite, got 1 values that are NaN or infinite"
+        ):
             Joints3D(seen, 0.1)
         blank[1, 2, 1, 0] = bad
-        with pytest.raises(ValueError, match="keypoints has 1 values that are NaN or infinite"):
+        with pytest.raises(
+            ValueError, match="keypoints must be finite, got 1 values that are NaN or infinite"
+        ):
             Keypoints2D(blank, cameras, 0.1)
     motion = Motion(some_positions(), CHAIN, 30)
-    with pytest.raises(ValueError, match=r"hidden has shape \(3, 3\), expected \(4, 3\)"):
+    with pytest.raises(ValueError, match=r"hidden must have shape \(4, 3\), got \(3, 3\)"):
         Joints3D.observe(motion, 0.1, 0, hidden=np.zeros((3, 3), dtype=bool))
 
 

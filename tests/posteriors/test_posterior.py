@@ -115,10 +115,10 @@ def test_evidence_of_another_clip_is_refused() -> None:
 
 
 def test_what_is_no_prior_or_likelihood_is_refused() -> None:
-    with pytest.raises(ValueError, match="prior is str, expected an object with skeleton, frames"):
+    with pytest.raises(ValueError, match="prior must be an object with skeleton, frames, got str"):
         MotionPosterior("walk")  # type: ignore[arg-type]
     with pytest.raises(
-        ValueError, match="likelihood is float, expected an object with log_density"
+        ValueError, match="likelihood must be an object with log_density, got float"
     ):
         MotionPosterior(Flat(), 0.3)  # type: ignore[arg-type]
 
@@ -126,9 +126,9 @@ def test_what_is_no_prior_or_likelihood_is_refused() -> None:
 def test_wrong_coordinates_are_refused() -> None:
     posterior = MotionPosterior(Flat())
     for call in (posterior.log_density, posterior.motion):
-        with pytest.raises(ValueError, match=r"theta has shape \(3, 5\), expected \(…, 12\)"):
+        with pytest.raises(ValueError, match=r"theta must have shape \(…, 12\), got \(3, 5\)"):
             call(np.zeros((3, 5)))
-    with pytest.raises(ValueError, match=r"theta has shape \(12,\), expected \(n, 12\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(n, 12\), got \(12,\)"):
         posterior.complete(np.random.default_rng(0), np.zeros(DIM))
 
 

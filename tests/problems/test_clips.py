@@ -95,9 +95,9 @@ def test_clips_that_are_too_short_are_left_out_and_said_so():
             "motions has at most 20 frames in the clips that are not held out",
         ),
         (gaits(), {"held_out": "jump"}, "held_out is 'jump', which names 0 clips, expected one of"),
-        (gaits(), {"held_out": 6}, "held_out is 6, expected an index into the 6 clips"),
-        (gaits(), {"observe": "sound"}, "observe is 'sound', expected one of none, monocular"),
-        (gaits(), {"noise": 0.0}, "noise is 0.0, expected a finite number above 0"),
+        (gaits(), {"held_out": 6}, "held_out must be an index into the 6 clips, got 6"),
+        (gaits(), {"observe": "sound"}, "observe must be one of none, monocular, got 'sound'"),
+        (gaits(), {"noise": 0.0}, "noise must be a finite number above 0, got 0.0"),
         (gaits(), {"rank": 500}, "give more or longer clips, fewer styles or a lower rank"),
     ],
 )

@@ -230,11 +230,11 @@ def test_an_arm_and_then_a_leg_are_hidden(walks):
 def test_what_does_not_fit_the_prior_is_one_sentence(prior, walks):
     with pytest.raises(ValueError, match=r"likelihood is at 60 frames per second, expected the pr"):
         denoising_problem(replace(walks[0], fps=60.0), prior, noise=0.04)
-    with pytest.raises(ValueError, match=r"joints has shape \(90, 17, 3\), expected \(L, 14, 3\)"):
+    with pytest.raises(ValueError, match=r"joints must have shape \(L, 14, 3\), got \(90, 17, 3\)"):
         denoising_problem(synthetic_walks(1, BODY, seconds=3.0)[0], prior, noise=0.04)
-    with pytest.raises(ValueError, match=r"noise is 0.0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match=r"noise must be a finite number above 0, got 0.0"):
         denoising_problem(walks[0], prior, noise=0.0)
-    with pytest.raises(ValueError, match=r"hidden has shape \(3, 14\), expected \(90, 14\)"):
+    with pytest.raises(ValueError, match=r"hidden must have shape \(90, 14\), got \(3, 14\)"):
         denoising_problem(walks[0], prior, noise=0.04, hidden=np.ones((3, 14), dtype=bool))
 
 

@@ -26,7 +26,7 @@ def test_reference_draws_are_the_posteriors_and_seeded(name):
 
 
 def test_an_unknown_problem_is_told_the_known_ones():
-    with pytest.raises(ValueError, match="problem is 'gate', expected one of gait, gait-mono"):
+    with pytest.raises(ValueError, match="problem must be one of gait, gait-mono, got 'gate'"):
         load_problem("gate")
 
 
@@ -79,7 +79,7 @@ def test_sparse_evidence_leaves_many_modes_and_every_style():
 
 def test_a_truth_of_another_shape_is_refused():
     posterior = load_problem("gait").posterior
-    with pytest.raises(ValueError, match=r"truth has shape \(29, 17, 3\), expected \(30, 17, 3\)"):
+    with pytest.raises(ValueError, match=r"truth must have shape \(30, 17, 3\), got \(29, 17, 3\)"):
         Problem("bad", "", posterior, np.zeros((29, 17, 3)))
 
 

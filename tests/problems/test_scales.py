@@ -60,14 +60,14 @@ def test_a_worker_gets_an_equal_problem():
     [
         ("gait-sparse", {"hidden": 0.5}, "knows no 'hidden', expected one of frames, components"),
         ("walk2d", {"frames": 5}, "walk2d knows no 'frames', expected no numbers"),
-        ("gait", {"frames": 1}, "frames is 1, expected an integer of at least 2"),
-        ("gait", {"components": 100}, "components is 100, expected a multiple of the 3 styles"),
-        ("gait-monocular", {"frames": 4, "joints": 18}, "joints is 18, expected at most the 17"),
+        ("gait", {"frames": 1}, "frames must be an integer of at least 2, got 1"),
+        ("gait", {"components": 100}, "components must be a multiple of the 3 styles, got 100"),
+        ("gait-monocular", {"frames": 4, "joints": 18}, "joints must be at most the 17, got 18"),
         ("gait-monocular", {"frames": 4, "noise": -1.0}, "noise is -1.0, expected"),
-        ("gait-monocular", {"frames": 4, "hidden": 1.5}, "hidden is 1.5, expected a share"),
-        ("gait(frames=[5])", {}, r"frames is \[5\], expected a number such as"),
+        ("gait-monocular", {"frames": 4, "hidden": 1.5}, "hidden must be a share, got 1.5"),
+        ("gait(frames=[5])", {}, r"frames must be a number such as, got \[5\]"),
         ("gait(frames 5)", {}, "is 'gait.frames 5.', expected numbers such as"),
-        ("gate(frames=5)", {}, "problem is 'gate', expected one of gait"),
+        ("gate(frames=5)", {}, "problem must be one of gait, got 'gate'"),
     ],
 )
 def test_what_makes_no_problem_is_told_in_one_sentence(name, scale, sentence):

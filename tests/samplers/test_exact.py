@@ -102,5 +102,5 @@ def test_evidence_without_a_closed_form_is_refused(posterior):
 
 
 def test_a_starting_point_means_nothing(posterior):
-    with pytest.raises(ValueError, match=r"initial is ndarray, expected None"):
+    with pytest.raises(ValueError, match=r"initial must be None, got ndarray"):
         ExactSampler().sample(posterior, initial=np.zeros((1, 2)), progress=False)

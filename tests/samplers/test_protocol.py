@@ -75,7 +75,7 @@ def test_the_entry_points_name_all_eight():
 
 
 def test_an_unknown_sampler_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"sampler is 'gibbs', expected one of .*ensemble, exact"):
+    with pytest.raises(ValueError, match=r"sampler must be one of .*ensemble, exact, got 'gibbs'"):
         load_sampler("gibbs")
 
 
@@ -178,12 +178,12 @@ def test_what_does_not_fit_is_refused_in_one_sentence(sampler):
 @pytest.mark.parametrize("name", ["draws", "chains"])
 @pytest.mark.parametrize("bad", [0, 1.5])
 def test_wrong_numbers_of_draws_are_refused(sampler, posterior, name, bad):
-    with pytest.raises(ValueError, match=f"{name} is {bad}, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1, got {bad}"):
         sampler.sample(posterior, progress=False, **{name: bad})
 
 
 def test_wrong_seeds_are_refused(sampler, posterior):
-    with pytest.raises(ValueError, match="seed is -1, expected an integer of at least 0"):
+    with pytest.raises(ValueError, match="seed must be an integer of at least 0, got -1"):
         sampler.sample(posterior, draws=1, seed=-1, progress=False)
 
 

@@ -100,7 +100,7 @@ class Budget:
 def check_budget(budget: object) -> None:
     """Raise ``ValueError`` unless it is a budget or None."""
     if budget is not None and not isinstance(budget, Budget):
-        raise ValueError(f"budget is {budget!r}, expected a Budget")
+        raise ValueError(f"budget must be a Budget, got {budget!r}")
 
 
 def effort_of(sampler: Sampler) -> tuple[str, ...]:

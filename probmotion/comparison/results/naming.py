@@ -38,7 +38,7 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
                 "MotionPosterior objects"
             )
     if not found:
-        raise ValueError("problems is empty, expected at least one")
+        raise ValueError("problems must contain at least one, got none")
     return found
 
 
@@ -70,7 +70,7 @@ def named_samplers(samplers: Any) -> dict[str, Sampler]:
                 f"samplers has {what}, expected names or objects with name, requires and sample()"
             )
     if not found:
-        raise ValueError("samplers is empty, expected at least one")
+        raise ValueError("samplers must contain at least one, got none")
     return found
 
 

@@ -108,7 +108,7 @@ def make_gait(
         If the style is unknown; the message lists the known ones.
     """
     if style not in GAITS:
-        raise ValueError(f"style is {style!r}, expected one of {', '.join(GAITS)}")
+        raise ValueError(f"style must be one of {', '.join(GAITS)}, got {style!r}")
     check_count("frames", frames)
     check_positive("fps", fps)
     gait = GAITS[style]

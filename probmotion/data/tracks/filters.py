@@ -230,4 +230,4 @@ def _share_inside(boxes: np.ndarray, others: np.ndarray) -> float:
 def _check_share(name: str, value: float) -> None:
     check_positive(name, value)
     if value > 1:
-        raise ValueError(f"{name} is {value:g}, expected a share of at most 1")
+        raise ValueError(f"{name} must be a share of at most 1, got {value:g}")

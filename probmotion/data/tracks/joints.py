@@ -89,7 +89,7 @@ def with_midpoint(
         If a joint is unknown, there are fewer than two, or the name is taken.
     """
     if isinstance(joints, str) or len(joints) < 2:
-        raise ValueError(f"joints is {joints!r}, expected the names of at least two joints")
+        raise ValueError(f"joints must be the names of at least two joints, got {joints!r}")
     places = [track.skeleton.index(joint) for joint in joints]
     middle = track.keypoints[:, places].mean(axis=1)
     return with_joint(track, name, middle, track.confidence[:, places].min(axis=1), parent)

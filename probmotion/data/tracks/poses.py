@@ -43,7 +43,7 @@ def centre_tracks(tracks: Sequence[KeypointTrack], *, per: str = "frame") -> Ste
         If ``per`` is another word.
     """
     if per not in ("frame", "sequence"):
-        raise ValueError(f"per is {per!r}, expected 'frame' or 'sequence'")
+        raise ValueError(f"per must be 'frame' or 'sequence', got {per!r}")
     rooted = [track for track in tracks if seen(track)[:, track.skeleton.roots[0]].any()]
     centred = []
     for track in rooted:

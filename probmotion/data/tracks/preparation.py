@@ -145,7 +145,7 @@ def prepare_tracks(
     check_positive("fps", fps)
     left = list(tracks)
     if not left:
-        raise ValueError("tracks is empty, expected at least one")
+        raise ValueError("tracks must contain at least one, got none")
     if skeleton is None and any(track.skeleton != left[0].skeleton for track in left):
         raise ValueError(
             "tracks have several skeletons, expected one, or skeleton to bring them to"

@@ -41,7 +41,7 @@ def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
         If there is no track, or the tracks have several skeletons.
     """
     if not tracks:
-        raise ValueError("tracks is empty, expected at least one")
+        raise ValueError("tracks must contain at least one, got none")
     skeleton = tracks[0].skeleton
     for number, track in enumerate(tracks):
         if track.skeleton != skeleton:
@@ -84,7 +84,7 @@ def scale_to_bones(
         If ``sizes`` is empty, a size is not above 0, or a skeleton has none of its bones.
     """
     if not sizes:
-        raise ValueError("sizes is empty, expected the size of at least one bone")
+        raise ValueError("sizes must contain the size of at least one bone, got none")
     for name, size in sizes.items():
         check_positive(f"sizes[{name!r}]", size)
     scaled, factors = [], []

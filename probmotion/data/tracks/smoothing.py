@@ -116,7 +116,7 @@ def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
     """
     check_positive("fps", fps)
     if fps > _HIGHEST_FPS:
-        raise ValueError(f"fps is {fps:g}, expected at most {_HIGHEST_FPS} frames per second")
+        raise ValueError(f"fps must be at most {_HIGHEST_FPS} frames per second, got {fps:g}")
     resampled = [track if track.fps == fps else _resampled(track, float(fps)) for track in tracks]
     rates = sorted({f"{track.fps:g}" for track in tracks}, key=float)
     why = f"brought {' and '.join(rates) or 'no'} fps to {fps:g}"

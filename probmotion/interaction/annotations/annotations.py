@@ -140,7 +140,7 @@ class Annotations:
             If there is none, or they differ in skeleton or frame rate.
         """
         if not several:
-            raise ValueError("several is empty, expected at least one set of annotations")
+            raise ValueError("several must contain at least one set of annotations, got none")
         first = several[0]
         for number, other in enumerate(several):
             if other.skeleton != first.skeleton or other.fps != first.fps:

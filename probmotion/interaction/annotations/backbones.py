@@ -110,7 +110,7 @@ def lift_torsos(
     check_shape("seed", seed, (skeleton.n_joints, 3))
     check_finite("seed", seed)
     if not frames_are_sound(pair_frames(seed, skeleton)):
-        raise ValueError("seed is degenerate, expected roots apart and backbones not along them")
+        raise ValueError("seed must be roots apart and backbones not along them, got degenerate")
     torsos = [list(joints) for joints in torso_joints(skeleton)]
     seen = np.stack([visible[:, joints].sum(axis=-1) for joints in torsos])
     lifted = np.asarray((seen >= LEAST_JOINTS).all(axis=0))

@@ -142,7 +142,7 @@ def world_axes(world_views: np.ndarray) -> np.ndarray:
 
 def _common(motions: Sequence[Motion]) -> tuple[Skeleton, float]:
     if len(motions) == 0:
-        raise ValueError("motions is empty, expected at least one clip")
+        raise ValueError("motions must contain at least one clip, got none")
     skeleton, fps = motions[0].skeleton, motions[0].fps
     for number, motion in enumerate(motions):
         if motion.skeleton != skeleton:
@@ -175,7 +175,7 @@ def _drawn_frames(
     clips = np.repeat(np.arange(len(frames)), [int(chosen.sum()) for chosen in frames])
     numbers = np.concatenate([np.flatnonzero(chosen) for chosen in frames])
     if n > len(clips):
-        raise ValueError(f"n is {n}, expected at most the {len(clips)} frames to draw from")
+        raise ValueError(f"n must be at most the {len(clips)} frames to draw from, got {n}")
     drawn = rng.permutation(len(clips))[:n]
     return clips[drawn], numbers[drawn]
 
@@ -185,7 +185,7 @@ def _pictures(
 ) -> np.ndarray:
     """Return what cameras see of poses, with noise: ``(n, 3, J, 3) → (n, 3, J, 2)``."""
     if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"noise is {noise!r}, expected a finite number of at least 0")
+        raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}")
     pictures = np.einsum("nai,ntji->ntja", axes[:, :2], poses)
     return pictures + noise * rng.standard_normal(pictures.shape)
 
@@ -208,7 +208,7 @@ def _with_neighbours(
 def _visible(n: int, skeleton: Skeleton, hidden: float, rng: np.random.Generator) -> np.ndarray:
     """Return which joints are seen, the same number hidden of each character: ``(n, J)``."""
     if not 0 <= hidden < 1:
-        raise ValueError(f"hidden is {hidden!r}, expected a share from 0 to below 1")
+        raise ValueError(f"hidden must be a share from 0 to below 1, got {hidden!r}")
     visible = np.ones((n, skeleton.n_joints), dtype=bool)
     order = rng.random((n, skeleton.n_joints))
     for root in skeleton.roots:

@@ -186,5 +186,5 @@ def _scale(pictures: np.ndarray, seed: np.ndarray, skeleton: Skeleton) -> float:
         if longest > 0:
             ratios.append(float(np.linalg.norm(seed[joint] - seed[parent]) / longest))
     if not ratios:
-        raise ValueError("tracks has no limb that is seen, expected one, or metres_per_pixel")
+        raise ValueError("tracks has no limb that must be one, or metres_per_pixel, got seen")
     return float(np.median(ratios))

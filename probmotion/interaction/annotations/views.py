@@ -71,7 +71,7 @@ class ViewDistribution:
             raise ValueError("views has infinite values, expected numbers, or NaN where unknown")
         known = views[~np.isnan(views).any(axis=-1)]
         if len(known) == 0:
-            raise ValueError(f"views has {len(views)} rows and none is known, expected at least 1")
+            raise ValueError(f"views has {len(views)} rows and none must be at least 1, got known")
         if known[:, 1].min() < 0 or known[:, 1].max() > np.pi:
             raise ValueError(
                 f"views has θ from {known[:, 1].min():g} to {known[:, 1].max():g}, expected it "

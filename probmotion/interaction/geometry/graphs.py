@@ -98,7 +98,7 @@ def is_degenerate(points: np.ndarray) -> bool:
 def check_graph(graph: str) -> None:
     """Raise ``ValueError`` unless ``graph`` is one of :data:`GRAPHS`."""
     if graph not in GRAPHS:
-        raise ValueError(f"graph is {graph!r}, expected one of {', '.join(GRAPHS)}")
+        raise ValueError(f"graph must be one of {', '.join(GRAPHS)}, got {graph!r}")
 
 
 def joggle_offsets(n_joints: int, n_axes: int) -> np.ndarray:

@@ -87,7 +87,7 @@ class PairComparer:
                 "256 joints"
             )
         if measure not in MEASURES:
-            raise ValueError(f"measure is {measure!r}, expected one of {', '.join(MEASURES)}")
+            raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
         check_graph(graph)
         check_positive("epsilon", epsilon)
         keypoints = np.where(visible[..., None], keypoints, 0.0)
@@ -180,7 +180,7 @@ class PairComparer:
             raise ValueError(f"candidates has dtype {candidates.dtype}, expected integers")
         if candidates.shape[1] == 0:
             raise ValueError(
-                f"candidates has shape {candidates.shape}, expected at least one annotation a view"
+                f"candidates must have shape at least one annotation a view, got {candidates.shape}"
             )
         if candidates.size and (candidates.min() < 0 or candidates.max() >= self.n_annotations):
             raise ValueError(

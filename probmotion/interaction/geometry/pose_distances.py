@@ -86,7 +86,7 @@ def pose_distances(first: np.ndarray, second: np.ndarray, measure: str) -> np.nd
 def check_measure(measure: str) -> None:
     """Raise ``ValueError`` unless ``measure`` is one of :data:`MEASURES`."""
     if measure not in MEASURES:
-        raise ValueError(f"measure is {measure!r}, expected one of {', '.join(MEASURES)}")
+        raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
 
 
 def _centred(poses: np.ndarray) -> Prepared:

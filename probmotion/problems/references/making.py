@@ -97,7 +97,7 @@ def make_reference(
     """
     check_count("draws", draws, least=8 * _CHAINS)
     if draws % (2 * _CHAINS):
-        raise ValueError(f"draws is {draws}, expected a multiple of {2 * _CHAINS}, 4 chains twice")
+        raise ValueError(f"draws must be a multiple of {2 * _CHAINS}, 4 chains twice, got {draws}")
     shape = (problem.posterior.frames, problem.posterior.skeleton.n_joints, 3)
     # A posterior that has no fingerprint is refused before hours are spent. Near the origin, where
     # cameras look: density is problem at any points that tell one evidence from another.

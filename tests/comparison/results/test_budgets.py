@@ -101,7 +101,7 @@ def test_a_budget_is_one_number(given):
 def test_a_budget_is_above_zero(given):
     with pytest.raises(ValueError, match=rf"{next(iter(given))} is .*, expected"):
         Budget(**given)
-    with pytest.raises(ValueError, match="budget is 5, expected a Budget"):
+    with pytest.raises(ValueError, match="budget must be a Budget, got 5"):
         compare(generation(), PriorDraws(), budget=5, **SMALL)
 
 

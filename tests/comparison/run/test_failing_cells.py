@@ -67,7 +67,10 @@ def test_every_failure_is_a_row_with_its_word(tmp_path):
         (type("OutOfMemoryError", (RuntimeError,), {})("CUDA"), "memory"),
         (WorkerDied(killed=True), "memory"),
         (WorkerDied(killed=False), "died"),
-        (ValueError("theta has 3 values that are NaN or infinite, the first"), "nan"),
+        (
+            ValueError("theta must be finite, got 3 values that are NaN or infinite, the first"),
+            "nan",
+        ),
         (FloatingPointError("overflow"), "nan"),
         (ValueError("theta is wrong"), "ValueError"),
         (TimeIsUp(3.0), "time"),
@@ -162,7 +165,7 @@ def test_the_limit_is_no_part_of_the_question(tmp_path):
         sampler = PriorDraws(diary=str(diary))
         compare(generation(), sampler, time_limit=limit, out=tmp_path, **SMALL)
     assert len(diary.read_text().split()) == 1
-    with pytest.raises(ValueError, match="time_limit is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="time_limit must be a finite number above 0, got 0"):
         compare(generation(), PriorDraws(), time_limit=0, **SMALL)
 
 

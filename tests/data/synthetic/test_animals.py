@@ -229,7 +229,7 @@ class TestDogs:
 def test_a_folder_without_dogs_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"folder has no deepmimic_dog/dog3d_canter\.npz"):
         animal_clips(tmp_path, n=2)
-    with pytest.raises(ValueError, match="seconds is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="seconds must be a finite number above 0, got 0"):
         animal_clips(seconds=0)
-    with pytest.raises(ValueError, match="n is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="n must be an integer of at least 1, got 0"):
         synthetic_animals(0)

@@ -103,7 +103,7 @@ def test_bad_input() -> None:
     cycle = sway(3)
     with pytest.raises(ValueError, match="cycle has 2 frames, expected at least 3"):
         repeated_cycle(cycle.window(0, 2), 9)
-    with pytest.raises(ValueError, match="frames is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 1, got 0"):
         repeated_cycle(cycle, 0)
     pair = Motion(np.zeros((4, 2, 3)), Skeleton(["one", "other"], [-1, -1]), 30.0)
     with pytest.raises(ValueError, match="cycle has 2 roots, expected one body"):

@@ -168,9 +168,9 @@ def test_a_limb_reaches_where_it_can():
 
 
 def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="n is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="n must be an integer of at least 1, got 0"):
         synthetic_dances(0)
-    with pytest.raises(ValueError, match="frames is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 1, got 0"):
         synthetic_dances(1, frames=0)
-    with pytest.raises(ValueError, match=r"fps is -30\.0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match=r"fps must be a finite number above 0, got -30\.0"):
         synthetic_dances(1, fps=-30.0)

@@ -65,7 +65,7 @@ def test_shares_are_kept():
 
 
 def test_unknown_style_lists_the_known_ones():
-    with pytest.raises(ValueError, match="style is 'crawl', expected one of walk, run, march"):
+    with pytest.raises(ValueError, match="style must be one of walk, run, march, got 'crawl'"):
         make_gait("crawl")
     with pytest.raises(ValueError, match=r"styles\['walk'\] is 0, expected a finite number above"):
         make_gaits(10, styles={"walk": 0})

@@ -73,7 +73,7 @@ def test_quality_is_the_share_of_sure_entries() -> None:
     assert (report.tracks_dropped, report.frames_dropped) == (1, 10)
     assert_adds_up(report)
     assert drop_low_quality(tracks, threshold=0.2, share=1.0)[0] == tracks
-    with pytest.raises(ValueError, match=r"share is 1.5, expected a share of at most 1"):
+    with pytest.raises(ValueError, match=r"share must be a share of at most 1, got 1.5"):
         drop_low_quality(tracks, share=1.5)
 
 

@@ -139,7 +139,7 @@ def test_bad_input_is_one_sentence() -> None:
         nearest_object(track, [[], [[0, 0, 1, 1]], [], [], [], []])
     with pytest.raises(ValueError, match=r"boxes\[0\] holds NaN or infinite values"):
         nearest_object(track, [[[0, 0, 1, np.nan, 1]], [], [], [], [], []])
-    with pytest.raises(ValueError, match=r"keypoints has shape \(5, 2\), expected \(6, 2\)"):
+    with pytest.raises(ValueError, match=r"keypoints must have shape \(6, 2\), got \(5, 2\)"):
         with_joint(track, "ball", np.zeros((5, 2)), np.zeros(6))
     with pytest.raises(ValueError, match=r"joint_names repeats \['nose'\]"):
         with_joint(track, "nose", np.zeros((6, 2)), np.zeros(6))

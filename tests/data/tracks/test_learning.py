@@ -370,7 +370,7 @@ def test_several_files_and_patterns(
         np.testing.assert_array_equal(track.keypoints, alone[0].keypoints)
     with pytest.raises(FileNotFoundError, match=r"matches no file"):
         read_tracks([str(tmp_path / "*.bvh")], PERSON, 20.0, sizes=sizes)
-    with pytest.raises(ValueError, match=r"fps is missing, expected frames per second"):
+    with pytest.raises(ValueError, match=r"fps must be frames per second, got missing"):
         read_tracks(paths, PERSON, 20.0, sizes=sizes)
 
 

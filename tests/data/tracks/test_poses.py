@@ -71,7 +71,7 @@ def test_tracks_that_never_show_their_root_are_dropped() -> None:
         assert [track.frames for track in kept] == [7]
         assert (report.tracks_dropped, report.frames_dropped) == (1, 12)
         assert report.frames_before == report.frames_after + report.frames_dropped
-    with pytest.raises(ValueError, match="per is 'clip', expected 'frame' or 'sequence'"):
+    with pytest.raises(ValueError, match="per must be 'frame' or 'sequence', got 'clip'"):
         centre_tracks(tracks, per="clip")
     assert centre_tracks([])[0] == mirror_tracks([])[0] == []
 

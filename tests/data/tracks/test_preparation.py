@@ -156,9 +156,9 @@ def test_the_table_has_a_line_for_each_step(
 
 
 def test_bad_input_is_one_sentence(raw: list[KeypointTrack], clean: list[KeypointTrack]) -> None:
-    with pytest.raises(ValueError, match="tracks is empty, expected at least one"):
+    with pytest.raises(ValueError, match="tracks must contain at least one, got none"):
         prepare_tracks([], fps=20)
-    with pytest.raises(ValueError, match="fps is None, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="fps must be a finite number above 0, got None"):
         prepare_tracks(raw, fps=None)
     with pytest.raises(TypeError, match="fps"):
         prepare_tracks(raw)

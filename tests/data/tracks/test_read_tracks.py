@@ -119,7 +119,9 @@ def test_sizes_of_some_bones_are_enough(tmp_path: Path) -> None:
     sizes = {"left_ankle": 0.5}
     (track,) = read_tracks([file], Skeleton.preset("coco17"), 20.0, sizes=sizes).tracks
     assert shin([track]) == pytest.approx([0.5])
-    with pytest.raises(ValueError, match="sizes is empty, expected the size of at least one bone"):
+    with pytest.raises(
+        ValueError, match="sizes must contain the size of at least one bone, got none"
+    ):
         read_tracks([file], Skeleton.preset("coco17"), 20.0, sizes={})
 
 

@@ -89,11 +89,13 @@ def test_bad_input_is_one_sentence() -> None:
     other = KeypointTrack(
         track.keypoints, track.confidence, Skeleton(["a", "b", "c"], [-1] * 3), 30
     )
-    with pytest.raises(ValueError, match="tracks is empty, expected at least one"):
+    with pytest.raises(ValueError, match="tracks must contain at least one, got none"):
         bone_sizes([])
     with pytest.raises(ValueError, match=r"tracks\[1\] has another skeleton than tracks\[0\]"):
         bone_sizes([track, other])
-    with pytest.raises(ValueError, match="sizes is empty, expected the size of at least one bone"):
+    with pytest.raises(
+        ValueError, match="sizes must contain the size of at least one bone, got none"
+    ):
         scale_to_bones([track], {})
     with pytest.raises(ValueError, match=r"sizes\['knee'\] is 0.0, expected"):
         scale_to_bones([track], {"knee": 0.0})

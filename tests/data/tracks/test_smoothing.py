@@ -110,9 +110,9 @@ def test_tracks_of_several_rates_and_bad_numbers() -> None:
     assert report.why == "brought 30 and 60 fps to 20"
     for step in (fill_gaps, smooth_tracks):
         assert step([])[0] == []
-    with pytest.raises(ValueError, match="fps is None, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="fps must be a finite number above 0, got None"):
         resample_tracks(tracks, fps=None)
-    with pytest.raises(ValueError, match="fps is 20000, expected at most 10000"):
+    with pytest.raises(ValueError, match="fps must be at most 10000, got 20000"):
         resample_tracks(tracks, fps=20000)
     with pytest.raises(ValueError, match="longest is 0, expected"):
         fill_gaps(tracks, longest=0)

@@ -75,7 +75,7 @@ def not_finite(given: Annotations) -> Annotations:
         ),
         (
             lambda a: replace(a, keypoints=a.keypoints[:, :17]),
-            r"keypoints has shape \(5, 17, 2\), expected \(n, 34, 2\)",
+            r"keypoints must have shape \(n, 34, 2\), got \(5, 17, 2\)",
         ),
         (lambda a: replace(a, visible=a.visible.astype(float)), "visible is of float64, expected"),
         (
@@ -88,11 +88,11 @@ def not_finite(given: Annotations) -> Annotations:
         ),
         (
             lambda a: replace(a, neighbours=a.neighbours[:, :1]),
-            r"neighbours has shape \(5, 1, 34, 2\), expected \(5, 2, 34, 2\)",
+            r"neighbours must have shape \(5, 2, 34, 2\), got \(5, 1, 34, 2\)",
         ),
         (lambda a: replace(a, neighbours=a.neighbours + np.inf), "neighbours has infinite values"),
-        (lambda a: replace(a, fps=0.0), "fps is 0.0, expected a finite number above 0"),
-        (lambda a: replace(a, views=np.zeros((4, 2))), r"views has shape \(4, 2\), expected \(5,"),
+        (lambda a: replace(a, fps=0.0), "fps must be a finite number above 0, got 0.0"),
+        (lambda a: replace(a, views=np.zeros((4, 2))), r"views must have shape \(5,, got \(4, 2\)"),
         (lambda a: replace(a, views=np.full((5, 2), np.inf)), "views has infinite values"),
         (lambda a: replace(a, sources=["a"]), "sources has 1 names, expected 5"),
         (lambda a: a.subset([0, 5]), "indices has values from 0 to 5, expected them from 0 to 4"),
@@ -290,9 +290,9 @@ def test_wrong_motions_are_refused_in_one_sentence() -> None:
     touching = DANCES[0].positions.copy()
     touching[:, 17] = touching[:, 0]
     for motions, n, message in (
-        ([], 1, "motions is empty, expected at least one clip"),
-        (DANCES, 121, "n is 121, expected at most the 120 frames to draw from"),
-        (DANCES, 0, "n is 0, expected an integer of at least 1"),
+        ([], 1, "motions must contain at least one clip, got none"),
+        (DANCES, 121, "n must be at most the 120 frames to draw from, got 121"),
+        (DANCES, 0, "n must be an integer of at least 1, got 0"),
         ([*DANCES, slow], 5, r"motions\[3\] has 25 frames per second and the first 30, expected"),
         ([*DANCES, alone], 5, r"motions\[3\] has other joints than the first, expected the"),
         ([alone], 5, r"has 1 character, expected at least two \(one person missing\)"),
@@ -300,9 +300,9 @@ def test_wrong_motions_are_refused_in_one_sentence() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             draw_annotations(motions, n, 0)
-    with pytest.raises(ValueError, match=r"noise is -0\.1, expected a finite number of at least 0"):
+    with pytest.raises(ValueError, match=r"noise must be a finite number of at least 0, got -0\.1"):
         draw_annotations(DANCES, 5, 0, noise=-0.1)
-    with pytest.raises(ValueError, match=r"hidden is 1\.0, expected a share from 0 to below 1"):
+    with pytest.raises(ValueError, match=r"hidden must be a share from 0 to below 1, got 1\.0"):
         draw_annotations(DANCES, 5, 0, hidden=1.0)
     with pytest.raises(ValueError, match="frames has 2 entries, expected 3, one per clip"):
         draw_annotations(DANCES, 5, 0, frames=[np.ones(40, dtype=bool)] * 2)
@@ -329,5 +329,5 @@ def test_indices_of_a_subset_are_integers_or_a_mask() -> None:
     seen = draw_annotations(DANCES[:1], 7, 0).annotations
     with pytest.raises(ValueError, match="indices is of float64, expected integers or a mask"):
         seen.subset([0.7, 1.2])
-    with pytest.raises(ValueError, match=r"indices has shape \(3,\), expected \(7\)"):
+    with pytest.raises(ValueError, match=r"indices must have shape \(7\), got \(3,\)"):
         seen.subset(np.ones(3, dtype=bool))

@@ -209,11 +209,13 @@ def test_one_annotation_and_characters_far_apart() -> None:
 def test_wrong_seeds_are_refused_in_one_sentence() -> None:
     seed = standing()
     seed[17:] -= seed[17] - seed[0]
-    with pytest.raises(ValueError, match="seed is degenerate, expected roots apart and backbones"):
+    with pytest.raises(ValueError, match="seed must be roots apart and backbones, got degenerate"):
         lifted(standing()[None], seed)
-    with pytest.raises(ValueError, match=r"seed has shape \(17, 3\), expected \(34, 3\)"):
+    with pytest.raises(ValueError, match=r"seed must have shape \(34, 3\), got \(17, 3\)"):
         lifted(standing()[None], standing()[:17])
-    with pytest.raises(ValueError, match="seed has 102 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="seed must be finite, got 102 values that are NaN or infinite"
+    ):
         lifted(standing()[None], np.full((34, 3), np.nan))
 
 

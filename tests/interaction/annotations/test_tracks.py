@@ -175,9 +175,9 @@ def test_wrong_tracks_are_refused_in_one_sentence() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             annotations_of_tracks(tracks, seed)
-    with pytest.raises(ValueError, match=r"seed has shape \(17, 3\), expected \(34, 3\)"):
+    with pytest.raises(ValueError, match=r"seed must have shape \(34, 3\), got \(17, 3\)"):
         annotations_of_tracks([first, second], seed[:17])
-    with pytest.raises(ValueError, match="metres_per_pixel is -1, expected a finite number above"):
+    with pytest.raises(ValueError, match="metres_per_pixel must be a finite number above, got -1"):
         annotations_of_tracks([first, second], seed, metres_per_pixel=-1)
 
 

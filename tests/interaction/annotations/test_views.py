@@ -205,18 +205,18 @@ def test_wrong_input_is_refused_in_one_sentence() -> None:
     chestless = Skeleton(["a:pelvis", "b:pelvis", "b:chest"], [-1, -1, 1])
     with pytest.raises(ValueError, match="skeleton has 0 chests in the tree of a:pelvis, expected"):
         pair_frames(np.zeros((3, 3)), chestless)
-    with pytest.raises(ValueError, match=r"positions has shape \(34, 2\), expected \(…, 34, 3\)"):
+    with pytest.raises(ValueError, match=r"positions must have shape \(…, 34, 3\), got \(34, 2\)"):
         pair_frames(np.zeros((34, 2)), PAIR)
     frame = pair_frames(poses(1), PAIR)[0]
     with pytest.raises(ValueError, match="direction is no direction, expected a vector"):
         view_angles(frame, np.zeros(3))
-    with pytest.raises(ValueError, match="views has 2 rows and none is known, expected at least 1"):
+    with pytest.raises(ValueError, match="views has 2 rows and none must be at least 1, got known"):
         ViewDistribution(np.full((2, 2), np.nan))
     with pytest.raises(
         ValueError, match=r"views has θ from -0\.1 to 0.5, expected it between 0 and"
     ):
         ViewDistribution(np.array([[0.0, 0.5], [0.0, -0.1]]))
-    with pytest.raises(ValueError, match="bandwidth is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="bandwidth must be a finite number above 0, got 0"):
         ViewDistribution(np.zeros((1, 2)), bandwidth=0)
 
 

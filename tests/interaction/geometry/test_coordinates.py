@@ -195,13 +195,13 @@ def test_gradients_are_finite_even_between_equals(differentiable: Any) -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     first, edges = joints(J, 2), graph_edges(joints(J, 2))
-    with pytest.raises(ValueError, match=r"second has shape \(14, 3\), expected \(…, 14, 2\)"):
+    with pytest.raises(ValueError, match=r"second must have shape \(…, 14, 2\), got \(14, 3\)"):
         align_rigidly(first, joints(J, 3))
-    with pytest.raises(ValueError, match=r"visible has shape \(3,\), expected \(…, 14\)"):
+    with pytest.raises(ValueError, match=r"visible must have shape \(…, 14\), got \(3,\)"):
         cartesian_distance(first, first, np.ones(3, dtype=bool))
-    with pytest.raises(ValueError, match=r"edges has shape \(3,\), expected \(E, 2\)"):
+    with pytest.raises(ValueError, match=r"edges must have shape \(E, 2\), got \(3,\)"):
         interaction_coordinates(first, np.arange(3))
-    with pytest.raises(ValueError, match="epsilon is -1, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="epsilon must be a finite number above 0, got -1"):
         dissimilarity(first, first, edges, edges, -1)
-    with pytest.raises(ValueError, match="graph is 'tree', expected one of delaunay"):
+    with pytest.raises(ValueError, match="graph must be one of delaunay, got 'tree'"):
         interaction_distance(first, first, "tree")

@@ -145,7 +145,9 @@ def test_real_pairs_have_scipys_edges(real_data: Path) -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"points has shape \(5, 3\), expected \(J, 2\)"):
+    with pytest.raises(ValueError, match=r"points must have shape \(J, 2\), got \(5, 3\)"):
         delaunay_edges(np.zeros((5, 3)))
-    with pytest.raises(ValueError, match="points has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="points must be finite, got 1 values that are NaN or infinite"
+    ):
         delaunay_edges(np.array([[0.0, 1.0], [np.nan, 0.0], [1.0, 1.0]]))

@@ -160,9 +160,9 @@ def test_joints_on_a_small_lattice_never_fail(points: np.ndarray) -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match="graph is 'tree', expected one of delaunay"):
+    with pytest.raises(ValueError, match="graph must be one of delaunay, got 'tree'"):
         graph_edges(joints(5, 2), "tree")
-    with pytest.raises(ValueError, match=r"points has shape \(5, 4\), expected \(J, 2\)"):
+    with pytest.raises(ValueError, match=r"points must have shape \(J, 2\), got \(5, 4\)"):
         graph_edges(joints(5, 4))
-    with pytest.raises(ValueError, match="points has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="points must be finite, got 1 values that are NaN"):
         graph_edges(np.array([[0.0, np.nan], [1.0, 2.0]]))

@@ -241,24 +241,27 @@ def test_what_does_not_fit_is_refused() -> None:
     comparer = PairComparer(keypoints, visible)
     one = np.zeros((1, 1, J, 2))
     for arguments, message in (
-        ((np.zeros((1, J, 2)), [[0]]), r"projections has shape \(1, 34, 2\), expected \(B, V, 34"),
-        ((one, [[0], [1]]), r"candidates has shape \(2, 1\), expected \(1, N\)"),
+        ((np.zeros((1, J, 2)), [[0]]), r"projections must have shape \(B, V, 34, got \(1, 34, 2\)"),
+        ((one, [[0], [1]]), r"candidates must have shape \(1, N\), got \(2, 1\)"),
         ((one, [[3]]), "candidates holds 3 to 3, expected 0 to 2"),
-        ((one, np.zeros((1, 0), int)), r"candidates has shape \(1, 0\), expected at least one"),
+        ((one, np.zeros((1, 0), int)), r"candidates must have shape at least one, got \(1, 0\)"),
         ((one, [[0.5]]), "candidates has dtype float64, expected integers"),
-        ((one + np.inf, [[0]]), "projections has 68 values that are NaN or infinite"),
+        (
+            (one + np.inf, [[0]]),
+            "projections must be finite, got 68 values that are NaN or infinite",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             comparer.nearest(*arguments)
-    with pytest.raises(ValueError, match="measure is 'angles', expected one of interaction"):
+    with pytest.raises(ValueError, match="measure must be one of interaction, got 'angles'"):
         PairComparer(keypoints, visible, measure="angles")
-    with pytest.raises(ValueError, match="graph is 'tree', expected one of delaunay"):
+    with pytest.raises(ValueError, match="graph must be one of delaunay, got 'tree'"):
         PairComparer(keypoints, visible, graph="tree")
-    with pytest.raises(ValueError, match="epsilon is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="epsilon must be a finite number above 0, got 0"):
         PairComparer(keypoints, visible, epsilon=0)
-    with pytest.raises(ValueError, match=r"visible has shape \(2, 34\), expected \(3, 34\)"):
+    with pytest.raises(ValueError, match=r"visible must have shape \(3, 34\), got \(2, 34\)"):
         PairComparer(keypoints, visible[:2])
-    with pytest.raises(ValueError, match=r"keypoints has shape \(0, 34, 2\), expected at least"):
+    with pytest.raises(ValueError, match=r"keypoints must have shape at least, got \(0, 34, 2\)"):
         PairComparer(keypoints[:0], visible[:0])
 
 

@@ -324,7 +324,7 @@ def test_what_is_no_body_is_refused():
     rest = some_rest(PERSON)
     with pytest.raises(ValueError, match="skeleton has 2 roots, expected one"):
         ArticulatedBody(Skeleton.preset("pair17"), np.zeros((34, 3)))
-    with pytest.raises(ValueError, match=r"rest has shape \(13, 3\), expected \(14, 3\)"):
+    with pytest.raises(ValueError, match=r"rest must have shape \(14, 3\), got \(13, 3\)"):
         ArticulatedBody(PERSON, rest[1:])
     flat = rest.copy()
     flat[3] = 0
@@ -332,13 +332,13 @@ def test_what_is_no_body_is_refused():
         ArticulatedBody(PERSON, flat)
     body = ArticulatedBody(PERSON, rest)
     turns, rotation, translation = some_pose(body)
-    with pytest.raises(ValueError, match=r"turns has shape \(5, 9, 3\), expected \(…, L, 10, 3\)"):
+    with pytest.raises(ValueError, match=r"turns must have shape \(…, L, 10, 3\), got \(5, 9, 3\)"):
         body.positions(turns[:, 1:], rotation, translation)
     with pytest.raises(ValueError, match=r"root_rotation has shape \(5, 3\), expected"):
         body.positions(turns, rotation[..., 0], translation)
     with pytest.raises(ValueError, match=r"root_translation has shape \(5, 2\), expected"):
         body.positions(turns, rotation, translation[:, 1:])
-    with pytest.raises(ValueError, match=r"log_lengths has shape \(14,\), expected \(…, 8\)"):
+    with pytest.raises(ValueError, match=r"log_lengths must have shape \(…, 8\), got \(14,\)"):
         body.positions(turns, rotation, translation, np.zeros(14))
-    with pytest.raises(ValueError, match=r"turns has shape \(10, 2\), expected \(…, 10, 3\)"):
+    with pytest.raises(ValueError, match=r"turns must have shape \(…, 10, 3\), got \(10, 2\)"):
         body.range_excess(np.zeros((10, 2)))

@@ -283,7 +283,7 @@ def test_the_rest_pose_stands_and_looks_ahead(walkers):
     assert rest[at("left_knee"), 1] < -0.2
     turned = [turned_about_vertical(clip.positions, 2.0) for clip in clips]
     np.testing.assert_allclose(rest_pose(PERSON, turned), rest, atol=1e-9)
-    with pytest.raises(ValueError, match="motions is empty, expected at least one"):
+    with pytest.raises(ValueError, match="motions must contain at least one, got none"):
         rest_pose(PERSON, [])
     chain = Skeleton(["a", "b"], [-1, 0])
     with pytest.raises(ValueError, match="skeleton has no left-right pairs, expected some"):
@@ -294,18 +294,20 @@ def test_what_is_no_body_is_refused(walkers):
     states, _ = walkers
     with pytest.raises(ValueError, match="skeleton has 2 roots, expected one"):
         BodyStates(Skeleton.preset("pair17"), np.zeros((34, 3)))
-    with pytest.raises(ValueError, match=r"rest has shape \(13, 3\), expected \(14, 3\)"):
+    with pytest.raises(ValueError, match=r"rest must have shape \(14, 3\), got \(13, 3\)"):
         BodyStates(PERSON, states.rest[1:])
     flat = states.rest.copy()
     flat[3] = 0
     with pytest.raises(ValueError, match="rest has a bone of no length, to left_elbow, expected"):
         BodyStates(PERSON, flat)
     flat[3] = np.nan
-    with pytest.raises(ValueError, match="rest has 3 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="rest must be finite, got 3 values that are NaN or infinite"
+    ):
         BodyStates(PERSON, flat)
-    with pytest.raises(ValueError, match=r"states has shape \(4, 70\), expected \(…, L, 69\)"):
+    with pytest.raises(ValueError, match=r"states must have shape \(…, L, 69\), got \(4, 70\)"):
         states.positions(np.zeros((4, 70)), states.rest)
-    with pytest.raises(ValueError, match=r"states has shape \(2, 4, 69\), expected \(L, 69\)"):
+    with pytest.raises(ValueError, match=r"states must have shape \(L, 69\), got \(2, 4, 69\)"):
         states.canonical(np.zeros((2, 4, 69)))
-    with pytest.raises(ValueError, match=r"lengths has shape \(3,\), expected \(14\)"):
+    with pytest.raises(ValueError, match=r"lengths must have shape \(14\), got \(3,\)"):
         states.of_lengths(np.ones(3))

@@ -92,7 +92,7 @@ def test_levels_are_those_of_the_schedule(power):
     # Another schedule may begin beyond this one's last level.
     assert size.level(0.1 * schedule.alpha_bar[-1]) == 100
     for wrong in (1.1, 0.0, float("nan")):
-        with pytest.raises(ValueError, match=r"alpha_bar is .*, expected above 0 and at most 1"):
+        with pytest.raises(ValueError, match=r"alpha_bar must be above 0 and at most 1, got .*"):
             size.level(wrong)
 
 
@@ -212,9 +212,9 @@ def test_other_lengths_share_the_network(prior):
     wanted = prior.denoise(x_t, 0.4, Cameras.ring(2))
     np.testing.assert_array_equal(short.denoise(x_t, 0.4, Cameras.ring(2)), wanted)
     for wrong in (1, 2.5):
-        with pytest.raises(ValueError, match=r"frames is .*, expected an integer of at least 2"):
+        with pytest.raises(ValueError, match=r"frames must be an integer of at least 2, got .*"):
             prior.of_length(wrong)
-    with pytest.raises(ValueError, match="frames is 13, expected at most 12, the longest motion"):
+    with pytest.raises(ValueError, match="frames must be at most 12, the longest motion, got 13"):
         prior.of_length(13)
 
 
@@ -290,9 +290,9 @@ def test_what_cannot_be_loaded_is_said_in_a_sentence(tmp_path):
     with pytest.raises(CheckpointError, match="has settings that are no motion diffusion model's"):
         MotionDiffusion.load(path)
     saved()
-    with pytest.raises(ValueError, match="frames is 99, expected at most 12"):
+    with pytest.raises(ValueError, match="frames must be at most 12, got 99"):
         MotionDiffusion.load(path, frames=99)
-    with pytest.raises(ValueError, match="device is 'tpu', expected cpu or cuda"):
+    with pytest.raises(ValueError, match="device must be cpu or cuda, got 'tpu'"):
         MotionDiffusion.load(path, device="tpu")
 
 
@@ -304,12 +304,14 @@ def test_bad_input_is_refused_in_a_sentence(prior):
         prior.denoise(noisy(prior)[0], 0.4, cameras)
     broken = noisy(prior)
     broken[0, 0, 0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="x_t has 1 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="x_t must be finite, got 1 values that are NaN or infinite"
+    ):
         prior.denoise(broken, 0.4, cameras)
     with pytest.raises(ValueError, match="vectors has shape"):
         prior.view_covariance_product(noisy(prior), 0.4, cameras, noisy(prior, B=2))
     point = Skeleton(["point"], [-1])
-    with pytest.raises(ValueError, match=r"standards has shape \(4, 2\), expected \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"standards must have shape \(1, 2\), got \(4, 2\)"):
         MotionDiffusion(TINY.network(1), TINY, prior.standards, point, 20.0)
     for name, value in [("layers", 0), ("frames", 1), ("steps", 1), ("dropout", 1.0), ("width", 9)]:
         with pytest.raises(ValueError, match=f"^{name} is .*, expected"):

@@ -78,9 +78,9 @@ def test_a_tenth_of_the_motions_is_held_out_in_all_views(prior, tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"motions": 1}, "motions is 1, expected an integer of at least 2"),
-        ({"views": 0}, "views is 0, expected an integer of at least 1"),
-        ({"size": "large"}, "size is 'large', expected one of tiny, small, paper"),
+        ({"motions": 1}, "motions must be an integer of at least 2, got 1"),
+        ({"views": 0}, "views must be an integer of at least 1, got 0"),
+        ({"size": "large"}, "size must be one of tiny, small, paper, got 'large'"),
     ],
 )
 def test_wrong_numbers_are_refused(prior, tmp_path, options, sentence):
@@ -89,10 +89,10 @@ def test_wrong_numbers_are_refused(prior, tmp_path, options, sentence):
 
 
 def test_a_size_that_has_no_network_is_refused(prior, tmp_path):
-    with pytest.raises(ValueError, match="size is 'reference-code', expected one of tiny, small"):
+    with pytest.raises(ValueError, match="size must be one of tiny, small, got 'reference-code'"):
         denoiser_of(prior, tmp_path, size="reference-code")
 
 
 def test_a_prior_that_cannot_be_sampled_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="prior is object, expected one that can be sampled"):
+    with pytest.raises(ValueError, match="prior must be one that can be sampled, got object"):
         denoiser_of(object(), tmp_path)

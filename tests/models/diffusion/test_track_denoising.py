@@ -348,14 +348,14 @@ def test_bad_input_is_one_sentence(prior: MotionDiffusion, came: list[KeypointTr
     with pytest.raises(ValueError, match=r"^track has 1 frame, expected at least 2"):
         denoise_track(one, prior, noise=NOISE)
     for noise in (0.0, -1.0, np.nan, np.inf, None):
-        with pytest.raises(ValueError, match=r"^noise is .*, expected a finite number above 0"):
+        with pytest.raises(ValueError, match=r"^noise must be a finite number above 0, got .*"):
             denoise_track(track, prior, noise=noise)
     for noise in (1e5, 1e200):
         with pytest.raises(
-            ValueError, match=r"^noise is 1.*0, expected at most .* metres, the most"
+            ValueError, match=r"^noise must be at most .* metres, the most, got 1.*0"
         ):
             denoise_track(track, prior, noise=noise)
-    with pytest.raises(ValueError, match=r"^rounds is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match=r"^rounds must be an integer of at least 1, got 0"):
         denoise_track(track, prior, noise=NOISE, rounds=0)
 
 

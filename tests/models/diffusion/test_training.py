@@ -263,7 +263,7 @@ def test_bad_input_is_refused_in_a_sentence():
     point = Skeleton(["point", "other"], [-1, 0])
     with pytest.raises(ValueError, match="validation has another skeleton than tracks"):
         DiffusionTrainee([track()], [track(skeleton=point)], SIZE)
-    with pytest.raises(ValueError, match="tracks is empty, expected at least one track"):
+    with pytest.raises(ValueError, match="tracks must contain at least one track, got none"):
         made([])
     faster = replace(track(seed=3), fps=25.0)
     with pytest.raises(ValueError, match="validation is at 25 frames per second, expected tracks'"):

@@ -36,13 +36,13 @@ def test_noise_is_as_it_says():
     clean = JointNoise.hardly_any().apply(np.random.default_rng(0), joints, BODY)
     assert clean.joints.std() == pytest.approx(5e-3, rel=0.02)
     for options, message in (
-        ({"least": 0.1}, "most is 0.08, expected at least least=0.1"),
-        ({"outliers": 1.5}, "outliers is 1.5, expected a share, 0 to 1"),
-        ({"least": 0.0}, "least is 0.0, expected a finite number above 0"),
-        ({"least": math.inf, "most": math.inf}, "least is inf, expected a finite number above 0"),
-        ({"most": math.inf}, "most is inf, expected a finite number above 0"),
-        ({"most": math.nan}, "most is nan, expected a finite number above 0"),
-        ({"hidden": math.nan}, "hidden is nan, expected a share, 0 to 1"),
+        ({"least": 0.1}, "most must be at least least=0.1, got 0.08"),
+        ({"outliers": 1.5}, "outliers must be a share, 0 to 1, got 1.5"),
+        ({"least": 0.0}, "least must be a finite number above 0, got 0.0"),
+        ({"least": math.inf, "most": math.inf}, "least must be a finite number above 0, got inf"),
+        ({"most": math.inf}, "most must be a finite number above 0, got inf"),
+        ({"most": math.nan}, "most must be a finite number above 0, got nan"),
+        ({"hidden": math.nan}, "hidden must be a share, 0 to 1, got nan"),
     ):
         with pytest.raises(ValueError, match=message):
             JointNoise(**options)

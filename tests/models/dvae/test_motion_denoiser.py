@@ -458,7 +458,7 @@ def test_noisy_joints_can_be_learnt_from_and_the_denoiser_comes_back(prior, tmp_
     np.testing.assert_allclose(*drawn, atol=0.02)
     trainee.anneal(5)
     assert trainee._weight == pytest.approx(0.25)
-    with pytest.raises(ValueError, match="size is 'huge', expected one of tiny, small, paper"):
+    with pytest.raises(ValueError, match="size must be one of tiny, small, paper, got 'huge'"):
         usual_denoiser_training("huge")
 
 
@@ -469,7 +469,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(prior, denoiser, tmp_path):
     with pytest.raises(ValueError, match="prior is another one than the denoiser was trained besi"):
         denoiser.on(other, evidence_of(prior))
     with pytest.raises(
-        ValueError, match=r"^prior is NoneType, expected the Motion-DVAE that the de"
+        ValueError, match=r"^prior must be the Motion-DVAE that the de, got NoneType"
     ):
         MotionDenoiser.load(tmp_path / "a.safetensors", None)
     for overlap, message in ((8, "8, expected less than the 8 frames of a wi"), (-1, "-1, expec")):

@@ -307,9 +307,9 @@ def test_what_cannot_be_loaded_is_said_in_a_sentence(prior, tmp_path):
 
 
 def test_bad_input_is_refused_in_a_sentence(prior):
-    with pytest.raises(ValueError, match=r"theta has shape \(2, 19\), expected \(…, 20\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(…, 20\), got \(2, 19\)"):
         prior.motion(np.zeros((2, 19)))
-    with pytest.raises(ValueError, match=r"theta has shape \(21,\), expected \(…, 20\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(…, 20\), got \(21,\)"):
         prior.log_density(np.zeros(21))
     import jax.numpy as jnp
 
@@ -317,7 +317,9 @@ def test_bad_input_is_refused_in_a_sentence(prior):
         prior.motion(jnp.zeros((2, 20)))
     with pytest.raises(TypeError, match=r"^theta is a list, expected NumPy's or torch's"):
         prior.motion([0.0] * 20)
-    with pytest.raises(ValueError, match=r"^theta has 1 values that are NaN or infinite, the fi"):
+    with pytest.raises(
+        ValueError, match=r"^theta must be finite, got 1 values that are NaN or infinite, the fi"
+    ):
         prior.motion(np.where(np.arange(20) == 3, np.nan, 0.0))
     flat, giant = REST.copy(), REST.copy()
     flat[4], giant[2] = 0.0, [400.0, 0.0, 0.0]
@@ -325,19 +327,19 @@ def test_bad_input_is_refused_in_a_sentence(prior):
         ({"body": 0 * REST}, "^body has a bone of no length, to chest, expected all bones to"),
         ({"body": flat}, "^body has a bone of no length, to left_foot, expected all bones to"),
         ({"body": giant}, "^body has a bone of length 400, to left_hand, expected metres, at most"),
-        ({"frames": 1}, "frames is 1, expected an integer of at least 2"),
-        ({"spread": 0.0}, "spread is 0.0, expected a finite number above 0"),
-        ({"body": REST[1:]}, r"body has shape \(5, 3\), expected \(6, 3\)"),
-        ({"body": REST * np.nan}, "body has 18 values that are NaN or infinite"),
+        ({"frames": 1}, "frames must be an integer of at least 2, got 1"),
+        ({"spread": 0.0}, "spread must be a finite number above 0, got 0.0"),
+        ({"body": REST[1:]}, r"body must have shape \(6, 3\), got \(5, 3\)"),
+        ({"body": REST * np.nan}, "body must be finite, got 18 values that are NaN or infinite"),
     ):
         with pytest.raises(ValueError, match=message):
             fresh(**options)
-    with pytest.raises(ValueError, match="frames is 1, expected an integer of at least 2"):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 2, got 1"):
         prior.of(frames=1)
     for name, value in [("frames", 1), ("latent", 0), ("hidden", 33), ("decoder", "other")]:
         with pytest.raises(ValueError, match=f"^{name} is .*, expected"):
             replace(TINY, **{name: value})
-    with pytest.raises(ValueError, match="decoder_scale is 'one', expected one of learned, unit"):
+    with pytest.raises(ValueError, match="decoder_scale must be one of learned, unit, got 'one'"):
         replace(TINY, decoder_scale="one")
 
 

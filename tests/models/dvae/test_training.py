@@ -291,5 +291,5 @@ def test_usual_runs_are_as_published():
     for size in ("tiny", "small"):
         settings, annealing = usual_dvae_training(size)
         assert annealing < settings.steps
-    with pytest.raises(ValueError, match="size is 'huge', expected one of tiny, small, paper"):
+    with pytest.raises(ValueError, match="size must be one of tiny, small, paper, got 'huge'"):
         usual_dvae_training("huge")

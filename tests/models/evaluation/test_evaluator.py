@@ -273,12 +273,14 @@ def test_views_that_do_not_fit_are_refused(evaluator, views):
         evaluator.features(np.zeros((1, 17, 17, 2)))
     broken = views.copy()
     broken[3, 2, 5] = np.nan
-    with pytest.raises(ValueError, match="views has 2 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="views must be finite, got 2 values that are NaN or infinite"
+    ):
         evaluator.features(broken)
-    with pytest.raises(ValueError, match=r"lengths has shape \(3,\), expected \(12\)"):
+    with pytest.raises(ValueError, match=r"lengths must have shape \(12\), got \(3,\)"):
         evaluator.features(views, np.array([3, 3, 3]))
     for lengths in (np.full(12, 17), np.full(12, 0), np.full(12, 3.0)):
-        with pytest.raises(ValueError, match=r"lengths is \[.*\], expected integers from 1 to 16"):
+        with pytest.raises(ValueError, match=r"lengths must be integers from 1 to 16, got \[.*\]"):
             evaluator.features(views, lengths)
 
 
@@ -288,11 +290,11 @@ def test_views_that_are_not_centred_are_refused(evaluator, views):
 
 
 def test_sizes_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="width is 30, expected an even multiple of heads, 4"):
+    with pytest.raises(ValueError, match="width must be an even multiple of heads, 4, got 30"):
         EvaluatorSettings(width=30)
-    with pytest.raises(ValueError, match="latent is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="latent must be an integer of at least 1, got 0"):
         EvaluatorSettings(latent=0)
-    with pytest.raises(ValueError, match="kl_weight is 0, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="kl_weight must be a finite number above 0, got 0"):
         EvaluatorSettings(kl_weight=0)
 
 

@@ -360,25 +360,27 @@ def test_it_learns_real_walks(tmp_path: Path, real_data: Path) -> None:
     ("changes", "message"),
     [
         ({"width": 0}, "width is 0"),
-        ({"deepest": 8.0}, "deepest is 8.0, expected below distance, 7.0"),
-        ({"steepest": 1.6}, "steepest is 1.6, expected below pi/2"),
+        ({"deepest": 8.0}, "deepest must be below distance, 7.0, got 8.0"),
+        ({"steepest": 1.6}, "steepest must be below pi/2, got 1.6"),
         ({"distance": -1.0}, "distance is -1.0"),
     ],
 )
 def test_bad_settings(changes: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(LifterSettings(), **changes)
-    with pytest.raises(ValueError, match="bones is -1, expected a number of at least 0"):
+    with pytest.raises(ValueError, match="bones must be a number of at least 0, got -1"):
         LossWeights(bones=-1)
 
 
 def test_bad_views_and_tracks() -> None:
     lifter = fresh_lifter()
-    with pytest.raises(ValueError, match=r"views has shape \(5, 14, 2\), expected \(N, L, 14, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"views must have shape \(N, L, 14, 2\), got \(5, 14, 2\)"
+    ):
         lifter.lift(views()[0])
     with pytest.raises(ValueError, match=r"views has shape .*, expected a motion and a frame"):
         lifter.lift(views()[:, :0])
-    with pytest.raises(ValueError, match="views has 1 values that are NaN"):
+    with pytest.raises(ValueError, match="views must be finite, got 1 values that are NaN"):
         lifter.lift(np.where(np.arange(420).reshape(3, 5, 14, 2) == 7, np.nan, views()))
     point = Skeleton(["root", "tip"], [-1, 0])
     other = [KeypointTrack(np.ones((3, 2, 2)), np.ones((3, 2)), point, 20.0, "point")]

@@ -185,8 +185,8 @@ def test_losses_are_addressed_by_their_generator() -> None:
     [
         ({"couplings": 0}, "couplings is 0"),
         ({"width": 1.5}, "width is 1.5"),
-        ({"share": 0.0}, "share is 0.0, expected above 0 and at most 1"),
-        ({"blur": -1.0}, "blur is -1.0, expected a number of at least 0"),
+        ({"share": 0.0}, "share must be above 0 and at most 1, got 0.0"),
+        ({"blur": -1.0}, "blur must be a number of at least 0, got -1.0"),
     ],
 )
 def test_bad_settings(changes: dict[str, float], message: str) -> None:

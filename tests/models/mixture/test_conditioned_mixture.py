@@ -104,7 +104,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(posterior, known):
             known.denoise_motion(x_t, level)
     with pytest.raises(ValueError, match=r"x_t has shape \(3, 2, 17, 3\)"):
         known.denoise_motion(x_t[:, :2], 0.5)
-    with pytest.raises(ValueError, match="cameras is perspective, expected orthographic"):
+    with pytest.raises(ValueError, match="cameras must be orthographic, got perspective"):
         known.denoise(x_t[:, None, ..., :2], 0.5, Cameras.around([0.0], [0.1], perspective=True))
     with pytest.raises(NotConjugate, match="there is evidence already"):
         known.exact_posterior(posterior.likelihood)

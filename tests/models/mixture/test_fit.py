@@ -96,7 +96,7 @@ def test_windows_are_centred_and_cover_each_clip():
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: cut_windows([], 10), "motions is empty, expected at least one clip"),
+        (lambda: cut_windows([], 10), "motions must contain at least one clip, got none"),
         (
             lambda: cut_windows(make_gaits(2, frames=10), 11),
             "motions has at most 10 frames in a clip, expected at least frames=11",
@@ -121,7 +121,7 @@ def test_windows_are_centred_and_cover_each_clip():
         ),
         (
             lambda: GaussianMixtureMotion.fit(make_gaits(10), 0),
-            "frames is 0, expected an integer of at least 1",
+            "frames must be an integer of at least 1, got 0",
         ),
     ],
 )

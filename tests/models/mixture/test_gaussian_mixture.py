@@ -425,10 +425,10 @@ def test_says_why_there_is_no_closed_form(prior, motions):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"noise": 0.0}, "noise is 0.0, expected a finite number above 0"),
+        ({"noise": 0.0}, "noise must be a finite number above 0, got 0.0"),
         ({"weights": np.array([0.5, 0.6])}, "expected numbers above 0 that sum to 1"),
-        ({"azimuths": 0}, "azimuths is 0, expected an integer of at least 1"),
-        ({"coordinates": "polar"}, "coordinates is 'polar', expected 'latent' or 'positions'"),
+        ({"azimuths": 0}, "azimuths must be an integer of at least 1, got 0"),
+        ({"coordinates": "polar"}, "coordinates must be 'latent' or 'positions', got 'polar'"),
         ({"means": np.zeros((K, L, J, 2))}, r"means has shape \(2, 2, 3, 2\), expected"),
         ({"factors": np.full((K, R, L, J, 3), np.nan)}, "factors has .* NaN or infinite"),
         ({"styles": ("walk",)}, "styles has 1 names, expected 2"),
@@ -444,7 +444,7 @@ def test_wrong_input_is_one_sentence(prior, change, sentence):
 
 
 def test_perspective_views_have_no_exact_denoiser(prior):
-    with pytest.raises(ValueError, match="cameras is perspective, expected orthographic"):
+    with pytest.raises(ValueError, match="cameras must be orthographic, got perspective"):
         prior.denoise(np.zeros((1, 1, L, J, 2)), 0.5, Cameras.ring(1, perspective=True))
 
 

@@ -398,11 +398,11 @@ def test_people_of_a_clip_come_without_suspect_frames(real_data):
         ),
         (
             lambda limits: learn_limits([swings(2)], dilation=2.0),
-            "dilation is 2.0, expected an angle from 0 to below π/2 radians",
+            "dilation must be an angle from 0 to below π/2 radians, got 2.0",
         ),
         (
             lambda limits: learn_limits([swings(2)], bin_rings=1),
-            "bin_rings is 1, expected an integer of at least 2",
+            "bin_rings must be an integer of at least 2, got 1",
         ),
         (lambda limits: limits.is_valid(np.zeros((34, 3))), r"expected \(…, 17, 3\)"),
         (lambda limits: limits.is_valid(np.full((17, 3), np.nan)), "poses has 51 values"),

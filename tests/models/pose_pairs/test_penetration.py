@@ -207,12 +207,12 @@ def test_real_pairs_carry_almost_no_penalty_and_made_collisions_do(real_data):
         ),
         (
             lambda: penetration_depth(np.zeros((17, 3)), PAIR),
-            r"positions has shape \(17, 3\), expected \(…, 34, 3\)",
+            r"positions must have shape \(…, 34, 3\), got \(17, 3\)",
         ),
         (lambda: penetration_depth(np.full((34, 3), np.inf), PAIR), "positions has 102 values"),
         (
             lambda: penetrating_bones(np.zeros((1, 34, 3)), PAIR),
-            r"pose has shape \(1, 34, 3\), expected \(34, 3\)",
+            r"pose must have shape \(34, 3\), got \(1, 34, 3\)",
         ),
     ],
 )

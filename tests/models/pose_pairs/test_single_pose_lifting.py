@@ -111,11 +111,13 @@ def test_bad_input_is_refused_in_a_sentence():
     seen = picture(SEED)
     with pytest.raises(ValueError, match="visible has 1 joints, expected at least 2"):
         lift_people(seen, np.arange(34) == 0, SEED, PAIR, VIEW)
-    with pytest.raises(ValueError, match=r"view has shape \(3,\), expected \(2\)"):
+    with pytest.raises(ValueError, match=r"view must have shape \(2\), got \(3,\)"):
         lift_people(seen, ALL, SEED, PAIR, np.zeros(3))
-    with pytest.raises(ValueError, match="seed_weight is -1, expected a finite number above 0"):
+    with pytest.raises(ValueError, match="seed_weight must be a finite number above 0, got -1"):
         lift_people(seen, ALL, SEED, PAIR, VIEW, seed_weight=-1)
-    with pytest.raises(ValueError, match="keypoints has 2 values that are NaN or infinite"):
+    with pytest.raises(
+        ValueError, match="keypoints must be finite, got 2 values that are NaN or infinite"
+    ):
         lift_people(np.where(np.arange(34)[:, None] == 5, np.nan, seen), ALL, SEED, PAIR, VIEW)
 
 

@@ -249,9 +249,9 @@ def test_tracks_are_described_by_what_is_learnt_from():
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(ValueError, match="tracks is empty, expected at least one track"):
+    with pytest.raises(ValueError, match="tracks must contain at least one track, got none"):
         TrackBatches([], 20, 0.3, NONE)
-    with pytest.raises(ValueError, match="frames is 1, expected an integer of at least 2"):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 2, got 1"):
         TrackBatches([track()], 1, 0.3, NONE)
     with pytest.raises(ValueError, match=r"tracks has no joint of confidence 0.3 or more"):
         TrackBatches([track(confidence=0.2)], 20, 0.3, NONE)
@@ -276,9 +276,9 @@ def test_bad_input_is_refused_in_a_sentence():
     for threshold in (float("nan"), -0.1):
         with pytest.raises(ValueError, match=r"^threshold is .*, expected"):
             TrackBatches([track()], 20, threshold, NONE)
-    with pytest.raises(ValueError, match="n is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="n must be an integer of at least 1, got 0"):
         draw(TrackBatches([track()], 20, 0.3, NONE), 0)
-    with pytest.raises(ValueError, match=r"deviation has shape \(3, 2\), expected \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"deviation must have shape \(2, 2\), got \(3, 2\)"):
         Standards(np.zeros((2, 2)), np.ones((3, 2)))
     with pytest.raises(ValueError, match="deviation is -1 at its least, expected 0 or more"):
         Standards(np.zeros((2, 2)), np.array([[1.0, 1.0], [-1.0, 1.0]]))

@@ -472,7 +472,7 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path):
     ]:
         with pytest.raises(ValueError, match=f"^{name} is .*expected"):
             TrainingSettings(**{name: value})
-    with pytest.raises(ValueError, match="device is 'tpu', expected cpu or cuda"):
+    with pytest.raises(ValueError, match="device must be cpu or cuda, got 'tpu'"):
         check_device("tpu")
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="this machine has no CUDA; expected 'cpu'"):

@@ -263,7 +263,7 @@ def on_a_grid(posterior):
 
 
 def test_what_cannot_be_read_is_refused(prior):
-    with pytest.raises(ValueError, match="prior is str, expected the MotionVAE whose encoder"):
+    with pytest.raises(ValueError, match="prior must be the MotionVAE whose encoder, got str"):
         VAEEncoder().on("prior", seen_of(prior))
     hidden = np.zeros((4, 4), dtype=bool)
     hidden[3] = True

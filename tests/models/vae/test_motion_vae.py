@@ -342,7 +342,7 @@ def test_a_body_that_no_one_has_placed_has_no_evidence(prior):
 
 def test_wrong_parts_are_refused(prior):
     joints = Joints3D(np.zeros((6, 9, 3)), 0.1)
-    with pytest.raises(ValueError, match="likelihood is Joints3D, expected Keypoints2D"):
+    with pytest.raises(ValueError, match="likelihood must be Keypoints2D, got Joints3D"):
         prior.placed_by(joints)
     with pytest.raises(ValueError, match="rigid has 5 frames, expected 6"):
         prior.placed(some_path(frames=5))
@@ -437,5 +437,5 @@ def test_all_directions_lose_nothing_and_more_there_are_not(prior):
     np.testing.assert_allclose(reduced.motion(theta), prior.motion(reduced.latent(theta)))
     np.testing.assert_allclose(reduced.log_density(theta), prior.log_density(theta))
     assert 0.3 < ReducedLatent(prior, 1).kept < ReducedLatent(prior, 2).kept < 1
-    with pytest.raises(ValueError, match="k is 4, expected at most the prior's 3 dimensions"):
+    with pytest.raises(ValueError, match="k must be at most the prior's 3 dimensions, got 4"):
         ReducedLatent(prior, 4)

@@ -333,7 +333,7 @@ def test_image_features_have_their_shapes(spatial):
     assert mean.shape == (B, TINY.latent)
     frames, joints = made_features()
     for given, message in (
-        (None, "features is None, expected image features of image_features=6 numbers"),
+        (None, "features must be image features of image_features=6 numbers, got None"),
         ((frames[..., 1:], joints), r"features\[0\] has shape \(3, 10, 5\)"),
         ((frames, joints[:, :, 1:]), r"features\[1\] has shape \(3, 10, 4, 6\)"),
         ((frames,), "features is a tuple, expected a tuple of two tensors"),

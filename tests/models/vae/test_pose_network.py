@@ -151,7 +151,7 @@ def test_image_features_have_their_shapes():
     network = PoseNetwork(replace(TINY, image_features=6), J, BONES, G)
     features = torch.randn(B, T, 6), torch.randn(B, T, J, 6)
     assert network(*made_input(), features).turns.shape == (B, H, T, BONES, 3)
-    with pytest.raises(ValueError, match="features is None, expected image features"):
+    with pytest.raises(ValueError, match="features must be image features, got None"):
         network(*made_input())
     with pytest.raises(ValueError, match="expected None where image_features is 0"):
         PoseNetwork(TINY, J, BONES, G)(*made_input(), features)

@@ -273,7 +273,7 @@ def test_what_cannot_be_learnt_with_is_refused_in_a_sentence(tracks, validation,
     with pytest.raises(ValueError, match="size has image_features=8, expected 0: tracks have none"):
         asked(replace(TINY, image_features=8))
     for distance in (-1.0, np.nan):
-        with pytest.raises(ValueError, match=r"distance is .*, expected a finite number above 0"):
+        with pytest.raises(ValueError, match=r"distance must be a finite number above 0, got .*"):
             asked(distance=distance)
     with pytest.raises(ValueError, match=r"distance is 0\.1 m, expected more than the body's own"):
         asked(distance=0.1)
@@ -373,5 +373,5 @@ def test_bad_input_is_refused_in_a_sentence(tracks, validation, body) -> None:
     other = ArticulatedBody(names, body.rest[order])
     with pytest.raises(ValueError, match="tracks has the joints pelvis, "):
         PoseTrainee(tracks, validation, TINY, other)
-    with pytest.raises(ValueError, match="size is 'huge', expected one of tiny, small, paper"):
+    with pytest.raises(ValueError, match="size must be one of tiny, small, paper, got 'huge'"):
         usual_motion_vae_training("huge")

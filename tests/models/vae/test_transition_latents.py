@@ -153,12 +153,12 @@ def test_the_body_stays_where_it_begins_and_has_its_bones(prior):
 @pytest.mark.parametrize(
     ("z", "options", "sentence"),
     [
-        (np.zeros((2, 3)), {}, r"z has shape \(2, 3\), expected \(S, 4\)"),
-        (np.zeros((0, 4)), {}, "segments is 0, expected an integer of at least 1"),
-        (np.full((2, 4), np.nan), {}, "z has 8 values that are NaN or infinite"),
-        (np.zeros((2, 4)), {"iterations": 0}, "iterations is 0, expected an integer of at least"),
-        (np.zeros((2, 4)), {"transitions": 0}, "transitions is 0, expected an integer of at least"),
-        (np.zeros((2, 4)), {"prior_weight": -1.0}, "prior_weight is -1.0, expected a finite numb"),
+        (np.zeros((2, 3)), {}, r"z must have shape \(S, 4\), got \(2, 3\)"),
+        (np.zeros((0, 4)), {}, "segments must be an integer of at least 1, got 0"),
+        (np.full((2, 4), np.nan), {}, "z must be finite, got 8 values that are NaN or infinite"),
+        (np.zeros((2, 4)), {"iterations": 0}, "iterations must be an integer of at least, got 0"),
+        (np.zeros((2, 4)), {"transitions": 0}, "transitions must be an integer of at least, got 0"),
+        (np.zeros((2, 4)), {"prior_weight": -1.0}, "prior_weight must be a finite numb, got -1.0"),
     ],
 )
 def test_wrong_arguments_are_refused(prior, z, options, sentence):

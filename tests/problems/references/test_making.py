@@ -223,7 +223,7 @@ def test_what_was_saved_is_read_and_served(tmp_path, heavy, made):
     np.testing.assert_array_equal(drawn, kept.reference(3, 480))
     assert len(np.unique(drawn.reshape(480, -1), axis=0)) == 480  # without replacement
     assert (kept.reference(4, 5) != drawn[:5]).any()
-    with pytest.raises(ValueError, match="n is 481, expected at most the 480 reference draws"):
+    with pytest.raises(ValueError, match="n must be at most the 480 reference draws, got 481"):
         kept.reference(0, 481)
     # What is there is replaced whole.
     made.save(folder)
@@ -349,7 +349,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_first_run(tmp_pat
 
 
 def test_a_number_of_draws_that_chains_cannot_share_is_refused(exact):
-    with pytest.raises(ValueError, match="draws is 100, expected a multiple of 8"):
+    with pytest.raises(ValueError, match="draws must be a multiple of 8, got 100"):
         make_reference(exact, draws=100)
 
 
@@ -402,7 +402,10 @@ def test_without_evidence_the_priors_own_draws_are_the_reference():
     ("drawn", "sentence"),
     [
         (np.zeros((5, 2, 3)), r"sample\(rng, 5\) of Odd has shape \(5, 2, 3\), expected"),
-        (np.full((5, 2, 1, 3), np.nan), r"sample\(rng, 5\) of Odd has 30 values that are NaN"),
+        (
+            np.full((5, 2, 1, 3), np.nan),
+            r"sample\(rng, 5\) of Odd must be finite, got 30 values that are NaN",
+        ),
     ],
 )
 def test_draws_of_a_prior_that_are_no_motions_are_no_reference(drawn, sentence):

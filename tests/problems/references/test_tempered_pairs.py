@@ -414,7 +414,7 @@ def test_what_it_cannot_draw_from_is_said(prior, evidence):
     partly = AnnotatedPairs(replace(evidence.annotations, visible=hidden), n_views=2)
     with pytest.raises(ValueError, match="AnnotatedPairs with 1 hidden joints, expected"):
         sampler.sample(MotionPosterior(prior, partly), progress=False)
-    with pytest.raises(ValueError, match="initial is ndarray, expected None"):
+    with pytest.raises(ValueError, match="initial must be None, got ndarray"):
         sampler.sample(MotionPosterior(prior, evidence), initial=np.zeros((1, 108)), progress=False)
     with pytest.raises(ValueError, match="levels is 2, expected"):
         TemperedPairs(levels=2)

@@ -94,11 +94,11 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     with pytest.raises(ValueError, match="camera has 2 views, expected one"):
         Ancestral2D().sample_views(MotionPosterior(lively), draws=1, camera=Cameras.ring(2))
     for wrong in (0, 2.5):
-        with pytest.raises(ValueError, match=r"draws is .*, expected an integer of at least 1"):
+        with pytest.raises(ValueError, match=r"draws must be an integer of at least 1, got .*"):
             Ancestral2D().sample_views(MotionPosterior(lively), draws=wrong, progress=False)
-    with pytest.raises(ValueError, match="steps is 200, expected at most the schedule's 100"):
+    with pytest.raises(ValueError, match="steps must be at most the schedule's 100, got 200"):
         Ancestral2D(steps=200, trained_steps=100)
-    with pytest.raises(ValueError, match="batch is 0, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="batch must be an integer of at least 1, got 0"):
         Ancestral2D(batch=0)
 
     class Flat:

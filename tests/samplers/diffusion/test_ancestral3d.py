@@ -123,7 +123,7 @@ def test_strided_levels_are_those_of_the_longer_schedule():
     schedule = cosine_schedule(20, 100, 2)
     np.testing.assert_array_equal(schedule.alpha_bar, NoiseSchedule.cosine(100).alpha_bar[::5])
     assert Ancestral3D(steps=20, trained_steps=100).schedule.steps == 20
-    with pytest.raises(ValueError, match="steps is 200, expected at most the schedule's 100"):
+    with pytest.raises(ValueError, match="steps must be at most the schedule's 100, got 200"):
         Ancestral3D(steps=200, trained_steps=100)
 
 

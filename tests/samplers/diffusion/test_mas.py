@@ -287,7 +287,7 @@ def test_replay_shows_the_run_from_any_view(lively, perspective):
         np.testing.assert_allclose(trace.replay(new, 4), Views(new).project(state), atol=1e-12)
     finished = new.project(draws) / lively.scale
     np.testing.assert_allclose(trace.replay(new), finished, atol=1e-12)
-    with pytest.raises(ValueError, match=r"level is 41, expected 0 or one from 1 to 40"):
+    with pytest.raises(ValueError, match=r"level must be 0 or one from 1 to 40, got 41"):
         trace.replay(new, 41)
 
 
@@ -352,18 +352,18 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively, gaussian_motion):
     with pytest.raises(ValueError, match=r"initial is ndarray, expected None: mas starts every"):
         MultiViewAncestral().sample(posterior, initial=np.zeros(3), progress=False)
     for wrong, message in (
-        ({"n_views": 1}, r"n_views is 1, expected an integer of at least 2"),
+        ({"n_views": 1}, r"n_views must be an integer of at least 2, got 1"),
         ({"steps": 0}, r"steps is 0"),
-        ({"stop_level": 101}, r"stop_level is 101, expected at most"),
-        ({"view_weights": (1.0, 2.0)}, r"view_weights has shape \(2,\), expected \(5\)"),
-        ({"trained_steps": 50}, r"steps is 100, expected at most the schedule's 50"),
+        ({"stop_level": 101}, r"stop_level must be at most, got 101"),
+        ({"view_weights": (1.0, 2.0)}, r"view_weights must have shape \(5\), got \(2,\)"),
+        ({"trained_steps": 50}, r"steps must be at most the schedule's 50, got 100"),
     ):
         with pytest.raises(ValueError, match=message):
             MultiViewAncestral(**wrong)
 
     class Flat(gaussian_motion):
         def denoise(self, x_t, alpha_bar, cameras):
-            raise ValueError("cameras is perspective, expected orthographic cameras")
+            raise ValueError("cameras must be orthographic cameras, got perspective")
 
     flat = MotionPosterior(Flat(lively.mean, lively.covariance))
     with pytest.raises(UnsupportedPosterior, match=r"perspective views needs a denoiser of such"):

@@ -208,10 +208,10 @@ def test_views_that_never_tilt_are_warned_of(lively):
 
 def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     for wrong, message in (
-        ({"corrector_size": 1.5}, r"corrector_size is 1.5, expected at most 1"),
+        ({"corrector_size": 1.5}, r"corrector_size must be at most 1, got 1.5"),
         ({"corrector_steps": -1}, r"corrector_steps is -1"),
-        ({"gamma": -0.5}, r"gamma is -0.5, expected a finite number of at least 0"),
-        ({"gamma_from": np.nan}, r"gamma_from is nan, expected a finite number of at least 0"),
+        ({"gamma": -0.5}, r"gamma must be a finite number of at least 0, got -0.5"),
+        ({"gamma_from": np.nan}, r"gamma_from must be a finite number of at least 0, got nan"),
     ):
         with pytest.raises(ValueError, match=message):
             MultiViewPredictorCorrector(**wrong)

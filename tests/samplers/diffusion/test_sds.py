@@ -123,10 +123,10 @@ def test_what_does_not_fit_is_refused_in_a_sentence(lively):
     with pytest.raises(ValueError, match="initial is int, expected None: sds starts every draw"):
         ScoreDistillation().sample(MotionPosterior(lively), initial=3, progress=False)
     for wrong, message in (
-        ({"levels": "falling"}, r"levels is 'falling', expected one of uniform, annealed"),
-        ({"weighting": "w"}, r"weighting is 'w', expected one of constant, variance, residual"),
+        ({"levels": "falling"}, r"levels must be one of uniform, annealed, got 'falling'"),
+        ({"weighting": "w"}, r"weighting must be one of constant, variance, residual, got 'w'"),
         ({"iterations": 0}, r"iterations is 0"),
-        ({"azimuths": 2, "n_views": 3}, r"azimuths is 2, expected an integer of at least 3"),
+        ({"azimuths": 2, "n_views": 3}, r"azimuths must be an integer of at least 3, got 2"),
         ({"learning_rate": 0.0}, r"learning_rate is 0.0"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -148,5 +148,5 @@ def test_the_reference_code_sees_a_radian_of_the_circle(monkeypatch):
     few.sample(load_problem("gait").posterior, draws=1, progress=False)
     assert 0 <= min(seen) < 0.1
     assert 0.9 < max(seen) < 1
-    with pytest.raises(ValueError, match=r"arc is 7.0, expected at most the circle, 2 pi"):
+    with pytest.raises(ValueError, match=r"arc must be at most the circle, 2 pi, got 7.0"):
         ScoreDistillation(arc=7.0)

@@ -139,9 +139,9 @@ def test_an_interrupt_of_the_warm_up_is_a_plain_one(posterior, monkeypatch):
 
 
 def test_too_few_walkers_are_refused(posterior):
-    with pytest.raises(ValueError, match="walkers is 5, expected at least 6, twice"):
+    with pytest.raises(ValueError, match="walkers must be at least 6, twice, got 5"):
         run(posterior, 2, sampler=Ensemble(walkers=5))
-    with pytest.raises(ValueError, match=r"initial has shape \(2, 3\), expected \(2, 8, 3\)"):
+    with pytest.raises(ValueError, match=r"initial must have shape \(2, 8, 3\), got \(2, 3\)"):
         run(posterior, 2, initial=np.zeros((2, 3)))
 
 
@@ -192,5 +192,5 @@ def test_a_short_run_gets_no_ess_of_a_chain(posterior, tmp_path, thin):
 
 @pytest.mark.parametrize("name", ["walkers", "warmup", "thin", "largest_dim"])
 def test_wrong_settings_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name} is -1, expected an integer of at least"):
+    with pytest.raises(ValueError, match=f"{name} must be an integer of at least, got -1"):
         Ensemble(**{name: -1})

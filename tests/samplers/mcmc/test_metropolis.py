@@ -105,8 +105,8 @@ def test_another_samplers_run_is_no_state_to_go_on_from(posterior):
 @pytest.mark.parametrize(
     ("initial", "message"),
     [
-        (np.zeros((2, 4)), r"initial has shape \(2, 4\), expected \(2, 3\)"),
-        (np.full((2, 3), np.nan), "initial has 6 values that are NaN or infinite"),
+        (np.zeros((2, 4)), r"initial must have shape \(2, 3\), got \(2, 4\)"),
+        (np.full((2, 3), np.nan), "initial must be finite, got 6 values that are NaN or infinite"),
         (np.full((2, 3), 1e200), "initial has log density -inf at point 0, expected"),
     ],
 )
@@ -158,8 +158,8 @@ def test_an_interrupt_of_the_warm_up_is_a_plain_one(posterior, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"warmup": -1}, "warmup is -1, expected an integer of at least 0"),
-        ({"thin": 0}, "thin is 0, expected an integer of at least 1"),
+        ({"warmup": -1}, "warmup must be an integer of at least 0, got -1"),
+        ({"thin": 0}, "thin must be an integer of at least 1, got 0"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

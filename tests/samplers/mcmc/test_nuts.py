@@ -247,10 +247,10 @@ def test_thinning_keeps_every_third_and_tells_of_all(posterior, long):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"warmup": 0}, "warmup is 0, expected an integer of at least 1"),
-        ({"thin": 0}, "thin is 0, expected an integer of at least 1"),
-        ({"target_acceptance": 1.0}, "target_acceptance is 1.0, expected a number between 0 and 1"),
-        ({"max_tree_depth": 0}, "max_tree_depth is 0, expected an integer of at least 1"),
+        ({"warmup": 0}, "warmup must be an integer of at least 1, got 0"),
+        ({"thin": 0}, "thin must be an integer of at least 1, got 0"),
+        ({"target_acceptance": 1.0}, "target_acceptance must be a number between 0 and 1, got 1.0"),
+        ({"max_tree_depth": 0}, "max_tree_depth must be an integer of at least 1, got 0"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

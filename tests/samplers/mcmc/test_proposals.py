@@ -152,8 +152,8 @@ def test_without_a_target_the_scale_stays():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Isotropic(scale=0.0), "scale is 0.0, expected a finite number above 0"),
-        (lambda: Isotropic(target=1.0), "target is 1.0, expected an acceptance between 0 and 1"),
+        (lambda: Isotropic(scale=0.0), "scale must be a finite number above 0, got 0.0"),
+        (lambda: Isotropic(target=1.0), "target must be an acceptance between 0 and 1, got 1.0"),
         (lambda: AdaptiveCovariance(scale=np.inf), "scale is inf, expected"),
         (lambda: AdaptiveCovariance(target=0.0), "target is 0.0, expected"),
     ],

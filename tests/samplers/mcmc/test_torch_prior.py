@@ -43,13 +43,13 @@ class DecodedMotion:
         if isinstance(theta, np.ndarray):
             return self.motion(torch.tensor(theta)).numpy()
         if not isinstance(theta, torch.Tensor):
-            raise TypeError(f"theta is {type(theta).__name__}, expected a NumPy or torch array")
+            raise TypeError(f"theta must be a NumPy or torch array, got {type(theta).__name__}")
         positions = torch.tanh(1.5 * theta @ self.first.T) @ self.last.T
         return positions.reshape(*theta.shape[:-1], self.frames, 3, 3)
 
     def log_density(self, theta):
         if not isinstance(theta, np.ndarray | torch.Tensor):
-            raise TypeError(f"theta is {type(theta).__name__}, expected a NumPy or torch array")
+            raise TypeError(f"theta must be a NumPy or torch array, got {type(theta).__name__}")
         return -0.5 * (theta**2).sum(-1) - 0.5 * DIM * math.log(2 * math.pi)
 
     def initial(self, rng, n):

@@ -385,7 +385,7 @@ def test_what_no_network_reads_is_learnt_from_simulations(prior, bare, walks, tr
 
 
 def test_networks_are_of_one_prior(two_bumps, posterior, denoiser):
-    with pytest.raises(ValueError, match="prior is TwoBumps, expected the Motion-DVAE that the de"):
+    with pytest.raises(ValueError, match="prior must be the Motion-DVAE that the de, got TwoBumps"):
         denoiser.on(two_bumps, posterior.likelihood)
 
 
@@ -403,7 +403,7 @@ def test_a_window_with_nothing_in_it_is_one_sentence(prior, walks):
 
 def test_windows_cannot_share_all_their_frames(posterior):
     run(DVAEInference(overlap=WINDOW - 1), posterior)
-    with pytest.raises(ValueError, match=r"^overlap is 12, expected less than the 12 frames of a"):
+    with pytest.raises(ValueError, match=r"^overlap must be less than the 12 frames of a, got 12"):
         run(DVAEInference(overlap=WINDOW), posterior)
 
 

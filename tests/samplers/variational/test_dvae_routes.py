@@ -376,20 +376,20 @@ def test_it_starts_from_noise():
 @pytest.mark.parametrize(
     ("setting", "value", "sentence"),
     [
-        ("mode", "both", "mode is 'both', expected one of regression, optimization"),
-        ("iterations", 0, "iterations is 0, expected an integer of at least 1"),
-        ("batch", 1.5, "batch is 1.5, expected an integer of at least 1"),
-        ("training_steps", 0, "training_steps is 0, expected an integer of at least 1"),
-        ("training_pairs", 99, "training_pairs is 99, expected an integer of at least 100"),
-        ("overlap", 0, "overlap is 0, expected an integer of at least 1"),
-        ("learning_rate", 0.0, "learning_rate is 0.0, expected a finite number above 0"),
-        ("degrees_of_freedom", 0.0, "degrees_of_freedom is 0.0, expected a number above 0 or inf"),
-        ("degrees_of_freedom", "4", "degrees_of_freedom is '4', expected a number above 0 or inf"),
-        ("degrees_of_freedom", math.nan, "degrees_of_freedom is nan, expected a number above 0"),
-        ("latent_weight", -0.1, "latent_weight is -0.1, expected a finite number of at least 0"),
-        ("latent_weight", math.inf, "latent_weight is inf, expected a finite number of at least"),
-        ("latent_weight", "x", "latent_weight is 'x', expected a finite number of at least 0"),
-        ("network", "body-dvae", "network is 'body-dvae', expected an InferenceNetwork"),
+        ("mode", "both", "mode must be one of regression, optimization, got 'both'"),
+        ("iterations", 0, "iterations must be an integer of at least 1, got 0"),
+        ("batch", 1.5, "batch must be an integer of at least 1, got 1.5"),
+        ("training_steps", 0, "training_steps must be an integer of at least 1, got 0"),
+        ("training_pairs", 99, "training_pairs must be an integer of at least 100, got 99"),
+        ("overlap", 0, "overlap must be an integer of at least 1, got 0"),
+        ("learning_rate", 0.0, "learning_rate must be a finite number above 0, got 0.0"),
+        ("degrees_of_freedom", 0.0, "degrees_of_freedom must be a number above 0 or inf, got 0.0"),
+        ("degrees_of_freedom", "4", "degrees_of_freedom must be a number above 0 or inf, got '4'"),
+        ("degrees_of_freedom", math.nan, "degrees_of_freedom must be a number above 0, got nan"),
+        ("latent_weight", -0.1, "latent_weight must be a finite number of at least 0, got -0.1"),
+        ("latent_weight", math.inf, "latent_weight must be a finite number of at least, got inf"),
+        ("latent_weight", "x", "latent_weight must be a finite number of at least 0, got 'x'"),
+        ("network", "body-dvae", "network must be an InferenceNetwork, got 'body-dvae'"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value, sentence):
@@ -400,6 +400,6 @@ def test_settings_out_of_range_are_refused(setting, value, sentence):
 @pytest.mark.parametrize(("name", "bad"), [("draws", 0), ("chains", 1.5)])
 def test_wrong_numbers_are_refused_before_anything_is_learnt(trainings, name, bad):
     posterior = MotionPosterior(mixture())
-    with pytest.raises(ValueError, match=f"{name} is {bad}, expected an integer of at least 1"):
+    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1, got {bad}"):
         run(DVAEInference(), posterior, **{name: bad})
     assert trainings == []
