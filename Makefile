@@ -1,18 +1,22 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+TUTORIALS := $(wildcard notebooks/[0-9]*.py)
 
-.PHONY: install demo test slow lint types bench clean
+.PHONY: install demo test slow lint types notebooks docs bench clean
 
 install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint]'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "probmotion needs Python 3.11 or later, got $$($(PYTHON) --version 2>&1); set PYTHON=python3.11."; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
+		{ echo "$(PYTHON) cannot create a virtual environment; install its venv package (Debian: python3-venv)."; exit 1; }
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]'
 	touch $@
 
 demo: install
-	$(BIN)/probmotion compare gait gait-monocular --quick --workers 2 --out demo --pictures
+	$(BIN)/probmotion compare gait gait-monocular --quick --workers 2 --out demo --figures
 
 test: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests
@@ -30,8 +34,17 @@ types: install
 	cp -r probmotion .types/probmotion && cp -r samplers models .types/probmotion/
 	cd .types && ../$(BIN)/mypy --config-file ../pyproject.toml -p probmotion
 
+# Execute the tutorials whose script is newer than its executed copy.
+notebooks: $(TUTORIALS:.py=.ipynb)
+
+notebooks/%.ipynb: notebooks/%.py
+	$(BIN)/python docs/_build_pages/execute_notebook.py $<
+
+docs: install
+	$(BIN)/python -m sphinx -W --keep-going -q -j 2 -b html docs docs/_build/html
+
 bench: install
 	for script in benchmarks/*.py; do echo "# $$script"; $(BIN)/python $$script || exit 1; done
 
 clean:
-	rm -rf build .types demo *.egg-info
+	rm -rf build .types demo docs/_build *.egg-info

@@ -1,12 +1,11 @@
-"""What two workers gain on a grid of equal cells: random walks on ``gait``, 32 of 5 seconds each.
+"""Parallel efficiency of comparisons: random walks on ``gait``, 32 runs of 5 seconds each.
 
-``efficiency_two_workers``: seconds in this process over twice those with two workers, both from the
-call of ``compare`` to its table, so that the start of processes and what they import is in it.
-``worker_import_seconds``, ``worker_problem_seconds``: what a worker does first;
-``seconds_beyond_half``: what two workers take longer than half of that, all in all, of which
-starting them is some 4 seconds and waiting for the last cell at most one cell's time;
-``slowdown_in_samplers``: seconds within samplers with two workers over those in one process, which
-is the machine's doing. Run it on a machine with two idle cores.
+``efficiency_two_workers``: seconds in this process over twice those with two workers, from the
+call of ``compare`` to its table, including the start of processes. ``worker_import_seconds``,
+``worker_problem_seconds``: start-up of a worker. ``seconds_beyond_half``: excess over half the
+serial time, of which about 4 s are process starts and at most one run's time is idle at the end.
+``slowdown_in_samplers``: seconds within samplers with two workers over those in one process, an
+effect of the machine. Run on two idle cores.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from probmotion.samplers import MetropolisHastings
 _START = """
 import time
 start = time.perf_counter()
-import probmotion.comparison.run.processes, probmotion.comparison.run.cells, probmotion.metrics
+import probmotion.comparison.run.processes, probmotion.comparison.run.grid_runs, probmotion.metrics
 from probmotion.problems import load_problem
 import probmotion.samplers.mcmc.metropolis
 imported = time.perf_counter()
@@ -37,7 +36,7 @@ print(imported - start, time.perf_counter() - imported)
 
 
 def seconds(workers: int, cells: int, thin: int) -> tuple[float, float]:
-    """Return how long the grid takes, and how much of it was spent within samplers."""
+    """Return the duration of a comparison, and the part of it spent within samplers."""
     sampler = MetropolisHastings(warmup=1000, thin=thin)
     start = time.perf_counter()
     found = compare(

@@ -1,8 +1,8 @@
-"""How many exact 2D denoiser evaluations a second: 108 components, r = 10, L = 30, J = 17.
+"""Rate of exact 2D denoiser evaluations: 108 components, r = 10, L = 30, J = 17.
 
-``evaluations_per_second`` is in the coordinates of ``GaussianMixtureMotion.reduced()``, which lose
-nothing; ``full_size_evaluations_per_second`` on whole motions. Float64, one thread. One evaluation
-is one view of one motion at one noise level.
+``evaluations_per_second`` uses the coordinates of ``GaussianMixtureMotion.reduced()``, which are
+exact; ``full_size_evaluations_per_second`` uses whole motions. Float64, one thread. One
+evaluation is one view of one motion at one noise level.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""What MAS costs with a network of the paper's size: V = 5, L = 180, J = 16, 100 steps.
+"""Cost of MAS with a network of the published size: V = 5, L = 180, J = 16, 100 steps.
 
-Perspective views, one motion, fresh weights. ``outside_network_share`` is the share of the time
-outside the network's forward passes; ``network_gflops_share`` the rate of its floating-point
-operations over that of a large product of float32 matrices in the same run, on the same threads;
-``memory_gib`` the peak of a process that does nothing else. ``strided_20_fid_ratio`` is the FID of
-20 steps over that of 100 with the prior walk2d, 256 motions each, ``strided_20_fid_gap`` their
-difference over the standard deviation of one of ten repeats, halves of the motions from other
-sides. With CUDA also motions per second, 64 at a time.
+Perspective views, one motion, untrained weights. ``outside_network_share``: fraction of the time
+outside the network's forward passes. ``network_gflops_share``: its floating-point rate over that
+of a large float32 matrix product in the same run, on the same threads. ``memory_gib``: peak
+memory of a separate process. ``strided_20_fid_ratio``: FID with 20 steps over that with 100,
+prior walk2d, 256 motions each; ``strided_20_fid_gap``: their difference over the standard
+deviation of ten repeats. With CUDA also motions per second, 64 at a time.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ FRAMES, JOINTS, VIEWS = 180, 16, 5
 
 
 def paper_prior(device: str = "cpu") -> tuple[MotionDiffusion, torch.nn.Module]:
-    """Return a prior of the paper's size with fresh weights, and its network."""
+    """Return a prior of the published size with untrained weights, and its network."""
     size = DiffusionSettings.paper(FRAMES)
     rng = np.random.default_rng(0)
     standards = Standards(0.2 * rng.normal(size=(JOINTS, 2)), np.full((JOINTS, 2), 0.2))
@@ -150,7 +149,7 @@ def on_cuda() -> dict[str, float]:
 
 
 def strided(draws: int = 256) -> dict[str, float]:
-    """Return how far 20 of the 100 levels that a network has learnt are from all of them."""
+    """Return FID with 20 of the 100 trained levels relative to all of them."""
     problem = load_problem("walk2d")
     assert problem.generation is not None
     # Against the clips that were learnt from: held-out ones are so far that no step count matters.

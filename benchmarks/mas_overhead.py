@@ -1,7 +1,7 @@
-"""What MAS adds to its denoiser, in time and memory: L = 30, J = 17, 108 components, V = 5.
+"""Overhead of MAS over its denoiser, in time and memory: L = 30, J = 17, 108 components, V = 5.
 
-``mas_denoiser_share`` is the share of time inside the exact prior's ``denoise``;
-``mas_1000_draws_gib`` how much the process grows while it makes 1000 draws at once. One thread.
+``mas_denoiser_share``: fraction of the time inside the exact prior's ``denoise``;
+``mas_1000_draws_gib``: growth of the process while it makes 1000 draws at once. One thread.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""How fast Motion-DVAE denoises, at the published size on the CPU; prints ``name: value``.
+"""Speed of Motion-DVAE denoising at the published size on the CPU.
 
-A motion of 300 frames is cut into overlapping windows that go through as one batch. Weights are
-fresh: what is computed does not depend on them.
+A motion of 300 frames is cut into overlapping windows that form one batch. Weights are untrained;
+the amount of computation does not depend on them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
-    """Return a prior and its denoiser of the published size, with fresh weights."""
+    """Return a prior and its denoiser of the published size, untrained."""
     states = BodyStates(
         walks[0].skeleton, rest_pose(walks[0].skeleton, [w.positions for w in walks])
     )
@@ -67,7 +67,7 @@ def observed(motion: Motion, frames: int) -> Joints3D:
 
 
 def throughput_ratio(prior: MotionDVAE, denoiser: MotionDenoiser, motion: Motion) -> float:
-    """Return how many times more sequences a second go through at once than one by one."""
+    """Return the throughput of a batch over that of single sequences."""
     one = denoiser.on(prior, observed(motion, WINDOW))
     many = NoisyMotion(one.denoiser, one.windows.repeated(SEQUENCES), one.stitching)
     rng = np.random.default_rng(0)
@@ -77,7 +77,7 @@ def throughput_ratio(prior: MotionDVAE, denoiser: MotionDenoiser, motion: Motion
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
-    """Return the least seconds of several runs, after one that warms up."""
+    """Return the minimum duration of several runs, after one warm-up run."""
     work()
     seconds = []
     for _ in range(times):

@@ -1,12 +1,11 @@
-"""How fast the motion VAE generates and learns, at the published size on the CPU: ``name: value``.
+"""Speed of motion VAE generation and training at the published size on the CPU.
 
-Weights are fresh: what is computed does not depend on them. A training step is one of the second
-phase, in mixed precision as the settings say. Its teacher is asked once of every frame, before the
-first step: ``teacher_seconds_per_1000_frames``.
+Weights are untrained. A training step is one of the second phase, in mixed precision. Pseudo-
+labels are computed once per frame before the first step: ``teacher_seconds_per_1000_frames``.
 
-How fast the processor is just then is measured beside it: ``product_gigaflops``, of bfloat16
-products of two matrices of 2048 rows. ``training_step_gigaflop`` is what a step has to multiply;
-``training_step_share_of_products`` is the share of its seconds that products alone would take.
+``product_gigaflops`` is the processor's rate for bfloat16 products of two matrices of 2048 rows;
+``training_step_gigaflop`` the number of multiplications of a step;
+``training_step_share_of_products`` the fraction of its time that products alone would take.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def main() -> None:
 
 
 def product_gigaflops(rows: int = 2048) -> float:
-    """Return how many operations of bfloat16 products the processor does in a nanosecond."""
+    """Return the rate of bfloat16 matrix products, gigaflops."""
     one = torch.randn(rows, rows, generator=torch.Generator().manual_seed(0)).bfloat16()
     return 2 * rows**3 / fastest(lambda: one @ one, 20) / 1e9
 
@@ -89,7 +88,7 @@ def generate(network: MotionVAENetwork, body: ArticulatedBody) -> torch.Tensor:
 def training(
     body: ArticulatedBody, settings: MotionVAESettings
 ) -> tuple[Callable[[], None], float]:
-    """Return a step of the second phase, all of it, and what its teacher takes for 1000 frames."""
+    """Return a step of the second phase, and the seconds of pseudo-labels for 1000 frames."""
     skeleton, rng = body.skeleton, np.random.default_rng(0)
     seen = np.ones((4 * settings.frames, skeleton.n_joints))
     tracks = []
@@ -120,7 +119,7 @@ def training(
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
-    """Return the least seconds of several runs, after one that warms up."""
+    """Return the minimum duration of several runs, after one warm-up run."""
     work()
     seconds = []
     for _ in range(times):

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import io
 import json
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -77,17 +75,17 @@ def _digests_of_tree(folder: Path) -> dict[str, str]:
     return dict(json.loads(done.stdout))
 
 
-def _lay_out(archive: bytes, folder: Path) -> Path:
-    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-        tar.extractall(folder, filter="data")
-    for wing in ("samplers", "models"):
-        (folder / wing).rename(folder / "probmotion" / wing)
-    return folder
-
-
-def _archive(revision: str) -> bytes:
-    command = ["git", "archive", revision, "probmotion", "samplers", "models"]
-    return subprocess.run(command, cwd=_ROOT, stdout=subprocess.PIPE, check=True).stdout
+def _lay_out(revision: str, folder: Path) -> Path:
+    """Install a revision into ``folder``, with its own entry points."""
+    source = folder / "source"
+    source.mkdir(parents=True)
+    archive = subprocess.run(
+        ["git", "archive", revision], cwd=_ROOT, stdout=subprocess.PIPE, check=True
+    )
+    subprocess.run(["tar", "-x"], cwd=source, input=archive.stdout, check=True)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", str(folder / "tree"), str(source)], check=True)
+    return folder / "tree"
 
 
 def main() -> None:
@@ -104,10 +102,10 @@ def main() -> None:
         if given.keep and given.keep.exists():
             before = dict(json.loads(given.keep.read_text(encoding="utf-8")))
         else:
-            before = _digests_of_tree(_lay_out(_archive(given.before), Path(made) / "before"))
+            before = _digests_of_tree(_lay_out(given.before, Path(made) / "before"))
             if given.keep:
                 given.keep.write_text(json.dumps(before, indent=1), encoding="utf-8")
-        after = _digests_of_tree(_lay_out(_archive("HEAD"), Path(made) / "after"))
+        after = _digests_of_tree(_lay_out("HEAD", Path(made) / "after"))
     differing = [run for run in before | after if before.get(run) != after.get(run)]
     for run in differing:
         print(f"{run}: {before.get(run)} before, {after.get(run)} after")

@@ -1,10 +1,9 @@
-"""What going through this package costs over calling NumPyro and emcee directly.
+"""Overhead of this package over NumPyro and emcee called directly.
 
-``nuts_ratio`` and ``ensemble_ratio``: processor seconds of our sampler over those of the library
-called by hand on the same density, from the same start with the same random numbers; both end with
-motions, and the script stops unless both made the same draws. NUTS is compiled anew by both every
-time. Medians over interleaved repeats in one process. ``import_seconds``: the statement ``import
-probmotion`` in a fresh process, the best of several. Float64, one thread.
+``nuts_ratio``, ``ensemble_ratio``: processor seconds of our sampler over those of the library on
+the same density, start and random numbers; the script stops unless both give the same draws. NUTS
+is compiled anew by both. Medians over interleaved repeats in one process. ``import_seconds``:
+``import probmotion`` in a new process, minimum of several. Float64, one thread.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ SEED = 0
 
 
 def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
-    """Return θ of one chain, as a user of NumPyro would draw it, and make the motions."""
+    """Return θ of one chain drawn with NumPyro directly, and make the motions."""
     start = posterior.initial(seeds.generator(SEED, "initial", 0), 1)[0]
     with jax.enable_x64(True):
         chain = MCMC(
@@ -66,7 +65,7 @@ def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
 
 
 def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
-    """Return θ of one ensemble, as a user of emcee would draw it, and make the motions."""
+    """Return θ of one ensemble drawn with emcee directly, and make the motions."""
     walkers = 4 * posterior.dim
     start = posterior.initial(seeds.generator(SEED, "initial", 0), walkers)
     source = np.random.RandomState(np.random.MT19937(seeds.sequence(SEED, "chain", 0)))
@@ -105,7 +104,7 @@ def ratio(ours: Callable[[], np.ndarray], theirs: Callable[[], np.ndarray], repe
 
 
 def import_seconds(repeats: int = 7) -> float:
-    """Return the time that ``import probmotion`` takes in a fresh process."""
+    """Return the duration of ``import probmotion`` in a new process."""
 
     code = "import time; t = time.perf_counter(); import probmotion; print(time.perf_counter() - t)"
     runs = [subprocess.check_output([sys.executable, "-c", code]) for _ in range(repeats)]

@@ -26,7 +26,7 @@ from probmotion.data.downloads import salsa_pairs
 from probmotion.data.pair_sets import SALSA_HELD_OUT
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.views import project_to_views
-from probmotion.interaction.geometry.delaunay import delaunay_into, most_edges
+from probmotion.interaction.geometry.delaunay import max_planar_edges, write_delaunay
 from probmotion.interaction.geometry.graphs import joggle_offsets
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.posteriors.problem import Problem
@@ -42,7 +42,7 @@ def triangulate_all(pictures: np.ndarray, offsets: np.ndarray, edges: np.ndarray
     """Triangulate every picture, (n, J, 2); return the number of edges."""
     total = 0
     for picture in pictures:
-        total += delaunay_into(picture, offsets, edges)[0]
+        total += write_delaunay(picture, offsets, edges)[0]
     return total
 
 
@@ -61,7 +61,7 @@ def triangulation_share(given: Problem, theta: np.ndarray) -> float:
     pictures = project_to_views(poses, posterior.likelihood.views, posterior.skeleton)
     pictures = np.ascontiguousarray(pictures.reshape(-1, *pictures.shape[2:]))
     joints = pictures.shape[1]
-    edges = np.empty((most_edges(joints), 2), dtype=np.int16)
+    edges = np.empty((max_planar_edges(joints), 2), dtype=np.int16)
     offsets = joggle_offsets(joints, 2)
     seconds = []
     for call in (

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -13,13 +14,20 @@
 # %% [markdown]
 # # One posterior, many samplers
 #
-# A camera films a person. What did the person do in three dimensions? One picture is not enough
-# to say: the depth is missing. The honest answer is a *distribution* over motions, and a method
-# that answers is a *sampler* of it.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/01_one_posterior_many_samplers.ipynb)
 #
-# This notebook goes from a BVH file to a table that says how far several samplers are from the
-# right distribution. That can be said because the belief used here, a Gaussian mixture, is one for
-# which the right distribution is known exactly.
+# A camera films a person. What did the person do in three dimensions? One view leaves depth open, so the
+# answer is a *distribution* over motions, and a method that returns it is a *sampler*.
+#
+# This notebook goes from BVH files to a table that says how far several samplers are from the right
+# distribution. The prior is a Gaussian mixture, for which that distribution is known exactly:
+#
+# $$
+# p(X \mid y) \propto p(X)\, p(y \mid X), \qquad
+# p(X) = \sum_k w_k\, \mathcal{N}(X; \mu_k, W_k W_k^\top + \sigma^2 I).
+# $$
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from pathlib import Path
@@ -29,7 +37,6 @@ from IPython.display import Image
 
 import probmotion as pm
 from probmotion.data.synthetic.gaits import make_gaits
-from probmotion.io.files import save_motion
 from probmotion.models import GaussianMixtureMotion
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector
@@ -37,22 +44,21 @@ from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredic
 # %% [markdown]
 # ## 1. Motion files
 #
-# Put BVH files of your own into the folder `walks`. If there is none, a few people who walk, run
-# and march are made and written there.
+# Put your own BVH files into the folder `walks`. If there are none, synthetic people who walk, run and
+# march are written there.
 
 # %%
 folder = Path("walks")
 if not list(folder.glob("*.bvh")):
     folder.mkdir(exist_ok=True)
     for clip in make_gaits(120, frames=32):
-        save_motion(clip, folder / f"{clip.name}.bvh")
+        pm.save(clip, folder / f"{clip.name}.bvh")
 
-clips = pm.load_motions(f"{folder}/*.bvh", fps=30)
+clips = pm.load_all(f"{folder}/*.bvh", fps=30)
 print(f"{len(clips)} clips, the first: {clips[0]}")
 
 # %% [markdown]
-# A `Motion` is an array of joint positions in metres, the world's Y axis up, with the skeleton's
-# joint names and the frame rate. Nothing more is needed to look at it.
+# A `Motion` is an array of joint positions in metres, with Y up, a skeleton and a frame rate.
 
 # %%
 draw_skeletons(
@@ -65,15 +71,15 @@ draw_skeletons(
 Image("clips.png")
 
 # %% [markdown]
-# ## 2. A belief: the prior
+# ## 2. The prior
 #
-# One clip is put aside; it plays the person in front of the camera. To all others we fit a prior:
-# three styles, each a Gaussian over whole motions of 30 frames, turned about the vertical by any
-# of 36 angles. A draw from it is a new motion.
+# The last clip is held out: it is the person in front of the camera. The prior is fitted to the others. It
+# has three styles, each a Gaussian over whole motions of 30 frames, rotated about the vertical axis by any
+# of 36 angles.
 
 # %%
-*seen, hidden = clips
-prior = GaussianMixtureMotion.fit(seen, frames=30, rank=8, styles=3)
+*training, held_out = clips
+prior = GaussianMixtureMotion.fit(training, frames=30, rank=8, styles=3)
 print(f"{len(prior.weights)} styles x {prior.azimuths} angles, {prior.rank} dimensions each")
 
 draw_skeletons(
@@ -85,53 +91,50 @@ draw_skeletons(
 Image("prior.png")
 
 # %% [markdown]
-# ## 3. Evidence: what one camera saw
+# ## 3. The observations
 #
-# The camera stands 15° above the horizon. A detector reports each joint's place in the picture with
-# an error of 3 cm, but of hips, shoulders and knees only, and only in every tenth frame. So a lot
-# is left open.
+# The camera is 15° above the horizon. It observes hips, shoulders and knees only, in every tenth frame, with
+# an error of 3 cm. Much is left open.
 
 # %%
-truth = hidden.window(0, 30).centred()
+truth = held_out.window(0, 30).centred()
 camera = pm.Cameras.ring(1, elevation=np.pi / 12)
-unseen = np.ones(truth.positions.shape[:2], dtype=bool)
+occluded = np.ones(truth.positions.shape[:2], dtype=bool)
 for part in ("hip", "shoulder", "knee"):
     for side in ("left", "right"):
-        unseen[::10, truth.skeleton.index(f"{side}_{part}")] = False
-evidence = pm.Keypoints2D.observe(truth, camera, noise=0.03, seed=0, hidden=unseen)
-posterior = pm.MotionPosterior(prior, evidence)
-print(f"{(~unseen).sum()} keypoints seen of {unseen.size}")
+        occluded[::10, truth.skeleton.index(f"{side}_{part}")] = False
+keypoints = pm.Keypoints2D.observe(truth, camera, noise=0.03, seed=0, hidden=occluded)
+posterior = pm.MotionPosterior(prior, keypoints)
+print(f"{(~occluded).sum()} of {occluded.size} keypoints observed")
 
 # %% [markdown]
-# Prior and evidence make the **posterior**: the one object that every sampler is given. Here it
-# can also be drawn from exactly. Below are exact draws, seen from the side of the camera, which is
-# the direction that the camera cannot see; the truth stands behind them in grey.
+# Prior and likelihood make the **posterior**, the one object that every sampler receives. This one has exact
+# draws. They are shown from the side, the direction that the camera cannot see; grey is the true motion.
 
 # %%
-exact = prior.exact_posterior(evidence).sample(np.random.default_rng(0), 3)
+exact = prior.exact_posterior(keypoints).sample(np.random.default_rng(0), 3)
 side = dict(azimuth=np.pi / 2, truth=truth.positions)
 draw_skeletons({"exact": exact}, prior.skeleton, "posterior.png", **side)
 Image("posterior.png")
 
 # %% [markdown]
-# All three agree with what was seen, yet they differ: that spread is the uncertainty that an honest
-# answer has to show.
+# All three agree with the observations, yet they differ. That spread is the uncertainty that a sampler has
+# to reproduce.
 #
 # ## 4. Four samplers
 #
-# They know nothing of the closed form. `ancestral3d` removes noise from a 3D motion step by step;
-# `mas` (multi-view ancestral sampling) does it with nothing but a 2D model, in five views at once;
-# `mvpc` is `mas` with a correction after every step; `mh`, Metropolis and Hastings' random walk,
-# needs a density only. All have the same one verb:
+# These samplers do not use the closed form. `ancestral3d` denoises a 3D motion step by step. `mas`
+# (multi-view ancestral sampling) does so with a 2D model in five views at once. `mvpc` adds a correction
+# after every step. `mh`, random-walk Metropolis-Hastings, needs a density only. All share one method:
 
 # %%
 draws = MultiViewAncestral(steps=50).sample(posterior, draws=20, seed=0, progress=False)
 print(draws.positions.sizes)
-save_motion(draws.motion(draw=3), "take3.bvh")
+pm.save(draws.motion(draw=3), "take3.bvh")
 
 # %% [markdown]
-# `compare` runs them all under the same clock, with the same measures, and keeps every finished run
-# in a folder, so that an interrupted comparison goes on where it stopped.
+# `compare` runs all samplers with the same metrics and stores every finished run in a folder, so that an
+# interrupted comparison continues where it stopped.
 
 # %%
 comparison = pm.compare(
@@ -152,27 +155,32 @@ comparison.table()
 # %% [markdown]
 # ## 5. What is wrong with each
 #
-# `swd_ratio` is the distance from the exact posterior in units of the distance between two sets of
-# exact draws: at 1 the two cannot be told apart. `variance_ratio` compares the spread: below 1 a
-# sampler is overconfident, above 1 underconfident. `off_manifold_ratio` compares the part that no
-# style explains: below 1 the
-# motions are too smooth. Read them together with the cost: that is the picture to look at first.
+# With $x$ the draws and $y$ exact draws of the same posterior,
+#
+# $$
+# \text{swd ratio} = \frac{\mathrm{SW}(x, y)}{\mathrm{SW}(y, y')}, \qquad
+# \text{variance ratio} = \frac{\mathrm{tr}\,\mathrm{Cov}[x]}{\mathrm{tr}\,\mathrm{Cov}[y]} .
+# $$
+#
+# The first is the sliced Wasserstein distance to exact draws in units of the distance between two exact sets:
+# 1 means that they cannot be told apart. A variance ratio below 1 is overconfident, above 1 underconfident.
+# `off_manifold_ratio` compares the variance that no style explains: below 1, motions are too smooth. Read them
+# together with the cost:
 
 # %%
 comparison.plot("quality.png")
 Image("quality.png")
 
 # %% [markdown]
-# - `ancestral3d` finds the right region, but its motions are too smooth: with 50 steps the
-#   smallest variance is never reached (`off_manifold_ratio` far below 1). More steps mend that.
-# - `mas` spreads about twice too wide. It corrects each of its views on its own, so that what the
-#   camera saw reaches the others weakened.
-# - `mvpc` is nearer at the same number of denoiser evaluations, and still too wide.
-# - `mh` is as near as exact draws are, but its chains have not settled (`R-hat` far above 1.01,
-#   and few effective draws, `ESS`). And it needs a log density, which a learnt 2D model does
-#   not have: that is when the three above are for.
+# - `ancestral3d` finds the right region, but its motions are too smooth: 50 first-order steps never reach the
+#   smallest variance (`off_manifold_ratio` far below 1). More steps reduce this error.
+# - `mas` has about twice the right spread: it guides each view separately, so the observations reach the other
+#   views weakened.
+# - `mvpc` is closer at the same number of denoiser evaluations, and still too wide.
+# - `mh` is as close as exact draws, but its chains have not converged (R-hat far above 1.01, few effective
+#   draws). It also needs a log density, which a learnt 2D model does not have.
 #
-# The draws themselves tell the same. Here are two of each, the truth in grey.
+# The draws show the same. Two draws per sampler, the truth in grey:
 
 # %%
 draw_skeletons(
@@ -188,7 +196,6 @@ Image("samplers.png")
 #
 # The same on your own clips, with all samplers, from the command line:
 #
-#     probmotion compare --clips "walks/*.bvh" --observe monocular --out mine --pictures
+#     probmotion compare --clips "walks/*.bvh" --observe monocular --out mine --figures
 #
-# A sampler of your own needs a name, a list of what it asks of a prior, and `sample`; the README
-# has one in twenty lines.
+# The documentation shows how to add your own sampler in twenty lines.

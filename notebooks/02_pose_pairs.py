@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -11,14 +12,24 @@
 # ---
 
 # %% [markdown]
-# # Two people who dance: 3D pose-pairs from 2D annotations
+# # Two dancers: 3D pose pairs from 2D annotations
 #
-# Videos of two people in close contact are easy to come by; 3D recordings are not, as each body
-# hides the other. Yin et al. (2018) never lift a picture to 3D. They build *one* posterior over
-# pose-pairs from all annotated pictures of a kind of motion, and walk through it from a single
-# 3D pose-pair, the seed. What comes out are new pose-pairs in space.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/02_pose_pairs.ipynb)
 #
-# This notebook goes from a dance clip to draws that can be played.
+# Videos of two people in close contact are common; 3D recordings are not, because each body occludes the
+# other. Yin et al. (2018) do not lift single images to 3D. They build *one* posterior over pose pairs from
+# all annotated frames of a kind of motion and explore it by MCMC, starting at a single 3D pose pair, the
+# seed:
+#
+# $$
+# p(x \mid \mathcal{A}) \propto p(x) \sum_{v} \sum_{a \in \mathcal{A}}
+#   \exp\!\left( - \frac{d_{IC}(P_v x, a)^2}{2 \sigma_l^2} \right),
+# $$
+#
+# with the prior $p(x)$ of physically possible poses, annotations $a$, views $v$ and the distance $d_{IC}$ in
+# interaction coordinates.
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from pathlib import Path
@@ -26,6 +37,7 @@ from pathlib import Path
 import numpy as np
 from IPython.display import Image
 
+import probmotion as pm
 from probmotion.data.pair_sets import choose_seed, dance_frames, describe_dance_frames, ground_truth
 from probmotion.data.pairs import load_pairs
 from probmotion.data.synthetic.dances import synthetic_dances
@@ -33,7 +45,6 @@ from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.retrieval import retrieve
-from probmotion.io.files import save_motion
 from probmotion.metrics.coverage import coverage
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
 from probmotion.plots.calibration_curves import draw_calibration
@@ -44,38 +55,36 @@ from probmotion.samplers.mcmc.proposals import Isotropic
 # %% [markdown]
 # ## 1. A dance
 #
-# Put `.npz` clips of two people into the folder `dances` (for two BVH files with a common frame
-# there is `probmotion.data.pairs.pair_motion`, for keypoint JSON of a video
-# `annotations_of_tracks`). If there is none, a few dances are made and written there.
+# Put `.npz` clips of two people into the folder `dances` (`probmotion.data.pairs.pair_motion` joins two BVH
+# files, `annotations_of_tracks` reads keypoint JSON of a video). If there are none, synthetic dances are written
+# there.
 
 # %%
 folder = Path("dances")
 if not list(folder.glob("*.npz")):
     folder.mkdir(exist_ok=True)
     for clip in synthetic_dances(6):
-        save_motion(clip, folder / f"{clip.name}.npz")
+        pm.save(clip, folder / f"{clip.name}.npz")
 
-*shown, hidden = load_pairs(sorted(folder.glob("*.npz")))
-print(describe_dance_frames(shown[0]))
-skeleton = shown[0].skeleton
+*training, held_out = load_pairs(sorted(folder.glob("*.npz")))
+print(describe_dance_frames(training[0]))
+skeleton = training[0].skeleton
 
-real, _, _ = ground_truth([hidden], 6)
+real, _, _ = ground_truth([held_out], 6)
 draw_pairs({"held out": real}, skeleton, "real.png", azimuth=0.6, elevation=0.2)
 Image("real.png")
 
 # %% [markdown]
-# The last clip is held out, whole: neighbouring frames of one clip are nearly the same pose, and
-# would tell what the draws are to find.
+# The last clip is held out as a whole, since neighbouring frames of one clip are nearly the same pose.
 #
-# ## 2. Annotations, and one seed
+# ## 2. Annotations and the seed
 #
-# Frames of the other clips are drawn in 2D, each from a camera somewhere around the dancers. Nobody
-# says where the camera stood: that is estimated from the torsos. The seed is the frame that is
-# most like all others.
+# Frames of the other clips are annotated in 2D, each from a random camera. The camera is unknown to the method,
+# which estimates the view from the torsos. The seed is the frame that is most similar to all others.
 
 # %%
-drawn = draw_annotations(shown, 200, seed=0, frames=[dance_frames(clip) for clip in shown])
-poses, _, _ = ground_truth(shown)
+drawn = draw_annotations(training, 200, seed=0, frames=[dance_frames(clip) for clip in training])
+poses, _, _ = ground_truth(training)
 seed = poses[choose_seed(poses)]
 print(drawn.annotations.describe())
 
@@ -89,10 +98,10 @@ Image("annotations.png")
 # %% [markdown]
 # ## 3. The posterior
 #
-# The prior says what bodies can do (joint limits learnt from motion capture, no limb through
-# another). The likelihood says that, seen from where cameras stand, the pair looks like some
-# annotation: compared in *interaction coordinates*, the edges of a triangulation of all joints of
-# both people, which hold the poses and what lies between them. A state has 108 numbers.
+# The prior contains joint limits learnt from motion capture and forbids limbs that penetrate each other. The
+# likelihood compares projections of the pair with annotations in *interaction coordinates*: the edges of a
+# Delaunay triangulation of all joints of both people, which describe the poses and the space between them. The
+# state has 108 dimensions.
 
 # %%
 posterior = pair_posterior(seed, drawn.annotations, PairSettings(n_views=16, n_near=16))
@@ -101,7 +110,7 @@ print(f"{posterior.dim} dimensions; log density of the seed {posterior.log_seed:
 # %% [markdown]
 # ## 4. Draws
 #
-# `mh` walks. Four chains, all from the seed; the warm-up finds the size of the steps.
+# Four Metropolis-Hastings chains start at the seed; warm-up adapts the step size.
 
 # %%
 sampler = MetropolisHastings(Isotropic(0.02), warmup=1500, thin=20)
@@ -114,11 +123,10 @@ draw_pairs({"draws": shown_poses}, skeleton, "draws.png", azimuth=0.6, elevation
 Image("draws.png")
 
 # %% [markdown]
-# Where the pair stands and which way is up is nothing that a picture tells: to be looked at, draws
-# are turned to the seed.
+# The likelihood determines neither the position of the pair nor its orientation in the world. For the figure,
+# draws are aligned to the seed.
 #
-# Is the density one that real pairs could be drawn from? Before anything is believed, look at what
-# it says of real pairs, of the seed and of its own draws.
+# Could real pairs be draws of this density? Compare log densities of real pairs, of the seed and of the draws:
 
 # %%
 levels = {}
@@ -131,22 +139,22 @@ draw_calibration(levels, "calibration.png")
 Image("calibration.png")
 
 # %% [markdown]
-# All three should overlap. Here draws are likelier than most real pairs: each chain has settled
-# where one annotation, seen from one side, is matched well, and moves on slowly.
+# The three should overlap. Here draws are more probable than most real pairs: each chain has settled where one
+# annotation, in one view, is matched well, and mixes slowly.
 #
 # ## 5. What are the draws like?
 #
-# For some draws, the annotation that is nearest to one of their views.
+# For some draws, the annotation closest to one of their views:
 
 # %%
 some = drawn_poses[:: len(drawn_poses) // 5][:5]
-pictures = project_to_views(some, posterior.likelihood.views, skeleton)
-distances, closest = posterior.likelihood.comparer.nearest(pictures, posterior.likelihood.near)
+projected = project_to_views(some, posterior.likelihood.views, skeleton)
+distances, closest = posterior.likelihood.comparer.nearest(projected, posterior.likelihood.near)
 best = distances.argmin(axis=1)
 rows = np.arange(len(some))
 draw_pairs(
     {
-        "draws, seen\nfrom a view": pictures[rows, best],
+        "draws, seen\nfrom a view": projected[rows, best],
         "nearest\nannotation": drawn.annotations.keypoints[closest[rows, best]],
     },
     skeleton,
@@ -156,26 +164,26 @@ draw_pairs(
 Image("nearest.png")
 
 # %% [markdown]
-# The other way round, *indirect lifting*: which draw looks most like a picture that nobody has
-# annotated? And how well do the draws cover the clip that was held out?
+# Conversely, *indirect lifting*: which draw looks most like an image that was not annotated? And how well do
+# the draws cover the held-out clip?
 
 # %%
-asked = draw_annotations([hidden], 1, seed=1)
-found = retrieve(asked.annotations.keypoints[0], drawn_poses, skeleton)
-print(f"nearest draw: {int(found.indices[0])}, {float(found.distances[0]):.3f} m away in 2D")
+query = draw_annotations([held_out], 1, seed=1)
+result = retrieve(query.annotations.keypoints[0], drawn_poses, skeleton)
+print(f"nearest draw: {int(result.indices[0])}, {float(result.distances[0]):.3f} m away in 2D")
 
-truth, _, _ = ground_truth([hidden], 60)
+truth, _, _ = ground_truth([held_out], 60)
 print(f"coverage: {coverage(truth, drawn_poses):.3f} m, by the seed alone "
       f"{coverage(truth, seed[None]):.3f} m")  # fmt: skip
 
 # %% [markdown]
-# ## 6. Play, and go on from where you like
+# ## 6. Animate the draws, and continue from one of them
 #
-# A chain's draws, one after the other, are a motion: open it in Blender. Any draw can be where
-# another run starts.
+# The draws of a chain, one after the other, form a motion that opens in Blender. Any draw can be the start of
+# another run.
 
 # %%
-save_motion(draws.playback(chain=0), "walk.bvh")
-liked = draws.dataset["theta"].values[:1, 120]
-again = sampler.sample(posterior, draws=5, chains=1, seed=1, initial=liked, progress=False)
+pm.save(draws.playback(chain=0), "walk.bvh")
+start = draws.dataset["theta"].values[:1, 120]
+again = sampler.sample(posterior, draws=5, chains=1, seed=1, initial=start, progress=False)
 print(again.positions.sizes)

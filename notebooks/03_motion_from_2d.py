@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -13,13 +14,20 @@
 # %% [markdown]
 # # 3D motion from 2D data alone
 #
-# Videos are everywhere, 3D recordings are not. Kapon et al. (2024) learn a diffusion model of what
-# motion looks like in *one* picture, from 2D tracks that nobody has lifted. Then they denoise
-# several views of one motion together, and what comes out is in 3D: multi-view ancestral sampling,
-# `mas`.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/03_motion_from_2d.ipynb)
 #
-# This notebook goes from tracks to 3D motions that play, and measures them. All networks are tiny,
-# so that it takes two minutes on one core; `notebooks/ablations/mas.py` is the same study in large.
+# Kapon et al. (2024) learn a diffusion model of motion in *one* view, from 2D tracks. Multi-view ancestral
+# sampling (MAS) then denoises several views of one motion together. At every noise level it replaces the
+# views' estimates $\hat{x}_0^v$ by the projections of the 3D motion that fits them best,
+#
+# $$
+# \hat{X}_0 = \arg\min_X \sum_v \lVert P_v X - \hat{x}_0^v \rVert^2 .
+# $$
+#
+# This notebook goes from tracks to 3D motion and measures it. All networks are tiny, so that it takes two
+# minutes on one core; `notebooks/ablations/mas.py` is the full study.
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from pathlib import Path
@@ -41,7 +49,7 @@ from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
 from probmotion.models.training.trainer import TrainingSettings, train
 from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
-from probmotion.plots.animation import play_skeletons
+from probmotion.plots.animation import animate_skeletons
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import MultiViewAncestral
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
@@ -49,10 +57,9 @@ from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 # %% [markdown]
 # ## 1. Tracks
 #
-# Put keypoint files of your own (COCO, OpenPose or AlphaPose JSON, DeepLabCut, npz) into the
-# folder `tracks`. If there is none, people who walk are made, cameras are placed around them at
-# random, and a detector that errs finds their joints: only that is learnt from. Either way a
-# preparation follows, which says what it did.
+# Put your own keypoint files (COCO, OpenPose or AlphaPose JSON, DeepLabCut, npz) into the folder `tracks`. If
+# there are none, synthetic walks are filmed by random cameras and detected with errors. The preparation reports
+# what each step did.
 
 # %%
 person = pm.Skeleton.preset("person14")
@@ -70,15 +77,14 @@ for part in ("train", "validation", "test"):
     print(f"{part}: {len(getattr(tracks, part))} tracks of {len(names)} clips")
 
 # %% [markdown]
-# Tracks of one clip stay together: a clip seen from elsewhere is no new motion. The clips of `test`
-# are not looked at until the end. From there on this notebook measures against the truth in 3D,
-# which made walks have; with tracks of your own, put motion capture in place of `walks`.
+# Tracks of one clip stay in one part of the split: the same motion from another side is not new data. The `test`
+# clips are used only at the end. Errors in 3D below need the truth, which synthetic walks have; with your own
+# tracks, put motion capture in place of `walks`.
 #
-# ## 2. A prior that has seen no third dimension
+# ## 2. A prior that has seen 2D only
 #
-# A transformer learns to take noise off windows of 20 frames, one second. (`probmotion train
-# diffusion` does it from the command line, in larger sizes. The same call goes on where it was
-# stopped.)
+# A transformer learns to denoise windows of 20 frames (one second). `probmotion train diffusion` does the same on
+# the command line at larger sizes; a stopped run continues with the same call.
 
 # %%
 trainee = DiffusionTrainee(tracks.train, tracks.validation, DiffusionSettings.tiny(20))
@@ -88,13 +94,13 @@ losses = pd.read_csv("diffusion/losses.csv")
 print(losses.round(3).to_string(index=False))
 
 # %% [markdown]
-# The loss is the squared error of the denoised motion, in units of the data's variance, over all
-# noise levels; it never gets to zero, because a motion that is nearly all noise cannot be guessed.
+# The loss is the squared error of the denoised motion in units of the data's variance, over all noise levels. It
+# does not reach zero, because a motion that is nearly all noise cannot be predicted.
 #
-# ## 3. Motions in 3D
+# ## 3. Motion in 3D
 #
-# For a sampler the network is a prior like any other. `mas` denoises five views at once, and
-# after every step makes them views of *one* motion.
+# To a sampler the network is a prior like any other. `mas` denoises five views at once and projects them to *one*
+# motion after every step.
 
 # %%
 prior = MotionDiffusion.load("diffusion")
@@ -115,20 +121,19 @@ draw_skeletons(rows, person, "side.png", heading=np.pi / 2, title="From their ri
 Image("side.png")
 
 # %% [markdown]
-# They are people who walk from either side, though every picture that was learnt from is flat. Drag
-# them, or press the arrow keys, to look from elsewhere.
+# They look like walking people from either side, although all training data are flat. Drag them, or press the
+# arrow keys, to rotate.
 
 # %%
-play_skeletons(rows, person, "walks.html", fps=20)
+animate_skeletons(rows, person, "walks.html", fps=20)
 
 # %% [markdown]
 # ## 4. How good are they?
 #
-# First as in the paper, in 2D. Draws are filmed from random sides, and an evaluator, the encoder of
-# a small autoencoder that learnt the same tracks, makes 2D motions into features. There, draws and
-# held-out motions are compared: `fid` is the distance of two Gaussians (0 is best), precision
-# the share of draws among real motions, recall the share of real motions among draws. What
-# the 2D model itself draws, one view at a time, is the published upper bound.
+# First in 2D, as in the paper. Draws are filmed from random sides and encoded by an evaluator, the encoder of a
+# small autoencoder trained on the same tracks. In feature space, `fid` is the Fréchet distance to held-out
+# motion (0 is best), precision the fraction of draws within real motion, recall the fraction of real motion within
+# the draws. The 2D model itself, drawn one view at a time, is the published upper bound.
 
 # %%
 trainee = EvaluatorTrainee(tracks.train, tracks.validation, EvaluatorSettings.tiny(20))
@@ -158,13 +163,11 @@ table = pd.DataFrame(
 print(table.round(2).to_string())
 
 # %% [markdown]
-# What `mas` draws looks no less real than what the 2D model draws: going to 3D costs nothing here,
-# and what is missing to real motion is the tiny network's. In the paper recall collapses without
-# 3D noise. Not here, where walks are much alike: views of independent noise still agree.
+# MAS looks as real as the 2D model: going to 3D costs nothing here, and the gap to real motion is that of the tiny
+# network. In the paper recall collapses without 3D noise; here it does not, since the walks are similar.
 #
-# Then what the paper could not do. We know the truth: how far is each draw from the nearest
-# real motion that was held out, when turned to it? And is its mirror image, near and far exchanged,
-# nearer than itself? In pictures the two are easily confused.
+# Then in 3D, where the truth is known: how far is each draw from the closest held-out motion after alignment
+# about the vertical axis? And is its mirror image in depth closer? The two are easily confused in 2D.
 
 # %%
 rng = np.random.default_rng(0)
@@ -181,13 +184,12 @@ for name, some in motions.items():
     )
 
 # %% [markdown]
-# Draws are about as near to held-out motion as other real motion is. That is 3D, learnt from
-# pictures alone.
+# Draws are about as close to held-out motion as other real motion is: 3D, learnt from 2D alone.
 #
-# ## 5. Cleaning a track
+# ## 5. Denoising a track
 #
-# The same denoiser cleans 2D tracks. A poor detector, which errs by 4 cm and at times loses a joint
-# altogether, looks at the held-out clips; the denoiser knows how confident it was.
+# The same denoiser cleans 2D tracks. A poor detector, with errors of 4 cm and missing joints, observes the
+# held-out clips; the denoiser uses its confidence.
 
 # %%
 clips = [walk.retarget(person).resample(20) for walk in hidden]
@@ -224,22 +226,21 @@ draw_skeletons(
 Image("cleaned.png")
 
 # %% [markdown]
-# Cleaning pays where the detector errs by more than is left after it, which depends on the network:
-# this one is tiny.
+# Denoising helps where the detector's error exceeds that of the network, which is tiny here.
 #
-# ## 6. Evidence
+# ## 6. Conditioning on observations
 #
-# Last, one camera watches a held-out walk, and the posterior is asked what happened in 3D.
-# Guidance by evidence wants orthographic views, which those from seven metres nearly are.
+# Finally one camera observes a held-out walk, and `mas` draws from the posterior. Guidance needs orthographic
+# views; views from seven metres are nearly that.
 
 # %%
 truth = pm.Motion(real[10], person, 20)
 camera = pm.Cameras.ring(1, elevation=np.pi / 16)
-evidence = pm.Keypoints2D.observe(truth, camera, noise=0.05, seed=0)
+keypoints = pm.Keypoints2D.observe(truth, camera, noise=0.05, seed=0)
 guided = MultiViewAncestral().sample(
-    pm.MotionPosterior(prior, evidence), draws=12, seed=0, progress=False
+    pm.MotionPosterior(prior, keypoints), draws=12, seed=0, progress=False
 )
-answers = guided.flat()
+draws = guided.flat()
 
 
 def errors(some: np.ndarray) -> np.ndarray:
@@ -247,15 +248,15 @@ def errors(some: np.ndarray) -> np.ndarray:
     return 1000 * np.linalg.norm(some - truth.positions, axis=-1).mean(axis=(1, 2))
 
 
-misses = np.linalg.norm(camera.project(answers)[:, 0] - evidence.keypoints[0], axis=-1)
+misses = np.linalg.norm(camera.project(draws)[:, 0] - keypoints.keypoints[0], axis=-1)
 misses = 1000 * misses.mean(axis=(1, 2))
 order = misses.argsort()
-print("misses what was seen by, mm:", *misses[order].round().astype(int))
-print("misses the truth by, mm:    ", *errors(answers)[order].round().astype(int))
-print(f"without evidence: {errors(drawn).mean():.0f} mm")
+print("error against observations, mm:", *misses[order].round().astype(int))
+print("error against truth, mm:       ", *errors(draws)[order].round().astype(int))
+print(f"without observations: {errors(drawn).mean():.0f} mm")
 
 draw_skeletons(
-    {"as the camera\nsees them": answers[order[[0, 1, -1]]]},
+    {"as the camera\nsees them": draws[order[[0, 1, -1]]]},
     person,
     "guided_front.png",
     elevation=np.pi / 16,
@@ -265,7 +266,7 @@ Image("guided_front.png")
 
 # %%
 draw_skeletons(
-    {"from the side": answers[order[[0, 1, -1]]]},
+    {"from the side": draws[order[[0, 1, -1]]]},
     person,
     "guided_side.png",
     azimuth=np.pi / 2,
@@ -274,17 +275,16 @@ draw_skeletons(
 Image("guided_side.png")
 
 # %% [markdown]
-# Most answers are near the truth also in the direction that the camera does not see. Look at the
-# first line before you believe any: guidance is an approximation, and the denoiser one too, so that
-# a draw can be caught in something else. Without knowing the truth, it is told by missing what was
-# seen by far more than the detector errs, which is here 63 mm on average. The worst stands last.
+# Most draws are close to the truth, also in the direction that the camera does not see. Guidance is approximate,
+# so single draws can be wrong. Such draws are recognised without the truth: they miss the observations by far
+# more than the detector's error, here 63 mm on average. The worst draw is shown last.
 #
 # ## Next
 #
-# A prior that was trained for longer, on real motion capture, comes with the package:
+# A prior trained for longer on real motion capture comes with the package:
 #
 #     probmotion compare walk2d --out learnt
 #
-# And to learn from tracks of your own:
+# To learn from your own tracks:
 #
 #     probmotion train diffusion --tracks "tracks/*.json" --out mine

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -11,17 +12,25 @@
 # ---
 
 # %% [markdown]
-# # A noisy recording in, a motion and its uncertainty out
+# # Denoise a recording, with uncertainty
 #
-# Cameras that triangulate joints err by centimetres, lose limbs behind furniture, and now and
-# then see a hand where there is none. A filter smooths what it was given. A *prior* knows how
-# bodies move: Motion-DVAE (Fiche et al. 2023) learnt from motion capture what a body does next,
-# and networks that read noisy joints answer with a distribution over motions, at once.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/04_denoising.ipynb)
 #
-# Put a recording of your own, a `.bvh` or `.npz` of 3D joints with the floor at height 0, into the
-# folder `recordings`; noise is put on it, so that errors can be told. Without one, a CMU clip is
-# taken that the prior has not learnt from, where it is at hand; else a body that the project makes
-# walks, as no body that was learnt from.
+# Triangulated joints are off by centimetres, limbs are occluded, and some detections are outliers. A filter
+# smooths what was recorded. Motion-DVAE (Fiche et al. 2023) is a *prior* of body motion with one latent variable
+# per frame,
+#
+# $$
+# p(x_{1:L}, z_{1:L}) = \prod_t p(z_t \mid z_{t-1}, x_{<t})\; p(x_t \mid x_{<t}, z_t),
+# $$
+#
+# together with networks that read noisy joints and return an approximate posterior.
+#
+# Put your own recording (`.bvh` or `.npz` of 3D joints, floor at height 0) into the folder `recordings`; noise is
+# added to it so that errors can be measured. Otherwise a held-out CMU clip is used if available, else a synthetic
+# walk of a body that the prior has not seen.
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from pathlib import Path
@@ -35,16 +44,16 @@ from probmotion.data.cmu_clips import cmu_clip
 from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzky_golay
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.metrics import accuracy
-from probmotion.plots.animation import play_skeletons
+from probmotion.plots.animation import animate_skeletons
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.posteriors.noisy_joints import noisy_joints
-from probmotion.problems.denoising import body_of, body_prior, limbs_hidden
+from probmotion.problems.denoising import body_of, body_prior, limb_occlusions
 from probmotion.samplers import DVAEInference
 
 prior = body_prior()
 files = [*Path("recordings").glob("*.bvh"), *Path("recordings").glob("*.npz")]
 if files:
-    clip = pm.load_motions(files[:1])[0]
+    clip = pm.load_all(files[:1])[0]
 else:
     try:
         clip = cmu_clip("cmu_02_02")
@@ -57,17 +66,16 @@ print(truth)
 # %% [markdown]
 # ## 1. The recording
 #
-# Every joint is off by 4 cm in each direction. The right elbow and wrist hide for a third of the
-# time, then the left knee and ankle.
+# Gaussian noise of 4 cm in each direction. The right elbow and wrist are occluded for a third of the time, then the
+# left knee and ankle.
 
 # %%
-hidden = limbs_hidden(truth)
+hidden = limb_occlusions(truth)
 recorded = pm.Joints3D.observe(truth, noise=0.04, seed=0, hidden=hidden)
 
 # %% [markdown]
-# A recording from elsewhere is an array of joints (frames, joints, 3) with NaN where nothing was
-# seen. `noisy_joints` makes evidence of it, and says in a sentence what does not fit: another
-# frame rate, millimetres, joints that the prior does not know.
+# Your own recording is an array (frames, joints, 3) with NaN where nothing was observed. `noisy_joints` turns it
+# into a likelihood and explains what does not fit: another frame rate, millimetres, unknown joints.
 
 # %%
 array = np.where(hidden[..., None], np.nan, recorded.joints)
@@ -79,8 +87,7 @@ assert np.array_equal(same.entries.visible, ~hidden)
 # %% [markdown]
 # ## 2. The posterior
 #
-# How long this body's bones are is estimated from the recording. Then prior and evidence make a
-# posterior like any other, of which a sampler draws.
+# Bone lengths are estimated from the recording. Prior and likelihood then make a posterior like any other.
 
 # %%
 body = body_of(recorded, prior)
@@ -91,9 +98,8 @@ drawn = draws.flat()
 print(f"{len(drawn)} draws in {float(draws.dataset.attrs['seconds']):.1f} s")
 
 # %% [markdown]
-# The networks learnt from other recordings (`mode="regression"`); they may also be fitted to this
-# one (`mode="optimization"`), which takes longer. `predict` gives one motion, between what was
-# observed and what is believed.
+# The networks were trained on other recordings (`mode="regression"`); they can also be fitted to this one
+# (`mode="optimization"`), which takes longer. `predict` returns a single estimate.
 
 # %%
 fit = DVAEInference(mode="optimization")
@@ -120,15 +126,14 @@ for name, found in estimates.items():
 print(pd.DataFrame(rows).T.round(2).to_string())
 
 # %% [markdown]
-# The last column is how much a motion accelerates against the truth: 1 is right, above 2 it
-# jitters, below a half it is smeared.
+# The last column is the acceleration relative to the truth: 1 is right, above 2 the motion jitters, below .5 it is
+# oversmoothed.
 #
-# ## 3. How sure is it?
+# ## 3. Is the uncertainty right?
 #
-# Draws differ where the recording does not say: hidden joints. An honest posterior's spread is as
-# large as its errors, and nine of ten coordinates lie inside its central 90 %. Those of a
-# variational approximation are too narrow, and of a body that the prior does not know, the more so:
-# the table below says by how much, and fitting helps.
+# Draws should differ where the recording says nothing. If the posterior is calibrated, its spread equals its error
+# and 90 % of coordinates lie in the central 90 % interval. The variational approximation is overconfident, more so
+# for a body that the prior has not seen; fitting helps:
 
 # %%
 fitted = fit.sample(posterior, draws=100, seed=0, progress=False).flat()
@@ -163,10 +168,10 @@ draw_skeletons(
 Image("denoised.png")
 
 # %% [markdown]
-# Side by side, in motion. Drag them to look from elsewhere.
+# The estimates side by side, animated. Drag to rotate.
 
 # %%
-play_skeletons(
+animate_skeletons(
     {
         "recorded": estimates["recorded, hidden ones interpolated"][None],
         "Kalman": kalman[None],
@@ -181,11 +186,11 @@ play_skeletons(
 # %% [markdown]
 # ## Next
 #
-# The same question as a comparison with other samplers, and from the command line:
+# The same comparison with other samplers, on the command line:
 #
 #     probmotion compare denoise-cmu denoise-cmu-occluded --samplers dvae nuts --draws 200
 #
-# A prior and a denoiser of your own clips:
+# A prior and a denoiser from your own clips:
 #
 #     probmotion train dvae --clips "clips/*.bvh" --out body
 #     probmotion train denoiser --prior body --clips "clips/*.bvh" --out denoiser

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -11,13 +12,23 @@
 # ---
 
 # %% [markdown]
-# # From pictures of animals to new motion in 3D
+# # From 2D tracks of animals to new 3D motion
 #
-# Nobody puts markers on a horse in the wild, but there are videos of it, and detectors that find
-# its joints in them. A motion VAE (Sun et al. 2024, *Ponymation*) learns from such 2D tracks alone
-# how a kind of body moves in 3D: it guesses poses, looks at their pictures, and is told how far off
-# they are. `animal-vae` comes with the package; it learnt from pictures of dogs and of made
-# quadrupeds that walk, trot, pace, canter and spin.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/05_animals.ipynb)
+#
+# Few animals wear markers, but there are videos of them and detectors for their joints. A motion VAE (Sun et al.
+# 2024, *Ponymation*) learns from such 2D tracks how a kind of body moves in 3D. It maximises the evidence lower
+# bound with one latent code $z \sim \mathcal{N}(0, I)$ per second of motion,
+#
+# $$
+# \mathcal{L} = \mathcal{L}_\text{reconstruction in 2D} + \lambda_{KL}\,
+#   \mathrm{KL}\left( q(z \mid \text{track}) \,\Vert\, \mathcal{N}(0, I) \right).
+# $$
+#
+# `animal-vae` comes with the package. It was trained on dogs and on synthetic quadrupeds that walk, trot, pace,
+# canter and spin.
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from dataclasses import replace
@@ -37,9 +48,9 @@ from probmotion.models.training.trainer import train
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee
 from probmotion.models.vae.transition_latents import greatest_acceleration, long_motion
-from probmotion.models.vae.view_hypotheses import judge_hypotheses
+from probmotion.models.vae.view_hypotheses import evaluate_hypotheses
 from probmotion.motion.rest_poses import estimate_rest_pose
-from probmotion.plots.animation import play_skeletons
+from probmotion.plots.animation import animate_skeletons
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.samplers import DVAEInference
 
@@ -48,10 +59,10 @@ skeleton = prior.skeleton
 print(skeleton.n_joints, "joints,", prior.frames, "frames at", prior.fps, "a second")
 
 # %% [markdown]
-# ## 1. What one has: tracks
+# ## 1. Tracks
 #
-# Eight animals that the prior has not seen are filmed from all sides. Of your own videos,
-# `probmotion.io.read_keypoints` reads what DeepLabCut and other detectors write.
+# Eight animals that the prior has not seen are filmed from all sides. For your own videos,
+# `pm.read_keypoints` reads DeepLabCut tables and the JSON of other detectors.
 
 # %%
 animals = synthetic_animals(8, seed=3)
@@ -59,8 +70,8 @@ tracks = film_clips(animals, skeleton, prior.fps, views=40).tracks
 print(len(tracks), "tracks of", tracks[0].frames, "frames")
 
 # %% [markdown]
-# How the body is built is in its pictures: over many sides, what stands behind what follows from
-# how widths vary together. No 3D is used; the last line compares with it.
+# The body is estimated from the tracks: over many views, the covariance of projected widths determines depth. No
+# 3D data are used; the last line compares with the truth.
 
 # %%
 body = ArticulatedBody(skeleton, estimate_rest_pose(tracks))
@@ -77,12 +88,12 @@ print(f"bones are {100 * np.abs(found / true - 1).mean():.1f} % off in length, o
 # %% [markdown]
 # ## 2. Which view is right?
 #
-# A picture does not say whether a leg points towards the camera or away from it. The network makes
-# four guesses, a quarter turn apart, and keeps the one that explains the pictures best with joints
-# that bend as joints do. Against the truth:
+# A single view does not say whether a leg points towards the camera or away from it. The network makes four
+# hypotheses, a quarter turn apart, and keeps the one that explains the tracks best within joint limits. Against
+# the truth:
 
 # %%
-judged = judge_hypotheses(
+judged = evaluate_hypotheses(
     prior.model.pose, prior.settings, prior.body, animals, n=300, fps=prior.fps
 )
 print(
@@ -91,10 +102,9 @@ print(
 print(f"joints are {1000 * judged.error:.0f} mm from the truth")
 
 # %% [markdown]
-# ## 3. New motions
+# ## 3. New motion
 #
-# One latent code is one second of motion. Every draw is new; they stay in place, since where the
-# animal goes is not in the code.
+# One latent code is one second of motion. Draws stay in place, because the code does not contain the path.
 
 # %%
 drawn = prior.sample(np.random.default_rng(0), 6)
@@ -102,9 +112,8 @@ draw_skeletons({"draws": drawn[:4]}, skeleton, "animals.png", moments=5, azimuth
 Image("animals.png")
 
 # %% [markdown]
-# Longer ones are made of several codes, with codes between them that are fitted to begin and end as
-# their neighbours do. At a seam a joint should accelerate no more than within the pieces; where no
-# transition is that smooth, `long_motion` warns. Here:
+# Longer motions join several codes by transition codes that are fitted to begin and end like their neighbours. At
+# a seam a joint should accelerate no more than within the segments; `long_motion` warns otherwise.
 
 # %%
 codes = prior.initial(np.random.default_rng(1), 4)
@@ -115,14 +124,13 @@ share = greatest_acceleration(long) / within
 print(f"{len(long)} frames; the greatest acceleration is {share:.2f} of that within pieces")
 
 # %%
-play_skeletons({"several codes": long[None]}, skeleton, "long.html", fps=prior.fps)
+animate_skeletons({"several codes": long[None]}, skeleton, "long.html", fps=prior.fps)
 
 # %% [markdown]
-# ## 4. What one camera saw
+# ## 4. One camera
 #
-# With keypoints as evidence the same prior gives a posterior like any other. Where the body stands
-# and looks is what its pose network sees; the code is inferred, here by the encoder, fitted to this
-# one recording.
+# With keypoints as observations, the same prior gives a posterior. The pose network places the body; the encoder
+# infers the code, and can be fitted to this recording.
 
 # %%
 truth = animals[1].retarget(skeleton).resample(prior.fps).window(5, prior.frames).centred()
@@ -142,14 +150,14 @@ print(pd.DataFrame(rows).T.round(0).to_string())
 # %%
 shown = {"drawn": drawn[:1], "seen by one camera": draws[:1], "the truth": truth.positions[None]}
 standing = {name: some - [0, some[..., 1].min(), 0] for name, some in shown.items()}
-play_skeletons(standing, skeleton, "animals.html", fps=prior.fps)
+animate_skeletons(standing, skeleton, "animals.html", fps=prior.fps)
 
 # %% [markdown]
-# ## 5. A prior of these very animals
+# ## 5. A prior of these animals
 #
-# All that was needed is in the tracks. The smallest networks learn something of them in a minute or
-# two: first poses, frame by frame under four views, then a code for a whole second. In the first
-# thousand steps hardly a bone turns: what is found is how bodies stand.
+# Tiny networks learn from the tracks above in a minute or two: first poses, frame by frame under four view
+# hypotheses, then a code for a whole second. In the first thousand steps hardly any bone rotates: the network
+# first learns the standing pose.
 
 # %%
 size = MotionVAESettings.tiny()
@@ -170,7 +178,7 @@ def speed(motions):
 
 real = [speed(animal.retarget(skeleton).resample(own.fps).positions) for animal in animals]
 print(f"new motions are {speed(new) / np.mean(real):.2f} as fast as the animals' own")
-play_skeletons(
+animate_skeletons(
     {
         "of the prior that ships": drawn[:2],
         "of these animals": new[:2],
@@ -183,9 +191,9 @@ play_skeletons(
 # %% [markdown]
 # ## Next
 #
-# The same from your own files, with networks of a size that is of use:
+# The same from your own files, at a useful size:
 #
 #     probmotion train motion-vae --tracks "videos/*.csv" --tracks-fps 30 --threshold 0.5 \
 #         --skeleton quadruped21 --out runs/mine
 #
-# and `notebooks/ablations/motion_vae.py` for what every part of it is worth.
+# `notebooks/ablations/motion_vae.py` measures what every part contributes.

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -13,9 +14,12 @@
 # %% [markdown]
 # # Which sampler, and how wrong is it?
 #
-# Samplers of one posterior are compared on problems whose answer is known, within the same budget;
-# what they claim about their own uncertainty is checked against simulated evidence; and where one
-# is wrong, its error is split into parts.
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/06_compare_and_calibrate.ipynb)
+#
+# Samplers are compared on problems with known answers and equal budgets, their uncertainty is checked by
+# simulation-based calibration, and the error of one of them is decomposed into parts.
+#
+# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
 from pathlib import Path
@@ -31,10 +35,9 @@ from probmotion.problems import load_problem
 from probmotion.samplers import ExactSampler, MetropolisHastings, MultiViewAncestral
 
 # %% [markdown]
-# ## 1. A problem, as hard as one likes
+# ## 1. A problem of adjustable difficulty
 #
-# What makes a problem hard is a number in its name. Here eight frames of one camera, keypoints with
-# σ = 5 cm: depth is all but unknown.
+# Here: eight frames, one camera, keypoints with σ = 5 cm, so that depth is nearly unknown.
 
 # %%
 problem = load_problem("gait-monocular", frames=8, noise=0.05)
@@ -43,8 +46,8 @@ print(problem.name, "has exact draws:", problem.has_reference)
 # %% [markdown]
 # ## 2. The same budget for all
 #
-# Every sampler may evaluate a density or a denoiser 20 000 times (a gradient counts as two); pilot
-# runs find the setting that spends it. `exact` needs none, and says how near one can come.
+# Every sampler may evaluate a density or a denoiser 20 000 times (a gradient counts twice); pilot runs find the
+# setting that spends the budget. `exact` needs none and shows how close one can get.
 
 # %%
 samplers = {
@@ -65,9 +68,9 @@ comparison = pm.compare(
 print(comparison.table())
 
 # %% [markdown]
-# Three seeds say how much of a difference is chance: the page marks the best, and all that cannot
-# be told from it. It holds the table, quality against cost, and draws that play beside exact ones
-# with the keypoints over them. It is one file: open `report.html` in a browser.
+# Three seeds show how much of a difference is chance: the report highlights the best sampler and all that are
+# statistically tied with it. It is one HTML file with the table, quality against cost, and animated draws beside
+# exact ones with the keypoints on top.
 
 # %%
 page = comparison.report("report.html")
@@ -78,22 +81,28 @@ comparison.plot("quality.png")
 Image("quality.png")
 
 # %% [markdown]
-# ## 3. Do they know how wrong they are?
+# ## 3. Are they calibrated?
 #
-# A truth is drawn from the prior, evidence is made of it, and its rank among the sampler's draws is
-# kept; over many simulations the ranks of a sampler that is right are uniform. `Overconfident`
-# pulls the draws of another sampler together: the control that has to fail.
+# A truth $\theta^\ast$ is drawn from the prior and observations from the likelihood. Over many simulations the rank
+# of $f(\theta^\ast)$ among the draws,
+#
+# $$
+# r = \sum_{i=1}^{n} \mathbb{1}\left[ f(\theta_i) < f(\theta^\ast) \right],
+# $$
+#
+# is uniform on $0, \dots, n$ if the sampler is right. `Overconfident` shrinks the draws of another sampler: the
+# negative control that must fail.
 
 # %%
 calibration = calibrate(
     problem,
-    {"exact": ExactSampler(), "too sure": Overconfident(ExactSampler())},
+    {"exact": ExactSampler(), "overconfident": Overconfident(ExactSampler())},
     simulations=60,
     draws=40,
     out="comparison",
     progress=False,
 )
-for name in ("exact", "too sure"):
+for name in ("exact", "overconfident"):
     print(calibration.verdict(problem.name, name))
 
 # %%
@@ -101,29 +110,29 @@ calibration.plot("calibration.png")
 Image("calibration.png")
 
 # %% [markdown]
-# ## 4. Where does MAS's error come from?
+# ## 4. Where does the error of MAS come from?
 #
-# A chain of samplers between exact draws and MAS, each of which differs from the one before in one
-# thing; the differences add up to the whole.
+# A chain of samplers leads from exact draws to MAS; neighbours differ in one property, and the differences add up
+# to the total error.
 
 # %%
-budget = decompose_error(
+errors = decompose_error(
     load_problem("gait", frames=8), steps=50, seeds=3, draws=60, progress=False
 )
-found = budget.table()
-print(found[found["measure"] == "spread"].drop(columns="measure").round(2).to_string(index=False))
-for sentence in budget.notes:
+table = errors.table()
+print(table[table["measure"] == "spread"].drop(columns="measure").round(2).to_string(index=False))
+for sentence in errors.notes:
     print(sentence)
 
 # %%
-budget.plot("bias.png")
-Image("bias.png")
+errors.plot("errors.png")
+Image("errors.png")
 
 # %% [markdown]
 # ## 5. Which sampler, then?
 #
-# Every sampler was measured on every problem of the library, with a small budget; `probmotion
-# which` says the same on the command line.
+# Every sampler was measured on every problem of the package with a small budget. `probmotion which` prints the same
+# on the command line.
 
 # %%
 print(advise("gait-monocular"))
@@ -131,14 +140,14 @@ print(advise("gait-monocular"))
 # %% [markdown]
 # ## 6. Your own
 #
-# Any posterior and any object with `name`, `requires` and `sample` take part; a package registers a
-# sampler by an entry point of the group `probmotion.samplers`.
+# Any posterior and any object with `name`, `requires` and `sample` can take part; packages register samplers by an
+# entry point of the group `probmotion.samplers`.
 
 # %%
-clips = pm.compare(
+table = pm.compare(
     {"mine": pm.MotionPosterior(problem.posterior.prior)},
     {"exact": ExactSampler(), "mh": MetropolisHastings()},
     draws=40,
     progress=False,
 ).table()
-print(pd.DataFrame(clips).query("metric == 'seconds'")[["sampler", "value"]].to_string(index=False))
+print(pd.DataFrame(table).query("metric == 'seconds'")[["sampler", "value"]].to_string(index=False))

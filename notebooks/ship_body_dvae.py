@@ -1,11 +1,10 @@
-"""What body-dvae ships with: trains prior and denoiser, writes weights and a model card.
+"""Train body-dvae and write the weights and model card that the package ships.
 
     python notebooks/ship_body_dvae.py --runs runs
 
-A run that was stopped goes on; one that is finished is not made again. Written to
-``models/weights``: both networks in half precision, and the card. The denoiser is trained beside
-the prior as it is shipped. Clips are looked for in ``--data``, by default ../shared/data beside the
-repository.
+A stopped run continues; a finished one is not repeated. Both networks are written to
+``models/weights`` in half precision. The denoiser is trained with the prior as it is shipped. Clips
+are read from ``--data``, by default ../shared/data beside the repository.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ NAME = "body-dvae"
 
 
 def main() -> None:
-    """Train what is not trained yet, and write weights and card."""
+    """Train what is missing; write weights and card."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")

@@ -1,13 +1,12 @@
-"""What motion VAEs ship with: trains them from 2D tracks, writes weights and cards.
+"""Train the motion VAEs and write the weights and model cards that the package ships.
 
     python notebooks/ship_motion_vae.py walk-vae --runs runs
     python notebooks/ship_motion_vae.py animal-vae --runs runs
 
-A run that was stopped goes on; one that is finished is not made again. Written to
-``models/weights``: both networks in half precision, the evaluator of draws with the features of
-held-out pictures, and the card. Clips are looked for in
-``--data``, by default ../shared/data beside the repository; they are filmed, and of the 3D nothing
-else is used but to count, at the end, how often the right view is chosen.
+A stopped run continues; a finished one is not repeated. Networks are written to
+``models/weights`` in half precision, with the evaluator and the features of held-out views. Clips
+are read from ``--data``, by default ../shared/data beside the repository, and filmed; their 3D
+positions are used only to count how often the correct view is chosen.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from probmotion.models.training.trainer import train
 from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
-from probmotion.models.vae.view_hypotheses import JudgedHypotheses, judge_hypotheses
+from probmotion.models.vae.view_hypotheses import HypothesisAccuracy, evaluate_hypotheses
 from probmotion.motion.distances import windows
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.rest_poses import estimate_rest_pose
@@ -49,7 +48,7 @@ FPS = 10.0
 
 @dataclass(frozen=True)
 class Kind:
-    """One prior: what moves, its clips by part, and where they come from."""
+    """One prior: its skeleton, clips by part, and their origin."""
 
     about: str
     skeleton: Skeleton
@@ -91,7 +90,7 @@ KINDS = {
 
 
 def main() -> None:
-    """Train what is not trained yet, and write weights and card."""
+    """Train what is missing; write weights and card."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("name", choices=KINDS)
     parser.add_argument("--runs", type=Path, default=Path("runs"))
@@ -115,7 +114,7 @@ def main() -> None:
 
 
 def filmed(kind: Kind, clips: dict[str, list[Motion]]) -> dict[str, list[KeypointTrack]]:
-    """Return what is learnt from and watched, by part: prepared 2D tracks."""
+    """Return prepared 2D tracks by part."""
     tracks: dict[str, list[KeypointTrack]] = {}
     for part in ("train", "validation"):
         tracks[part] = []
@@ -141,7 +140,7 @@ def trained(kind: Kind, tracks: dict[str, list[KeypointTrack]], folder: Path) ->
 def trained_evaluator(
     tracks: dict[str, list[KeypointTrack]], frames: int, folder: Path
 ) -> TrackEvaluator:
-    """Return the evaluator of draws, trained in a folder on the same tracks."""
+    """Return the evaluator, trained in a folder on the same tracks."""
     trainee = EvaluatorTrainee(
         tracks["train"], tracks["validation"], EvaluatorSettings.small(frames)
     )
@@ -151,21 +150,21 @@ def trained_evaluator(
 
 def judged_views(
     kind: Kind, prior: MotionVAE, clips: dict[str, list[Motion]]
-) -> dict[str, JudgedHypotheses]:
-    """Return how often the right view is chosen, by part and data set: real and made ones apart."""
+) -> dict[str, HypothesisAccuracy]:
+    """Return how often the correct view is chosen, by part and data set."""
     found = {}
     for part in ("train", "test"):
         for start in kind.views:
             of = f"{part}, {start}" if start else part
             some = of_kind(clips[part], start, kind)
-            found[of] = judge_hypotheses(
+            found[of] = evaluate_hypotheses(
                 prior.model.pose, prior.settings, prior.body, some, fps=FPS
             )
     return found
 
 
 def of_kind(clips: list[Motion], start: str, kind: Kind) -> list[Motion]:
-    """Return the clips whose names begin so, but for those that a longer beginning is for."""
+    """Return the clips whose names start with a prefix, unless a longer prefix applies."""
     longer = [other for other in kind.views if other.startswith(start) and other != start]
     return [
         clip
@@ -175,9 +174,9 @@ def of_kind(clips: list[Motion], start: str, kind: Kind) -> list[Motion]:
 
 
 def pace_of_draws(prior: MotionVAE, clips: dict[str, list[Motion]]) -> tuple[float, float]:
-    """Return the mean speed of draws over held-out motion's, and what share hardly moves.
+    """Return the mean speed of draws relative to held-out motion, and the proportion of slow draws.
 
-    That share is slower than 99 of 100 held-out sequences.
+    A draw is slow if it is slower than 99 of 100 held-out sequences.
     """
     motions = [
         centre_motion(clip.retarget(prior.skeleton).resample(prior.fps)) for clip in clips["test"]
@@ -248,7 +247,7 @@ Command: `python notebooks/ship_motion_vae.py {name} --runs runs`.
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a row; made clips, which are numbered, are counted by kind."""
+    """Return names in a row; synthetic clips are counted by kind."""
     kinds = Counter(re.sub(r"-\d+$", "", name) for name in names)
     return ", ".join(f"{kind} ({n} clips)" if n > 1 else kind for kind, n in kinds.items())
 

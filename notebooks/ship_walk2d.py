@@ -1,11 +1,10 @@
-"""What the problem walk2d ships with, from its training runs.
+"""Write the weights, features and model card of walk2d from its training runs.
 
     python notebooks/ship_walk2d.py --runs runs
 
-The commands that make the runs stand in the model card, ``models/weights/walk2d.md``, and below;
-``--list`` prints what goes into them. Written to ``models/weights``: the prior and the
-evaluator in half precision, the features of held-out pictures, and a model card. Clips are looked
-for in ``--data``, by default ../shared/data beside the repository.
+``--list`` prints the training clips; the commands of the runs are in the model card,
+``models/weights/walk2d.md``. Prior and evaluator are written in half precision. Clips are read from
+``--data``, by default ../shared/data beside the repository.
 """
 
 from __future__ import annotations
@@ -82,7 +81,7 @@ def write_features(
     prior: MotionDiffusion | MotionVAE,
     clips: dict[str, list[Motion]],
 ) -> None:
-    """Write the features of random windows of test and training clips, and how they were filmed."""
+    """Write features of random windows of test and training clips and their cameras."""
     filming, found = Filming(), {}
     for seed, (part, of) in enumerate((("test", "held_out"), ("train", "learnt")), start=1):
         views = film_windows(
@@ -96,7 +95,7 @@ def write_features(
 
 
 def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
-    """Return the model card: what was learnt, from what, how, and how well it went."""
+    """Return the model card: data, training and results."""
     size, data = prior["network"]["size"], prior["network"]["data"]
     lines = [
         "# walk2d",
@@ -139,7 +138,7 @@ def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
 
 
 def measured(table: pd.DataFrame) -> list[str]:
-    """Return the rows of the ablation's table that say how good the prior is."""
+    """Return the rows of the ablation's table that concern the prior."""
     columns = ("fid_learnt", "precision_learnt", "recall_learnt", "fid", "to_real_mm")
     lines = [
         "",

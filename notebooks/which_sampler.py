@@ -1,81 +1,101 @@
-"""The tables that ``probmotion which`` and the README advise from, of the whole grid.
+"""Write the tables of "which sampler?" in the documentation and the README.
 
-    probmotion compare all --quick --workers 2 --seeds 5 --out grid --report
-    python notebooks/which_sampler.py              # reads grid/
-
-It writes ``measured.csv`` and ``measured.json`` to ``probmotion/advice`` and the README's tables.
+probmotion compare all --quick --workers 2 --seeds 5 --out grid --report
+python notebooks/which_sampler.py --grid grid    # store its measurements, then write the tables
+python notebooks/which_sampler.py                # write the tables from stored measurements
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-
-from readme_figures import replace_block
 
 from probmotion import Comparison
 from probmotion.comparison import advise
 from probmotion.comparison.advice import Advice, Standing
-from probmotion.comparison.measurements import save_measurements
+from probmotion.comparison.measurements import measured, save_measurements
 
 ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", ROOT / "docs" / "which-sampler.md")
 SHOWN = ("gait", "gait-monocular", "gait-sparse", "cmu-monocular")
 WHEN = {
-    "exact": "prior and evidence have a closed form, or there is no evidence and a prior that can "
-    "be drawn from: nothing else is needed",
-    "ensemble": "there is a log density of at most about 20 dimensions, and modes are not far "
-    "apart",
-    "nuts": "there is a log density with a gradient; start many chains, and look at R-hat: chains "
-    "that began in different modes stay there",
-    "mh": "there is a log density without a gradient; the same warning",
-    "ancestral3d": "there is a 3D denoiser",
-    "mvpc": "there is a 2D denoiser only",
-    "mas": "to compare with the published method; `mvpc` costs the same",
-    "dvae": "a network that reads the evidence comes with the prior; else it trains one first",
-    "sds": "one plausible motion is enough: it does not sample",
+    "exact": "prior and likelihood have a closed-form posterior, or there are no observations",
+    "ensemble": "log density of at most about 20 dimensions, modes not far apart",
+    "nuts": "log density with a gradient; start many chains and check R-hat",
+    "mh": "log density without a gradient; start many chains and check R-hat",
+    "ancestral3d": "3D denoiser",
+    "mvpc": "2D denoiser only",
+    "mas": "comparison with the published method; `mvpc` costs the same",
+    "dvae": "prior with an inference network; otherwise it trains one first",
+    "sds": "one plausible motion is enough; it does not sample",
 }
-"""When to take which sampler, from what is right of itself to what does not sample."""
+"""When to take which sampler, from exact to not sampling at all."""
 
 
 def main() -> None:
-    """Rewrite what was measured."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    found = Comparison.load(ROOT / "grid")
-    save_measurements(
-        found, f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}"
-    )
-    advices = {name: advise(name) for name in found.plan.problems}
-    readme = ROOT / "README.md"
-    text = readme.read_text(encoding="utf-8")
-    text = replace_block(text, "which", "\n".join(table_of(advices.values())))
-    text = replace_block(text, "advice", "\n".join(when_table(advices)))
-    readme.write_text(text, encoding="utf-8")
+    """Rewrite the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--grid", type=Path, help="Folder of a finished comparison to store.")
+    grid = parser.parse_args().grid
+    if grid is not None:
+        found = Comparison.load(grid)
+        command = f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}"
+        save_measurements(found, command)
+    advices = {name: advise(name) for name in dict.fromkeys(measured().rows["problem"])}
+    tables = {
+        "advice": "\n".join(advice_table(advices)),
+        "problems": "\n".join(problem_table(advices.values())),
+        "without": "\n".join(without_table(advices.values())),
+    }
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for name, table in tables.items():
+            if f"<!-- {name}:" in text:
+                text = replace_block(text, name, table)
+        page.write_text(text, encoding="utf-8")
 
 
-def table_of(advices: Iterable[Advice]) -> Iterator[str]:
-    """Yield the lines of the README's table."""
-    yield "| problem | by | take | as good | not told from it, doubtful | worse | without draws |"
-    yield "|---|---|---|---|---|---|---|"
+def replace_block(text: str, name: str, block: str) -> str:
+    """Return a page with the block between two comments replaced."""
+    pattern = rf"(<!-- {name}:.*?-->\n).*?(<!-- end of {name} -->)"
+    changed, count = re.subn(pattern, lambda m: m[1] + block + "\n" + m[2], text, flags=re.DOTALL)
+    if count != 1:
+        raise ValueError(f"the page must contain one block called {name!r}, got {count}")
+    return changed
+
+
+def problem_table(advices: Iterable[Advice]) -> Iterator[str]:
+    """Yield the table of all problems."""
+    yield "| Problem | Metric | Take | On par | On par, with warnings | Worse |"
+    yield "|---|---|---|---|---|---|"
     for each in advices:
-        without = ", ".join(f"`{name}`: {word}" for name, word in each.without.items())
+        warned = " (not right yet)" if each.recommended.warnings else ""
         cells = [
             f"`{each.problem}`",
-            each.measure.partition(",")[0],
-            in_brief([each.take])
-            + f", {each.take.seconds:.2g} s"
-            + (" – not right yet" if each.take.warnings else ""),
-            in_brief(each.alike),
-            in_brief(each.doubtful),
+            each.metric.partition(",")[0],
+            f"{in_brief([each.recommended])}, {each.recommended.seconds:.2g} s{warned}",
+            in_brief(each.tied),
+            in_brief(each.tied_with_warnings),
             in_brief(each.worse),
-            without,
         ]
         yield f"| {' | '.join(cells)} |"
 
 
+def without_table(advices: Iterable[Advice]) -> Iterator[str]:
+    """Yield the table of samplers without draws."""
+    yield "| Problem | Samplers without draws and why |"
+    yield "|---|---|"
+    for each in advices:
+        if each.without_draws:
+            listed = ", ".join(f"`{name}` ({word})" for name, word in each.without_draws.items())
+            yield f"| `{each.problem}` | {listed} |"
+
+
 def in_brief(standings: Sequence[Standing]) -> str:
-    """Return samplers with their means and deviations."""
+    """Return samplers with their means and standard deviations."""
     return ", ".join(
         f"`{each.sampler}` {each.value:.3g}"
         + (f" ± {each.spread:.1g}" if math.isfinite(each.spread) else "")
@@ -83,21 +103,26 @@ def in_brief(standings: Sequence[Standing]) -> str:
     )
 
 
-def when_table(advices: Mapping[str, Advice]) -> Iterator[str]:
-    """Yield the lines of the table that says when to take which sampler."""
-    yield f"| take | when | {' | '.join(f'`{name}`' for name in SHOWN)} |"
+def advice_table(advices: Mapping[str, Advice]) -> Iterator[str]:
+    """Yield the table that says when to take which sampler."""
+    yield f"| Sampler | Take it for | {' | '.join(f'`{name}`' for name in SHOWN)} |"
     yield "|---" * (2 + len(SHOWN)) + "|"
+    results = {name: {s: result(advices[name], s) for s in WHEN} for name in SHOWN}
+    best = {name: advices[name].recommended.sampler for name in SHOWN}
     for sampler, when in WHEN.items():
-        cells = [how_far(advices[name], sampler) for name in SHOWN]
+        cells = [
+            f"**{results[name][sampler]}**" if best[name] == sampler else results[name][sampler]
+            for name in SHOWN
+        ]
         yield f"| `{sampler}` | {when} | {' | '.join(cells)} |"
 
 
-def how_far(advice: Advice, sampler: str) -> str:
+def result(advice: Advice, sampler: str) -> str:
     """Return a sampler's mean on a problem, or why it has none."""
-    for each in (advice.take, *advice.alike, *advice.doubtful, *advice.worse):
+    for each in (advice.recommended, *advice.tied, *advice.tied_with_warnings, *advice.worse):
         if each.sampler == sampler:
             return f"{each.value:.3g}"
-    return advice.without[sampler]
+    return advice.without_draws[sampler]
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
 from . import models as models, samplers as samplers
-from .comparison.comparison import Comparison as Comparison
-from .comparison.grid import compare as compare
+from .comparison.grid import Comparison as Comparison, compare as compare
 from .geometry.cameras import Cameras as Cameras
 from .geometry.triangulation import triangulate as triangulate
 from .io.files import (
-    load_motion as load_motion,
-    load_motions as load_motions,
+    load as load,
+    load_all as load_all,
     read_keypoints as read_keypoints,
-    save_motion as save_motion,
+    save as save,
 )
 from .motion.motion import KeypointTrack as KeypointTrack, Motion as Motion
 from .motion.skeleton import Skeleton as Skeleton

@@ -1,8 +1,4 @@
-"""One source for NumPy, PyTorch and JAX: namespaces, constants and a few products.
-
-Geometry, kinematics and densities are written against the Python Array API standard; the
-functions here are what that standard leaves out.
-"""
+"""Array helpers for NumPy, PyTorch and JAX that the Python Array API standard lacks."""
 
 from __future__ import annotations
 
@@ -16,7 +12,6 @@ __all__ = [
     "Array",
     "array_namespace",
     "constant",
-    "dot",
     "jax_from_torch",
     "logsumexp",
     "to_numpy",
@@ -27,15 +22,7 @@ Array = Any
 
 
 def constant(value: Any, like: Array) -> Array:
-    """Return ``value`` as an array of the library, dtype and device of ``like``.
-
-    Parameters
-    ----------
-    value : array_like
-        Numbers of any shape, NumPy arrays or lists.
-    like : Array
-        A floating-point array that says where the result will be used.
-    """
+    """Return ``value`` as an array of the library, dtype and device of the float array ``like``."""
     xp = array_namespace(like)
     if is_jax_array(like):
         return xp.asarray(np.asarray(value), dtype=like.dtype)
@@ -49,21 +36,17 @@ def to_numpy(x: Array) -> np.ndarray:
     return np.asarray(x)
 
 
-def dot(a: Array, b: Array) -> Array:
-    """Return the inner product over the last axis, batch axes broadcast: ``(…, D) → (…)``."""
-    xp = array_namespace(a, b)
-    return xp.sum(a * b, axis=-1)
-
-
 def logsumexp(x: Array, axis: int = -1) -> Array:
-    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` where every entry is."""
+    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` for entries of ``-inf``
+    only.
+    """
     xp = array_namespace(x)
     top = xp.max(x, axis=axis, keepdims=True)
     top = xp.where(xp.isfinite(top), top, xp.zeros_like(top))
     total = xp.sum(xp.exp(x - top), axis=axis, keepdims=True)
+    # NumPy would warn about log 0.
     none = total == 0
     log_total = xp.log(xp.where(none, xp.ones_like(total), total))
-    # A sum of nothing is log 0, which NumPy would warn of.
     log_total = xp.where(none, xp.full_like(total, -float("inf")), log_total)
     return xp.squeeze(log_total + top, axis=axis)
 
@@ -71,14 +54,14 @@ def logsumexp(x: Array, axis: int = -1) -> Array:
 def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
     """Return a torch function of one float64 point, ``(dim,) → ()``, as a JAX function.
 
-    It can be jitted, mapped and differentiated once: value and gradient come from one call of
-    ``function`` and torch's autograd, through ``jax.pure_callback``.
+    The result supports jit, vmap and first-order gradients. Each call evaluates value and gradient
+    with torch's autograd through ``jax.pure_callback``.
     """
     import jax
     import torch
 
-    # XLA calls back on a thread of its own, where ``jax.enable_x64`` of the caller does not hold
-    # and JAX would round to float32. So numbers cross as pairs of 32-bit words.
+    # XLA runs callbacks on its own thread, outside the caller's ``jax.enable_x64``, and would round
+    # to float32. float64 numbers are therefore passed as pairs of 32-bit words.
     words, real = jax.numpy.uint32, np.float64
 
     def value_and_gradient(theta: Array) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What to cite for draws: this program, the method, and the library that ran it."""
+"""References to cite for draws: the method, the sampling library and probmotion."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Foreman-Mackey, Hogg, Lang, Goodman (2013). emcee: the MCMC hammer. PASP 125.",
     ),
 }
-"""By sampler, without this program itself."""
+"""References by sampler name, without probmotion itself."""
 
 OF_SETTINGS: Mapping[str, tuple[str, ...]] = {
     '"pseudo_marginal": true': (
@@ -61,7 +61,7 @@ OF_SETTINGS: Mapping[str, tuple[str, ...]] = {
         "computations. Annals of Statistics 37.",
     ),
 }
-"""By what stands in a run's settings."""
+"""References by a fragment of the settings' JSON."""
 
 POSE_PAIRS = (
     "Yin, Huang, Ho, Wang, Komura, Cohen-Or, Zhang (2018). A sampling approach to generating "
@@ -69,20 +69,13 @@ POSE_PAIRS = (
     "Akhter, Black (2015). Pose-conditioned joint angle limits for 3D human pose "
     "reconstruction. CVPR.",
 )
-"""Of draws of people who interact."""
+"""References for draws of interacting people."""
 
 
 def citations_of(sampler: str, settings: str = "", people: int = 1) -> list[str]:
-    """Return the works to cite for draws; ours alone if the sampler is unknown.
+    """Return the references for draws of a sampler; probmotion alone if the sampler is unknown.
 
-    Parameters
-    ----------
-    sampler : str
-        Its name.
-    settings : str
-        Its settings as JSON.
-    people : int
-        People in the motion.
+    ``settings`` are the sampler's settings as JSON, ``people`` the number of people in the motion.
     """
     used = [work for words, works in OF_SETTINGS.items() if words in settings for work in works]
     pairs = POSE_PAIRS if people > 1 and sampler == "mh" else ()

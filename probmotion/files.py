@@ -1,4 +1,4 @@
-"""Writing files so that a reader never meets half of one."""
+"""Atomic file writes and checks of output folders."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["forget_killed", "writable_folder", "written_whole"]
 
 
 def _machine() -> str:
-    """Return what tells processes of this machine from those of another that has the same name."""
+    """Return an identifier of this machine or container; host names alone may repeat."""
     known = [platform.node()]
     with suppress(OSError):
         known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
@@ -35,38 +35,36 @@ def written_whole(path: Path) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the folder does not exist or cannot be written to; the message names it.
+        If the folder does not exist or is not writable.
     """
     path = Path(path)
-    # The ending is kept last, because writers choose a format or append a suffix by it.
-    whose = f"{_MACHINE}.{os.getpid()}"
-    unfinished = path.with_name(f".{path.stem}.{whose}.unfinished{path.suffix}")
+    # Writers choose the format by the suffix, so the temporary name ends in the same one.
+    owner = f"{_MACHINE}.{os.getpid()}"
+    unfinished = path.with_name(f".{path.stem}.{owner}.unfinished{path.suffix}")
     try:
         yield unfinished
         os.replace(unfinished, path)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise OSError(
-            f"cannot write {path}: {reason}; expected a folder that is writable"
-        ) from error
+        raise OSError(f"cannot write {path}: {reason}; choose a writable folder") from error
     finally:
-        # Where the folder is none, this fails as the writing did, and must not hide its message.
+        # If the folder is missing, unlink fails too and must not replace the first error.
         with suppress(OSError):
             unfinished.unlink()
 
 
 def forget_killed(folder: Path) -> None:
-    """Remove what processes of this machine that were killed had begun to write in ``folder``.
+    """Remove temporary files in ``folder`` left by killed processes of this machine.
 
-    Other machines may share the folder, and their processes may still be at it.
+    Files of other machines that share the folder are left alone, since their processes may still
+    run.
     """
-    # Elsewhere there is no asking whether a process lives that does not disturb it.
+    # Only POSIX can test for a process without affecting it.
     if os.name != "posix" or not folder.is_dir():
         return
     for path in folder.iterdir():
         begun = _UNFINISHED.fullmatch(path.name)
         if begun and not _lives(int(begun[1])):
-            # Another user's file may stay.
             with suppress(OSError):
                 path.unlink()
 
@@ -76,24 +74,18 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:
+    except PermissionError:  # a process of another user
         pass
     return True
 
 
 def writable_folder(folder: Path) -> Path:
-    """Return ``out``, made where it is missing, once it is known that it can be written to.
-
-    Raises
-    ------
-    OSError
-        If it cannot.
-    """
+    """Return ``folder``, created if needed; raise ``OSError`` if it is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         reason = error.strerror or str(error)
-        raise OSError(f"out is {str(folder)!r}, {reason}; expected a writable folder") from error
+        raise OSError(f"out must be a writable folder, got {str(folder)!r}: {reason}") from error
     return folder

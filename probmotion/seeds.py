@@ -1,8 +1,7 @@
-"""One integer seed → named, independent generators of every library.
+"""Named independent random generators from one integer seed, for NumPy, PyTorch and JAX.
 
-A generator is addressed by the path of names that leads to it (``"draw", 3, 17``), never by the
-order in which generators were asked for, so that workers, batches, bars and the number of chains
-cannot change what any one of them yields.
+A generator is identified by its path of names (``"draw", 3, 17``), not by the order of requests.
+Draws therefore do not depend on the number of workers, batches or chains.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ _INTEGERS = (int, np.integer)
 
 
 class RandomNumbers(Protocol):
-    """What a batch of n draws may ask for: arrays whose first axis is the draw.
+    """Source of random arrays whose first axis indexes draws.
 
-    A NumPy generator is one; so is :class:`NormalStreams`, where every draw has its own stream.
+    Satisfied by a NumPy generator and by :class:`NormalStreams`, which has one stream per draw.
     """
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:
@@ -45,14 +44,7 @@ class RandomNumbers(Protocol):
 
 
 def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
-    """Return the ``SeedSequence`` at ``path`` below ``seed``.
-
-    Parameters
-    ----------
-    seed : int
-        The user's one seed, at least 0.
-    *path : str or int
-        Names of the nodes from the root, such as ``"chain", 2``.
+    """Return the ``SeedSequence`` at ``path``, names such as ``"chain", 2``, below ``seed``.
 
     Raises
     ------
@@ -61,7 +53,7 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
     """
     if isinstance(seed, bool) or not isinstance(seed, _INTEGERS) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-    # A string and an integer must never address the same node: each carries a tag of its kind.
+    # The type tag prevents a string and an integer from addressing the same node.
     key: tuple[int, ...] = ()
     for name in path:
         if isinstance(name, str):
@@ -77,10 +69,7 @@ def generator(seed: int, *path: Name) -> np.random.Generator:
 
 
 def state_words(rng: np.random.Generator) -> np.ndarray:
-    """Return where a generator of :func:`generator` is, as ten 32-bit words.
-
-    They are signed, because netCDF has no other integers.
-    """
+    """Return the state of a PCG64 generator as ten 32-bit words, signed for netCDF."""
     held: Any = rng.bit_generator.state
     numbers = held["state"]
     bits = numbers["state"] | numbers["inc"] << 128
@@ -89,7 +78,7 @@ def state_words(rng: np.random.Generator) -> np.ndarray:
 
 
 def resumed_generator(words: np.ndarray) -> np.random.Generator:
-    """Return the generator that goes on where :func:`state_words` was taken."""
+    """Return the generator whose state is ``words`` (:func:`state_words`)."""
     bits = int.from_bytes(np.asarray(words).astype("<i4").tobytes(), "little")
     low, word = (1 << 128) - 1, (1 << 32) - 1
     source = np.random.PCG64()
@@ -122,15 +111,10 @@ def jax_key(seed: int, *path: Name) -> Any:
 
 
 class NormalStreams:
-    """Standard normal numbers for a batch of draws, one independent stream per draw.
+    """Random numbers for a batch of draws, with one independent generator per draw.
 
-    The ``i``-th row of every array that :meth:`normal` returns comes from the ``i``-th draw's own
-    generator, so a draw does not depend on which others share its batch.
-
-    Parameters
-    ----------
-    generators : list of numpy.random.Generator
-        One generator per draw of the batch.
+    Row ``i`` of every returned array comes from the generator of draw ``i``, so a draw does not
+    depend on the other draws of its batch.
     """
 
     def __init__(self, generators: list[np.random.Generator]) -> None:
@@ -138,7 +122,7 @@ class NormalStreams:
 
     @classmethod
     def of_draws(cls, seed: int, draws: list[tuple[int, int]]) -> NormalStreams:
-        """Return the streams of ``draws``, given as pairs (chain, draw)."""
+        """Return the streams of ``draws``, pairs (chain, draw)."""
         return cls([generator(seed, "draw", chain, draw) for chain, draw in draws])
 
     def normal(self, *shape: int) -> np.ndarray:
@@ -166,6 +150,6 @@ class NormalStreams:
     def _row(self, size: tuple[int, ...]) -> tuple[int, ...]:
         if size[:1] != (len(self.generators),):
             raise ValueError(
-                f"size must be {len(self.generators)} first, one row per draw, got {size}"
+                f"size must begin with the number of draws, {len(self.generators)}, got {size}"
             )
         return size[1:]

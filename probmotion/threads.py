@@ -1,4 +1,4 @@
-"""One thread, so that sums run in one order and the bits do not depend on the number of cores."""
+"""Single-threaded execution, so that results do not depend on the number of cores."""
 
 from __future__ import annotations
 
@@ -13,36 +13,35 @@ from typing import Any
 
 __all__ = ["one_thread", "only_one_thread"]
 
-_READ_WHEN_LOADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _ONLY_ONE: ContextVar[bool] = ContextVar("only_one_thread", default=False)
 
 
 def only_one_thread() -> bool:
-    """Return whether the caller is inside :func:`one_thread`: our own loops then use one, too."""
+    """Return whether the caller is inside :func:`one_thread`."""
     return _ONLY_ONE.get()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let the block's linear algebra and torch use one thread; the caller's numbers come back.
+    """Limit linear algebra and torch to one thread inside the block.
 
-    Several threads may be inside at once. What they share, the environment and the pools of
-    linear algebra, is limited when the first comes in and comes back when the last goes out; what
-    torch and OpenMP count for each thread comes back as that thread goes out.
-
-    Libraries that are first loaded inside the block read theirs from the environment.
+    Several threads may be inside at once. Process-wide limits (the environment and the BLAS pools)
+    are set by the first to enter and restored by the last to leave; torch's and OpenMP's per-thread
+    limits are restored as each thread leaves. Libraries first loaded inside the block take their
+    limit from the environment.
     """
-    # SciPy brings a BLAS of its own, which can be limited only once it is loaded.
+    # SciPy has its own BLAS, which can be limited only once it is loaded.
     import scipy.linalg  # noqa: F401
 
-    # Libraries look whether an array is torch's or JAX's as soon as these have begun to load. On
-    # an executor's threads another may be loading them: import_module waits for it.
+    # On an executor, another thread may be importing torch or JAX, and array libraries would see
+    # the half-imported module. import_module waits until the import is complete.
     if current_thread() is not main_thread():
         for name in ("torch", "jax"):
             importlib.import_module(name)
     torch = importlib.import_module("torch") if "torch" in sys.modules else None
-    with _SHARED.limited(torch), _own_numbers_limited(torch):
+    with _SHARED.limited(torch), _per_thread_limits(torch):
         token = _ONLY_ONE.set(True)
         try:
             yield
@@ -51,9 +50,9 @@ def one_thread() -> Iterator[None]:
 
 
 class _Shared:
-    """What all threads share, and how many blocks are inside.
+    """Process-wide limits and the number of threads inside the block.
 
-    ``torch_threads`` is torch's number when the first came in, 0 where torch was not loaded.
+    ``torch_threads`` is torch's thread count at the first entry, 0 if torch was not loaded.
     """
 
     def __init__(self) -> None:
@@ -64,7 +63,7 @@ class _Shared:
 
     @contextmanager
     def limited(self, torch: Any) -> Iterator[None]:
-        """Limit at the first entry, and give back at the last exit."""
+        """Set the limits at the first entry and restore them at the last exit."""
         with self._lock:
             if not self._inside:
                 self.torch_threads = torch.get_num_threads() if torch else 0
@@ -86,27 +85,27 @@ _SHARED = _Shared()
 
 
 def _limit_linear_algebra() -> Callable[[], None]:
-    """Limit the pools of linear algebra; return what gives them back, in whichever thread."""
+    """Limit the BLAS pools; return a function that restores them from any thread."""
     from threadpoolctl import OpenBLASController, ThreadpoolController
 
-    # From 3.8 on, threadpoolctl lets only the thread that set a number set it again, and does
-    # nothing, silently, in others; but the last to go out is not always the first who came in.
-    let_go = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
-    let_go(force=True)
+    # Since 3.8, threadpoolctl silently ignores calls from a thread other than the one that set the
+    # limit, but the last thread to leave need not be the first that entered.
+    release = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
+    release(force=True)
     limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
 
-    def give_back() -> None:
-        let_go(force=True)
+    def restore() -> None:
+        release(force=True)
         limits.restore_original_limits()
-        let_go(force=True)
+        release(force=True)
 
-    return give_back
+    return restore
 
 
 @contextmanager
 def _environment_of_one() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _READ_WHEN_LOADED}
-    os.environ.update(dict.fromkeys(_READ_WHEN_LOADED, "1"))
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
@@ -118,13 +117,13 @@ def _environment_of_one() -> Iterator[None]:
 
 
 @contextmanager
-def _own_numbers_limited(torch: Any) -> Iterator[None]:
-    """Limit what is counted for each thread: OpenMP's number, and torch's, which is made of it."""
+def _per_thread_limits(torch: Any) -> Iterator[None]:
+    """Limit the per-thread counts of OpenMP and torch."""
     from threadpoolctl import ThreadpoolController
 
     own = torch.get_num_threads() if torch else 0
-    # A thread that meets torch while another is inside is given the other's 1, which it would
-    # keep for good and hand to threads after it.
+    # A thread that loads torch while another one is inside inherits a count of 1 and would restore
+    # that 1 on leaving.
     if own == 1 and not only_one_thread():
         own = _SHARED.torch_threads or own
     try:

@@ -1,4 +1,4 @@
-"""Validation of arguments. Each error names the argument, the requirement and the value."""
+"""Validation of arguments."""
 
 from __future__ import annotations
 
@@ -12,17 +12,10 @@ __all__ = ["check_count", "check_finite", "check_positive", "check_shape"]
 
 
 def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> None:
-    """Raise ``ValueError`` unless the trailing axes of ``value`` are ``expected``.
+    """Raise ``ValueError`` unless the shape of ``value`` is ``expected``.
 
-    Parameters
-    ----------
-    name : str
-        The argument's name, for the message.
-    value : Array
-        The array to look at; extra axes may stand in front where ``expected`` begins with ``"…"``.
-    expected : tuple
-        Integers are compared; strings (``"L"``, ``"J"``) accept any size; a leading ``"…"``
-        accepts any batch axes.
+    Integers in ``expected`` are compared; strings (``"L"``, ``"J"``) accept any size; a leading
+    ``"…"`` accepts any batch axes.
     """
     batch = bool(expected) and expected[0] == "…"
     axes = expected[1:] if batch else expected
@@ -37,7 +30,7 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
 
 
 def check_finite(name: str, value: Any) -> None:
-    """Raise ``ValueError`` if a NumPy, torch or JAX array holds NaN or infinite entries."""
+    """Raise ``ValueError`` if a NumPy, torch or JAX array contains NaN or infinite entries."""
     xp = array_namespace(value)
     bad = to_numpy(~xp.isfinite(value))
     if bad.any():

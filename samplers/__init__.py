@@ -1,4 +1,4 @@
-"""Samplers: how to draw from a posterior. None imports a model."""
+"""Samplers of motion posteriors; none imports a model."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""`Adam`: the optimiser of samplers that descend."""
+"""Adam optimiser for NumPy arrays."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Adam"]
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015, algorithm 1), which changes the parameters in place."""
+    """Adam (Kingma and Ba 2015, algorithm 1); updates ``parameters`` in place."""
 
     def __init__(self, parameters: np.ndarray, learning_rate: float) -> None:
         self.parameters = parameters
@@ -24,7 +24,7 @@ class Adam:
         self.mean += 0.1 * gradient
         self.square *= 0.999
         self.square += 0.001 * gradient**2
-        # Both means start at 0, which the two divisors make good.
+        # The divisors correct the bias of moments that start at 0.
         size = np.sqrt(self.square / (1 - 0.999**self.n_steps))
         size += 1e-8
         step = self.learning_rate / (1 - 0.9**self.n_steps)

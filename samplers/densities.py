@@ -1,8 +1,4 @@
-"""What samplers that walk on a log density share: the density, where to start, motions at the end.
-
-A chain's own random numbers are addressed by its number, a motion's by (chain, draw), so that
-chain k is the same however many chains run and a continued run goes on as if it had not stopped.
-"""
+"""Shared code of samplers that evaluate a log density: counting, starting points, restarts."""
 
 from __future__ import annotations
 
@@ -23,20 +19,7 @@ __all__ = ["Density", "continued", "motions", "not_conjugate", "starting_points"
 
 
 class Density:
-    """The log density of one run's posterior, with its evaluations counted.
-
-    Parameters
-    ----------
-    sampler : Sampler
-        Who asks, for messages.
-    posterior : MotionPosterior
-        Whose density.
-
-    Raises
-    ------
-    UnsupportedPosterior
-        If the prior lacks what the sampler requires.
-    """
+    """Log density of a posterior, with a counter of evaluations."""
 
     def __init__(self, sampler: Sampler, posterior: MotionPosterior) -> None:
         require(sampler, posterior)
@@ -45,30 +28,16 @@ class Density:
         self.evaluations = 0
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
-        """Return log p(θ) + log p(y | θ): ``(n, dim) → (n,)``.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the posterior has no density in these coordinates.
-        ValueError
-            If a value is NaN or +∞.
-        """
+        """Return log p(θ) + log p(y | θ): ``(n, dim) → (n,)``; NaN and +∞ are errors."""
         return _below_infinity(self._counted(self.posterior.log_density, theta), theta)
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None, guided: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log density and the guide of proposals there (:mod:`proposals`).
+        """Return the log density, (n,), and the guide of proposals at ``theta``, (n, dim).
 
-        Parameters
-        ----------
-        theta : ndarray, (n, dim)
-            Where.
-        generators : sequence of numpy.random.Generator, optional
-            One per point; the density is then an estimate from views that each draws anew.
-        guided : bool
-            Whether the guide is wanted; else it has no width.
+        With ``generators``, one per point, the density is estimated from freshly drawn views. The
+        guide has shape (n, dim) if ``guided``, else (n, 0).
         """
         if generators is None and not guided:
             return self(theta), np.empty((len(theta), 0))
@@ -78,7 +47,7 @@ class Density:
         return _below_infinity(value, theta), guide
 
     def likelihood(self, theta: np.ndarray) -> np.ndarray:
-        """Return log p(y | θ), ``(n, dim) → (n,)``; an evaluation like any other."""
+        """Return log p(y | θ), ``(n, dim) → (n,)``; counted as n evaluations."""
         return self._counted(self.posterior.log_likelihood, theta)
 
     def _counted(
@@ -96,32 +65,31 @@ class Density:
         generators: Sequence[np.random.Generator] | None = None,
         guided: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return density and guide where chains start; a start of density 0 is an error."""
+        """Return :meth:`evaluate` at starting points; raise ``ValueError`` if a density is 0."""
         value, guide = self.evaluate(theta, generators, guided)
         if not np.isfinite(value).all():
             bad = int(np.flatnonzero(~np.isfinite(value))[0])
             raise ValueError(
-                f"initial has log density {value[bad]} at point {bad}, expected starting points "
-                "of density above 0"
+                f"initial must have a finite log density, got {value[bad]} at point {bad}"
             )
         return value, guide
 
 
 def _below_infinity(value: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    # NaN compares as false: one look finds both.
+    # NaN compares as false, so one comparison detects NaN and +∞.
     if not value.max() < np.inf:
         bad = int(np.flatnonzero(~(value < np.inf))[0])
         raise ValueError(
-            f"log_density is {value[bad]} at theta {theta[bad]}, expected a finite number or -inf"
+            f"log_density must be finite or -inf, got {value[bad]} at theta {theta[bad]}"
         )
     return value
 
 
 def not_conjugate(sampler: Sampler, error: NotConjugate) -> UnsupportedPosterior:
-    """Return the error of a density that has no closed form where the prior marginalises."""
+    """Return the error for a marginal likelihood without a closed form."""
     return UnsupportedPosterior(
         sampler.name,
-        f"has no density to walk on: {error}; a prior with coordinates='positions' has one",
+        f"cannot evaluate the log density: {error}; use a prior with coordinates='positions'",
         word="not-conjugate",
     )
 
@@ -134,32 +102,16 @@ def starting_points(
     seed: int,
     candidates: int,
 ) -> np.ndarray:
-    """Return where chains start, unless told: draws from the prior, chosen by their likelihood.
+    """Return ``initial``, or prior draws resampled in proportion to their likelihood.
 
-    A posterior after much evidence has modes that a chain cannot leave. Each chain chooses among
-    ``candidates`` draws of its own from the prior, in proportion to their likelihood
-    (sampling-importance-resampling, Rubin 1987): nearly a draw from the posterior where enough
-    candidates have a share, so that starts are spread over the modes as the mass is, and R-hat
-    still sees a chain that stays where it began. Without evidence it is a draw from the prior. Of a
-    prior with seeds each chain starts at one of them in turn.
-
-    Parameters
-    ----------
-    posterior : MotionPosterior
-        What is drawn from.
-    log_likelihood : callable
-        log p(y | θ), ``(n, dim) → (n,)``; not called where there is no evidence.
-    initial : ndarray, optional
-        The starting points themselves.
-    shape : tuple of int
-        (chains, dim), or (chains, walkers, dim).
-    seed : int
-        The run's seed.
-    candidates : int
-        Draws from the prior per chain; with no more than it needs, it starts at them.
+    Each chain draws its own ``candidates`` from the prior and resamples among them (sampling-
+    importance-resampling, Rubin 1987). With enough candidates a start is nearly a draw from the
+    posterior, so starts cover its modes in proportion to their mass and R-hat detects chains that
+    do not mix. If the prior has seeds, chains start at them in turn. ``shape`` is (chains, dim) or
+    (chains, walkers, dim).
     """
     if initial is not None:
-        assert not isinstance(initial, MotionDraws), "a run to go on from has a state"
+        assert not isinstance(initial, MotionDraws)
         points = np.array(initial, dtype=np.float64)
         check_shape("initial", points, shape)
         check_finite("initial", points)
@@ -177,7 +129,7 @@ def starting_points(
             starts.append(posterior.initial(rng, n))
             continue
         drawn = posterior.initial(rng, candidates)
-        # The n largest of log w + Gumbel noise are n choices without replacement, ∝ w.
+        # Gumbel top-n: n choices without replacement, with probability ∝ likelihood.
         keys = log_likelihood(drawn) + rng.gumbel(size=candidates)
         starts.append(drawn[np.argsort(-keys, kind="stable")[:n]])
     return np.stack(starts).reshape(shape)
@@ -190,38 +142,37 @@ def continued(
     chains: int,
     seed: int,
 ) -> Mapping[str, np.ndarray] | None:
-    """Return the state that ``initial`` stopped in, or ``None`` where it is no finished run.
+    """Return the final state of ``initial`` if it is an earlier run, else ``None``.
 
     Raises
     ------
     ValueError
-        If the run was of another sampler, settings, seed, number of chains or posterior: it would
-        not go on as if it had not stopped.
+        If the run had another sampler, settings, seed, number of chains or posterior.
     """
     check_count("chains", chains)
     if not isinstance(initial, MotionDraws):
         return None
     attributes = initial.dataset.attrs
     settings = settings_of(sampler)
-    for name, came, expected in (
+    for name, given, before in (
         ("sampler", sampler.name, attributes["sampler"]),
         ("settings", settings, json.loads(attributes["settings"])),
         ("seed", seed, int(attributes["seed"])),
         ("chains", chains, initial.dataset.sizes["chain"]),
     ):
-        if came != expected:
+        if given != before:
             raise ValueError(
-                f"initial is a run with {name} {expected}, and {name} is {came}: a run goes on as "
-                "it began; to start afresh where it stopped, pass an array of points"
+                f"{name} must be {before}, as in the run to be continued, got {given}; to start a "
+                "new run at its end, pass an array of points"
             )
     last = initial.dataset.isel(draw=-1)
-    # Of a run whose densities are estimates the state holds what they are to be compared with.
+    # With estimated densities the state contains the deterministic values to compare with.
     stored = initial.state.get("fixed", last["log_density"].values)
-    found = log_density(last["theta"].values)
-    if not np.allclose(found, stored, rtol=1e-6, atol=1e-6):
+    recomputed = log_density(last["theta"].values)
+    if not np.allclose(recomputed, stored, rtol=1e-6, atol=1e-6):
         raise ValueError(
-            f"initial is a run of another posterior: its last log density is {stored[0]:.6g}, and "
-            f"this posterior's there is {found[0]:.6g}"
+            f"initial must be a run of the same posterior, got one with last log density "
+            f"{stored[0]:.6g} instead of {recomputed[0]:.6g}"
         )
     return initial.state
 

@@ -1,14 +1,13 @@
-"""`ExactSampler`: independent draws from a posterior that is known exactly."""
+"""Independent draws from posteriors in closed form."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from probmotion import seeds
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import (
@@ -17,26 +16,18 @@ from probmotion.posteriors.protocols import (
     NotConjugate,
     Samplable,
 )
-from probmotion.posteriors.sampling import (
-    Interrupted,
-    UnsupportedPosterior,
-    progress_bar,
-    require,
-    suited,
-)
-from probmotion.validation import check_count
+from probmotion.posteriors.sampling import UnsupportedPosterior, require, suited
+from probmotion.samplers.independent import draw_independently, refuse_initial
+from probmotion.seeds import NormalStreams
 
 __all__ = ["ExactSampler"]
 
 
 @dataclass(frozen=True)
 class ExactSampler:
-    """Independent draws from the posterior that the prior knows in closed form.
+    """Independent draws from a posterior in closed form, or from the prior without observations.
 
-    Without evidence the posterior is the prior, and any that can be drawn from will do.
-
-    Draw i of chain k comes from its own random numbers, so that it is the same however many draws
-    and chains there are.
+    Each draw has its own random stream and does not depend on the number of draws or chains.
     """
 
     name: ClassVar[str] = "exact"
@@ -57,46 +48,35 @@ class ExactSampler:
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no closed form, and is not the prior.
+            If the posterior has no closed form.
         Interrupted
-            On Ctrl-C; it carries the draws that were finished.
+            On Ctrl-C, with the finished draws.
         """
         exact = self._source(posterior)
-        check_count("draws", draws)
-        check_count("chains", chains)
-        if initial is not None:
-            raise ValueError(
-                f"initial is {type(initial).__name__}, expected None: exact draws start nowhere"
-            )
-        start = time.perf_counter()
-        finished: list[np.ndarray] = []
+        refuse_initial(self, initial)
 
-        def result() -> MotionDraws:
-            return MotionDraws.of(
-                posterior,
-                self,
-                np.stack(finished, axis=1),
-                seed=seed,
-                seconds=time.perf_counter() - start,
-                independent=True,
-            )
+        def draw_batch(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            tick()
+            return np.concatenate([exact.sample(rng, 1) for rng in streams.generators])
 
-        try:
-            with progress_bar(draws, self.name, progress) as bar:
-                for draw in range(draws):
-                    streams = [seeds.generator(seed, "draw", k, draw) for k in range(chains)]
-                    finished.append(np.concatenate([exact.sample(rng, 1) for rng in streams]))
-                    bar.update(1)
-        except KeyboardInterrupt as stop:
-            if not finished:
-                raise
-            raise Interrupted(result()) from stop
-        return result()
+        return draw_independently(
+            self,
+            posterior,
+            draw_batch,
+            draws=draws,
+            chains=chains,
+            seed=seed,
+            batch=chains,
+            steps=1,
+            scale=1.0,
+            counts={},
+            progress=progress,
+        )
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether it can."""
-        if posterior.reshaped:
+        """Return whether the posterior has a closed form."""
+        if posterior.truncated:
             return False
         if isinstance(posterior.prior, HasExactPosterior):
             try:
@@ -109,29 +89,27 @@ class ExactSampler:
     def _source(self, posterior: MotionPosterior) -> ExactPosterior | Samplable:
         require(self, posterior)
         prior = posterior.prior
-        if posterior.reshaped:
-            raise UnsupportedPosterior(
-                self.name,
-                "draws from prior and evidence, and the posterior's density is cut",
-                word="truncated",
-                others=suited(posterior),
+        if posterior.truncated:
+            raise self._unsupported(
+                posterior, "truncated", "cannot draw from a posterior with a truncated density"
             )
         if not isinstance(prior, HasExactPosterior):
             if posterior.likelihood is None and isinstance(prior, Samplable):
                 return prior
-            raise UnsupportedPosterior(
-                self.name,
-                "needs a prior with HasExactPosterior where there is evidence, which "
-                f"{type(prior).__name__} is not",
-                word="HasExactPosterior",
-                others=suited(posterior),
+            raise self._unsupported(
+                posterior,
+                "HasExactPosterior",
+                "needs a prior with HasExactPosterior to condition on observations, got "
+                f"{type(prior).__name__}",
             )
         try:
             return prior.exact_posterior(posterior.likelihood)
         except NotConjugate as error:
-            raise UnsupportedPosterior(
-                self.name,
-                f"needs a posterior in closed form, but {error}",
-                word="not-conjugate",
-                others=suited(posterior),
+            raise self._unsupported(
+                posterior, "not-conjugate", f"needs a posterior in closed form, but {error}"
             ) from error
+
+    def _unsupported(
+        self, posterior: MotionPosterior, word: str, reason: str
+    ) -> UnsupportedPosterior:
+        return UnsupportedPosterior(self.name, reason, word=word, others=suited(posterior))

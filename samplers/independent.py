@@ -1,4 +1,4 @@
-"""Samplers whose draws are independent: batches, streams of random numbers, bars, provenance."""
+"""Shared code of samplers with independent draws: batches, random streams, provenance."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
 from probmotion.validation import check_count
 
-__all__ = ["DrawBatch", "draw_independently", "refuse_initial", "with_coordinates"]
+__all__ = ["draw_independently", "refuse_initial"]
 
 DrawBatch = Callable[[NormalStreams, Callable[[], Any]], np.ndarray]
-"""(streams, tick) → motions (B, L, J, 3) in normalised units; calls ``tick()`` once per step."""
+"""(streams, tick) → motions (B, L, J, 3), normalised; calls ``tick()`` once per step."""
 
 
 def draw_independently(
@@ -37,35 +37,18 @@ def draw_independently(
     scale: float,
     counts: Mapping[str, int],
     progress: bool,
+    thetas: Sequence[np.ndarray] = (),
 ) -> MotionDraws:
-    """Return ``chains`` × ``draws`` draws, at most ``batch`` at a time.
+    """Return ``chains`` × ``draws`` independent draws, computed in batches of at most ``batch``.
 
-    Parameters
-    ----------
-    sampler, posterior
-        For the result's provenance.
-    draw_batch : callable
-        Draws one batch.
-    draws, chains, seed, progress
-        As in :class:`~probmotion.posteriors.sampling.Sampler`.
-    batch : int
-        Draws at a time; draw i of chain k uses its own random numbers whatever its batch.
-    steps : int
-        How often ``draw_batch`` ticks.
-    scale : float
-        Metres per normalised unit.
-    counts : mapping of int
-        Evaluations, read when the draws are done.
-
-    Raises
-    ------
-    Interrupted
-        At Ctrl-C, with the draws of the finished batches.
+    ``draw_batch`` ticks ``steps`` times per batch, updates the evaluation ``counts``, and may
+    append θ, (B, dim), to ``thetas``; the result then has θ and log densities. ``scale`` is in
+    metres per normalised unit. Ctrl-C raises :class:`Interrupted` with the finished batches.
     """
     check_count("draws", draws)
     check_count("chains", chains)
     start = time.perf_counter()
-    # Draw by draw, so that an interrupted run has as many of every chain.
+    # Ordered by draw, so that an interrupted run has the same number of draws in every chain.
     pairs = [(chain, draw) for draw in range(draws) for chain in range(chains)]
     done: list[np.ndarray] = []
     spent = dict(counts)
@@ -73,7 +56,7 @@ def draw_independently(
     def result() -> MotionDraws:
         motions = np.concatenate(done)
         whole = motions[: len(motions) // chains * chains]
-        return MotionDraws.of(
+        result = MotionDraws.of(
             posterior,
             sampler,
             whole.reshape(-1, chains, *whole.shape[1:]).swapaxes(0, 1),
@@ -82,10 +65,11 @@ def draw_independently(
             counts=spent,
             independent=True,
         )
+        return _with_coordinates(result, posterior, thetas) if thetas else result
 
     bars = progress_bar(steps * -(-len(pairs) // batch), sampler.name, progress)
-    # How a product is split over threads depends on its size, and its rounding on the split: after
-    # a hundred steps draws would differ with the batch by far more than rounding.
+    # Multithreaded products round differently for different batch sizes, and a hundred steps
+    # amplify the difference.
     try:
         with threadpool_limits(1, user_api="blas"), bars as bar:
             for some in batches(pairs, batch):
@@ -99,31 +83,20 @@ def draw_independently(
     return result()
 
 
-def with_coordinates(
-    found: MotionDraws, posterior: MotionPosterior, batches_of_theta: Sequence[np.ndarray]
+def _with_coordinates(
+    result: MotionDraws, posterior: MotionPosterior, thetas: Sequence[np.ndarray]
 ) -> MotionDraws:
-    """Return draws with their θ and log density.
-
-    Parameters
-    ----------
-    found : MotionDraws
-        What :func:`draw_independently` gave.
-    posterior : MotionPosterior
-        Whose density.
-    batches_of_theta : sequence of ndarray, (B, dim)
-        θ of every batch, as ``draw_batch`` was called.
-    """
-    sizes = found.dataset.sizes
-    # Draw by draw, as the batches were made.
+    """Return draws with θ and log densities added."""
+    sizes = result.dataset.sizes
     shape = (sizes["draw"], sizes["chain"])
-    theta = np.concatenate(batches_of_theta)[: math.prod(shape)]
-    # One by one: the bits of a product depend on its shape and on the place of a row in it.
+    theta = np.concatenate(thetas)[: math.prod(shape)]
+    # Row by row: the rounding of a product depends on its batch.
     with one_thread():
         log_density = np.concatenate([to_numpy(posterior.log_density(row[None])) for row in theta])
     log_density = log_density.reshape(shape).T
     theta = theta.reshape(*shape, -1).swapaxes(0, 1)
     return MotionDraws(
-        found.dataset.assign(
+        result.dataset.assign(
             theta=(("chain", "draw", "coordinate"), theta),
             log_density=(("chain", "draw"), log_density),
         )
@@ -131,9 +104,9 @@ def with_coordinates(
 
 
 def refuse_initial(sampler: Sampler, initial: object) -> None:
-    """Raise ``ValueError`` if starting points are given to a sampler that starts from noise."""
+    """Raise ``ValueError`` if ``initial`` is not None."""
     if initial is not None:
         raise ValueError(
-            f"initial is {type(initial).__name__}, expected None: {sampler.name} starts every draw "
-            "from noise"
+            f"initial must be None, got {type(initial).__name__}: {sampler.name} has no starting "
+            "points"
         )

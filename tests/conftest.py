@@ -1,4 +1,4 @@
-"""What tests of several rooms share: one array library after the other."""
+"""Fixtures of several test folders: array libraries and real motions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-# A busy machine is no fault of what is tested.
+# No time limit per example, since the machine may be busy.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 
 
 def pytest_configure() -> None:
-    """Hear Ctrl-C even where the tests run in the background of a shell, which switches it off.
+    """Enable Ctrl-C when the shell runs the tests in the background and ignores SIGINT.
 
-    What a process ignores its children ignore too, and some tests interrupt theirs.
+    Child processes inherit the setting, and some tests interrupt theirs.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -29,10 +29,11 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """Let torch use one thread in every test and its fixtures.
+    """Limit torch to one thread in every test and its fixtures.
 
-    Numba's first kernel on threads sets OpenMP's number of them, which is torch's too, whatever
-    OMP_NUM_THREADS says; on small tensors threads that wait for each other cost ten times as much.
+    Numba's first parallel kernel sets the number of OpenMP threads, and thereby torch's, regardless
+    of
+    OMP_NUM_THREADS; on small tensors, synchronisation makes torch ten times slower.
     """
     torch = sys.modules.get("torch")
     if torch is not None:
@@ -41,7 +42,7 @@ def pytest_runtest_setup() -> None:
 
 @dataclass(frozen=True)
 class Library:
-    """An array library at one precision, and the agreement to ask of it."""
+    """Array library at one precision."""
 
     name: str
     dtype: str
@@ -67,7 +68,7 @@ class Library:
         return values
 
     def compiled(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function under ``jax.jit`` with JAX, itself elsewhere."""
+        """Return the function under ``jax.jit`` for JAX, unchanged otherwise."""
         if self.name == "jax":
             import jax
 
@@ -75,7 +76,7 @@ class Library:
         return function
 
     def gradient(self, function: Callable[[Any], Any], at: np.ndarray) -> np.ndarray:
-        """Return the gradient of a scalar function, by torch or JAX."""
+        """Return the gradient of a scalar function by torch or JAX."""
         if self.name == "torch":
             point = self.array(at).requires_grad_()
             function(point).backward()
@@ -96,7 +97,7 @@ class Library:
     ids="-".join,
 )
 def library(request: pytest.FixtureRequest) -> Iterator[Library]:
-    """NumPy, torch, JAX and the strict standard, in double and single precision."""
+    """NumPy, torch, JAX and array-api-strict in double and single precision."""
     name, dtype = request.param
     if name == "jax":
         import jax
@@ -109,7 +110,7 @@ def library(request: pytest.FixtureRequest) -> Iterator[Library]:
 
 @pytest.fixture(params=["torch", "jax"])
 def differentiable(request: pytest.FixtureRequest) -> Iterator[Library]:
-    """The libraries that differentiate, in double precision."""
+    """Libraries with automatic differentiation, in double precision."""
     import jax
 
     with jax.enable_x64(True):
@@ -118,7 +119,7 @@ def differentiable(request: pytest.FixtureRequest) -> Iterator[Library]:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real motions beside the repository; tests skip where it is missing."""
+    """Folder of real motions beside the repository; tests are skipped if it is missing."""
     folder = Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip("the folder ../shared/data with real motions is not beside the repository")

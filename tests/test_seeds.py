@@ -1,6 +1,4 @@
-"""One integer, many independent generators, addressed by name."""
-
-from __future__ import annotations
+"""Named generators: reproducibility, independence and resumption."""
 
 import zlib
 from itertools import combinations
@@ -32,26 +30,24 @@ ADDRESSES: list[tuple[Any, ...]] = [
     (1, 0),
     (0, 1),
     (0, 0),
-    # A string must not be its own checksum, nor a tag a name.
+    # A string must differ from its checksum, and a tag from a name.
     (zlib.crc32(b"chain"),),
     (1, zlib.crc32(b"chain")),
     ("", "chain"),
 ]
 
 
-def test_the_same_address_gives_the_same_numbers() -> None:
-    for address in ADDRESSES:
-        a = seeds.generator(3, *address).standard_normal(5)
-        np.testing.assert_array_equal(a, seeds.generator(3, *address).standard_normal(5))
-
-
-def test_different_addresses_and_seeds_give_different_numbers() -> None:
+def test_addresses_and_seeds_determine_the_stream():
     streams = {(seed, a): seeds.generator(seed, *a).random() for seed in (0, 1) for a in ADDRESSES}
     assert len(set(streams.values())) == len(streams)
+    for (seed, address), number in streams.items():
+        assert seeds.generator(seed, *address).random() == number
+    assert seeds.integer(np.int64(4), "a") == seeds.integer(4, "a")
+    assert 0 <= seeds.integer(2**100, "a") < 2**63
 
 
-def test_streams_are_uncorrelated() -> None:
-    """|r| √n is a standard normal for each of the 231 pairs; none is above 5."""
+def test_streams_are_uncorrelated():
+    """|r| √n is standard normal for each of the 231 pairs of addresses."""
     n = 2000
     numbers = [seeds.generator(0, *address).standard_normal(n) for address in ADDRESSES]
     worst = max(abs(stats.pearsonr(a, b)[0]) for a, b in combinations(numbers, 2))
@@ -60,25 +56,13 @@ def test_streams_are_uncorrelated() -> None:
     assert stats.kstest(neighbours, stats.norm.cdf).pvalue > 1e-4
 
 
-def test_an_address_does_not_depend_on_who_asked_before() -> None:
-    alone = seeds.integer(5, "chain", 3)
-    for chain in range(3):
-        seeds.generator(5, "chain", chain).random(1000)
-    assert seeds.integer(5, "chain", 3) == alone
-
-
 @pytest.mark.parametrize("seed", [-1, 1.0, True, "0", None, np.float64(2)])
-def test_what_is_no_seed_is_refused(seed: Any) -> None:
+def test_invalid_seeds_are_refused(seed):
     with pytest.raises(ValueError, match=r"seed must be an integer of at least 0, got .*"):
         seeds.generator(seed)
 
 
-def test_any_integer_is_a_seed() -> None:
-    assert seeds.integer(np.int64(4), "a") == seeds.integer(4, "a")
-    assert 0 <= seeds.integer(2**100, "a") < 2**63
-
-
-def test_every_library_has_its_generator() -> None:
+def test_torch_and_jax_generators_are_addressed_by_path():
     import jax
     import torch
 
@@ -92,8 +76,7 @@ def test_every_library_has_its_generator() -> None:
     assert not (keys[0] == keys[2]).all()
 
 
-def test_a_draw_does_not_depend_on_its_batch() -> None:
-    """Row i of every array is draw i's own, whichever draws share the batch, in any order."""
+def test_draws_do_not_depend_on_their_batch():
     draws = [(chain, draw) for chain in range(2) for draw in range(4)]
     together = seeds.NormalStreams.of_draws(9, draws)
     first, uniform, second = together.normal(3, 2), together.uniform(5), together.normal(4)
@@ -103,25 +86,18 @@ def test_a_draw_does_not_depend_on_its_batch() -> None:
     for batch in ([(1, 2)], [(1, 3), (0, 0), (1, 2)], draws[::-1]):
         apart = seeds.NormalStreams.of_draws(9, batch)
         rows = [draws.index(draw) for draw in batch]
-        np.testing.assert_array_equal(apart.normal(3, 2), first[rows])
-        np.testing.assert_array_equal(apart.uniform(5), uniform[rows])
+        # A generator's methods take the size with the number of draws in front.
+        np.testing.assert_array_equal(apart.standard_normal((len(batch), 3, 2)), first[rows])
+        np.testing.assert_array_equal(apart.random((len(batch), 5)), uniform[rows])
         np.testing.assert_array_equal(apart.normal(4), second[rows])
+    with pytest.raises(ValueError, match="size must begin with the number of draws, 8, got"):
+        together.standard_normal((3, 2))
 
 
-def test_sizes_begin_with_the_number_of_draws() -> None:
-    """Streams stand in for a generator, whose arrays hold one draw per row."""
-    draws = [(0, 0), (0, 1)]
-    a, b = (seeds.NormalStreams.of_draws(2, draws) for _ in range(2))
-    np.testing.assert_array_equal(a.standard_normal((2, 3)), b.normal(3))
-    np.testing.assert_array_equal(a.random((2,)), b.uniform())
-    with pytest.raises(ValueError, match=r"size is \(3, 2\), expected 2 first, one row per draw"):
-        a.standard_normal((3, 2))
-
-
-def test_a_generator_goes_on_where_it_was() -> None:
+def test_generators_resume_from_their_state():
     rng = seeds.generator(3, "chain", 1)
     rng.random(5)
-    rng.integers(0, 10, dtype=np.uint32)  # leaves half of a 64-bit word behind
+    rng.integers(0, 10, dtype=np.uint32)  # buffers half of a 64-bit word
     words = seeds.state_words(rng)
     assert (words.shape, words.dtype) == ((10,), np.int32)
     again = seeds.resumed_generator(words)
@@ -134,7 +110,7 @@ def test_a_generator_goes_on_where_it_was() -> None:
     )
 
 
-def test_streams_are_standard_normal() -> None:
+def test_streams_are_standard_normal():
     streams = seeds.NormalStreams.of_draws(1, [(0, draw) for draw in range(100)])
     numbers = streams.normal(100)
     assert stats.kstest(numbers.ravel(), stats.norm.cdf).pvalue > 1e-4

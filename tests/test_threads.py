@@ -1,14 +1,10 @@
-"""Several threads inside `one_thread` at once: each computes on one, and nothing of it stays."""
-
-from __future__ import annotations
+"""Single-threaded blocks in several threads: limits inside, restored afterwards."""
 
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from typing import Any
 
 import pytest
 import torch
@@ -19,47 +15,47 @@ from probmotion.threads import one_thread, only_one_thread
 NAMES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Person:
-    """A thread of its own that goes in and out when it is told to."""
+class Worker:
+    """Thread that enters and leaves blocks on request."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.thread = ThreadPoolExecutor(1)
         self.blocks: list[ExitStack] = []
 
-    def do(self, what: Callable[[], Any]) -> Any:
+    def do(self, what):
         return self.thread.submit(what).result(timeout=60)
 
-    def enter(self) -> None:
-        def go_in() -> None:
+    def enter(self):
+        def go_in():
             self.blocks.append(ExitStack())
             self.blocks[-1].enter_context(one_thread())
 
         self.do(go_in)
 
-    def leave(self) -> None:
+    def leave(self):
         self.do(lambda: self.blocks.pop().close())
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self):
         return self.do(numbers)
 
 
-def numbers() -> dict[str, Any]:
-    """What the calling thread would compute on."""
-    torch_threads = torch.get_num_threads()  # First: torch sets OpenMP's at the first look.
+def numbers():
+    """Return the thread limits that the calling thread sees."""
+    torch_threads = torch.get_num_threads()  # first, since the first call sets OpenMP's count
     found = {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
     environment = {name: os.environ.get(name) for name in NAMES}
-    return found | environment | {"torch": torch_threads, "told": only_one_thread()}
+    return found | environment | {"torch": torch_threads, "only_one": only_one_thread()}
 
 
-def of_pools(numbers: dict[str, Any]) -> set[int]:
-    return {number for name, number in numbers.items() if name not in (*NAMES, "told")}
+def of_pools(numbers):
+    return {number for name, number in numbers.items() if name not in (*NAMES, "only_one")}
 
 
 @pytest.fixture(autouse=True)
-def _two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let there be two threads in every pool, whatever the number of cores."""
+def _two_threads(monkeypatch):
+    """Provide two threads in every pool, regardless of the number of cores."""
     with one_thread():
-        pass  # Loads what it needs.
+        pass  # loads the libraries
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
@@ -71,24 +67,21 @@ def _two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def people() -> Iterator[tuple[Person, Person]]:
-    a, b = Person(), Person()
+def workers():
+    a, b = Worker(), Worker()
     yield a, b
-    for person in (a, b):
-        while person.blocks:
-            person.leave()
-        person.thread.shutdown()
+    for worker in (a, b):
+        while worker.blocks:
+            worker.leave()
+        worker.thread.shutdown()
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["torch-known", "torch-new"])
 @pytest.mark.parametrize("first_out", ["a", "b"])
-def test_threads_that_overlap_leave_nothing_behind(people, first_out, known):
-    a, b = people
+def test_overlapping_threads_restore_all_limits(workers, first_out, known):
+    a, b = workers
     before = numbers()
-    if known:
-        before_a, before_b = a.numbers(), b.numbers()
-    else:
-        before_a = before_b = None
+    before_each = (a.numbers(), b.numbers()) if known else None
     a.enter()
     b.enter()
     first, last = (a, b) if first_out == "a" else (b, a)
@@ -96,22 +89,21 @@ def test_threads_that_overlap_leave_nothing_behind(people, first_out, known):
     inside = last.numbers()
     assert of_pools(inside) == {1}
     assert {inside[name] for name in NAMES} == {"1"}
-    assert inside["told"]
+    assert inside["only_one"]
     last.leave()
     assert numbers() == before
     if known:
-        assert (a.numbers(), b.numbers()) == (before_a, before_b)
+        assert (a.numbers(), b.numbers()) == before_each
     assert a.do(torch.get_num_threads) == b.do(torch.get_num_threads) == 2
-    # Nor does a thread that comes after them.
     with ThreadPoolExecutor(1) as later:
         assert later.submit(torch.get_num_threads).result() == 2
 
 
-def test_each_thread_s_own_number_comes_back(people):
-    a, b = people
-    for person, number in ((a, 2), (b, 3)):
-        person.numbers()  # Torch forgets a number that is set before the thread's first look.
-        person.do(lambda number=number: torch.set_num_threads(number))
+def test_per_thread_limits_are_restored(workers):
+    a, b = workers
+    for worker, number in ((a, 2), (b, 3)):
+        worker.numbers()  # torch drops a count set before the thread's first query
+        worker.do(lambda number=number: torch.set_num_threads(number))
     a.enter()
     b.enter()
     assert a.do(torch.get_num_threads) == b.do(torch.get_num_threads) == 1
@@ -120,8 +112,8 @@ def test_each_thread_s_own_number_comes_back(people):
     assert (a.do(torch.get_num_threads), b.do(torch.get_num_threads)) == (2, 3)
 
 
-def test_a_block_within_a_block_limits_until_the_outer_ends(people):
-    a, b = people
+def test_nested_blocks_limit_until_the_outer_one_ends(workers):
+    a, b = workers
     before = a.numbers()
     a.enter()
     b.enter()
@@ -130,13 +122,13 @@ def test_a_block_within_a_block_limits_until_the_outer_ends(people):
     b.leave()
     inside = a.numbers()
     assert of_pools(inside) == {1}
-    assert inside["told"]
+    assert inside["only_one"]
     a.leave()
     assert a.numbers() == before
 
 
-def test_an_error_inside_gives_all_back(people):
-    a, _ = people
+def test_limits_are_restored_after_an_error(workers):
+    a, _ = workers
     before = numbers()
     a.enter()
     with pytest.raises(KeyError), one_thread():
@@ -145,20 +137,8 @@ def test_an_error_inside_gives_all_back(people):
     assert numbers() == before
 
 
-def test_many_threads_that_come_and_go_leave_nothing_behind():
-    before = numbers()
-
-    def visit(_: int) -> set[int]:
-        with one_thread():
-            return of_pools(numbers())
-
-    with ThreadPoolExecutor(8) as crowd:
-        assert all(found == {1} for found in crowd.map(visit, range(60)))
-    assert numbers() == before
-
-
-def test_on_an_executor_s_threads_libraries_are_whole():
-    """While one thread loads JAX, another may ask whether an array is JAX's."""
+def test_libraries_are_fully_imported_on_executor_threads():
+    """Array libraries check for ``jax.Array`` while another thread may still import JAX."""
     code = (
         "import sys\n"
         "from concurrent.futures import ThreadPoolExecutor\n"

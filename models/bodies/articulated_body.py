@@ -1,7 +1,7 @@
-"""A body of bones that turn: from rotation vectors and a rigid pose to where the joints are.
+"""Articulated body: joint positions from bone rotations and a rigid pose.
 
-It is the ξ of a motion VAE learnt from 2D (*Ponymation*, section 3.1): ξ₁ ∈ SE(3), the rigid pose,
-and ξ_b ∈ SO(3), one rotation for each bone from its rest pose.
+These are the ξ of a motion VAE learnt from 2D (*Ponymation*, section 3.1): ξ₁ ∈ SE(3) is the rigid
+pose, ξ_b ∈ SO(3) the rotation of bone b from its rest pose.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant
 from probmotion.geometry.rotations import vector_to_matrix
-from probmotion.models.bodies.body_states import check_bones, trunk_joints
+from probmotion.models.bodies.body_states import check_bones, check_single_root, trunk_joints
 from probmotion.models.bodies.joint_ranges import range_of
 from probmotion.motion.kinematics import forward_kinematics
 from probmotion.motion.rest_poses import is_four_legged
@@ -26,35 +26,31 @@ __all__ = ["ArticulatedBody"]
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedBody:
-    """Bones that turn from a rest pose.
+    """Skeleton with a rest pose, whose bones rotate.
 
-    Where a trunk leaves a joint that limbs hang on, as at the pelvis, it turns on its own, as in
-    :class:`~probmotion.models.bodies.body_states.BodyStates`.
+    Trunks have their own rotation, as in :class:`~probmotion.models.bodies.body_states.BodyStates`.
 
     Parameters
     ----------
     skeleton : Skeleton
         J joints, one root.
     rest : ndarray, (J, 3)
-        Each joint's offset from its parent in the rest pose, metres; the root's is not used. The
-        body looks along +Z, up is +Y and its left is at +X. Ranges of joints are meant for a rest
-        pose that is the mean pose, as of :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
+        Offset of each joint from its parent in the rest pose, metres; the root's is ignored. The
+        body faces +Z, up is +Y and its left is +X. Joint ranges assume a mean pose, as from
+        :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
 
     Raises
     ------
     ValueError
-        If the skeleton has several roots, a shape does not fit, or a bone has no length or one
-        that no bone has in metres.
+        If the skeleton has several roots, a shape is wrong, or a bone has length 0 or more than
+        3 m.
     """
 
     skeleton: Skeleton
     rest: np.ndarray
 
     def __post_init__(self) -> None:
-        if len(self.skeleton.roots) != 1:
-            raise ValueError(
-                f"skeleton has {len(self.skeleton.roots)} roots, expected one: it is one body"
-            )
+        check_single_root(self.skeleton)
         rest = np.array(self.rest, dtype=np.float64)
         check_bones("rest", rest, self.skeleton)
         rest[self.skeleton.roots[0]] = 0.0
@@ -62,7 +58,7 @@ class ArticulatedBody:
 
     @cached_property
     def _rig(self) -> Skeleton:
-        """The skeleton with a joint more for every trunk, at its lower end, that turns it."""
+        """Skeleton with an additional joint for every trunk, at its lower end."""
         names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
         for joint in trunk_joints(self.skeleton):
             names.append(f"{names[joint]} trunk")
@@ -72,18 +68,18 @@ class ArticulatedBody:
 
     @cached_property
     def _turning(self) -> tuple[int, ...]:
-        """The rig's joints that have children, other than the root."""
+        """The rig's joints with children, except the root."""
         below = set(self._rig.parents) - {self.skeleton.roots[0], -1}
         return tuple(joint for joint in range(self._rig.n_joints) if joint in below)
 
     @property
     def bones(self) -> tuple[str, ...]:
-        """Names of the B bones that turn, by the joint they turn at; trunks are at the end."""
+        """Names of the B rotating bones, by the joint they rotate about; trunks last."""
         return tuple(self._rig.joint_names[joint] for joint in self._turning)
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether the skeleton has left-right pairs and is its own mirror image."""
+        """Whether the skeleton has left-right pairs and is mirror-symmetric."""
         order, parents = self.skeleton.mirrored_order, self.skeleton.parents
         return bool(self.skeleton.mirrored_pairs) and all(
             parents[order[joint]] == order[parent] for joint, parent in self.skeleton.bones
@@ -91,10 +87,9 @@ class ArticulatedBody:
 
     @cached_property
     def length_groups(self) -> tuple[int, ...]:
-        """For every joint the group whose length its bone shares with its mirror image, 0 to G−1.
+        """Index of each joint's bone-length group, 0 to G−1, shared by mirrored bones.
 
-        Bones of a body that is not :attr:`symmetric` have a group each; so has the root, which
-        has no bone, and the number for it changes nothing.
+        The bones of an asymmetric skeleton have a group each; that of the root has no effect.
         """
         order = self.skeleton.mirrored_order
         n_joints = self.skeleton.n_joints
@@ -103,27 +98,27 @@ class ArticulatedBody:
 
     @property
     def n_groups(self) -> int:
-        """Number of lengths G."""
+        """Number of bone lengths G."""
         return max(self.length_groups) + 1
 
     @property
     def rest_positions(self) -> np.ndarray:
-        """Joints of the rest pose relative to the root, (J, 3) metres."""
-        found = np.zeros_like(self.rest)
+        """Joint positions of the rest pose relative to the root, (J, 3), metres."""
+        positions = np.zeros_like(self.rest)
         for joint in self.skeleton.topological_order:
             parent = self.skeleton.parents[joint]
             if parent >= 0:
-                found[joint] = found[parent] + self.rest[joint]
-        return found
+                positions[joint] = positions[parent] + self.rest[joint]
+        return positions
 
     @property
     def lower(self) -> np.ndarray:
-        """Least rotation vectors in range, (B, 3) radians; the numbers are ours."""
+        """Minimum rotation vectors in range, (B, 3), radians."""
         return self._ranges[0]
 
     @property
     def upper(self) -> np.ndarray:
-        """Greatest rotation vectors in range, (B, 3) radians; the numbers are ours."""
+        """Maximum rotation vectors in range, (B, 3), radians."""
         return self._ranges[1]
 
     @cached_property
@@ -145,7 +140,7 @@ class ArticulatedBody:
         return lower, upper
 
     def range_excess(self, turns: Array) -> Array:
-        """Return how far turns are out of range: ``(…, B, 3) → (…)``, squared radians, summed."""
+        """Return the summed squared excess over the ranges: ``(…, B, 3) → (…)``, radians²."""
         check_shape("turns", turns, ("…", len(self.bones), 3))
         xp = array_namespace(turns)
         lower, upper = constant(self.lower, turns), constant(self.upper, turns)
@@ -161,25 +156,20 @@ class ArticulatedBody:
         root_translation: Array,
         log_lengths: Array | None = None,
     ) -> Array:
-        """Return where the joints are, (…, L, J, 3), metres.
+        """Return the joint positions, (…, L, J, 3), metres.
 
-        NumPy or torch arrays of one library, differentiable; batch axes broadcast.
+        Differentiable; NumPy or torch arrays of one library, batch axes broadcast.
 
         Parameters
         ----------
         turns : Array, (…, L, B, 3)
-            Rotation vectors of :attr:`bones` in the parents' frames, radians; 0 is the rest pose.
+            Rotation vectors of :attr:`bones` in their parents' frames, radians; 0 is the rest pose.
         root_rotation : Array, (…, L, 3, 3)
-            Of the whole body.
+            Rotation of the whole body.
         root_translation : Array, (…, L, 3)
-            Where the root is, metres.
+            Position of the root, metres.
         log_lengths : Array, (…, G), optional
-            Logarithm of what each group's bones are longer by than in the rest pose.
-
-        Raises
-        ------
-        ValueError
-            If a shape does not fit.
+            Logarithm of the length of each group's bones relative to the rest pose.
         """
         check_shape("turns", turns, ("…", "L", len(self.bones), 3))
         check_shape("root_rotation", root_rotation, ("…", "L", 3, 3))

@@ -1,11 +1,10 @@
-"""A pose as numbers that a network can follow: where the root is, how each joint is turned.
+"""Pose vectors of an articulated body: root translation and joint rotations.
 
-The state of a frame is the root's translation (3), then six numbers of rotation (Zhou et al. 2019)
-for every joint that has children, the root's first (Motion-DVAE's x_t). Bone lengths are
-not in it: they are the body's.
+The state of a frame is the root's translation (3) followed by the 6D rotation (Zhou et al. 2019) of
+every joint with children, root first (Motion-DVAE's x_t). Bone lengths belong to the body.
 
-Where a trunk leaves a joint that limbs hang on, as at the pelvis, it has a rotation of its own:
-markers' skeletons without a spine's joints would else tilt the hips with every bow.
+A trunk joint with paired limbs, such as the neck of ``person14``, has an additional rotation for
+the trunk: otherwise skeletons without spine joints would tilt the hips with every bow.
 """
 
 from __future__ import annotations
@@ -16,93 +15,53 @@ from functools import cached_property
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant
-from probmotion.geometry.rotations import matrix_to_six_numbers, six_numbers_to_matrix
+from probmotion.geometry.rotations import matrix_to_rotation_6d, rotation_6d_to_matrix
 from probmotion.motion.kinematics import fit_rotations, forward_kinematics
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
 __all__ = [
     "BodyStates",
-    "Placement",
     "check_bones",
+    "check_single_root",
     "heading_of",
     "rest_pose",
+    "to_world",
     "trunk_joints",
     "turned_about_vertical",
 ]
 
 _GUIDE = 0.07
-"""How far up a trunk its guide is, as a share of the trunk."""
+"""Position of a trunk's guide joint, as a fraction of the trunk's length."""
 _LONGEST = 3.0
-# A millionth of a metre: less points nowhere.
+"""Maximum bone length, metres; longer bones indicate another unit."""
 _SHORTEST = 1e-6
-"""Metres: longer bones are in another unit."""
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Where a canonical motion stands in the world: turned about the vertical, then moved.
-
-    Parameters
-    ----------
-    heading : ndarray, (…)
-        Radians about Y.
-    ground : ndarray, (…, 2)
-        X and Z of the origin, metres.
-    """
-
-    heading: np.ndarray
-    ground: np.ndarray
-
-    def to_world(self, positions: Array) -> Array:
-        """Return canonical positions in the world, ``(…, L, J, 3) → (…, L, J, 3)``."""
-        xp = array_namespace(positions)
-        turned = turned_about_vertical(positions, self.heading)
-        ground = constant(self.ground, positions)
-        zero = xp.zeros_like(ground[..., 0])
-        return (
-            turned + xp.stack([ground[..., 0], zero, ground[..., 1]], axis=-1)[..., None, None, :]
-        )
-
-    def to_canonical(self, positions: Array) -> Array:
-        """Return world positions in the canonical frame; the inverse of :meth:`to_world`."""
-        xp = array_namespace(positions)
-        ground = constant(self.ground, positions)
-        zero = xp.zeros_like(ground[..., 0])
-        moved = (
-            positions
-            - xp.stack([ground[..., 0], zero, ground[..., 1]], axis=-1)[..., None, None, :]
-        )
-        return turned_about_vertical(moved, -self.heading)
+"""Minimum bone length, metres; shorter bones have no direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyStates:
-    """States of one skeleton, seen from one rest pose; the root's rotation is the first.
+    """Conversion between joint positions and pose vectors of one skeleton.
 
     Parameters
     ----------
     skeleton : Skeleton
         J joints, one root.
     rest : ndarray, (J, 3)
-        Each joint's offset from its parent in the rest pose, metres: which way bones point where
-        nothing is turned, and how long those of the usual body are.
+        Offset of each joint from its parent in the rest pose, metres.
 
     Raises
     ------
     ValueError
-        If the skeleton has several roots, a shape does not fit, or a bone has no length or one
-        that no bone has in metres.
+        If the skeleton has several roots, a shape is wrong, or a bone has length 0 or more than
+        3 m.
     """
 
     skeleton: Skeleton
     rest: np.ndarray
 
     def __post_init__(self) -> None:
-        if len(self.skeleton.roots) != 1:
-            raise ValueError(
-                f"skeleton has {len(self.skeleton.roots)} roots, expected one: a state is one body"
-            )
+        check_single_root(self.skeleton)
         rest = np.asarray(self.rest, dtype=np.float64)
         check_bones("rest", rest, self.skeleton)
         object.__setattr__(self, "rest", rest)
@@ -113,10 +72,10 @@ class BodyStates:
 
     @cached_property
     def _rig(self) -> Skeleton:
-        """The skeleton with two joints more per trunk.
+        """Skeleton with two additional joints per trunk.
 
-        One that turns the trunk, at its lower joint, and one a little way up that turns with the
-        limbs: it says how the lower joint is pitched where the limbs are in line with it.
+        One rotates the trunk, at its lower end. The other, a guide slightly above, rotates with the
+        limbs and determines the pitch of the lower joint when the limbs are collinear with it.
         """
         names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
         for joint in self._trunks:
@@ -126,7 +85,7 @@ class BodyStates:
         return Skeleton(names, parents)
 
     def _rigged(self, offsets: Array) -> Array:
-        """Return offsets (…, J, 3) with those of the rig's joints."""
+        """Return offsets (…, J, 3) extended by those of the rig's joints."""
         xp = array_namespace(offsets)
         parts = [offsets]
         for joint in self._trunks:
@@ -142,43 +101,32 @@ class BodyStates:
 
     @cached_property
     def turning(self) -> tuple[int, ...]:
-        """Joints that have children, the root first and trunks' own at the end.
-
-        The others turn nothing.
-        """
+        """Joints with children, root first, trunks last; only these have rotations."""
         root = self.skeleton.roots[0]
         below = set(self._rig.parents) - {root}
         return (root, *(joint for joint in range(self._rig.n_joints) if joint in below))
 
     @property
     def dim(self) -> int:
-        """Numbers of a state."""
+        """Length of a state."""
         return 3 + 6 * len(self.turning)
 
     @property
     def groups(self) -> tuple[tuple[str, int, int], ...]:
-        """Name, first and end of the state's parts: translation, orientation, joints' rotations.
-
-        Orientation is the root's rotation.
-        """
+        """Name, start and end of each part of a state; orientation is the root's rotation."""
         return (("translation", 0, 3), ("orientation", 3, 9), ("rotations", 9, self.dim))
 
     def body(self, positions: np.ndarray) -> np.ndarray:
-        """Return the body that moves, its rest offsets (J, 3), metres: the design's β.
+        """Return the rest offsets of the moving body β, ``(L, J, 3) → (J, 3)``, metres.
 
-        Bones' mean lengths; where a joint has several children, their mean directions too, since
-        bodies differ in how wide hips and shoulders are.
-
-        Parameters
-        ----------
-        positions : ndarray, (L, J, 3)
-            Metres.
+        Bones have their mean lengths. Where a joint has several children, bones also have their
+        mean directions, since bodies differ in the width of hips and shoulders.
         """
         lengths = np.zeros(self.skeleton.n_joints)
         for joint, parent in self.skeleton.bones:
             bones = positions[:, joint] - positions[:, parent]
             lengths[joint] = np.linalg.norm(bones, axis=-1).mean()
-        # Of its own size: in bones of other lengths no joint would be where the next begins.
+        # Rotations must be fitted to a body of the same size, or joints would not coincide.
         offsets = self.of_lengths(lengths)
         turns = self._turns(positions, offsets)
         parents = self._rig.parents
@@ -190,36 +138,31 @@ class BodyStates:
         return offsets
 
     def of_lengths(self, lengths: np.ndarray) -> np.ndarray:
-        """Return the body whose bones point as in the rest pose and are so long, (J,) → (J, 3)."""
+        """Return rest offsets with given bone lengths, ``(J,) → (J, 3)``, metres."""
         check_shape("lengths", lengths, (self.skeleton.n_joints,))
         bones = np.linalg.norm(self.rest, axis=-1, keepdims=True)
         return self.rest * (np.asarray(lengths)[:, None] / np.where(bones > 0, bones, 1.0))
 
     def states(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the states that are nearest to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
+        """Return the closest states to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
 
-        How a limb turns about itself is not seen in positions: see
+        Positions do not determine the twist of a limb; see
         :func:`~probmotion.motion.kinematics.fit_rotations`.
         """
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), self._rigged(body))
-        numbers = matrix_to_six_numbers(rotations[:, list(self.turning)])
+        numbers = matrix_to_rotation_6d(rotations[:, list(self.turning)])
         root = positions[:, self.skeleton.roots[0]]
         return np.concatenate([root, numbers.reshape(len(positions), -1)], axis=-1)
 
     def positions(self, states: Array, body: Array) -> Array:
-        """Return M_β(x), where the joints are: ``(…, L, dim) → (…, L, J, 3)``, metres.
+        """Return the joint positions M_β(x): ``(…, L, dim), (…, J, 3) → (…, L, J, 3)``, metres.
 
-        Parameters
-        ----------
-        states : Array, (…, L, dim)
-            x.
-        body : Array, (…, J, 3)
-            β: rest offsets of one body for all motions, or of one for each.
+        ``body`` is β, the rest offsets of one body or of one for each motion.
         """
         check_shape("states", states, ("…", "L", self.dim))
         xp = array_namespace(states)
         numbers = xp.reshape(states[..., 3:], (*states.shape[:-1], len(self.turning), 6))
-        matrices = six_numbers_to_matrix(numbers)
+        matrices = rotation_6d_to_matrix(numbers)
         still = xp.zeros_like(matrices[..., 0, :, :]) + constant(np.eye(3), states)
         which = {joint: at for at, joint in enumerate(self.turning)}
         joints = range(self._rig.n_joints)
@@ -230,24 +173,8 @@ class BodyStates:
         )
         return found[..., : self.skeleton.n_joints, :]
 
-    def canonical(self, states: np.ndarray) -> tuple[np.ndarray, Placement]:
-        """Return states whose first frame stands at the origin and looks ahead, and where it was.
-
-        The root of frame 0 is above the origin and its heading is 0 (Motion-DVAE, A.4): ``(L, dim)
-        → (L, dim)``.
-        """
-        check_shape("states", states, ("L", self.dim))
-        root = six_numbers_to_matrix(states[..., 3:9])
-        place = Placement(heading_of(root[0]), states[0, [0, 2]])
-        back = _about_vertical(-place.heading)
-        moved = states.copy()
-        moved[:, :3] -= np.array([place.ground[0], 0.0, place.ground[1]])
-        moved[:, :3] = moved[:, :3] @ back.T
-        moved[:, 3:9] = matrix_to_six_numbers(back @ root)
-        return moved, place
-
     def _turns(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the rotations in the world of joints of a body, (L, J', 3, 3)."""
+        """Return the global rotations of the rig's joints, (L, J', 3, 3)."""
         rest = self._rigged(body)
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), rest)
         still = np.zeros((len(positions), 1, 3))
@@ -255,40 +182,41 @@ class BodyStates:
 
 
 def trunk_joints(skeleton: Skeleton) -> tuple[int, ...]:
-    """Return joints at the end of a trunk: unpaired, on a joint that has paired children too."""
+    """Return the upper ends of trunks: unpaired joints whose parent also has paired children."""
     paired = {joint for pair in skeleton.mirrored_pairs for joint in pair}
     limbed = {parent for joint, parent in skeleton.bones if joint in paired}
     return tuple(j for j, parent in skeleton.bones if parent in limbed and j not in paired)
 
 
+def check_single_root(skeleton: Skeleton) -> None:
+    """Raise ``ValueError`` unless the skeleton is of one body."""
+    if len(skeleton.roots) != 1:
+        raise ValueError(f"skeleton must have one root, got {len(skeleton.roots)}")
+
+
 def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
-    """Raise ``ValueError`` unless offsets (J, 3) from parents are those of a body, in metres."""
+    """Raise ``ValueError`` unless offsets from parents, (J, 3), are plausible bones in metres."""
     check_shape(name, offsets, (skeleton.n_joints, 3))
     check_finite(name, offsets)
     lengths = np.linalg.norm(offsets, axis=-1)
     for joint, _ in skeleton.bones:
-        if not lengths[joint] > _SHORTEST:
+        if not lengths[joint] > _SHORTEST or lengths[joint] > _LONGEST:
             raise ValueError(
-                f"{name} has a bone of no length, to {skeleton.joint_names[joint]}, expected all "
-                "bones to point somewhere"
-            )
-        if lengths[joint] > _LONGEST:
-            raise ValueError(
-                f"{name} has a bone of length {lengths[joint]:.4g}, to "
-                f"{skeleton.joint_names[joint]}, expected metres, at most {_LONGEST:g}"
+                f"{name} must have bones longer than 0 and at most {_LONGEST:g} m, got "
+                f"{lengths[joint]:.4g} m to {skeleton.joint_names[joint]}"
             )
 
 
 def heading_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the angle about Y that is nearest to a rotation, ``(…, 3, 3) → (…)``, radians.
+    """Return the closest rotation angle about Y, ``(…, 3, 3) → (…)``, radians.
 
-    It is unstable only near half turns about horizontal axes, where no heading is nearest.
+    It is unstable near half turns about horizontal axes.
     """
     return np.arctan2(matrix[..., 0, 2] - matrix[..., 2, 0], matrix[..., 0, 0] + matrix[..., 2, 2])
 
 
 def turned_about_vertical(positions: Array, angle: Array) -> Array:
-    """Return motions turned about Y by one angle each: ``(…, L, J, 3), (…) → (…, L, J, 3)``."""
+    """Return motions rotated about Y by one angle each: ``(…, L, J, 3), (…) → (…, L, J, 3)``."""
     xp = array_namespace(positions)
     angle = constant(angle, positions) if isinstance(angle, np.ndarray | float) else angle
     cosine, sine = xp.cos(angle)[..., None, None], xp.sin(angle)[..., None, None]
@@ -296,29 +224,33 @@ def turned_about_vertical(positions: Array, angle: Array) -> Array:
     return xp.stack([cosine * x + sine * z, y, cosine * z - sine * x], axis=-1)
 
 
+def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array:
+    """Return canonical motions, rotated about Y and then translated on the ground.
+
+    ``(…, L, J, 3), (…), (…, 2) → (…, L, J, 3)``: heading in radians, X and Z in metres.
+    """
+    xp = array_namespace(positions)
+    turned = turned_about_vertical(positions, heading)
+    moved = constant(ground, positions)
+    zero = xp.zeros_like(moved[..., 0])
+    return turned + xp.stack([moved[..., 0], zero, moved[..., 1]], axis=-1)[..., None, None, :]
+
+
 def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
-    """Return the rest pose of a kind of body: bones as they point on average.
+    """Return mean bone directions and lengths of motions (L, J, 3): (J, 3) offsets, metres.
 
-    Every frame is turned so that what is left of the body is at +X (so it looks along +Z); bones'
-    mean directions there, and mean lengths, are the rest offsets (J, 3), metres.
-
-    Parameters
-    ----------
-    skeleton : Skeleton
-        J joints, some of them left-right pairs.
-    motions : list of ndarray, (L, J, 3)
-        Metres.
+    Every frame is first rotated so that its left side points to +X and it faces +Z.
 
     Raises
     ------
     ValueError
-        If there is no motion, or the skeleton has no left-right pairs: no side, no heading.
+        If there is no motion, the skeleton has no left-right pairs, or a bone has length 0.
     """
     if not motions:
         raise ValueError("motions must contain at least one, got none")
     pairs = skeleton.mirrored_pairs
     if not pairs:
-        raise ValueError("skeleton has no left-right pairs, expected some, to tell where it looks")
+        raise ValueError("skeleton must have left-right pairs to determine the heading, got none")
     poses = np.concatenate(motions)
     left, right = (list(side) for side in zip(*pairs, strict=True))
     across = (poses[:, left] - poses[:, right]).sum(axis=1)
@@ -331,13 +263,7 @@ def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
         mean = bones.mean(axis=0)
         if not length > 0:
             raise ValueError(
-                f"motions has a bone of no length, to {skeleton.joint_names[joint]}, expected all "
-                "bones to point somewhere"
+                f"motions must have bones longer than 0, got 0 m to {skeleton.joint_names[joint]}"
             )
         offsets[joint] = mean * length / np.linalg.norm(mean)
     return offsets
-
-
-def _about_vertical(angle: np.ndarray | float) -> np.ndarray:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])

@@ -1,7 +1,7 @@
-"""How far joints turn: soft ranges of rotation vectors, by what a joint is called.
+"""Soft joint-rotation limits, looked up by joint name.
 
-The numbers are ours: round values wide enough for motion capture of walks, dances and jumps and
-for trotting dogs, so that what they forbid is a body bent the wrong way. They are no anatomy.
+The values are ours, not anatomical: round numbers wide enough for motion capture of walks, dances
+and jumps and for trotting dogs. They exclude bodies bent the wrong way.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 __all__ = ["range_of"]
 
 Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-"""Least and greatest X, Y and Z of a rotation vector, radians, for the left side of the body."""
+"""Minimum and maximum X, Y and Z of a rotation vector, radians, left side of the body."""
 
 _UNKNOWN: Box = ((-1.2, 1.2), (-1.2, 1.2), (-1.2, 1.2))
-# About X, positive is to swing what hangs down backwards, and to bow what stands up. About Z,
-# positive is to lift a left limb that hangs down sideways.
+# Positive X swings a hanging limb backwards and bows an upright trunk. Positive Z lifts a hanging
+# left limb sideways.
 _PEOPLE: Mapping[str, Box] = {
     "trunk": ((-0.8, 1.5), (-0.9, 0.9), (-0.8, 0.8)),
     "spine": ((-0.8, 1.2), (-0.8, 0.8), (-0.7, 0.7)),
@@ -47,35 +47,28 @@ _SAME = {
     "palm": "wrist",
     "foot": "ankle",
 }
-# A hinge: where along Z people's lower limb goes, and how far it bends from straight.
+# Hinges: direction of the human lower limb along Z, and the maximum angle from straight.
 _HINGES: Mapping[str, tuple[float, float]] = {"knee": (-1.0, 2.7), "elbow": (1.0, 2.7)}
 _SIDEWAYS = 0.5
-"""Radians that a hinge turns about what is square to its axis: it also takes up errors."""
+"""Tolerance of a hinge about directions perpendicular to its axis, radians."""
 _IN_LINE = 0.15
-"""Radians below which two bones are in line: mean poses from 2D are no more exact than that."""
+"""Angle below which two bones count as collinear, radians: the accuracy of poses from 2D."""
 
 
 def range_of(
     name: str, animal: bool, above: np.ndarray, below: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest rotation vector of a joint, (3,) each, radians.
+    """Return the minimum and maximum rotation vector of a joint from the rest pose, (3,), radians.
 
-    Rotation vectors are from the rest pose. A knee or an elbow is a hinge: its axis is square to
-    the two bones that meet there, and it turns back until they are in line and no further. Where
-    the rest pose has them in line, the axis is square to them and to Z, as X is to what hangs down:
-    people's shins then go backwards, their forearms forwards. Animals' go both ways, since names
-    do not tell their elbows and knees from wrists and hocks.
+    A knee or elbow is a hinge whose axis is perpendicular to its two bones; it opens until they are
+    collinear. If they are collinear in the rest pose, the axis is perpendicular to them and to Z
+    (X for a hanging limb): human shins then bend backwards and forearms forwards. Those of animals
+    bend both ways, because their joint names do not distinguish elbows and knees from wrists and
+    hocks.
 
-    Parameters
-    ----------
-    name : str
-        Canonical, ``left_knee``; right ones have the mirror image of the left ones' range. Others
-        than the table has may turn 1.2 radians about every axis.
-    animal : bool
-        Four-legged.
-    above, below : ndarray, (3,)
-        The bone that ends at the joint and the one that begins there, in the rest pose. The body
-        looks along +Z, +X is its left.
+    ``name`` is canonical, e.g. ``left_knee``; right joints have the mirrored range of left ones.
+    Joints without an entry may rotate 1.2 radians about every axis. ``above`` and ``below`` are the
+    bones that end and begin at the joint in the rest pose; the body faces +Z and its left is +X.
     """
     part = name.removeprefix("left_").removeprefix("right_")
     if part in _HINGES:
@@ -83,7 +76,7 @@ def range_of(
     table = _ANIMALS if animal else _PEOPLE
     lower, upper = np.array(table.get(_SAME.get(part, part), _UNKNOWN)).T
     if name.startswith("right_"):
-        # The mirror image of (x, y, z) is (x, −y, −z).
+        # A rotation vector (x, y, z) is mirrored to (x, −y, −z).
         lower, upper = np.array([lower[0], *-upper[1:]]), np.array([upper[0], *-lower[1:]])
     return lower, upper
 
@@ -93,7 +86,7 @@ def _hinge(
 ) -> tuple[np.ndarray, np.ndarray]:
     way, far = _HINGES[part]
     across = np.cross(above, below)
-    # Positive turns about the axis bend the hinge more; −bent is where it is straight.
+    # Positive rotations about the axis bend the hinge further; it is straight at −bent.
     bent = float(np.arctan2(np.linalg.norm(across), above @ below))
     least = -bent
     if bent > _IN_LINE:
@@ -101,7 +94,7 @@ def _hinge(
     else:
         axis = np.cross(above, [0.0, 0.0, way])
         size = float(np.linalg.norm(axis))
-        # Of what points along Z itself, up is the way of an elbow.
+        # For bones along Z the direction is ambiguous: elbows bend upwards.
         alone = size < _IN_LINE * np.linalg.norm(above)
         axis = np.array([-way, 0.0, 0.0]) if alone else axis / size
         bent = float(np.arctan2(across @ axis, above @ below))

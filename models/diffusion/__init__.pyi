@@ -1,5 +1,4 @@
-from .motion_diffusion import KIND as KIND, MotionDiffusion as MotionDiffusion
-from .motion_transformer import MotionTransformer as MotionTransformer, sinusoids as sinusoids
+from .motion_diffusion import MotionDiffusion as MotionDiffusion
 from .projected_denoiser import denoiser_of as denoiser_of
 from .settings import DiffusionSettings as DiffusionSettings
 from .track_denoising import denoise_track as denoise_track

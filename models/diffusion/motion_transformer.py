@@ -1,7 +1,7 @@
-"""The transformer of the motion diffusion model (MDM, Tevet et al. 2023), which MAS learns in 2D.
+"""Transformer of the motion diffusion model (MDM, Tevet et al. 2023; used in 2D by MAS).
 
-An encoder over frames: input and output are linear maps of a frame's 2J numbers, the noise level
-is one more token in front, positions are sinusoidal.
+An encoder over frames with linear maps from and to the 2J coordinates of a frame, one additional
+token for the noise level, and sinusoidal positions.
 """
 
 from __future__ import annotations
@@ -17,16 +17,7 @@ __all__ = ["MotionTransformer", "sinusoids"]
 class MotionTransformer(nn.Module):
     """(noisy motion, level) → clean motion, in standardised units.
 
-    Parameters
-    ----------
-    features : int
-        Numbers per frame, 2J.
-    frames : int
-        Most frames L.
-    layers, width, heads, feedforward : int
-        Of the encoder.
-    dropout : float
-        Share of activations that are left out in training.
+    ``features`` is 2J, the length of a frame, and ``frames`` the maximum L.
     """
 
     def __init__(
@@ -56,20 +47,9 @@ class MotionTransformer(nn.Module):
     def forward(
         self, motions: torch.Tensor, levels: torch.Tensor, valid: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Return the clean motions.
+        """Return the clean motions, ``(N, L, 2J), (N,), (N, L) → (N, L, 2J)``.
 
-        Parameters
-        ----------
-        motions : Tensor, (N, L, 2J)
-            Noisy motions.
-        levels : Tensor, (N,)
-            Numbers of the noise levels, 0 to T, which need not be whole.
-        valid : Tensor of bool, (N, L), optional
-            Frames that are part of the motion; all by default.
-
-        Returns
-        -------
-        Tensor, (N, L, 2J)
+        Levels are 0 to T and may be fractional; frames that are not ``valid`` are padding.
         """
         first = self.level(sinusoids(levels, self.width))[:, None]
         tokens = torch.cat([first, self.enter(motions)], dim=1)
@@ -83,7 +63,7 @@ class MotionTransformer(nn.Module):
 def sinusoids(places: torch.Tensor, width: int) -> torch.Tensor:
     """Return the embedding of positions (Vaswani et al. 2017, section 3.5): ``(N,) → (N, width)``.
 
-    Sines stand at even places, cosines at odd ones.
+    Sines are at even indices, cosines at odd ones.
     """
     rates = torch.exp(
         torch.arange(0, width, 2, device=places.device) * (-math.log(10_000.0) / width)

@@ -1,7 +1,7 @@
-"""Cleaning a 2D track with a 2D motion diffusion model.
+"""Denoising of a 2D track with a 2D motion diffusion model.
 
-A detection is the true keypoint plus an error of standard deviation σ: up to a factor, a noisy
-motion at the level where √((1−ᾱ)/ᾱ) is σ, of which the denoiser's estimate is the posterior mean.
+A detection is the true keypoint plus an error of standard deviation σ. Up to a factor this is a
+noisy motion at the level with √((1−ᾱ)/ᾱ) = σ, and the denoiser estimates its posterior mean.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["denoise_track"]
 
-# Detections farther than so many deviations of the data from its mean, in root mean square, are in
-# pixels or millimetres, or not centred: metres are within a few.
+# Maximum root mean square of detections, in units of the prior's scale. Larger values indicate
+# pixels, millimetres or tracks that are not centred.
 _FARTHEST = 20.0
 
 
@@ -31,92 +31,87 @@ def denoise_track(
     threshold: float = 0.3,
     rounds: int = 10,
 ) -> KeypointTrack:
-    """Return the track as the prior believes it to be.
+    """Return the denoised track.
 
-    A joint that is believed moves by at most ``noise``, in root mean square over its frames and
-    axes: so far goes the exact posterior mean, and an imperfect network may go no farther.
-
-    Joints below the threshold are not believed at all. They start at the prior's mean and take
-    the denoiser's estimate, at levels that fall from as much noise as signal to the detector's,
-    while what was seen stays as it was: a heuristic fill, not a draw.
+    Joints at or above the threshold move by at most ``noise`` in root mean square over frames and
+    axes, the bound for an exact posterior mean. Joints below it are filled in: they start at the
+    prior's mean and follow the denoiser at decreasing noise levels, with the visible joints fixed.
+    This fill is a heuristic, not a draw.
 
     Parameters
     ----------
     track : KeypointTrack
-        Prepared: metres, centred as the prior's data were, its joints and frame rate.
+        Prepared track with the prior's joints, frame rate and centring; metres.
     prior : MotionDiffusion
-        What cleans it.
+        Denoiser.
     noise : float
-        σ, standard deviation of a confident detection, metres.
+        Standard deviation σ of a confident detection, metres.
     threshold : float
-        Least confidence of a detection that is believed.
+        Minimum confidence of a visible joint.
     rounds : int
-        Noise levels on the way to the detector's, where some joint is not believed.
+        Number of noise levels for filling in joints.
 
     Returns
     -------
     KeypointTrack
-        Every joint in every frame; confidence 1 where it was believed, and as it came elsewhere.
+        All joints in all frames; visible joints have confidence 1, the others are unchanged.
 
     Raises
     ------
     ValueError
-        If joints or frame rate are not the prior's, no joint is confident, detections are so far
-        from the prior's mean that they cannot be in metres about the root, a number is out of
-        range, or the noise is beyond the levels that the prior has learnt.
+        If joints or frame rate are not the prior's, no joint is confident, detections are not in
+        metres about the root, a number is out of range, or the noise is above the prior's levels.
     """
     check_positive("noise", noise)
     check_count("rounds", rounds)
     _check_track(track, prior)
-    believed = (track.confidence >= threshold) & (track.confidence > 0)
-    if not believed.any():
+    visible = (track.confidence >= threshold) & (track.confidence > 0)
+    if not visible.any():
         raise ValueError(
-            f"track {track.name or 'unnamed'} has no joint of confidence {threshold:g} or more, "
-            "expected some"
+            f"track {track.name or 'unnamed'} must have a joint with a confidence of "
+            f"{threshold:g} or more, got none"
         )
-    _check_metres(track, prior, believed)
-    seen = np.where(believed[..., None], track.keypoints, prior.standards.mean) / prior.scale
+    _check_metres(track, prior, visible)
+    seen = np.where(visible[..., None], track.keypoints, prior.standards.mean) / prior.scale
     target = noise / prior.scale
     last = prior.settings.schedule.alpha_bar[-1]
     if target > (most := math.sqrt((1 - last) / last)):
         raise ValueError(
-            f"noise is {noise:g}, expected at most {most * prior.scale:.3g} metres, the most that "
-            "the prior has learnt"
+            f"noise must be at most {most * prior.scale:.3g} m, the prior's highest level, got "
+            f"{noise:g}"
         )
     levels = np.array([target])
-    if not believed.all():
+    if not visible.all():
         levels = np.geomspace(max(1.0, target), target, rounds)
     clean = seen
     for sigma in levels:
-        given = np.where(believed[..., None], seen, clean)
+        given = np.where(visible[..., None], seen, clean)
         clean = _denoise(prior, given, float(sigma))
-    clean = _drawn_back(clean, seen, believed, target)
-    confidence = np.where(believed, 1.0, track.confidence)
+    clean = _shrunk_towards(clean, seen, visible, target)
+    confidence = np.where(visible, 1.0, track.confidence)
     return replace(track, keypoints=clean * prior.scale, confidence=confidence)
 
 
-def _drawn_back(
-    clean: np.ndarray, seen: np.ndarray, believed: np.ndarray, sigma: float
+def _shrunk_towards(
+    clean: np.ndarray, seen: np.ndarray, visible: np.ndarray, sigma: float
 ) -> np.ndarray:
-    """Return the estimate, drawn towards detections as far as the network errs more than they.
+    """Return the estimate, moved towards detections where it deviates more than they can.
 
-    The posterior mean is, in mean square, nearer than σ to a detection: σ² − v with posterior
-    variance v. If r², a joint's mean square distance, is more, the network has an error of its own.
-    Were that independent of the detection's, it would be r² − σ², and the best combination would
-    take the share σ²/r² of the estimate; as estimates lean on detections, less would be best.
+    The posterior mean deviates from a detection by less than σ in mean square: by σ² − v, with v
+    the posterior variance. A larger mean square deviation r² shows an error of the network. If this
+    error were independent, it would be r² − σ², and σ²/r² the best weight of the estimate.
     """
-    off = np.where(believed[..., None], seen - clean, 0.0)
-    count = 2 * np.maximum(believed.sum(axis=0), 1)
+    off = np.where(visible[..., None], seen - clean, 0.0)
+    count = 2 * np.maximum(visible.sum(axis=0), 1)
     squares = (off**2).sum(axis=(0, 2)) / count
-    share = sigma**2 / np.maximum(squares, sigma**2)
-    return np.where(believed[..., None], seen - share[:, None] * off, clean)
+    weight = sigma**2 / np.maximum(squares, sigma**2)
+    return np.where(visible[..., None], seen - weight[:, None] * off, clean)
 
 
 def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the estimate of a track of any length, (L, J, 2), normalised units.
+    """Return the estimate for a track of any length, (L, J, 2), normalised units.
 
-    Longer ones go through in windows that overlap by half, blended by weights that fall to the
-    windows' ends, so that there is no seam.
+    Long tracks are processed in half-overlapping windows, blended by triangular weights.
     """
     alpha_bar = 1 / (1 + sigma**2)
     noisy = math.sqrt(alpha_bar) * keypoints
@@ -137,23 +132,23 @@ def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.
 def _check_track(track: KeypointTrack, prior: MotionDiffusion) -> None:
     if track.skeleton.canonical_names != prior.skeleton.canonical_names:
         raise ValueError(
-            f"track is of the joints {', '.join(track.skeleton.joint_names)}, expected the prior's,"
-            f" {', '.join(prior.skeleton.joint_names)}"
+            f"track must have the prior's joints {', '.join(prior.skeleton.joint_names)}, got "
+            f"{', '.join(track.skeleton.joint_names)}"
         )
     if abs(track.fps - prior.fps) > 1e-6 * prior.fps:
         raise ValueError(
-            f"track is at {track.fps:g} frames per second, expected the prior's {prior.fps:g}; "
+            f"track must have the prior's {prior.fps:g} frames per second, got {track.fps:g}; "
             "resample it"
         )
     if track.frames < 2:
-        raise ValueError("track has 1 frame, expected at least 2")
+        raise ValueError("track must have at least 2 frames, got 1")
 
 
-def _check_metres(track: KeypointTrack, prior: MotionDiffusion, believed: np.ndarray) -> None:
-    off = (track.keypoints - prior.standards.mean)[believed]
+def _check_metres(track: KeypointTrack, prior: MotionDiffusion, visible: np.ndarray) -> None:
+    off = (track.keypoints - prior.standards.mean)[visible]
     distance = math.sqrt((off**2).mean())
     if distance > (most := _FARTHEST * prior.scale):
         raise ValueError(
-            f"track {track.name or 'unnamed'} spans {distance:.3g} along an axis about the prior's "
-            f"mean, in root mean square, expected metres about the root, at most {most:.3g}"
+            f"track {track.name or 'unnamed'} must be in metres about the root, at most "
+            f"{most:.3g} m in root mean square, got {distance:.3g}"
         )

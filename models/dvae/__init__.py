@@ -1,4 +1,4 @@
-"""The Motion-DVAE prior and its denoiser."""
+"""Motion-DVAE prior and denoiser (dynamical variational autoencoder)."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Learning to denoise without clean motion (B, C, E.2): the loss is of noisy joints."""
+"""Training of the denoiser from noisy joints only (B, C, E.2)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from probmotion import seeds
-from probmotion.models.bodies.body_states import Placement
+from probmotion.models.bodies.body_states import to_world
 from probmotion.models.dvae.inference import Denoiser, DenoisingNetworks
 from probmotion.models.dvae.joint_noise import JointNoise
 from probmotion.models.dvae.motion_denoiser import KIND
 from probmotion.models.dvae.motion_dvae import MotionDVAE
-from probmotion.models.dvae.motion_windows import MotionWindows, Windows
+from probmotion.models.dvae.motion_windows import Windows, WindowTrainee
 from probmotion.models.dvae.noisy_windows import NoisyWindows
 from probmotion.models.training.checkpoints import weights_digest
 from probmotion.models.training.settings import TrainingSettings
@@ -24,32 +23,29 @@ from probmotion.motion.motion import Motion
 
 __all__ = ["DenoiserTrainee", "usual_denoiser_training"]
 
-_VALIDATION_BATCH = 256
 
+class DenoiserTrainee(WindowTrainee):
+    """Loss and data for :func:`~probmotion.models.training.trainer.train` of a denoiser.
 
-class DenoiserTrainee:
-    """What :func:`~probmotion.models.training.trainer.train` needs to learn to denoise.
-
-    The loss is minus the evidence lower bound of noisy joints, per frame. Clips make the noisy
-    joints and tell whose bones they are (the design's β, which is not inferred); their motion is
-    not looked at again. The prior stays as it is.
+    The loss is minus the evidence lower bound of noisy joints, per frame. Clips are used only to
+    simulate noisy joints and for their bone lengths (β, which is not inferred). The prior is fixed.
 
     Parameters
     ----------
     clips : sequence of Motion
-        Motion of the prior's skeleton and frame rate, metres.
+        Motion with the prior's skeleton and frame rate, metres.
     validation : sequence of Motion
-        Clips that are not among them.
+        Held-out clips.
     prior : MotionDVAE
-        What motion is like.
+        The prior.
     noise : JointNoise
-        What recordings are like.
+        Corruption model.
     latent_weight : float
-        Weight of the motion prior; 0 leaves it out (the ablation "no prior").
+        Weight of the motion prior; 0 for the ablation "no prior".
     annealing : int
-        Steps over which the weight of the motion prior rises.
+        Steps over which this weight rises.
     seed : int
-        Of the first weights and the validation's noise.
+        Seed of the initial weights and the validation noise.
     """
 
     kind = KIND
@@ -65,16 +61,18 @@ class DenoiserTrainee:
         annealing: int = 0,
         seed: int = 0,
     ) -> None:
-        frames = prior.settings.frames
+        super().__init__(
+            clips,
+            validation,
+            prior.states,
+            prior.settings.frames,
+            weight=latent_weight,
+            annealing=annealing,
+            seed=seed,
+        )
         self.prior = prior
         self.noise = JointNoise() if noise is None else noise
-        self.latent_weight = latent_weight
-        self.annealing = annealing
-        self.windows = MotionWindows(clips, prior.states, frames)
-        self.held_out = MotionWindows(validation, prior.states, frames)
         self.network = DenoisingNetworks(prior, seed)
-        self._seed = seed
-        self._weight = latent_weight
         self.settings: Mapping[str, Any] = {
             "prior": dict(prior.card["network"]),
             "prior_weights": weights_digest(prior.model),
@@ -84,23 +82,6 @@ class DenoiserTrainee:
             "clips": sorted(clip.name for clip in clips),
             "validation_clips": sorted(clip.name for clip in validation),
         }
-
-    def anneal(self, step: int) -> None:
-        """Set the weight of the motion prior at a step."""
-        risen = min(1.0, step / self.annealing) if self.annealing else 1.0
-        self._weight = self.latent_weight * risen
-
-    def training_loss(
-        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
-    ) -> torch.Tensor:
-        """Return the loss of fresh noisy windows."""
-        return self._loss(network, self.windows.draw(rng, batch), rng, self._weight, device)
-
-    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on held-out windows with noise that never changes."""
-        rng = seeds.generator(self._seed, "validation")
-        windows = self.held_out.spread(_VALIDATION_BATCH)
-        return float(self._loss(network, windows, rng, self.latent_weight, device))
 
     def _loss(
         self,
@@ -113,30 +94,29 @@ class DenoiserTrainee:
         assert isinstance(network, DenoisingNetworks)
         skeleton = self.prior.skeleton
         clean = self.prior.states.positions(windows.states, windows.bodies)
-        # Anywhere, looking anywhere: else a network would know where it looks that cannot be seen.
+        # Random placement keeps the network from learning the canonical heading and position.
         heading = rng.uniform(-np.pi, np.pi, len(clean))
         ground = rng.normal(0.0, self.prior.spread, (len(clean), 2))
-        noisy = self.noise.apply(rng, Placement(heading, ground).to_world(clean), skeleton)
-        evidence = NoisyWindows.of(*noisy, windows.bodies, skeleton).to(device)
+        noisy = self.noise.apply(rng, to_world(clean, heading, ground), skeleton)
+        noisy_windows = NoisyWindows.of(*noisy, windows.bodies, skeleton).to(device)
         self.prior.model.to(device)
         denoiser = Denoiser(self.prior, network)
         numbers, shape = denoiser.noise_numbers(clean.shape[1])
         drawn = rng.standard_normal((len(clean), numbers), dtype=np.float32)
         further = rng.standard_normal((len(clean), *shape), dtype=np.float32)
         inferred = denoiser.infer(
-            evidence,
+            noisy_windows,
             torch.as_tensor(drawn, device=device),
             torch.as_tensor(further, device=device),
         )
-        bound = denoiser.bound(evidence, inferred, first=True)
+        bound = denoiser.bound(noisy_windows, inferred, first=True)
         return -bound.total(weight).mean() / clean.shape[1]
 
 
 def usual_denoiser_training(size: str) -> tuple[TrainingSettings, int]:
-    """Return how a denoiser of a size is trained, and over how many steps KL is annealed.
+    """Return the training settings of a size and its KL annealing steps.
 
-    ``paper``: 500 epochs at most, until the validation loss has not fallen for 10 (E.2); an epoch,
-    which there is of AMASS, is 1000 steps here.
+    ``paper``: up to 500 epochs with a patience of 10 (E.2); an epoch of AMASS is 1000 steps here.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The inference models of a Motion-DVAE, q(z_t | z_{1:t−1}, y_{t:T}, x₀)."""
+"""Inference networks of the Motion-DVAE, q(z_t | z_{1:t−1}, y_{t:T}, x₀)."""
 
 from __future__ import annotations
 
@@ -9,28 +9,21 @@ import torch
 from torch import nn
 
 from probmotion.models.dvae.latent_rollouts import Inference
-from probmotion.models.dvae.layers import State, mean_and_log_scale, numbers_read, perceptron
+from probmotion.models.dvae.layers import State, mean_and_log_scale, n_encoder_inputs, perceptron
 from probmotion.models.dvae.settings import DVAESettings
 
-__all__ = ["Evidence", "JointEncoder", "TrackingEncoder"]
+__all__ = ["EncoderInputs", "JointEncoder", "TrackingEncoder"]
 
 _STEP = 0.05
-"""What a joint's way from frame to frame is measured in, metres."""
+"""Unit of joint displacements between frames, metres."""
 
 
-class Evidence(NamedTuple):
-    """What inference reads of B windows, in their canonical frames.
+class EncoderInputs(NamedTuple):
+    """Encoder inputs of B windows in their canonical frames.
 
-    Parameters
-    ----------
-    observed : Tensor, (B, L, M)
-        :meth:`~probmotion.models.dvae.network.DVAEModel.observed`.
-    joints : Tensor, (B, L, J, 3)
-        y, metres; not read where hidden.
-    trust : Tensor, (B, L, J)
-        0 where hidden.
-    pose : callable
-        M_β: standardised states of a frame (B, D) to joints (B, J, 3), metres.
+    ``observed`` (B, L, M): features from :meth:`DVAEModel.observed`; ``joints`` (B, L, J, 3): y,
+    metres, ignored where occluded; ``trust`` (B, L, J): weights, 0 where occluded; ``pose``: M_β,
+    maps standardised states (B, D) to joints (B, J, 3), metres.
     """
 
     observed: torch.Tensor
@@ -40,19 +33,10 @@ class Evidence(NamedTuple):
 
 
 class JointEncoder(nn.Module):
-    """q(z_t | z_{1:t−1}, y_{t:T}, x₀) as published, but for what it reads (A.2).
+    """Published encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) with joints as inputs (A.2).
 
-    The published encoder reads states x_t. Joints' positions say the same, and what is noisy or
-    hidden can be said of them too, so that what learnt on clean motion can go on with noisy joints.
-
-    Parameters
-    ----------
-    size : DVAESettings
-        Its size.
-    dim : int
-        Numbers of a state.
-    joints : int
-        J.
+    The published encoder reads states x_t. Joint positions carry the same information and allow
+    noise and occlusion, so an encoder trained on clean motion can be fine-tuned on noisy joints.
     """
 
     def __init__(self, size: DVAESettings, dim: int, joints: int) -> None:
@@ -60,16 +44,16 @@ class JointEncoder(nn.Module):
         width, groups = size.hidden, size.groups
         self.starts = perceptron(dim, 2 * width, width, groups)
         self.recurrent = nn.LSTMCell(size.latent, width)
-        self.reader = nn.LSTM(numbers_read(joints), width, batch_first=True)
+        self.reader = nn.LSTM(n_encoder_inputs(joints), width, batch_first=True)
         self.latents = perceptron(2 * width, 2 * size.latent, width, groups)
 
-    def reading(self, evidence: Evidence) -> Inference:
-        """Return the inference model of some evidence."""
-        return _Reading(self, _read_backwards(self.reader, evidence))
+    def conditioned(self, inputs: EncoderInputs) -> Inference:
+        """Return the inference model conditioned on observations."""
+        return _JointPosterior(self, _read_backwards(self.reader, inputs))
 
 
-class _Reading:
-    """A :class:`JointEncoder` that has read its evidence."""
+class _JointPosterior:
+    """A :class:`JointEncoder` conditioned on observations."""
 
     def __init__(self, encoder: JointEncoder, read: torch.Tensor) -> None:
         self.encoder = encoder
@@ -95,54 +79,49 @@ class _Reading:
 
 
 class TrackingEncoder(nn.Module):
-    """q(z_t | z_{1:t−1}, y_{t:T}, x₀) that sees how far the motion so far is from the evidence.
+    """Encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) that reads the tracking error of the current motion.
 
-    z_{1:t−1} and x₀ enter through what the generative model has made of them, its state and its
-    pose, so that no second recurrent network walks beside it; and the difference between the joints
-    observed at t and the pose at t − 1 is read as such, as in a Kalman filter.
-
-    Parameters
-    ----------
-    size, dim, joints
-        As of :class:`JointEncoder`.
+    z_{1:t−1} and x₀ enter through the state and pose of the generative model, so no second
+    recurrent network is needed. As in a Kalman filter, the encoder reads the innovation: observed
+    joints at t minus the pose at t − 1.
     """
 
     def __init__(self, size: DVAESettings, dim: int, joints: int) -> None:
         super().__init__()
         width, groups = size.hidden, size.groups
-        self.reader = nn.LSTM(numbers_read(joints), width, batch_first=True)
+        self.reader = nn.LSTM(n_encoder_inputs(joints), width, batch_first=True)
         read = 2 * width + dim + 4 * joints
         self.latents = perceptron(read, 2 * size.latent, width, groups)
 
-    def reading(self, evidence: Evidence) -> Inference:
-        """Return the inference model of some evidence."""
-        return _Tracking(self, evidence, _read_backwards(self.reader, evidence))
+    def conditioned(self, inputs: EncoderInputs) -> Inference:
+        """Return the inference model conditioned on observations."""
+        return _TrackingPosterior(self, inputs, _read_backwards(self.reader, inputs))
 
 
-class _Tracking:
-    """A :class:`TrackingEncoder` that has read its evidence."""
+class _TrackingPosterior:
+    """A :class:`TrackingEncoder` conditioned on observations."""
 
-    def __init__(self, encoder: TrackingEncoder, evidence: Evidence, read: torch.Tensor) -> None:
+    def __init__(self, encoder: TrackingEncoder, inputs: EncoderInputs, read: torch.Tensor) -> None:
         self.encoder = encoder
-        self.evidence = evidence
+        self.inputs = inputs
         self.read = read
 
     def start(self, initial: torch.Tensor) -> None:
-        """Begin with nothing of its own."""
+        """Return None: the encoder has no recurrent state."""
 
     def posterior(self, state: None, frame: int, moved: State) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log scale of q(z_t | …)."""
-        trust = self.evidence.trust[:, frame]
-        apart = (self.evidence.joints[:, frame] - self.evidence.pose(moved.motion)) / _STEP
+        trust = self.inputs.trust[:, frame]
+        apart = (self.inputs.joints[:, frame] - self.inputs.pose(moved.motion)) / _STEP
         apart = torch.where(trust[..., None] > 0, apart, torch.zeros_like(apart))
         seen = [moved.hidden, self.read[:, frame - 1], moved.motion, apart.flatten(-2), trust]
         return mean_and_log_scale(self.encoder.latents(torch.cat(seen, dim=-1)))
 
     def step(self, state: None, latent: torch.Tensor) -> None:
-        """Keep nothing."""
+        """Return None: the encoder has no recurrent state."""
 
 
-def _read_backwards(reader: nn.LSTM, evidence: Evidence) -> torch.Tensor:
-    """Return (B, T, H): what stands at frame t has read the frames from T down to t."""
-    read, _ = reader(evidence.observed[:, 1:].flip(1))
+def _read_backwards(reader: nn.LSTM, inputs: EncoderInputs) -> torch.Tensor:
+    """Return (B, T, H) features; entry t summarises the frames t to T."""
+    read, _ = reader(inputs.observed[:, 1:].flip(1))
     return read.flip(1)

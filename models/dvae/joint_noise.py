@@ -1,4 +1,4 @@
-"""What happens to joints on the way to a recording: noise, outliers, and joints that hide."""
+"""Corruption model for recorded joints: noise, outliers and occlusion."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive
 
-__all__ = ["JointNoise", "Noisy"]
+__all__ = ["JointNoise", "NoisyJoints"]
 
 
-class Noisy(NamedTuple):
+class NoisyJoints(NamedTuple):
     """Noisy windows: joints (B, L, J, 3), noise (B, L, J), seen (B, L, J), tails (B,)."""
 
     joints: np.ndarray
@@ -24,18 +24,16 @@ class Noisy(NamedTuple):
 
 @dataclass(frozen=True)
 class JointNoise:
-    """What recordings are like that a denoiser is to learn from.
+    """Distribution of the corruption that a denoiser is trained on.
 
     Parameters
     ----------
     least, most : float
-        Range of the noise's standard deviation (Student-t: scale), metres; even in its logarithm,
-        one per window.
+        Range of the noise standard deviation (Student-t: scale), metres; log-uniform per window.
     outliers : float
-        Share of windows whose noise is Student-t, with 2 to 8 degrees of freedom; in the others it
-        is Gaussian.
+        Fraction of windows with Student-t noise of 2 to 8 degrees of freedom; the rest is Gaussian.
     hidden : float
-        Share of windows in which limbs hide for a while, and single joints here and there.
+        Fraction of windows with temporarily occluded limbs and single occluded joints.
 
     Raises
     ------
@@ -55,21 +53,23 @@ class JointNoise:
             raise ValueError(f"most must be at least least={self.least}, got {self.most}")
         for name in ("outliers", "hidden"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be a share, 0 to 1, got {getattr(self, name)}")
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
     @classmethod
-    def hardly_any(cls) -> JointNoise:
-        """Return half a centimetre of noise and nothing hidden: all but clean motion."""
+    def nearly_clean(cls) -> JointNoise:
+        """Return 5 mm of Gaussian noise without occlusion."""
         return cls(least=5e-3, most=5e-3, outliers=0.0, hidden=0.0)
 
-    def apply(self, rng: np.random.Generator, joints: np.ndarray, skeleton: Skeleton) -> Noisy:
-        """Return noisy windows of clean ones, (B, L, J, 3)."""
+    def apply(
+        self, rng: np.random.Generator, joints: np.ndarray, skeleton: Skeleton
+    ) -> NoisyJoints:
+        """Return corrupted copies of clean windows, (B, L, J, 3), metres."""
         n, frames, count, _ = joints.shape
         scale = np.exp(rng.uniform(np.log(self.least), np.log(self.most), n))
         heavy = np.less(rng.random(n), self.outliers)
         freedom = np.exp(rng.uniform(np.log(2.0), np.log(8.0), n))
         error = rng.standard_normal(joints.shape)
-        # Student-t is Gaussian over the root of a mean square.
+        # A Student-t variable is a normal one divided by the root of χ²/ν.
         square = (
             rng.chisquare(freedom[:, None, None, None], joints.shape) / freedom[:, None, None, None]
         )
@@ -77,17 +77,17 @@ class JointNoise:
         seen = np.stack([self._seen(rng, frames, skeleton) for _ in range(n)])
         noise = np.broadcast_to(scale[:, None, None], (n, frames, count))
         tails = np.where(heavy, 1 / freedom, 0.0)
-        return Noisy(joints + scale[:, None, None, None] * error, noise, seen, tails)
+        return NoisyJoints(joints + scale[:, None, None, None] * error, noise, seen, tails)
 
     def _seen(self, rng: np.random.Generator, frames: int, skeleton: Skeleton) -> np.ndarray:
-        """Return what one window shows, (L, J)."""
+        """Return the visibility of one window, (L, J)."""
         seen = np.ones((frames, skeleton.n_joints), dtype=bool)
         if rng.random() >= self.hidden:
             return seen
         for _ in range(rng.integers(1, 4)):
             top = int(rng.integers(skeleton.n_joints))
             limb = [j for j in range(skeleton.n_joints) if j == top or top in skeleton.ancestors(j)]
-            # All of the body hides for a moment only: what it did then cannot be known.
+            # Keep whole-body occlusions short: the motion cannot be recovered from nothing.
             most = frames // 4 if len(limb) > skeleton.n_joints // 2 else frames
             length = int(rng.integers(1, most + 1))
             start = int(rng.integers(0, frames - length + 1))

@@ -1,4 +1,4 @@
-"""What the networks of a Motion-DVAE are made of."""
+"""Layers shared by the Motion-DVAE networks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-__all__ = ["State", "mean_and_log_scale", "numbers_read", "perceptron", "trust_in"]
+__all__ = ["State", "mean_and_log_scale", "n_encoder_inputs", "perceptron", "trust_weight"]
 
-_WIDEST = 6.0
-_HALF_TRUSTED = 0.05
+_LOG_SCALE_BOUND = 6.0
+_HALF_WEIGHT_NOISE = 0.05
 
 
 class State(NamedTuple):
-    """The LSTM's two parts, (B, H) each, and μ_x so far, (B, D), standardised."""
+    """LSTM state, (B, H) each, and the standardised mean μ_x so far, (B, D)."""
 
     hidden: torch.Tensor
     cell: torch.Tensor
@@ -22,7 +22,7 @@ class State(NamedTuple):
 
 
 def perceptron(inputs: int, outputs: int, width: int, groups: int) -> nn.Sequential:
-    """Return a network of two hidden layers with group normalisation and ReLU (A.1)."""
+    """Return a perceptron with two group-normalised ReLU layers (A.1)."""
     return nn.Sequential(
         nn.Linear(inputs, width),
         nn.GroupNorm(groups, width),
@@ -35,16 +35,17 @@ def perceptron(inputs: int, outputs: int, width: int, groups: int) -> nn.Sequent
 
 
 def mean_and_log_scale(numbers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Split network outputs into a mean and a bounded log scale."""
     mean, raw = numbers.chunk(2, dim=-1)
-    # Bounded smoothly, so that no scale over- or underflows before the network has learnt.
-    return mean, _WIDEST * torch.tanh(raw / _WIDEST)
+    # The smooth bound prevents overflow and underflow early in training.
+    return mean, _LOG_SCALE_BOUND * torch.tanh(raw / _LOG_SCALE_BOUND)
 
 
-def numbers_read(joints: int) -> int:
-    """Return how many numbers inference reads of a frame of J joints."""
+def n_encoder_inputs(joints: int) -> int:
+    """Return the number of encoder inputs per frame for J joints."""
     return 4 * joints + 1
 
 
-def trust_in(noise: torch.Tensor) -> torch.Tensor:
-    """Return how far a joint is trusted by its noise, metres: 1 without any, ½ at 5 cm, to 0."""
-    return 1 / (1 + (noise / _HALF_TRUSTED) ** 2)
+def trust_weight(noise: torch.Tensor) -> torch.Tensor:
+    """Return the weight of a joint by its noise in metres: 1 at 0, ½ at 5 cm, 0 at infinity."""
+    return 1 / (1 + (noise / _HALF_WEIGHT_NOISE) ** 2)

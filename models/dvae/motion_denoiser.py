@@ -1,4 +1,4 @@
-"""`MotionDenoiser`: the inference network of a Motion-DVAE, which reads noisy joints."""
+"""`MotionDenoiser`: amortised inference of motion from noisy joints in a Motion-DVAE."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from probmotion import seeds
-from probmotion.models.dvae.inference import Bound, Denoiser, DenoisingNetworks, Inferred
+from probmotion.models.dvae.inference import Bound, Denoiser, DenoisingNetworks, InferenceDraw
 from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.noisy_windows import NoisyWindows, Stitching, windows_of
 from probmotion.models.training.checkpoints import (
@@ -38,17 +38,7 @@ _MEANS = 64
 
 
 class MotionDenoiser:
-    """Inference networks of one Motion-DVAE, trained on noisy joints.
-
-    Parameters
-    ----------
-    networks : DenoisingNetworks
-        Trained beside the prior.
-    prior : MotionDVAE
-        The prior that they infer in.
-    card : mapping, optional
-        What is known of their training.
-    """
+    """Inference networks of one Motion-DVAE, trained on noisy joints; ``card``: training record."""
 
     def __init__(
         self, networks: DenoisingNetworks, prior: MotionDVAE, card: Mapping[str, Any] | None = None
@@ -58,60 +48,48 @@ class MotionDenoiser:
         self.card = dict(card or {})
 
     def __repr__(self) -> str:
-        """What it reads and how large it is: what tables and saved draws say of it."""
+        """Summary for tables and stored draws."""
         numbers = sum(value.numel() for value in self.networks.parameters())
         return f"{type(self).__name__}({self.prior.skeleton.n_joints} joints, {numbers} numbers)"
 
     @classmethod
     def load(cls, source: str | Path, prior: MotionDVAE) -> MotionDenoiser:
-        """Return a trained denoiser of a prior.
-
-        Parameters
-        ----------
-        source : str or Path
-            A checkpoint's file, the folder of a training run, or the name of one in the package.
-        prior : MotionDVAE
-            The prior that it was trained beside.
+        """Load a trained denoiser of a prior: a file, the folder of a run or a shipped name.
 
         Raises
         ------
         CheckpointError
-            If the file is damaged, of another version, no denoiser, or of another prior.
+            If the file is damaged, not a denoiser of this version, or of another prior.
         FileNotFoundError
-            If there is no such file and no such name.
+            If there is no such file or name.
         ValueError
-            If the prior is no Motion-DVAE.
+            If the prior is not a Motion-DVAE.
         """
         _check_kind(prior)
         checkpoint = load_checkpoint(source, KIND)
         try:
-            beside = checkpoint.settings["network"]["prior_weights"]
+            digest = checkpoint.settings["network"]["prior_weights"]
         except (KeyError, TypeError) as error:
             raise CheckpointError(
-                f"{source} has settings that are no denoiser's: {error}"
+                f"{source} does not contain valid denoiser settings: {error}"
             ) from error
-        if beside != weights_digest(prior.model):
-            raise CheckpointError(f"{source} is the denoiser of another prior than the one given")
+        if digest != weights_digest(prior.model):
+            raise CheckpointError(f"{source} must be a denoiser of the given prior, got another's")
         networks = DenoisingNetworks(prior)
         load_weights(networks, checkpoint.tensors)
         return cls(networks, prior, checkpoint.settings)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:
-        """Write the denoiser as a checkpoint, which :meth:`load` reads; halved if asked.
+        """Save the denoiser as a checkpoint for :meth:`load`, optionally in half precision.
 
-        Raises
-        ------
-        ValueError
-            If it has no card to rebuild it by: only trained ones have.
-        OSError
-            If the file cannot be written.
+        Raises ``ValueError`` if there is no training record.
         """
         if "network" not in self.card:
-            raise ValueError("the denoiser has no card, expected one that was trained or loaded")
+            raise ValueError("denoiser must have a training record to be saved; train or load it")
         save_checkpoint(path, Checkpoint(KIND, self.card, self.networks.state_dict()), half=half)
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether the networks can read some evidence: noisy 3D joints."""
+        """Whether the observations are noisy 3D joints."""
         return isinstance(likelihood, Joints3D)
 
     def on(
@@ -122,28 +100,28 @@ class MotionDenoiser:
         degrees_of_freedom: float | None = None,
         overlap: int = 10,
     ) -> NoisyMotion:
-        """Return the inference of one recording, with networks of its own.
+        """Return the inference of one recording, with its own copy of the networks.
 
         Parameters
         ----------
         prior : MotionDVAE
-            The posterior's prior: this denoiser's, of any length and body.
+            This denoiser's prior, with any length and body.
         likelihood : Joints3D
-            The evidence.
+            Observations.
         degrees_of_freedom : float, optional
-            λ of the noise that is supposed; ``inf`` for Gaussian. By default the evidence's own.
+            Assumed λ of the noise; ``inf`` for Gaussian. By default the likelihood's.
         overlap : int
-            Frames that windows share, one less than a window has at most.
+            Overlap of windows in frames, less than the window length.
 
         Raises
         ------
         ValueError
-            If the prior is another one, a whole window is hidden, or ``overlap`` is out of range.
+            If the prior is another one, a whole window is occluded, or ``overlap`` is out of range.
         """
         _check_kind(prior)
         same = prior.model is self.prior.model
         if not same and weights_digest(prior.model) != weights_digest(self.prior.model):
-            raise ValueError("prior is another one than the denoiser was trained beside")
+            raise ValueError("prior must be the one that the denoiser was trained for")
         own = likelihood.entries.degrees_of_freedom
         freedom = own if degrees_of_freedom is None else degrees_of_freedom
         tails = 0.0 if freedom is None or math.isinf(freedom) else 1 / freedom
@@ -151,8 +129,7 @@ class MotionDenoiser:
         check_count("overlap", overlap, least=0)
         if overlap >= window:
             raise ValueError(
-                f"overlap is {overlap}, expected less than the {window} frames of a window of the "
-                "denoiser's"
+                f"overlap must be less than the denoiser's window of {window} frames, got {overlap}"
             )
         stitching = Stitching(likelihood.frames, window, overlap)
         windows = windows_of(likelihood, prior.body, prior.skeleton, stitching, tails)
@@ -160,17 +137,7 @@ class MotionDenoiser:
 
 
 class NoisyMotion:
-    """One recording with the networks that infer what moved, which may be fitted to it alone.
-
-    Parameters
-    ----------
-    denoiser : Denoiser
-        Prior and networks.
-    windows : NoisyWindows
-        The recording's.
-    stitching : Stitching
-        How they lie.
-    """
+    """Inference of one recording in windows; its networks may be optimised for it."""
 
     def __init__(self, denoiser: Denoiser, windows: NoisyWindows, stitching: Stitching) -> None:
         self.denoiser = denoiser
@@ -178,12 +145,12 @@ class NoisyMotion:
         self.stitching = stitching
 
     def parameters(self) -> list[torch.nn.Parameter]:
-        """Return what may be fitted, from now on with gradients."""
+        """Enable gradients and return the trainable parameters."""
         self.denoiser.networks.requires_grad_(True)
         return list(self.denoiser.networks.parameters())
 
     def bound(self, rng: np.random.Generator, *, initial_entropy: bool = True) -> Bound:
-        """Return the evidence lower bound's parts at one draw per window, (B,) each."""
+        """Return the terms of the bound at one draw per window, (B,) each."""
         inferred = self.denoiser.infer(self.windows, *self._numbers(rng, 1))
         return self.denoiser.bound(self.windows, inferred, first=initial_entropy)
 
@@ -194,12 +161,12 @@ class NoisyMotion:
         return -self.bound(rng, initial_entropy=initial_entropy).total(latent_weight).sum()
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return draws of the motion, (n, L, J, 3), metres, and θ where it is one window."""
+        """Return draws (n, L, J, 3), metres, and their θ for a single window."""
         count = len(self.windows)
         first, shape = self.denoiser.noise_numbers(self.stitching.length)
         drawn = streams.standard_normal((n, count, first + math.prod(shape)))
         positions, thetas = [], []
-        # Rounding depends on the shape of a product, and draws must not depend on their batch.
+        # Fixed batch shapes make the rounding, and so the draws, independent of n.
         whole = max(1, _ROWS // count)
         for at in range(0, n, whole):
             rows = np.zeros((whole, *drawn.shape[1:]), dtype=np.float32)
@@ -212,7 +179,7 @@ class NoisyMotion:
         windows = np.concatenate(positions)
         if count == 1:
             theta = np.concatenate(thetas)
-            # The heading's two numbers have a length too, of which nothing is known.
+            # The observations do not inform the length of the two heading numbers.
             length = np.linalg.norm(streams.standard_normal((n, 2)), axis=-1, keepdims=True)
             theta[:, 2:4] *= length
             return windows[:, 0], theta
@@ -220,21 +187,15 @@ class NoisyMotion:
 
     @torch.no_grad()
     def predict(self, rng: np.random.Generator, *, average: bool = True) -> np.ndarray:
-        """Return the motion predicted, (L, J, 3), metres (D, equation 11).
+        """Return the predicted motion, (L, J, 3), metres (D, equation 11).
 
-        The mean over draws of what lies between observation and decoded joint by their variances;
-        of the decoded joint where nothing was observed. Frame 0 is M_β(μ_ω).
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Of the draws.
-        average : bool
-            Average over draws; else decode the means of q, once ("NN output").
+        The mean over draws of the precision-weighted average of observed and decoded joints; the
+        decoded joints where occluded. Frame 0 is M_β(μ_ω). ``average=False`` decodes the means of q
+        once instead ("NN output").
         """
-        begun = self._apart(self._inferred_from(self._still(1)).positions)[0]
+        decoded = self._apart(self._inferred_from(self._still(1)).positions)[0]
         if not average:
-            return self.stitching.mean(begun)
+            return self.stitching.mean(decoded)
         inferred = self.denoiser.infer(
             self.windows.repeated(_AVERAGED), *self._numbers(rng, _AVERAGED)
         )
@@ -244,7 +205,7 @@ class NoisyMotion:
         between = (v * inferred.positions + square * windows.joints) / (v + square)
         seen = windows.seen[..., None]
         mean = self._apart(torch.where(seen, between, inferred.positions)).mean(axis=0)
-        mean[:, 0] = begun[:, 0]
+        mean[:, 0] = decoded[:, 0]
         return self.stitching.mean(mean)
 
     def _numbers(self, rng: np.random.Generator, n: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -259,8 +220,8 @@ class NoisyMotion:
         first, shape = self.denoiser.noise_numbers(self.stitching.length)
         return np.zeros((n, len(self.windows), first + math.prod(shape)), dtype=np.float32)
 
-    def _inferred_from(self, numbers: np.ndarray) -> Inferred:
-        """Return draws from numbers (n, B, …), n copies of all windows, without gradients."""
+    def _inferred_from(self, numbers: np.ndarray) -> InferenceDraw:
+        """Return draws from random numbers (n, B, …) without gradients."""
         first, shape = self.denoiser.noise_numbers(self.stitching.length)
         flat = torch.as_tensor(numbers).flatten(0, 1)
         windows = self.windows.repeated(len(numbers))
@@ -270,9 +231,9 @@ class NoisyMotion:
             )
 
     def _apart(self, positions: torch.Tensor) -> np.ndarray:
-        """Return (n B, …) as (n, B, …), double precision."""
-        found = positions.detach().double().numpy()
-        return found.reshape(-1, len(self.windows), *found.shape[1:])
+        """Reshape (n B, …) to (n, B, …) in double precision."""
+        result = positions.detach().double().numpy()
+        return result.reshape(-1, len(self.windows), *result.shape[1:])
 
     def _mean_of_windows(self) -> np.ndarray:
         with torch.no_grad():
@@ -280,7 +241,7 @@ class NoisyMotion:
             inferred = self.denoiser.infer(self.windows.repeated(_MEANS), *numbers)
         return self._apart(inferred.positions).mean(axis=0)
 
-    def _theta(self, inferred: Inferred) -> np.ndarray:
+    def _theta(self, inferred: InferenceDraw) -> np.ndarray:
         parts = (inferred.ground, inferred.heading, inferred.first, inferred.rolled.innovations)
         return self.denoiser.prior.coordinates(*(part.double().numpy() for part in parts))
 
@@ -288,6 +249,6 @@ class NoisyMotion:
 def _check_kind(prior: Any) -> None:
     if not isinstance(prior, MotionDVAE):
         raise ValueError(
-            f"prior is {type(prior).__name__}, expected the Motion-DVAE that the denoiser was "
-            "trained beside"
+            "prior must be the Motion-DVAE that the denoiser was trained for, "
+            f"got {type(prior).__name__}"
         )

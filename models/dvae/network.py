@@ -1,4 +1,4 @@
-"""The networks of Motion-DVAE: what a body does next, and all that is learnt beside it (A.1)."""
+"""Networks of the Motion-DVAE and their standardisation (A.1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import nn
 
 from probmotion import seeds
 from probmotion.models.bodies.body_states import BodyStates
-from probmotion.models.dvae.encoders import Evidence, JointEncoder, TrackingEncoder
+from probmotion.models.dvae.encoders import EncoderInputs, JointEncoder, TrackingEncoder
 from probmotion.models.dvae.latent_rollouts import Rollout
 from probmotion.models.dvae.layers import State, mean_and_log_scale, perceptron
 from probmotion.models.dvae.settings import DVAESettings
@@ -17,20 +17,13 @@ from probmotion.models.dvae.settings import DVAESettings
 __all__ = ["PARTS", "DVAEModel", "DVAENetwork"]
 
 PARTS = 4
-"""What has a decoder scale: root's translation, its rotation, other rotations, joints."""
+"""Parts with a decoder scale: root translation, root rotation, joint rotations, joints."""
 
 
 class DVAENetwork(nn.Module):
-    """p(x_{1:T}, z_{1:T} | x₀): what a body does next, in standardised states.
+    """Generative network p(x_{1:T}, z_{1:T} | x₀) over standardised states of dimension ``dim``.
 
-    Parameters
-    ----------
-    size : DVAESettings
-        Its size.
-    dim : int
-        Numbers of a state.
-    parts : int
-        Parts of a state that have a decoder scale of their own, and one more: joints.
+    ``parts`` is the number of decoder scales, including the one for joint positions.
     """
 
     def __init__(self, size: DVAESettings, dim: int, parts: int) -> None:
@@ -43,7 +36,7 @@ class DVAENetwork(nn.Module):
         self.cumulative = size.decoder == "cumulative"
         if self.cumulative:
             self.straight = nn.Linear(size.latent, dim, bias=False)
-            _quiet(self.decoder)
+            _shrink_output(self.decoder)
         self.log_scales = nn.Parameter(torch.full((parts,), math.log(0.1)))
 
     def start(self, initial: torch.Tensor) -> State:
@@ -58,34 +51,23 @@ class DVAENetwork(nn.Module):
     def step(self, state: State, latent: torch.Tensor) -> State:
         """Return h_t = LSTM(h_{t−1}, z_t)."""
         hidden, cell = self.recurrent(latent, (state.hidden, state.cell))
-        # A direct decoder's motion is decoded at once, when all frames are there.
+        # The direct decoder decodes all frames at once, in `decode`.
         if not self.cumulative:
             return State(hidden, cell, state.motion)
         moved = state.motion + self.decoder(hidden) + self.straight(latent)
         return State(hidden, cell, moved)
 
     def decode(self, states: list[State]) -> torch.Tensor:
-        """Return μ_x of every frame, ``T × (B, H) → (B, T, D)``, standardised."""
+        """Return μ_x of all frames, ``T × (B, H) → (B, T, D)``, standardised."""
         if self.cumulative:
             return torch.stack([state.motion for state in states], dim=1)
         return _over_frames(self.decoder, states)
 
 
 class DVAEModel(nn.Module):
-    """All that a Motion-DVAE learns: two networks, what they are standardised by, and p(x₀).
+    """Generative network, encoder, standardisation and initial-state distribution p(x₀).
 
-    Parameters
-    ----------
-    size : DVAESettings
-        Its size.
-    dim : int
-        Numbers D of a state.
-    joints : int
-        J.
-    rank : int
-        Directions r in which the first state varies.
-    seed : int
-        Of the first weights.
+    ``dim`` D is that of a state, ``rank`` r the number of principal directions of the first state.
     """
 
     state_mean: torch.Tensor
@@ -113,55 +95,50 @@ class DVAEModel(nn.Module):
             self.register_buffer(name, torch.zeros(shape))
 
     def standardised(self, states: torch.Tensor) -> torch.Tensor:
-        """Return states as the networks read them, ``(…, D) → (…, D)``."""
+        """Return standardised states, ``(…, D) → (…, D)``."""
         return (states - self.state_mean) / self.state_deviation
 
     def decoded(self, rolled: Rollout) -> torch.Tensor:
-        """Return μ_x of frames 1 to T, (B, T, D), in the states' own units."""
+        """Return μ_x of frames 1 to T, (B, T, D), in state units."""
         return self.state_mean + self.state_deviation * self.generative.decode(rolled.states)
 
     def first_states(self, coordinates: torch.Tensor) -> torch.Tensor:
-        """Return x₀ at its coordinates, ``(…, r) → (…, D)``: N(0, I) there is p(x₀)."""
+        """Return x₀ from its coordinates, ``(…, r) → (…, D)``; N(0, I) coordinates give p(x₀)."""
         return self.initial_mean + coordinates @ self.initial_factor.T
 
     def observed(
         self, joints: torch.Tensor, trust: torch.Tensor, tails: torch.Tensor
     ) -> torch.Tensor:
-        """Return what inference reads of frames, (…, L, 4 J + 1).
+        """Return encoder features of frames, (…, L, 4 J + 1).
 
-        Parameters
-        ----------
-        joints : Tensor, (…, L, J, 3)
-            In the canonical frame, metres; not read where hidden.
-        trust : Tensor, (…, L, J)
-            How far each is trusted, :func:`trust_in`; 0 where hidden.
-        tails : Tensor, (…)
-            One over the degrees of freedom of the noise; 0 where it is Gaussian.
+        Takes canonical joints (…, L, J, 3), metres, ignored where occluded, their weights (…, L, J)
+        from :func:`trust_weight`, 0 where occluded, and reciprocal degrees of freedom (…), 0 for
+        Gaussian noise.
         """
-        shown = (joints - self.joint_mean) / self.joint_deviation
-        shown = torch.where(trust[..., None] > 0, shown, torch.zeros_like(shown))
+        visible = (joints - self.joint_mean) / self.joint_deviation
+        visible = torch.where(trust[..., None] > 0, visible, torch.zeros_like(visible))
         tail = tails[..., None, None].expand(*trust.shape[:-1], 1)
-        return torch.cat([shown.flatten(-2), trust, tail], dim=-1)
+        return torch.cat([visible.flatten(-2), trust, tail], dim=-1)
 
-    def evidence(
+    def encoder_inputs(
         self,
         joints: torch.Tensor,
         trust: torch.Tensor,
         tails: torch.Tensor,
         states: BodyStates,
         bodies: torch.Tensor,
-    ) -> Evidence:
-        """Return what an encoder reads of B windows; ``bodies`` (B, J, 3) are who moves."""
+    ) -> EncoderInputs:
+        """Return the encoder inputs of B windows; ``bodies`` (B, J, 3): rest offsets, metres."""
 
         def pose(motion: torch.Tensor) -> torch.Tensor:
             own = self.state_mean + self.state_deviation * motion
             return states.positions(own[:, None], bodies)[:, 0]
 
-        return Evidence(self.observed(joints, trust, tails), joints, trust, pose)
+        return EncoderInputs(self.observed(joints, trust, tails), joints, trust, pose)
 
 
-def _quiet(network: nn.Sequential) -> None:
-    """Let a network begin near 0: frames hardly differ."""
+def _shrink_output(network: nn.Sequential) -> None:
+    """Scale the last layer so that consecutive frames initially barely differ."""
     with torch.no_grad():
         network[-1].weight.mul_(0.1)
         network[-1].bias.zero_()

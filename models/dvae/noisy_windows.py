@@ -1,4 +1,4 @@
-"""Noisy joints of a motion as overlapping windows, and one motion made of windows again."""
+"""Overlapping windows of noisy joints and their stitching to whole motions."""
 
 from __future__ import annotations
 
@@ -15,29 +15,17 @@ from probmotion.posteriors.likelihoods import Joints3D
 
 __all__ = ["NoisyWindows", "Stitching", "rough_placement"]
 
-_FIRST = 5
+_PLACEMENT_FRAMES = 5
 
 
 @dataclass(frozen=True)
 class NoisyWindows:
-    """B windows of noisy joints, in the world, and roughly where each begins.
+    """B windows of noisy joints in the world with an approximate initial placement.
 
-    Parameters
-    ----------
-    joints : Tensor, (B, L, J, 3)
-        y, metres; 0 where hidden.
-    noise : Tensor, (B, L, J)
-        Standard deviation (Student-t: scale) of a coordinate, metres; 1 where hidden.
-    seen : Tensor of bool, (B, L, J)
-        What was observed.
-    tails : Tensor, (B,)
-        One over the degrees of freedom of the noise, 0 where it is Gaussian.
-    heading : Tensor, (B,)
-        Of the first frame, radians, roughly.
-    ground : Tensor, (B, 2)
-        X and Z of the first frame's root, metres, roughly.
-    bodies : Tensor, (B, J, 3)
-        Rest offsets of who moves, metres.
+    ``joints`` (B, L, J, 3): y, metres, 0 where occluded; ``noise`` (B, L, J): standard deviation
+    (Student-t: scale), metres, 1 where occluded; ``seen`` (B, L, J): visibility; ``tails`` (B,):
+    reciprocal degrees of freedom, 0 for Gaussian noise; ``heading`` (B,), radians, and ``ground``
+    (B, 2), metres: of the first frame; ``bodies`` (B, J, 3): rest offsets, metres.
     """
 
     joints: torch.Tensor
@@ -58,7 +46,7 @@ class NoisyWindows:
         bodies: np.ndarray,
         skeleton: Skeleton,
     ) -> NoisyWindows:
-        """Return windows of arrays in the shapes above, with their rough placement."""
+        """Build windows from arrays in the shapes above and estimate their placement."""
         heading, ground = rough_placement(joints, seen, skeleton)
 
         def single(values: np.ndarray) -> torch.Tensor:
@@ -79,25 +67,22 @@ class NoisyWindows:
         return len(self.joints)
 
     def to(self, device: torch.device) -> NoisyWindows:
-        """Return the same on a device."""
+        """Return a copy on a device."""
         return NoisyWindows(*(getattr(self, name).to(device) for name in self.__annotations__))
 
     def repeated(self, n: int) -> NoisyWindows:
-        """Return n copies of all windows, one after the other."""
-
-        def copies(values: torch.Tensor) -> torch.Tensor:
-            return values.repeat(n, *(1 for _ in values.shape[1:]))
-
-        return NoisyWindows(*(copies(getattr(self, name)) for name in self.__annotations__))
+        """Return n consecutive copies of all windows."""
+        parts = (getattr(self, name) for name in self.__annotations__)
+        return NoisyWindows(*(part.repeat(n, *[1] * (part.ndim - 1)) for part in parts))
 
     def in_frame(self, heading: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
-        """Return the joints in canonical frames, (B, L, J, 3); hidden ones are of no meaning."""
+        """Return canonical joints, (B, L, J, 3); meaningless where occluded."""
         moved = self.joints - on_ground(ground)[:, None, None, :]
         return turned_about_vertical(moved, -heading)
 
 
 def on_ground(ground: torch.Tensor) -> torch.Tensor:
-    """Return points of the ground in space, ``(…, 2) → (…, 3)``."""
+    """Return ground points in space, ``(…, 2) → (…, 3)``."""
     x, z = ground[..., 0], ground[..., 1]
     return torch.stack([x, torch.zeros_like(x), z], dim=-1)
 
@@ -105,30 +90,22 @@ def on_ground(ground: torch.Tensor) -> torch.Tensor:
 def rough_placement(
     joints: np.ndarray, seen: np.ndarray, skeleton: Skeleton
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where windows roughly begin: headings (B,), radians, and ground points (B, 2), metres.
+    """Estimate headings (B,), radians, and ground points (B, 2), metres, of B windows.
 
-    The heading is that of left-right pairs in the first frames that show one; the ground point is
-    the root's in the first frames that show it, or the mean of what they show.
-
-    Parameters
-    ----------
-    joints : ndarray, (B, L, J, 3)
-        World positions; not read where hidden.
-    seen : ndarray of bool, (B, L, J)
-        What was observed.
-    skeleton : Skeleton
-        J joints.
+    The heading comes from left-right joint pairs in the first frames with a visible pair. The
+    ground point is the root, or the mean visible joint, in the first frames where it is visible.
+    Takes world positions (B, L, J, 3), ignored where occluded, and visibility (B, L, J).
 
     Raises
     ------
     ValueError
-        If a window shows nothing at all.
+        If no joint of a window is visible.
     """
-    blind = np.flatnonzero(seen.sum(axis=(1, 2)) == 0)
-    if len(blind):
+    empty = np.flatnonzero(seen.sum(axis=(1, 2)) == 0)
+    if len(empty):
         raise ValueError(
-            f"joints has window {blind[0]} of {len(joints)} with every joint hidden, expected at "
-            "least one joint in one frame of each"
+            f"every window of joints must have a visible joint, got none in window {empty[0]} of "
+            f"{len(joints)}"
         )
     left, right = (list(side) for side in zip(*skeleton.mirrored_pairs, strict=True))
     both = seen[:, :, left] & seen[:, :, right]
@@ -137,9 +114,9 @@ def rough_placement(
     heading = np.arctan2(-across[:, 2], across[:, 0])
     root = skeleton.roots[0]
     count = seen.sum(axis=2)
-    shown = np.where(seen[..., None], joints, 0.0).sum(axis=2) / np.maximum(count, 1)[..., None]
+    visible = np.where(seen[..., None], joints, 0.0).sum(axis=2) / np.maximum(count, 1)[..., None]
     rooted = seen[:, :, root].sum(axis=1) > 0
-    points = np.where(rooted[:, None, None], np.nan_to_num(joints[:, :, root]), shown)
+    points = np.where(rooted[:, None, None], np.nan_to_num(joints[:, :, root]), visible)
     there = np.where(rooted[:, None], seen[:, :, root], count > 0)
     first = _over_first(np.ones_like(there, dtype=float)[..., None], there)
     ground = (first * points).sum(axis=1) / first.sum(axis=1)
@@ -147,23 +124,23 @@ def rough_placement(
 
 
 def _over_first(values: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Return values (B, L, …) with 0 but in each window's first frames that are there."""
+    """Zero values (B, L, …) outside the first valid frames of each window."""
     order = np.cumsum(there, axis=1)
-    return np.where((there & (order <= _FIRST))[..., None], values, 0.0)
+    return np.where((there & (order <= _PLACEMENT_FRAMES))[..., None], values, 0.0)
 
 
 @dataclass(frozen=True)
 class Stitching:
-    """How a motion of ``frames`` is cut into overlapping windows and made whole again.
+    """Segmentation of a motion into overlapping windows, and its inverse.
 
     Parameters
     ----------
     frames : int
-        L, of the motion.
+        L, length of the motion.
     window : int
         Frames of a window; a shorter motion is one window.
     overlap : int
-        Frames that neighbours share, at least; the last window ends with the motion.
+        Minimum overlap of neighbouring windows; the last window ends with the motion.
     """
 
     frames: int
@@ -183,9 +160,9 @@ class Stitching:
 
     @property
     def weights(self) -> np.ndarray:
-        """Share of each window in each of its frames, (B, length); they add up to 1 in the motion.
+        """Weights of each window per frame, (B, length), which sum to 1 in every frame.
 
-        Shares rise and fall smoothly over the overlap, so that no frame jumps.
+        They follow sin² ramps over the overlap.
         """
         from_edge = np.minimum(np.arange(self.length), np.arange(self.length)[::-1]) + 1
         ramp = np.sin(0.5 * math.pi * np.minimum(1, from_edge / (self.overlap + 1))) ** 2
@@ -197,30 +174,23 @@ class Stitching:
         return np.stack([values[at : at + self.length] for at in self.starts])
 
     def joined(self, windows: np.ndarray) -> np.ndarray:
-        """Return the sum of windows where they lie, ``(…, B, length, D) → (…, L, D)``."""
+        """Return the overlap-added windows, ``(…, B, length, D) → (…, L, D)``."""
         out = np.zeros((*windows.shape[:-3], self.frames, windows.shape[-1]))
         for number, at in enumerate(self.starts):
             out[..., at : at + self.length, :] += windows[..., number, :, :]
         return out
 
     def mean(self, windows: np.ndarray) -> np.ndarray:
-        """Return one motion by shares, ``(…, B, length, J, 3) → (…, L, J, 3)``."""
+        """Return the weighted mean of windows, ``(…, B, length, J, 3) → (…, L, J, 3)``."""
         flat = windows.reshape(*windows.shape[:-2], -1) * self.weights[:, :, None]
         return self.joined(flat).reshape(*windows.shape[:-4], self.frames, *windows.shape[-2:])
 
     def draws(self, windows: np.ndarray, means: np.ndarray) -> np.ndarray:
-        """Return draws of whole motions from independent draws of windows.
+        """Return draws of whole motions (n, L, J, 3) from independent draws of windows.
 
-        The mean of two independent draws varies less than either. So what differs from the
-        windows' means is divided by the root of the sum of squared shares, which keeps the
-        variance where windows agree on it.
-
-        Parameters
-        ----------
-        windows : ndarray, (n, B, length, J, 3)
-            Draws of windows, metres.
-        means : ndarray, (B, length, J, 3)
-            Their means.
+        Averaging independent draws reduces their variance. Deviations from the window ``means``
+        (B, length, J, 3) are therefore divided by the root of the summed squared weights, which
+        preserves a common variance.
         """
         squares = self.joined(self.weights[..., None] ** 2)[:, 0]
         around = self.mean(windows - means) / np.sqrt(squares)[:, None, None]
@@ -228,14 +198,14 @@ class Stitching:
 
 
 def windows_of(
-    evidence: Joints3D, body: np.ndarray, skeleton: Skeleton, stitching: Stitching, tails: float
+    likelihood: Joints3D, body: np.ndarray, skeleton: Skeleton, stitching: Stitching, tails: float
 ) -> NoisyWindows:
-    """Return the windows of some evidence; ``tails`` is one over the degrees of freedom."""
-    entries: Any = evidence.entries
-    noise = evidence.noise / np.sqrt(np.where(entries.visible, entries.confidence, 1.0))
+    """Return the windows of observed joints; ``tails``: reciprocal degrees of freedom."""
+    entries: Any = likelihood.entries
+    noise = likelihood.noise / np.sqrt(np.where(entries.visible, entries.confidence, 1.0))
     n = len(stitching.starts)
     return NoisyWindows.of(
-        stitching.cut(evidence.joints),
+        stitching.cut(likelihood.joints),
         stitching.cut(noise),
         stitching.cut(entries.visible),
         np.full(n, tails),

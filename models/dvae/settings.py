@@ -1,4 +1,4 @@
-"""Sizes of a Motion-DVAE, by name."""
+"""Network sizes of the Motion-DVAE."""
 
 from __future__ import annotations
 
@@ -15,30 +15,29 @@ DecoderScale = Literal["learned", "unit"]
 
 @dataclass(frozen=True)
 class DVAESettings:
-    """Size of a Motion-DVAE, and what its decoder's error is measured in.
+    """Network size and decoder of a Motion-DVAE.
 
     Parameters
     ----------
     frames : int
-        Frames of the windows that it learns.
+        Frames of a training window.
     latent : int
-        Numbers in z_t.
+        Dimension of z_t.
     hidden : int
-        Width of recurrent states and of layers.
+        Width of the recurrent states and hidden layers.
     groups : int
-        Of the group normalisation.
+        Groups of the group normalisation.
     decoder : {"cumulative", "direct"}
-        μ_x(z_{1:t}, x₀) is the last frame's plus d_x(h_t) and a linear map of z_t, or d_x(h_t)
-        alone, as published. The first begins at x₀ exactly and says how frames differ; inference
-        is then a ``TrackingEncoder``. It needs much less motion to learn from.
+        ``direct`` (published): μ_x = d_x(h_t). ``cumulative``: μ_x adds d_x(h_t) and a linear map
+        of z_t to the previous frame, starts exactly at x₀ and uses a ``TrackingEncoder``; it needs
+        much less training motion.
     decoder_scale : {"learned", "unit"}
-        s_x: a standard deviation learnt for each part of a state, or 1 in the state's own units,
-        as published.
+        s_x: one learned standard deviation per part of the state, or 1 (published).
 
     Raises
     ------
     ValueError
-        If a number is out of range, or ``hidden`` is no multiple of ``groups``.
+        If a number is out of range or ``hidden`` is not a multiple of ``groups``.
     """
 
     frames: int = 30
@@ -59,18 +58,18 @@ class DVAESettings:
         for name, known in (("decoder", Decoder), ("decoder_scale", DecoderScale)):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(
-                    f"{name} is {getattr(self, name)!r}, expected one of "
-                    f"{', '.join(get_args(known))}"
+                    f"{name} must be one of {', '.join(get_args(known))}, "
+                    f"got {getattr(self, name)!r}"
                 )
 
     @classmethod
     def tiny(cls) -> DVAESettings:
-        """Return the size for tests: learns a toy in seconds."""
+        """Return a size for tests that trains in seconds."""
         return cls(frames=12, latent=6, hidden=32, groups=4, decoder="cumulative")
 
     @classmethod
     def small(cls) -> DVAESettings:
-        """Return the size that two cores train in minutes, and that ships."""
+        """Return the size of the shipped prior, which trains in minutes on two cores."""
         return cls(latent=24, hidden=160, decoder="cumulative")
 
     @classmethod

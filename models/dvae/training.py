@@ -1,4 +1,4 @@
-"""Learning a Motion-DVAE from clean motion (A.3, A.4)."""
+"""Training of the Motion-DVAE from clean motion (A.3, A.4)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from probmotion import seeds
 from probmotion.models.bodies.body_states import BodyStates
 from probmotion.models.dvae.latent_rollouts import Rollout, rollout
 from probmotion.models.dvae.motion_dvae import KIND, MotionDVAE, description_of
-from probmotion.models.dvae.motion_windows import MotionWindows, Windows
+from probmotion.models.dvae.motion_windows import (
+    VALIDATION_BATCH,
+    MotionWindows,
+    Windows,
+    WindowTrainee,
+)
 from probmotion.models.dvae.network import DVAEModel
 from probmotion.models.dvae.settings import DVAESettings
 from probmotion.models.dvae.variational_terms import log_normal
@@ -23,37 +28,35 @@ from probmotion.motion.motion import Motion
 
 __all__ = ["DVAETrainee", "refit_joint_scale", "usual_dvae_training"]
 
-_VALIDATION_BATCH = 256
-_LOOKED_AT = 4000
-_VARIANCE_KEPT = 0.999
+_STATISTICS_WINDOWS = 4000
+_EXPLAINED_VARIANCE = 0.999
 
 
-class DVAETrainee:
-    """What :func:`~probmotion.models.training.trainer.train` needs to learn a Motion-DVAE.
+class DVAETrainee(WindowTrainee):
+    """Loss and data for :func:`~probmotion.models.training.trainer.train` of a Motion-DVAE.
 
-    The loss is −log p(x | z, x₀) + KL(q ‖ p) + the error of joints' positions, per frame. With
-    decoder scales that are learnt, the three errors are Gaussian and each has its own; with unit
-    scales they are squared errors, as published.
+    The loss is −log p(x | z, x₀) + KL(q ‖ p) + the joint position error, per frame. With learned
+    decoder scales the errors are Gaussian; with unit scales they are squared, as published.
 
     Parameters
     ----------
     clips : sequence of Motion
         Clean motion of one skeleton and frame rate, metres.
     validation : sequence of Motion
-        Clips that are not among them.
+        Held-out clips.
     size : DVAESettings
-        The networks'.
+        Network size.
     states : BodyStates
-        How a pose becomes numbers.
+        Conversion between poses and state vectors.
     annealing : int
-        Steps over which the weight of KL rises from 0 to 1.
+        Steps over which the KL weight rises from 0 to 1.
     seed : int
-        Of the first weights and the validation's noise.
+        Seed of the initial weights and the validation noise.
 
     Raises
     ------
     ValueError
-        If no clip is as long as a window, or they differ in skeleton or frame rate.
+        If no clip is as long as a window, or clips differ in skeleton or frame rate.
     """
 
     kind = KIND
@@ -68,22 +71,14 @@ class DVAETrainee:
         annealing: int = 0,
         seed: int = 0,
     ) -> None:
-        self.size = size
-        self.states = states
-        self.annealing = annealing
-        self.windows = MotionWindows(clips, states, size.frames)
-        self.held_out = MotionWindows(validation, states, size.frames)
-        if self.held_out.fps != self.windows.fps:
-            raise ValueError(
-                f"validation is at {self.held_out.fps:g} frames per second, expected "
-                f"{self.windows.fps:g}"
-            )
-        looked_at = self.windows.spread(_LOOKED_AT)
-        factor = _first_poses(looked_at.states[:, 0])
+        super().__init__(
+            clips, validation, states, size.frames, weight=1.0, annealing=annealing, seed=seed
+        )
+        self.size, self.states = size, states
+        windows = self.windows.spread(_STATISTICS_WINDOWS)
+        factor = _first_poses(windows.states[:, 0])
         self.network = DVAEModel(size, states.dim, states.skeleton.n_joints, factor.shape[1], seed)
-        self._learn_standards(looked_at, factor)
-        self._seed = seed
-        self._weight = 1.0
+        self._learn_standards(windows, factor)
         self.settings: Mapping[str, Any] = {
             **description_of(size, states, self.windows.fps, factor.shape[1]),
             "annealing": annealing,
@@ -91,26 +86,10 @@ class DVAETrainee:
             "validation_data": _description(validation, len(self.held_out)),
         }
 
-    def anneal(self, step: int) -> None:
-        """Set the weight of KL at a step."""
-        self._weight = min(1.0, step / self.annealing) if self.annealing else 1.0
-
-    def training_loss(
-        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
-    ) -> torch.Tensor:
-        """Return the loss of fresh windows."""
-        return self._loss(network, self.windows.draw(rng, batch), rng, self._weight, device)
-
-    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on held-out windows, KL in full, with noise that never changes."""
-        rng = seeds.generator(self._seed, "validation")
-        windows = self.held_out.spread(_VALIDATION_BATCH)
-        return float(self._loss(network, windows, rng, 1.0, device))
-
-    def _learn_standards(self, looked_at: Windows, factor: np.ndarray) -> None:
-        states = looked_at.states
-        joints = self.states.positions(states, looked_at.bodies)
-        found = {
+    def _learn_standards(self, windows: Windows, factor: np.ndarray) -> None:
+        states = windows.states
+        joints = self.states.positions(states, windows.bodies)
+        statistics = {
             "state_mean": states.mean(axis=(0, 1)),
             "state_deviation": np.maximum(states.std(axis=(0, 1)), _least(states)),
             "joint_mean": joints.mean(axis=(0, 1)),
@@ -118,7 +97,7 @@ class DVAETrainee:
             "initial_mean": states[:, 0].mean(axis=0),
             "initial_factor": factor,
         }
-        for name, value in found.items():
+        for name, value in statistics.items():
             getattr(self.network, name).copy_(torch.as_tensor(value))
 
     def _loss(
@@ -130,20 +109,21 @@ class DVAETrainee:
         device: torch.device,
     ) -> torch.Tensor:
         assert isinstance(network, DVAEModel)
-        states, joints, found = _reconstruct(network, self.states, windows, rng, device)
-        decoded, bodies, rolled = found
+        states, joints, (decoded, bodies, rolled) = _reconstruct(
+            network, self.states, windows, rng, device
+        )
         errors = [(decoded - states[:, 1:])[..., first:end] for _, first, end in self.states.groups]
         errors.append(self.states.positions(decoded, bodies) - joints[:, 1:])
         fitted = self._misfit(network, errors)
         return (fitted + weight * rolled.kl.mean()) / (self.size.frames - 1)
 
     def _misfit(self, network: DVAEModel, errors: list[torch.Tensor]) -> torch.Tensor:
-        """Return how far windows are from what is decoded, mean over windows."""
+        """Return the reconstruction error, mean over windows."""
         n = len(errors[0])
         scales = network.generative.log_scales
         if self.size.decoder_scale == "unit":
             squares = sum((error**2).sum() for error in errors) / n
-            # Only so that eq. 11 knows how far joints are off: nothing else learns from it.
+            # Trains only the joint scale, which eq. 11 needs; hence the detached error.
             own = -log_normal(errors[-1].detach(), torch.exp(scales[-1])).mean()
             return torch.as_tensor(squares + own)
         return -torch.stack(
@@ -154,8 +134,8 @@ class DVAETrainee:
         ).sum()
 
 
-class _Found(NamedTuple):
-    """Decoded states (B, T, D), the bodies (B, J, 3) and what happened on the way."""
+class _Reconstruction(NamedTuple):
+    """Decoded states (B, T, D), bodies (B, J, 3) and rollout."""
 
     decoded: torch.Tensor
     bodies: torch.Tensor
@@ -168,7 +148,7 @@ def _reconstruct(
     windows: Windows,
     rng: np.random.Generator,
     device: torch.device,
-) -> tuple[torch.Tensor, torch.Tensor, _Found]:
+) -> tuple[torch.Tensor, torch.Tensor, _Reconstruction]:
     """Return states (B, L, D) and joints (B, L, J, 3) of windows, and their reconstruction."""
     states = torch.as_tensor(windows.states, dtype=torch.float32, device=device)
     bodies = torch.as_tensor(windows.bodies, dtype=torch.float32, device=device)
@@ -178,42 +158,42 @@ def _reconstruct(
     joints = body_states.positions(states, bodies)
     trusted = torch.ones_like(joints[..., 0])
     tails = torch.zeros_like(trusted[:, 0, 0])
-    reading = network.encoder.reading(network.evidence(joints, trusted, tails, body_states, bodies))
-    rolled = rollout(network.generative, network.standardised(states[:, 0]), noise, reading)
-    return states, joints, _Found(network.decoded(rolled), bodies, rolled)
+    inputs = network.encoder_inputs(joints, trusted, tails, body_states, bodies)
+    encoder = network.encoder.conditioned(inputs)
+    rolled = rollout(network.generative, network.standardised(states[:, 0]), noise, encoder)
+    return states, joints, _Reconstruction(network.decoded(rolled), bodies, rolled)
 
 
 def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0) -> float:
-    """Set how far joints are from what is decoded to what it is on other clips; return it, metres.
+    """Set the joint decoder scale to its RMS error on held-out clips and return it, metres.
 
-    What was learnt from is decoded better than what is new, and eq. 11 asks how far to believe the
-    decoder of something new.
+    The training error underestimates this scale, which weights the decoder in eq. 11.
 
     Parameters
     ----------
     prior : MotionDVAE
-        A trained prior, which is changed.
+        Trained prior, changed in place.
     clips : sequence of Motion
-        Clips that were not learnt from.
+        Held-out clips.
     seed : int
-        Of the draws from the encoder.
+        Seed of the encoder draws.
     """
-    windows = MotionWindows(clips, prior.states, prior.settings.frames).spread(_VALIDATION_BATCH)
+    windows = MotionWindows(clips, prior.states, prior.settings.frames).spread(VALIDATION_BATCH)
     with torch.no_grad():
-        _, joints, found = _reconstruct(
+        _, joints, rebuilt = _reconstruct(
             prior.model, prior.states, windows, seeds.generator(seed, "scale"), torch.device("cpu")
         )
-        error = prior.states.positions(found.decoded, found.bodies) - joints[:, 1:]
+        error = prior.states.positions(rebuilt.decoded, rebuilt.bodies) - joints[:, 1:]
         scale = float((error**2).mean().sqrt())
         prior.model.generative.log_scales[-1] = math.log(scale)
     return scale
 
 
 def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
-    """Return how a size is trained, and over how many steps KL is annealed.
+    """Return the training settings of a size and its KL annealing steps.
 
-    ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4). An epoch there is of
-    AMASS; here it is 1000 steps.
+    ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4); an epoch of AMASS is
+    1000 steps here.
 
     Raises
     ------
@@ -252,16 +232,16 @@ def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
 
 
 def _first_poses(states: np.ndarray) -> np.ndarray:
-    """Return the directions in which first states vary, (D, r), times their deviations."""
+    """Return the principal directions of first states times their deviations, (D, r)."""
     centred = states - states.mean(axis=0)
     _, size, directions = np.linalg.svd(centred, full_matrices=False)
-    share = np.cumsum(size**2) / (size**2).sum()
-    rank = int(np.searchsorted(share, _VARIANCE_KEPT)) + 1
+    explained = np.cumsum(size**2) / (size**2).sum()
+    rank = int(np.searchsorted(explained, _EXPLAINED_VARIANCE)) + 1
     return (directions[:rank] * (size[:rank, None] / math.sqrt(len(states)))).T
 
 
 def _least(states: np.ndarray) -> float:
-    # What hardly varies would be blown up into noise: a twentieth of what usually does.
+    # Bound deviations below, or standardisation would amplify nearly constant dimensions.
     return 0.05 * float(np.median(states.std(axis=(0, 1)))) or 1.0
 
 

@@ -1,9 +1,8 @@
-"""Learning an evaluator from 2D tracks: a variational autoencoder (MAS, section 6.3)."""
+"""Training of the evaluator: a variational autoencoder of 2D tracks (MAS, section 6.3)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,47 +12,24 @@ from torch import nn
 from probmotion import seeds
 from probmotion.models.evaluation.evaluator import KIND
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings, TrackAutoencoder
-from probmotion.models.training.track_batches import (
-    Augmentation,
-    TrackBatches,
-    learning_and_held_out,
-)
+from probmotion.models.training.track_batches import TrackBatches
+from probmotion.models.training.track_trainee import TrackTrainee
 from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["EvaluatorTrainee"]
 
-_VALIDATION_BATCH = 256
 
+class EvaluatorTrainee(TrackTrainee):
+    """Trainee of an evaluator.
 
-class EvaluatorTrainee:
-    """What :func:`~probmotion.models.training.trainer.train` needs to learn an evaluator.
-
-    The loss is the mean squared error in standardised units, over frames that are there and joints
-    whose confidence is not below the threshold, plus ``kl_weight`` times the mean divergence of a
-    motion's latent from N(0, I).
-
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Prepared: metres, centred, of one skeleton and frame rate.
-    validation : sequence of KeypointTrack
-        Of clips that are not among those of ``tracks``.
-    size : EvaluatorSettings
-        The network's.
-    threshold : float
-        Least confidence of a joint that counts; the encoder sees the others at their mean.
-    augmentation : Augmentation
-        How tracks are varied.
-    seed : int
-        Of the first weights and the validation batch.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, they differ in skeleton or frame rate, or none has a confident joint.
+    The loss is the mean squared error in standardised units over visible joints, plus ``kl_weight``
+    times the mean divergence of the latents from N(0, I). Parameters are those of
+    :class:`~probmotion.models.training.track_trainee.TrackTrainee`; occluded joints are set to
+    their mean.
     """
 
     kind = KIND
+    size: EvaluatorSettings
 
     def __init__(
         self,
@@ -61,44 +37,13 @@ class EvaluatorTrainee:
         validation: Sequence[KeypointTrack],
         size: EvaluatorSettings,
         *,
-        threshold: float = 0.3,
-        augmentation: Augmentation | None = None,
         seed: int = 0,
+        **options: Any,
     ) -> None:
-        varied = Augmentation() if augmentation is None else augmentation
-        self.size = size
-        self.batches, self.held_out = learning_and_held_out(
-            tracks, validation, size.frames, threshold, varied
-        )
-        skeleton = self.batches.skeleton
-        self.standards = self.batches.standards
+        super().__init__(tracks, validation, size, seed=seed, **options)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
-            self.network: nn.Module = TrackAutoencoder(size, skeleton.n_joints)
-        self._seed = seed
-        self.settings: Mapping[str, Any] = {
-            "size": asdict(size),
-            "joint_names": list(skeleton.joint_names),
-            "parents": list(skeleton.parents),
-            "fps": self.batches.fps,
-            "mean": self.standards.mean.tolist(),
-            "deviation": self.standards.deviation.tolist(),
-            "threshold": threshold,
-            "augmentation": asdict(varied),
-            "data": self.batches.description,
-            "validation_data": self.held_out.description,
-        }
-
-    def training_loss(
-        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
-    ) -> torch.Tensor:
-        """Return the loss of a fresh batch."""
-        return self._loss(network, self.batches, rng, batch, device)
-
-    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on held-out tracks with noise that never changes."""
-        rng = seeds.generator(self._seed, "validation")
-        return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
+            self.network = TrackAutoencoder(size, self.batches.skeleton.n_joints)
 
     def _loss(
         self,

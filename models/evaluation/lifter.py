@@ -1,10 +1,9 @@
-"""`PoseLifter`: 3D poses from 2D poses, frame by frame, learnt from 2D poses alone.
+"""Lifting of 2D poses to 3D poses, frame by frame, trained on 2D poses only.
 
-The network says how deep each joint is and how far above the horizon the camera stands (Wandt,
-Little and Rhodin, "ElePose", CVPR 2022); :mod:`probmotion.models.evaluation.lifter_training` is how
-it learns. A point at p in the picture and z metres behind the root is at (p (1 + z/d), z) in the
-camera, d being the camera's distance and focal length, so that a lifted pose projects onto what was
-lifted.
+The network estimates the depth of each joint and the elevation of the camera (Wandt, Little and
+Rhodin, "ElePose", CVPR 2022). A joint at p in the image and z metres behind the root is at
+(p (1 + z/d), z) in camera coordinates, with d the camera's distance and focal length, so that a
+lifted pose projects exactly onto its 2D pose.
 """
 
 from __future__ import annotations
@@ -33,27 +32,27 @@ __all__ = [
 ]
 
 KIND = "pose-lifter"
-# Poses of a chunk, always as many: the bits of a row depend on the shape it is computed in.
+# Fixed number of poses per chunk, as rounding depends on the shape of a batch.
 _CHUNK = 256
 
 
 @dataclass(frozen=True)
 class LifterSettings:
-    """Size of the network, and the cameras that it supposes.
+    """Size of the network and assumptions about cameras.
 
     Parameters
     ----------
     width : int
-        Of every layer.
+        Width of every layer.
     blocks : int
         Residual blocks of each of the two branches.
     deepest : float
-        Metres that a joint may be before or behind the root at most, below ``distance``.
+        Maximum depth of a joint relative to the root, metres, below ``distance``.
     steepest : float
-        Highest elevation of a camera, radians. The lowest is 0: cameras stand above the horizon.
-        Without that, a motion and its reflection seen from below make nearly the same pictures.
+        Maximum camera elevation, radians. The minimum is 0, because a motion and its reflection
+        seen from below have nearly the same 2D projection.
     distance : float
-        Metres from the camera to the root.
+        Distance from the camera to the root, metres.
 
     Raises
     ------
@@ -79,27 +78,17 @@ class LifterSettings:
 
     @classmethod
     def tiny(cls) -> LifterSettings:
-        """Return the size for tests."""
+        """Return a size for tests."""
         return cls(width=64, blocks=1)
 
     @classmethod
     def small(cls) -> LifterSettings:
-        """Return the size that one core trains in minutes."""
+        """Return a size that trains in minutes on one core."""
         return cls()
 
 
 class LifterNetwork(nn.Module):
-    """Depths of the joints and elevation of the camera, from one root-centred 2D pose.
-
-    Parameters
-    ----------
-    settings : LifterSettings
-        Its size.
-    n_joints, root : int
-        Number of joints J, and which is the root, at depth 0.
-    seed : int
-        Of the first weights.
-    """
+    """Joint depths and camera elevation from a root-centred 2D pose; the root has depth 0."""
 
     mean: torch.Tensor
     deviation: torch.Tensor
@@ -125,13 +114,13 @@ class LifterNetwork(nn.Module):
         most = self.settings.deepest
         depth = poses.new_zeros(poses.shape[:2])
         depth[:, self.joints] = most * torch.tanh(self.depth(entered) / most)
-        # It begins in the middle, between a camera on the horizon and the steepest one.
+        # The initial elevation is half of the steepest one.
         elevation = self.settings.steepest * torch.sigmoid(self.elevation(entered)[:, 0])
         return depth, elevation
 
 
 class _Block(nn.Module):
-    """Two layers beside a way around them."""
+    """Residual block of two layers."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -158,18 +147,10 @@ def raise_points(
     elevation: torch.Tensor,
     distance: float,
 ) -> torch.Tensor:
-    """Return where the joints of 2D poses are in the world, root at the origin: (N, J, 3), metres.
+    """Return the global joint positions of 2D poses, root at the origin: (N, J, 3), metres.
 
-    Parameters
-    ----------
-    poses : Tensor, (N, J, 2)
-        Pictures centred on the root, metres.
-    depth : Tensor, (N, J)
-        Metres behind the root, as the camera sees it.
-    azimuth, elevation : Tensor, (N,)
-        Of each pose's camera, radians, as in :meth:`probmotion.geometry.cameras.Cameras.around`.
-    distance : float
-        Metres from the camera to the root.
+    Poses are (N, J, 2), depths relative to the root (N, J), azimuths and elevations of the cameras
+    (N,), as in :meth:`probmotion.geometry.cameras.Cameras.around`.
     """
     plane = poses * (1 + depth[..., None] / distance)
     return torch.cat([plane, depth[..., None]], dim=-1) @ _turn(azimuth, elevation)
@@ -178,13 +159,13 @@ def raise_points(
 def project_points(
     points: torch.Tensor, azimuth: torch.Tensor, elevation: torch.Tensor, distance: float
 ) -> torch.Tensor:
-    """Return the pictures of points (N, J, 3), each seen by its camera: (N, J, 2), metres."""
+    """Return perspective projections of points (N, J, 3), a camera each: (N, J, 2), metres."""
     seen = points @ _turn(azimuth, elevation).mT
     return seen[..., :2] / (1 + seen[..., 2:] / distance)
 
 
 def _turn(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Tensor:
-    """Rotations from the world to cameras around it, (N, 3, 3)."""
+    """Return rotations from world to camera coordinates, (N, 3, 3)."""
     ca, sa, ce, se = azimuth.cos(), azimuth.sin(), elevation.cos(), elevation.sin()
     zero = torch.zeros_like(ca)
     rows = [ca, zero, -sa, se * sa, -ce, se * ca, -ce * sa, -se, -ce * ca]
@@ -192,17 +173,7 @@ def _turn(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Tensor:
 
 
 class PoseLifter:
-    """A trained lifter.
-
-    Parameters
-    ----------
-    network : LifterNetwork
-        What says depths and elevation.
-    skeleton : Skeleton
-        The J joints.
-    device : str
-        ``cpu`` or ``cuda``.
-    """
+    """Trained lifter of 2D motions of one skeleton."""
 
     def __init__(self, network: LifterNetwork, skeleton: Skeleton, *, device: str = "cpu") -> None:
         self.skeleton = skeleton
@@ -212,43 +183,39 @@ class PoseLifter:
 
     @classmethod
     def load(cls, source: str | Path, *, device: str = "cpu") -> PoseLifter:
-        """Return a trained lifter from a checkpoint's file or the folder of a training run.
+        """Return a trained lifter from a checkpoint or the folder of a training run.
 
         Raises
         ------
         CheckpointError
-            If the file is damaged, of another version or no lifter.
+            If the file is damaged or not a lifter of this version.
         FileNotFoundError
             If there is no such file.
         """
         checkpoint = load_checkpoint(source, KIND)
-        kept = checkpoint.settings["network"]
-        skeleton = Skeleton(kept["joint_names"], kept["parents"])
-        settings = LifterSettings(**kept["size"])
+        stored = checkpoint.settings["network"]
+        skeleton = Skeleton(stored["joint_names"], stored["parents"])
+        settings = LifterSettings(**stored["size"])
         network = LifterNetwork(settings, skeleton.n_joints, skeleton.roots[0])
         load_weights(network, checkpoint.tensors)
         return cls(network, skeleton, device=device)
 
     def lift(self, views: np.ndarray) -> np.ndarray:
-        """Return the 3D motion of each 2D motion: ``(N, L, J, 2) → (N, L, J, 3)``.
+        """Return the 3D motion of each 2D motion: ``(N, L, J, 2) → (N, L, J, 3)``, metres.
+
+        Y is up and the root at the origin. The centred views are the exact projections by
+        ``Cameras.around([0], [elevation], distance=settings.distance, perspective=True)`` with the
+        :meth:`elevations` of the views.
 
         Parameters
         ----------
         views : ndarray, (N, L, J, 2)
-            Metres at the root's distance, x right and y down. Every frame is centred on the root,
-            as in pictures that follow the subject.
-
-        Returns
-        -------
-        ndarray, (N, L, J, 3)
-            Metres, Y up, root at the origin. The camera
-            ``Cameras.around([0], [elevation], distance=settings.distance, perspective=True)``, with
-            the :meth:`elevations` of the views, sees the centred views exactly.
+            Metres at the root's distance, x right and y down. Every frame is centred on the root.
 
         Raises
         ------
         ValueError
-            If the shape is another or a number is not finite.
+            If the shape is wrong or a number is not finite.
         """
         poses, depth, elevation = self._seen(views)
         L, J = views.shape[1:3]
@@ -263,10 +230,10 @@ class PoseLifter:
         return points.numpy().reshape(len(views), L, J, 3)
 
     def elevations(self, views: np.ndarray) -> np.ndarray:
-        """Return the elevation of each motion's camera, radians: ``(N, L, J, 2) → (N,)``.
+        """Return the camera elevation of each motion, radians: ``(N, L, J, 2) → (N,)``.
 
-        It is the mean over the frames: a track is filmed by one camera, so that what differs from
-        frame to frame is error, and motions that nodded with it would look alive where they rest.
+        It is the mean over frames: the camera is assumed to be static, so differences between
+        frames are errors.
         """
         return self._seen(views)[2]
 
@@ -276,7 +243,7 @@ class PoseLifter:
         check_shape("views", views, ("N", "L", J, 2))
         check_finite("views", views)
         if 0 in views.shape:
-            raise ValueError(f"views must have shape a motion and a frame, got {views.shape}")
+            raise ValueError(f"views must contain a motion and a frame, got shape {views.shape}")
         root = self.skeleton.roots[0]
         poses = np.asarray(views, np.float64).reshape(-1, J, 2)
         poses = poses - poses[:, root : root + 1]
@@ -286,7 +253,7 @@ class PoseLifter:
             full = np.zeros((_CHUNK, J, 2), np.float32)
             full[: len(some)] = some
             with torch.inference_mode():
-                found = self._network(torch.from_numpy(full).to(self._device))
+                estimate = self._network(torch.from_numpy(full).to(self._device))
             rows = slice(start, start + len(some))
-            depth[rows], elevation[rows] = (part.cpu().numpy()[: len(some)] for part in found)
+            depth[rows], elevation[rows] = (part.cpu().numpy()[: len(some)] for part in estimate)
         return poses, depth, elevation.reshape(views.shape[:2]).mean(axis=1)

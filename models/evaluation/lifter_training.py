@@ -1,21 +1,19 @@
-"""Learning to lift from 2D poses alone (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
+"""Training of the lifter on 2D poses only (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
 
-A lifted pose is right if it looks like a pose from everywhere else. Each 2D pose is lifted, turned
-to a random azimuth, seen from an elevation that another pose's camera is thought to have, and the
-picture is asked of a normalising flow. The picture is lifted again, and both 3D poses must agree.
+Each 2D pose is lifted, rotated to a random azimuth and projected at the estimated elevation of
+another pose's camera. The projection must be likely under a normalising flow of 2D poses, and
+lifting it again must give the same 3D pose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from probmotion import seeds
 from probmotion.models.evaluation.lifter import (
     KIND,
     LifterNetwork,
@@ -24,38 +22,36 @@ from probmotion.models.evaluation.lifter import (
     raise_points,
 )
 from probmotion.models.evaluation.pose_flow import PoseFlow
-from probmotion.models.evaluation.pose_flow_training import whole_poses
-from probmotion.models.training.track_batches import describe_tracks
+from probmotion.models.evaluation.pose_flow_training import PoseTrainee
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["LifterTrainee", "LossWeights", "bone_sizes", "lifting_losses"]
 
-_VALIDATION_POSES = 1024
-# Quantile of a bone's length in pictures that stands for its length: most bones are now and then
-# seen from the side, and the longest pictures of all are errors of the detector.
+# Quantile of a bone's 2D length taken as its length: most bones are at times parallel to the image,
+# and the very longest are detection errors.
 _QUANTILE = 0.9
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each term counts.
+    """Weights of the loss terms.
 
     Parameters
     ----------
     likelihood : float
-        Of −log density of the new pictures, nats per coordinate.
+        Weight of the negative log density of the new projections, nats per coordinate.
     points : float
-        Of the squared distance of the twice lifted pose, metres².
+        Weight of the squared distance between both 3D poses, metres².
     picture : float
-        Of the squared distance of its picture from the one given, metres².
+        Weight of the squared distance of the final projection from the input, metres².
     bones : float
-        Of the squared relative error of bone lengths.
+        Weight of the squared relative error of bone lengths.
 
     Raises
     ------
     ValueError
-        If one is below 0.
+        If a weight is below 0.
     """
 
     likelihood: float = 1.0
@@ -70,26 +66,16 @@ class LossWeights:
 
 
 def bone_sizes(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
-    """Return the length of every bone by its pictures, left and right alike: (K,), metres.
+    """Return bone lengths estimated from 2D poses, equal for mirrored bones: (K,), metres.
 
-    ElePose is given the proportions of bodies; here there is nothing 3D to take them from. A bone's
-    picture is as long as the bone where it is seen from the side, and shorter elsewhere: the 90 %
-    quantile over the data is a number of 2D poses alone.
-
-    Parameters
-    ----------
-    skeleton : Skeleton
-        The K bones.
-    poses : ndarray, (N, J, 2)
-        Metres.
+    The 2D length of a bone is at most its length. The 90 % quantile over the data replaces the body
+    proportions that ElePose takes from 3D data.
     """
     lengths = {
         (joint, parent): np.linalg.norm(poses[:, joint] - poses[:, parent], axis=-1)
         for joint, parent in skeleton.bones
     }
-    other = {joint: joint for joint in range(skeleton.n_joints)}
-    for left, right in skeleton.mirrored_pairs:
-        other[left], other[right] = right, left
+    other = skeleton.mirrored_order
     sizes = []
     for joint, parent in skeleton.bones:
         twin = lengths.get((other[joint], other[parent]), lengths[joint, parent])
@@ -106,25 +92,11 @@ def lifting_losses(
     sizes: torch.Tensor,
     distance: float,
 ) -> dict[str, torch.Tensor]:
-    """Return the terms of the loss, as :class:`LossWeights` names them.
+    """Return the terms of the loss, named as in :class:`LossWeights`.
 
-    Parameters
-    ----------
-    network : Module
-        ``(N, J, 2) → (N, J), (N,)``: depths and elevations.
-    flow : PoseFlow
-        Trained; it is not changed.
-    poses : Tensor, (N, J, 2)
-        Root-centred, metres.
-    azimuth : Tensor, (N,)
-        Of each pose's new camera, radians, from the one that it was seen by.
-    order : Tensor, (N,)
-        Whose camera's elevation the new one has: a permutation, so that new cameras have exactly
-        the elevations that the network finds in the data.
-    sizes : Tensor, (K,)
-        Lengths of the bones.
-    distance : float
-        Of the cameras, metres.
+    The lifter maps root-centred poses (N, J, 2) to depths (N, J) and elevations (N,). ``azimuth``
+    (N,) is that of the new cameras relative to the original ones, ``order`` (N,) a permutation of
+    the estimated elevations among them, ``sizes`` (K,) the bone lengths.
     """
     bones = torch.tensor(flow.skeleton.bones, device=poses.device)
     here = torch.zeros_like(azimuth)
@@ -143,32 +115,16 @@ def lifting_losses(
     }
 
 
-class LifterTrainee:
-    """What :func:`~probmotion.models.training.trainer.train` needs to learn to lift. It sees 2D
-    alone.
+class LifterTrainee(PoseTrainee):
+    """Trainee of a lifter, with 2D data only.
 
-    Parameters
-    ----------
-    tracks, validation : sequence of KeypointTrack
-        Prepared: metres, of one skeleton; of other clips for validation.
-    flow : PoseFlow
-        Trained on tracks such as these.
-    size : LifterSettings
-        The network's.
-    weights : LossWeights, optional
-        How much each term counts.
-    threshold : float
-        Least confidence of every joint of a pose that is learnt from.
-    seed : int
-        Of the first weights and of the validation's views.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, skeletons differ, or no frame is seen whole.
+    Parameters are those of :class:`~probmotion.models.evaluation.pose_flow_training.PoseTrainee`, a
+    flow trained on similar tracks, and weights of the loss terms.
     """
 
     kind = KIND
+    size: LifterSettings
+    _validation_poses = 1024
 
     def __init__(
         self,
@@ -181,13 +137,10 @@ class LifterTrainee:
         threshold: float = 0.3,
         seed: int = 0,
     ) -> None:
-        self.poses = whole_poses(tracks, threshold).astype(np.float32)
-        self.held_out = whole_poses(validation, threshold).astype(np.float32)
-        skeleton = tracks[0].skeleton
-        for name, other in (("validation", validation[0].skeleton), ("flow", flow.skeleton)):
-            if other != skeleton:
-                raise ValueError(f"{name} has another skeleton than tracks, expected the same")
-        self.size = size
+        super().__init__(tracks, validation, size, threshold=threshold, seed=seed)
+        skeleton = self.skeleton
+        if flow.skeleton != skeleton:
+            raise ValueError("flow must have the same skeleton as tracks")
         self.weights = LossWeights() if weights is None else weights
         self.sizes = bone_sizes(skeleton, self.poses.astype(np.float64))
         self.network = LifterNetwork(size, skeleton.n_joints, skeleton.roots[0], seed)
@@ -195,31 +148,12 @@ class LifterTrainee:
         self.network.mean.copy_(torch.from_numpy(flat.mean(axis=0)))
         self.network.deviation.copy_(torch.from_numpy(np.maximum(flat.std(axis=0), 1e-3)))
         self.flow = flow.eval().requires_grad_(False)
-        self._seed = seed
-        self.settings: Mapping[str, Any] = {
-            "size": asdict(size),
+        self.settings = {
+            **self.settings,
             "weights": asdict(self.weights),
-            "joint_names": list(skeleton.joint_names),
-            "parents": list(skeleton.parents),
-            "threshold": threshold,
             "bone_sizes": self.sizes.tolist(),
             "flow": flow.digest,
-            "data": describe_tracks(tracks),
-            "validation_data": describe_tracks(validation),
         }
-
-    def training_loss(
-        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
-    ) -> torch.Tensor:
-        """Return the loss of fresh poses in fresh views."""
-        chosen = self.poses[rng.integers(len(self.poses), size=batch)]
-        return self._loss(network, chosen, rng, device)
-
-    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on held-out poses in views that never change."""
-        rng = seeds.generator(self._seed, "validation")
-        chosen = self.held_out[rng.permutation(len(self.held_out))[:_VALIDATION_POSES]]
-        return float(self._loss(network, chosen, rng, device).detach())
 
     def _loss(
         self,
@@ -230,7 +164,7 @@ class LifterTrainee:
     ) -> torch.Tensor:
         azimuth = torch.as_tensor(rng.uniform(0, 2 * np.pi, len(poses)), dtype=torch.float32)
         order = torch.as_tensor(rng.permutation(len(poses)))
-        # A density needs single precision, whatever the trainer computes in.
+        # Densities require single precision.
         with torch.autocast(device.type, enabled=False):
             terms = lifting_losses(
                 network,

@@ -1,10 +1,9 @@
-"""`PoseFlow`: the density of 2D poses, learnt by a normalising flow.
+"""Normalising flow over 2D poses.
 
-An unsupervised lifter asks it how likely a pose is that nobody has filmed: its own 3D pose, seen
-from elsewhere (Wandt, Little and Rhodin, "ElePose", CVPR 2022). Joints depend on each other so
-closely that a flow over their coordinates is nearly singular. As there, it works on the leading
-principal components; what they leave over is a Gaussian here rather than nothing, so that the
-density is one of whole poses and a pose off their plane is unlikely.
+It is the pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
+Joints are so strongly correlated that a flow over their coordinates is nearly singular. As in the
+paper, the flow acts on the leading principal components. Unlike there, the remaining components are
+Gaussian, so that the density covers whole poses.
 """
 
 from __future__ import annotations
@@ -27,25 +26,25 @@ from probmotion.validation import check_count, check_shape
 __all__ = ["KIND", "CouplingFlow", "FlowSettings", "PoseFlow"]
 
 KIND = "pose-flow"
-# Couplings scale by at most e to this, either way, so that a step can never explode.
+# Maximum absolute log scale of a coupling, for stability.
 _MOST = 1.5
 
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Size of the flow and what it takes for a pose.
+    """Size of the flow and preparation of poses.
 
     Parameters
     ----------
     couplings : int
-        Affine coupling layers.
+        Number of affine coupling layers.
     width : int
-        Of each coupling's network.
+        Width of each coupling's network.
     share : float
-        Share of the variance that the principal components hold, above 0 and at most 1.
+        Proportion of the variance in the leading principal components; in (0, 1].
     blur : float
-        Standard deviation of the noise added to every coordinate in training, metres: the density
-        is that of slightly blurred poses, whose slopes reach further.
+        Standard deviation of the noise added to coordinates in training, metres. It smooths the
+        density so that its gradients are useful further from the data.
 
     Raises
     ------
@@ -68,39 +67,38 @@ class FlowSettings:
 
     @classmethod
     def tiny(cls) -> FlowSettings:
-        """Return the size for tests."""
+        """Return a size for tests."""
         return cls(couplings=4, width=32)
 
     @classmethod
     def small(cls) -> FlowSettings:
-        """Return the size that one core trains in a minute."""
+        """Return a size that trains in a minute on one core."""
         return cls()
 
 
 class CouplingFlow(nn.Module):
-    """Invertible map of R^D by affine couplings: x ↦ z with a standard normal density of z.
+    """Invertible map x ↦ z of R^D by affine couplings, with standard normal z.
 
-    A coupling keeps half of the coordinates, and scales and shifts the others by a function of the
-    kept ones (Dinh, Sohl-Dickstein and Bengio, "Density estimation using Real NVP", 2017). A fixed
-    permutation stands before each, so that all coordinates meet. It begins as the identity up to
-    the permutations.
+    A coupling scales and shifts half of the coordinates by a function of the others (Dinh,
+    Sohl-Dickstein and Bengio, "Density estimation using Real NVP", 2017), after a fixed
+    permutation. The initial map is the identity up to permutations.
     """
 
     def __init__(self, dimensions: int, couplings: int, width: int, seed: int = 0) -> None:
         super().__init__()
         check_count("dimensions", dimensions, least=2)
-        self.kept = dimensions // 2
-        changed = dimensions - self.kept
+        self.fixed = dimensions // 2
+        changed = dimensions - self.fixed
         rng = seeds.generator(seed, "permutations")
-        # Every other permutation brings what was kept to the end: two couplings change everything.
-        turns = np.roll(np.arange(dimensions), -self.kept)
+        # Every second permutation swaps the halves, so that two couplings change all coordinates.
+        turns = np.roll(np.arange(dimensions), -self.fixed)
         orders = [turns if n % 2 else rng.permutation(dimensions) for n in range(couplings)]
         self.register_buffer("orders", torch.tensor(np.array(orders)))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
             self.networks = nn.ModuleList(
                 nn.Sequential(
-                    nn.Linear(self.kept, width),
+                    nn.Linear(self.fixed, width),
                     nn.SiLU(),
                     nn.Linear(width, width),
                     nn.SiLU(),
@@ -117,41 +115,23 @@ class CouplingFlow(nn.Module):
         """Return z and log |det dz/dx|: ``(N, D) → (N, D), (N,)``."""
         log_determinant = x.new_zeros(len(x))
         for order, network in zip(self.orders, self.networks, strict=True):
-            kept, changed = x[:, order].split([self.kept, x.shape[1] - self.kept], dim=1)
-            log_scale, shift = _scale_and_shift(network, kept)
-            x = torch.cat([kept, changed * log_scale.exp() + shift], dim=1)
+            fixed, changed = x[:, order].split([self.fixed, x.shape[1] - self.fixed], dim=1)
+            log_scale, shift = _scale_and_shift(network, fixed)
+            x = torch.cat([fixed, changed * log_scale.exp() + shift], dim=1)
             log_determinant = log_determinant + log_scale.sum(dim=1)
         return x, log_determinant
 
-    def inverse(self, z: torch.Tensor) -> torch.Tensor:
-        """Return the x that :meth:`forward` takes to z."""
-        backwards = reversed(list(zip(self.orders, self.networks, strict=True)))
-        for order, network in backwards:
-            kept, changed = z.split([self.kept, z.shape[1] - self.kept], dim=1)
-            log_scale, shift = _scale_and_shift(network, kept)
-            z = torch.cat([kept, (changed - shift) * (-log_scale).exp()], dim=1)
-            z = z[:, torch.argsort(order)]
-        return z
 
-
-def _scale_and_shift(network: nn.Module, kept: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    log_scale, shift = network(kept).chunk(2, dim=1)
+def _scale_and_shift(network: nn.Module, fixed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    log_scale, shift = network(fixed).chunk(2, dim=1)
     return _MOST * torch.tanh(log_scale / _MOST), shift
 
 
 class PoseFlow(nn.Module):
     """Density of root-centred 2D poses.
 
-    Parameters
-    ----------
-    skeleton : Skeleton
-        The J joints; the first root, which is at the origin, has no coordinates of its own.
-    settings : FlowSettings
-        Size of the flow.
-    components : int
-        Leading principal components that the flow works on, at least 2.
-    seed : int
-        Of the first weights and the permutations.
+    The flow covers the ``components`` leading principal components, at least 2. The root is at the
+    origin and not part of the density.
     """
 
     mean: torch.Tensor
@@ -179,7 +159,7 @@ class PoseFlow(nn.Module):
     def of_poses(
         cls, skeleton: Skeleton, settings: FlowSettings, poses: np.ndarray, seed: int = 0
     ) -> PoseFlow:
-        """Return an untrained flow with the principal components of poses (N, J, 2), metres."""
+        """Return an untrained flow with the principal components of poses, (N, J, 2), metres."""
         root = skeleton.roots[0]
         flat = np.delete(poses, root, axis=1).reshape(len(poses), -1)
         mean = flat.mean(axis=0)
@@ -188,9 +168,9 @@ class PoseFlow(nn.Module):
         variance, basis = np.linalg.eigh(covariance)
         variance, basis = variance[::-1], basis[:, ::-1]
         if not variance[-1] > 1e-12:
-            raise ValueError("blur is 0 and poses fill no volume, expected blur above 0")
-        held = np.cumsum(variance) / variance.sum()
-        components = max(2, min(len(variance), 1 + int((held < settings.share).sum())))
+            raise ValueError("blur must be above 0 for poses in a subspace, got 0")
+        explained = np.cumsum(variance) / variance.sum()
+        components = max(2, min(len(variance), 1 + int((explained < settings.share).sum())))
         flow = cls(skeleton, settings, components, seed)
         flow.mean.copy_(torch.from_numpy(mean))
         flow.basis.copy_(torch.from_numpy(basis.copy()))
@@ -199,35 +179,32 @@ class PoseFlow(nn.Module):
 
     @classmethod
     def load(cls, source: str | Path) -> PoseFlow:
-        """Return a trained flow from a checkpoint's file or the folder of a training run.
+        """Return a trained flow from a checkpoint or the folder of a training run.
 
         Raises
         ------
         CheckpointError
-            If the file is damaged, of another version or no pose flow.
+            If the file is damaged or not a pose flow of this version.
         FileNotFoundError
             If there is no such file.
         """
         checkpoint = load_checkpoint(source, KIND)
-        kept = checkpoint.settings["network"]
-        skeleton = Skeleton(kept["joint_names"], kept["parents"])
-        flow = cls(skeleton, FlowSettings(**kept["size"]), kept["components"])
+        stored = checkpoint.settings["network"]
+        skeleton = Skeleton(stored["joint_names"], stored["parents"])
+        flow = cls(skeleton, FlowSettings(**stored["size"]), stored["components"])
         load_weights(flow, checkpoint.tensors)
         return flow.eval().requires_grad_(False)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the weights, which says what was asked for densities."""
-        found = hashlib.sha256()
+        """SHA-256 of the weights."""
+        digest = hashlib.sha256()
         for name, tensor in sorted(self.state_dict().items()):
-            found.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
-        return found.hexdigest()
+            digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     def log_density(self, poses: torch.Tensor) -> torch.Tensor:
-        """Return the logarithm of the density of poses per metre^2(J−1): ``(N, J, 2) → (N,)``.
-
-        Poses must be centred on the root, whose own coordinates are not looked at.
-        """
+        """Return the log density of root-centred poses per metre^2(J−1): ``(N, J, 2) → (N,)``."""
         check_shape("poses", poses, ("N", self.skeleton.n_joints, 2))
         flat = poses[:, self.joints].flatten(1)
         standard = (flat - self.mean) @ self.basis / self.deviation

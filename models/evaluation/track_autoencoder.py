@@ -1,7 +1,6 @@
-"""The variational autoencoder of 2D motions: what it keeps of a motion are its features.
+"""Variational autoencoder of 2D motions.
 
-Its shape follows the released code of MAS: transformers whose latent is that of ACTOR (Petrovich
-et al. 2021).
+It follows the released code of MAS: transformers with the latent of ACTOR (Petrovich et al. 2021).
 """
 
 from __future__ import annotations
@@ -12,74 +11,58 @@ import torch
 from torch import nn
 
 from probmotion.models.diffusion.motion_transformer import sinusoids
+from probmotion.models.diffusion.settings import TransformerSettings
 from probmotion.validation import check_count, check_positive
 
-__all__ = [
-    "EvaluatorSettings",
-    "TrackAutoencoder",
-    "TrackDecoder",
-    "TrackEncoder",
-    "divergence_from_normal",
-]
+__all__ = ["EvaluatorSettings", "TrackAutoencoder", "TrackEncoder"]
 
 
 @dataclass(frozen=True)
-class EvaluatorSettings:
+class EvaluatorSettings(TransformerSettings):
     """Size of the autoencoder.
 
     Parameters
     ----------
-    frames : int
-        Most frames L of a motion.
-    layers, width, heads, feedforward : int
-        Of each of its two transformers.
+    frames, layers, width, heads, feedforward : int
+        Size of each of the two transformers.
     latent : int
         Number of features.
     kl_weight : float
-        Weight of the Kullback-Leibler divergence from N(0, I), summed over the latent, beside the
-        mean squared error in standardised units.
+        Weight of the Kullback-Leibler divergence from N(0, I), summed over the latent, relative to
+        the mean squared error in standardised units.
 
     Raises
     ------
     ValueError
-        If a number is out of range, or ``width`` is no multiple of ``heads`` and of 2.
+        If a number is out of range.
     """
 
-    frames: int = 60
-    layers: int = 6
     width: int = 256
-    heads: int = 4
-    feedforward: int = 1024
     latent: int = 256
     kl_weight: float = 1e-5
 
     def __post_init__(self) -> None:
-        for name in ("layers", "width", "heads", "feedforward", "latent"):
-            check_count(name, getattr(self, name))
-        check_count("frames", self.frames, least=2)
+        super().__post_init__()
+        check_count("latent", self.latent)
         check_positive("kl_weight", self.kl_weight)
-        if self.width % self.heads or self.width % 2:
-            raise ValueError(
-                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
-            )
 
     @classmethod
     def tiny(cls, frames: int = 20) -> EvaluatorSettings:
-        """Return the size for tests: learns a toy in seconds."""
+        """Return a size for tests, which trains in seconds."""
         return cls(frames, layers=2, width=32, heads=2, feedforward=64, latent=8)
 
     @classmethod
     def small(cls, frames: int = 40) -> EvaluatorSettings:
-        """Return the size that two cores train in minutes, and that ships."""
+        """Return the shipped size, which trains in minutes on two cores."""
         return cls(frames, layers=4, width=96, heads=4, feedforward=256, latent=64)
 
     @classmethod
     def reference_code(cls, frames: int = 180) -> EvaluatorSettings:
-        """Return the size of the MAS authors' released code."""
+        """Return the size in the MAS authors' released code."""
         return cls(frames)
 
     def transformer(self) -> nn.TransformerEncoder:
-        """Return layers of self-attention over frames."""
+        """Return a transformer over frames."""
         layer = nn.TransformerEncoderLayer(
             self.width, self.heads, self.feedforward, 0.0, activation="gelu", batch_first=True
         )
@@ -87,17 +70,9 @@ class EvaluatorSettings:
 
 
 class TrackEncoder(nn.Module):
-    """Standardised motion → mean and logarithmic variance of its latent.
+    """Standardised motion → mean and log variance of its latent.
 
-    Two learnt tokens stand before the frames; what the transformer makes of them are the two
-    answers (ACTOR, Petrovich et al. 2021).
-
-    Parameters
-    ----------
-    size : EvaluatorSettings
-        Of the transformer.
-    n_joints : int
-        J.
+    Two learnt tokens precede the frames; their outputs give mean and log variance (ACTOR).
     """
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
@@ -113,28 +88,17 @@ class TrackEncoder(nn.Module):
     def forward(
         self, motions: torch.Tensor, valid: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and logarithmic variance: ``(N, L, 2J), (N, L) → (N, latent), (N, latent)``.
-
-        Frames that are not ``valid`` are not looked at.
-        """
+        """Return mean and log variance: ``(N, L, 2J), (N, L) → (N, latent), (N, latent)``."""
         frames = self.enter(motions) + self.places[: motions.shape[1]]
-        asked = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
+        tokens = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
         ignored = torch.cat([torch.zeros_like(valid[:, :2]), ~valid], dim=1)
-        tokens = torch.cat([asked, frames], dim=1)
-        found = self.transformer(tokens, src_key_padding_mask=ignored)
-        return self.mean(found[:, 0]), self.log_variance(found[:, 1])
+        tokens = torch.cat([tokens, frames], dim=1)
+        encoded = self.transformer(tokens, src_key_padding_mask=ignored)
+        return self.mean(encoded[:, 0]), self.log_variance(encoded[:, 1])
 
 
 class TrackDecoder(nn.Module):
-    """Latent → standardised motion: every frame starts from the latent and its place in time.
-
-    Parameters
-    ----------
-    size : EvaluatorSettings
-        Of the transformer.
-    n_joints : int
-        J.
-    """
+    """Latent → standardised motion; every frame is the latent plus a positional embedding."""
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
         super().__init__()
@@ -151,15 +115,7 @@ class TrackDecoder(nn.Module):
 
 
 class TrackAutoencoder(nn.Module):
-    """Encoder and decoder: ``encoder`` is what :class:`TrackEvaluator` keeps.
-
-    Parameters
-    ----------
-    size : EvaluatorSettings
-        Of both.
-    n_joints : int
-        J.
-    """
+    """Encoder and decoder."""
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
         super().__init__()
@@ -169,11 +125,11 @@ class TrackAutoencoder(nn.Module):
     def forward(
         self, motions: torch.Tensor, valid: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the motions again, (N, L, 2J), and each latent's divergence from N(0, I), (N,).
+        """Return reconstructions (N, L, 2J) and divergences of latents from N(0, I), (N,).
 
         ``noise`` is standard normal, (N, latent) (Kingma and Welling 2014, section 2.4).
         """
-        mean, log_variance = (found.float() for found in self.encoder(motions, valid))
+        mean, log_variance = (part.float() for part in self.encoder(motions, valid))
         latents = mean + torch.exp(0.5 * log_variance) * noise
         return self.decoder(latents, valid), divergence_from_normal(mean, log_variance)
 

@@ -1,4 +1,4 @@
-"""`decode_rows`: a torch decoder of rows, for any batch of NumPy's or torch's arrays."""
+"""Batched decoding of NumPy or torch arrays by a torch decoder."""
 
 from __future__ import annotations
 
@@ -21,43 +21,28 @@ def decode_rows(
     shape: tuple[int, ...],
     rows: int,
 ) -> Array:
-    """Return what a decoder makes of θ, of θ's kind of array.
+    """Return the decoded θ, ``(…, dim) → (…, *shape)``, as an array of the same library.
 
-    Parameters
-    ----------
-    decode : callable
-        ``(B, dim) → (B, *shape)``, in the precision of what it is given.
-    theta : ndarray or Tensor, (…, dim)
-        NumPy's are decoded in their own precision, single or double, without a gradient; torch's
-        keep theirs.
-    dim : int
-        Length of θ.
-    shape : tuple of int
-        Of what is decoded of one θ.
-    rows : int
-        Of a NumPy array, how many are decoded at a time: memory stays small.
-
-    Returns
-    -------
-    ndarray or Tensor, (…, *shape)
+    ``decode`` maps ``(B, dim) → (B, *shape)`` in the precision of its input. NumPy arrays are
+    decoded in single or double precision, without gradients, ``rows`` at a time to limit memory.
 
     Raises
     ------
     TypeError
-        If θ is no array of NumPy's or torch's.
+        If θ is neither a NumPy array nor a torch tensor.
     ValueError
         If θ has another length, or a NumPy array is not finite.
     """
     if not (is_numpy_array(theta) or is_torch_array(theta)):
         kind = "JAX array" if is_jax_array(theta) else type(theta).__name__
-        raise TypeError(f"theta is a {kind}, expected NumPy's or torch's: this prior is torch's")
+        raise TypeError(f"theta must be a NumPy or torch array, got a {kind}")
     check_shape("theta", theta, ("…", dim))
     whole = (*theta.shape[:-1], *shape)
     if is_torch_array(theta):
         return decode(theta.reshape(-1, dim)).reshape(whole)
     check_finite("theta", theta)
-    kept = theta.dtype if theta.dtype == np.float32 else np.float64
+    dtype = theta.dtype if theta.dtype == np.float32 else np.float64
     with torch.no_grad():
-        flat = torch.as_tensor(np.ascontiguousarray(theta, kept)).reshape(-1, dim)
-        found = [to_numpy(decode(some)) for some in flat.split(rows)]
-    return np.concatenate(found).reshape(whole)
+        flat = torch.as_tensor(np.ascontiguousarray(theta, dtype)).reshape(-1, dim)
+        parts = [to_numpy(decode(part)) for part in flat.split(rows)]
+    return np.concatenate(parts).reshape(whole)

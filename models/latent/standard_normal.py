@@ -1,6 +1,6 @@
-"""`StandardNormalPrior`: what every prior whose coordinates are N(0, I) can do with them.
+"""Base class of priors over standard-normal coordinates.
 
-A learnt decoder makes motions of θ; of θ itself density, draws and denoiser are known exactly.
+Subclasses decode θ into motions; density, draws and denoiser of θ itself are exact.
 """
 
 from __future__ import annotations
@@ -17,10 +17,7 @@ __all__ = ["StandardNormalPrior"]
 
 
 class StandardNormalPrior(ABC):
-    """θ ~ N(0, I); how long θ is and which motion stands at it, a subclass says.
-
-    Densities and denoiser are of θ's kind of array: NumPy, torch or JAX.
-    """
+    """θ ~ N(0, I), for NumPy, torch and JAX arrays."""
 
     @property
     @abstractmethod
@@ -32,13 +29,7 @@ class StandardNormalPrior(ABC):
         """Return the motion at θ, ``(…, dim) → (…, L, J, 3)``, metres."""
 
     def log_density(self, theta: Array) -> Array:
-        """Return log N(θ; 0, I): ``(…, dim) → (…)``.
-
-        Raises
-        ------
-        ValueError
-            If θ has another length.
-        """
+        """Return log N(θ; 0, I): ``(…, dim) → (…)``."""
         check_shape("theta", theta, ("…", self.dim))
         xp = array_namespace(theta)
         return -0.5 * (xp.sum(theta**2, axis=-1) + self.dim * math.log(2 * math.pi))
@@ -52,5 +43,5 @@ class StandardNormalPrior(ABC):
         return self.motion(self.initial(rng, n))
 
     def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
-        """Return E[θ | θ_t] = √ᾱ θ_t, exactly, since θ ~ N(0, I): ``(…, dim) → (…, dim)``."""
+        """Return E[θ | θ_t] = √ᾱ θ_t, which is exact: ``(…, dim) → (…, dim)``."""
         return math.sqrt(alpha_bar) * theta_t

@@ -1,4 +1,4 @@
-"""The Gaussian mixture prior, exact in density, denoising and posterior."""
+"""Gaussian mixture prior over motions, with exact density, denoising and posterior."""
 
 import lazy_loader
 

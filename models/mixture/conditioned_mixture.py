@@ -1,9 +1,10 @@
-"""`ConditionedMixture`: a Gaussian-mixture prior given evidence, with its exact denoisers.
+"""Gaussian-mixture prior conditioned on a likelihood, with exact denoisers.
 
-Evidence y about X is exp(−½ xᵀΛx + ηᵀx) at each joint and frame, and so is a noisy view of X:
-x_t = √ᾱ P X + √(1−ᾱ) ε adds ᾱ/(1−ᾱ) PᵀP to Λ and √ᾱ/(1−ᾱ) Pᵀ x_t to η. Hence E[X₀ | x_t, y] is
-a mixture's posterior mean (:mod:`~probmotion.models.mixture.posterior` has the algebra), and Λ is
-the same for all draws of a noise level: what depends on it is computed once per batch.
+At each joint and frame a linear Gaussian likelihood of X is exp(−½ xᵀΛx + ηᵀx). A noisy view
+x_t = √ᾱ P X + √(1−ᾱ) ε has the same form: it adds ᾱ/(1−ᾱ) PᵀP to Λ and √ᾱ/(1−ᾱ) Pᵀ x_t to η.
+Hence E[X₀ | x_t, y] is the posterior mean of a mixture (see
+:mod:`~probmotion.models.mixture.posterior`). Λ is the same for all draws at a noise level, so
+everything that depends on it is computed once per batch.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.models.mixture.posterior import MixturePosterior
 from probmotion.models.mixture.turned_mixture import turning_coefficients
-from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Likelihood, NotConjugate
 from probmotion.validation import check_shape
 
@@ -25,14 +25,16 @@ __all__ = ["ConditionedMixture"]
 
 
 class ConditionedMixture:
-    """p(X | y) as a prior of its own: E[X₀ | X_t, y] and E[x₀ | x_t, y] of any view are exact.
+    """p(X | y) as a prior, with exact E[X₀ | X_t, y] and E[x₀ | x_t, y] for every view.
+
+    θ contains all positions; ``scale`` is the prior's (metres per normalised unit).
 
     Parameters
     ----------
     prior : GaussianMixtureMotion
-        The belief before the evidence.
+        Prior p(X).
     likelihood : Likelihood
-        The evidence.
+        Likelihood p(y | X).
 
     Raises
     ------
@@ -43,42 +45,15 @@ class ConditionedMixture:
     def __init__(self, prior: GaussianMixtureMotion, likelihood: Likelihood) -> None:
         self.prior = prior
         self.likelihood = likelihood
+        self.skeleton = prior.skeleton
+        self.frames = prior.frames
+        self.fps = prior.fps
+        self.scale = prior.scale
+        self.dim = prior.means[0].size
         self._posterior = prior.exact_posterior(likelihood)
-        linear = getattr(likelihood, "linear", None)
-        if linear is None:
-            raise NotConjugate(f"the likelihood {type(likelihood).__name__} has no linear()")
-        axes, target, precision = linear()
-        F = prior.means[0].size // 3
-        precision = precision.reshape(len(axes), F)
-        target = target.reshape(len(axes), F, -1)
-        self._information = np.einsum("vf,vmi,vmj->fij", precision, axes, axes)
-        self._shift = np.einsum("vf,vmi,vfm->fi", precision, axes, target)
+        self._information = self._posterior.information
+        self._shift = self._posterior.shift
         self._turns = turning_coefficients(prior.yaws)
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The prior's skeleton."""
-        return self.prior.skeleton
-
-    @property
-    def frames(self) -> int:
-        """Number of frames L."""
-        return self.prior.frames
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.prior.fps
-
-    @property
-    def dim(self) -> int:
-        """Length of θ, which is all positions."""
-        return self.prior.means[0].size
-
-    @property
-    def scale(self) -> float:
-        """Metres per normalised unit, the prior's."""
-        return self.prior.scale
 
     def motion(self, theta: Array) -> Array:
         """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
@@ -89,15 +64,12 @@ class ConditionedMixture:
         return self._posterior.sample(rng, n)
 
     def exact_posterior(self, likelihood: Likelihood | None) -> MixturePosterior:
-        """Return p(X | y).
-
-        Raises
-        ------
-        NotConjugate
-            If there is more evidence: it belongs with the first.
-        """
+        """Return p(X | y); raise ``NotConjugate`` if a second likelihood is given."""
         if likelihood is not None:
-            raise NotConjugate("there is evidence already; give the prior all of it at once")
+            raise NotConjugate(
+                "likelihood must be None, the prior already includes one; condition the prior on "
+                "all observations at once"
+            )
         return self._posterior
 
     def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
@@ -107,15 +79,9 @@ class ConditionedMixture:
         return self._mean(seen, alpha_bar, np.eye(3)).reshape(x_t.shape)
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
-        """Return E[x₀ | x_t, y] view by view, all arrays (B, V, L, J, 2), normalised units.
-
-        Raises
-        ------
-        ValueError
-            If a camera is perspective.
-        """
+        """Return E[x₀ | x_t, y] for each orthographic view, (B, V, L, J, 2), normalised units."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic cameras, got perspective")
+            raise ValueError("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.prior.means.shape[1:3], 2))
         out = np.empty_like(x_t)
         for view, axes in enumerate(cameras.image_axes):
@@ -127,7 +93,7 @@ class ConditionedMixture:
         """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``; P is ``axes``, (M, 3)."""
         prior, scale, variance = self.prior, self.prior.scale, self.prior.noise**2
         if not 0 < alpha_bar < 1:
-            raise ValueError(f"alpha_bar must be a number between 0 and 1, got {alpha_bar!r}")
+            raise ValueError(f"alpha_bar must be between 0 and 1 (exclusive), got {alpha_bar!r}")
         precision = alpha_bar / ((1 - alpha_bar) * scale**2)
         information = self._information + precision * axes.T @ axes
         shrink = np.linalg.inv(np.eye(3) + variance * information)
@@ -138,7 +104,7 @@ class ConditionedMixture:
         moved = np.einsum("fij,knefj->knefi", shrink @ information, fields, optimize=True)
         gram = (flat @ moved.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
         gram = np.einsum("kicjd,ac,ad->kaij", gram, turns, turns, optimize=True)
-        # From here on one row per draw.
+        # The arrays below have one row per draw.
         shift = self._shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (seen @ axes)
         pull = np.einsum("fij,bfj->bfi", shrink, shift)
         products = pull.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T

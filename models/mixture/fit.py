@@ -1,9 +1,9 @@
-"""Fitting the mixture: windows of clips, a common heading, one probabilistic PCA per style."""
+"""Fitting the Gaussian mixture: windows, heading alignment, probabilistic PCA per style."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,17 +11,7 @@ from probmotion import seeds
 from probmotion.motion.motion import Motion
 from probmotion.validation import check_count
 
-__all__ = ["FittedStyles", "cut_windows", "fit_styles", "turn_to"]
-
-
-class FittedStyles(NamedTuple):
-    """Means (K, L, J, 3), factors (K, r, L, J, 3), δ, the styles' names and shares (K,)."""
-
-    means: np.ndarray
-    factors: np.ndarray
-    noise: float
-    names: tuple[str, ...]
-    shares: np.ndarray
+__all__ = ["cut_windows", "fit_styles"]
 
 
 def fit_styles(
@@ -31,13 +21,11 @@ def fit_styles(
     styles: int | Sequence[str],
     stride: int | None,
     seed: int,
-) -> FittedStyles:
-    """Return the styles of :meth:`GaussianMixtureMotion.fit`, whose arguments these are.
+) -> dict[str, Any]:
+    """Return the fields of a prior; arguments as in :meth:`GaussianMixtureMotion.fit`.
 
-    Notes
-    -----
-    Each style is a probabilistic PCA (Tipping and Bishop 1999): the r largest principal
-    directions, shortened by δ², and δ² the mean variance of all others, pooled over styles.
+    Each style is a probabilistic PCA (Tipping and Bishop 1999): the r leading principal directions
+    with variances reduced by δ², the mean variance of the other directions, pooled over styles.
     """
     check_count("rank", rank)
     windows, clip_of = cut_windows(motions, frames, stride)
@@ -45,7 +33,7 @@ def fit_styles(
     flat = windows.reshape(len(windows), -1)
     if np.ptp(flat, axis=0).max() < 1e-9:
         raise ValueError(
-            f"motions has {len(windows)} windows that are all alike, expected clips that differ"
+            f"motions must contain windows that differ, got {len(windows)} identical ones"
         )
     if isinstance(styles, int):
         check_count("styles", styles)
@@ -54,7 +42,7 @@ def fit_styles(
     else:
         if len(styles) != len(motions):
             raise ValueError(
-                f"styles has {len(styles)} labels, expected {len(motions)}, one per motion"
+                f"styles must contain {len(motions)} labels, one per motion, got {len(styles)}"
             )
         names = tuple(sorted(set(styles)))
         labels = np.array([names.index(styles[clip]) for clip in clip_of])
@@ -64,8 +52,8 @@ def fit_styles(
         members = windows[labels == k]
         if len(members) < rank + 2:
             raise ValueError(
-                f"styles puts {len(members)} windows into {name}, expected at least {rank + 2} "
-                f"for rank {rank}; give more or longer clips, fewer styles or a lower rank"
+                f"style {name} must have at least {rank + 2} windows for rank {rank}, got "
+                f"{len(members)}; use more or longer clips, fewer styles or a lower rank"
             )
         members = _turned_to_mean(members)
         mean = members.mean(axis=0)
@@ -75,52 +63,39 @@ def fit_styles(
         means.append(mean)
         spectra.append(size**2 / (len(members) - 1))
         directions.append(axes[:rank])
-    shares = np.bincount(labels, minlength=len(names)) / len(labels)
+    proportions = np.bincount(labels, minlength=len(names)) / len(labels)
     left_over = np.array([spectrum[rank:].sum() for spectrum in spectra])
-    variance = float(shares @ left_over) / (flat.shape[1] - rank)
+    variance = float(proportions @ left_over) / (flat.shape[1] - rank)
     if not variance > 0:
         raise ValueError(
-            f"rank is {rank}, which explains the clips to the last digit and leaves no noise, "
-            "expected fewer directions than the windows span"
+            f"rank must be below the dimension that the windows span, got {rank}, which leaves no "
+            "noise"
         )
     factors = [
         np.sqrt(np.maximum(spectrum[:rank] - variance, 0.0))[:, None] * axes
         for spectrum, axes in zip(spectra, directions, strict=True)
     ]
-    return FittedStyles(
-        means=np.stack(means),
-        factors=np.stack(factors).reshape(len(names), rank, *shape),
-        noise=float(np.sqrt(variance)),
-        names=names,
-        shares=shares,
-    )
+    return {
+        "means": np.stack(means),
+        "factors": np.stack(factors).reshape(len(names), rank, *shape),
+        "noise": float(np.sqrt(variance)),
+        "styles": names,
+        "weights": proportions,
+    }
 
 
 def cut_windows(
     motions: Sequence[Motion], frames: int, stride: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return all windows of ``frames`` frames, centred on the root, and each one's clip.
+    """Return all windows of clips, centred on the root, (n, frames, J, 3), and their clips (n,).
 
-    Parameters
-    ----------
-    motions : sequence of Motion
-        Clips of one skeleton and frame rate; those shorter than ``frames`` give no window.
-    frames : int
-        Frames per window.
-    stride : int, optional
-        Frames from one window's start to the next; a quarter of ``frames`` by default.
-
-    Returns
-    -------
-    windows : ndarray, (n, frames, J, 3)
-        Metres.
-    clip_of : ndarray of int, (n,)
-        Index of the clip that each window is from.
+    ``stride`` frames lie between the starts of windows, by default ``frames // 4``; shorter clips
+    are skipped.
 
     Raises
     ------
     ValueError
-        If there is no clip, they do not share skeleton and frame rate, or all are too short.
+        If there is no clip, clips differ in skeleton or frame rate, or all are too short.
     """
     check_count("frames", frames)
     step = max(1, frames // 4) if stride is None else stride
@@ -131,13 +106,12 @@ def cut_windows(
     for motion in motions:
         if motion.skeleton != first.skeleton:
             raise ValueError(
-                f"motions has {motion} beside {first}, expected clips of one skeleton; retarget "
-                "them to their common joints"
+                f"motions must share one skeleton, got {motion} and {first}; retarget them to "
+                "their common joints"
             )
         if motion.fps != first.fps:
             raise ValueError(
-                f"motions has {motion} beside {first}, expected clips of one frame rate; resample "
-                "them"
+                f"motions must share one frame rate, got {motion} and {first}; resample them"
             )
     windows, clip_of = [], []
     for clip, motion in enumerate(motions):
@@ -147,15 +121,14 @@ def cut_windows(
     if not windows:
         longest = max(motion.frames for motion in motions)
         raise ValueError(
-            f"motions has at most {longest} frames in a clip, expected at least frames={frames}"
+            f"motions must contain a clip of at least {frames} frames, the longest has {longest}"
         )
     return np.stack(windows), np.array(clip_of)
 
 
 def turn_to(motions: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the motions, each turned about the vertical to be nearest ``target``.
+    """Return motions rotated about the vertical onto ``target`` by least squares over the yaw.
 
-    Least squares over the yaw: tan ψ = Σ (x·target_z-part) / Σ (…), in closed form.
     ``(n, L, J, 3), (L, J, 3) → (n, L, J, 3)``.
     """
     x, z = motions[..., 0], motions[..., 2]
@@ -171,16 +144,16 @@ def _turned(motions: np.ndarray, yaw: np.ndarray) -> np.ndarray:
 
 
 def _common_heading(windows: np.ndarray, motion: Motion) -> np.ndarray:
-    """Turn every window so that its mean left-to-right axis points along −X.
+    """Rotate every window so that its mean left-to-right axis points along −X.
 
-    Skeletons without named sides are turned to the first window instead.
+    For a skeleton without left-right pairs, align the windows with the first one instead.
     """
     pairs = motion.skeleton.mirrored_pairs
     if not pairs:
         return turn_to(windows, windows[0])
     left, right = np.array(pairs).T
     side = (windows[:, :, right] - windows[:, :, left]).mean(axis=(1, 2))
-    # A body that faces +Z, its up being +Y, has its right on −X.
+    # With +Y up, a body that faces +Z has its right side at −X.
     return _turned(windows, np.arctan2(-side[:, 2], -side[:, 0]))
 
 
@@ -191,7 +164,7 @@ def _turned_to_mean(windows: np.ndarray, sweeps: int = 5) -> np.ndarray:
 
 
 def _cluster(flat: np.ndarray, styles: int, rank: int, seed: int) -> np.ndarray:
-    """k-means on the principal coordinates, labels ordered from the largest cluster down."""
+    """Return k-means labels in principal coordinates, largest cluster first."""
     if styles == 1:
         return np.zeros(len(flat), dtype=int)
     from scipy.cluster.vq import ClusterError, kmeans2
@@ -204,8 +177,8 @@ def _cluster(flat: np.ndarray, styles: int, rank: int, seed: int) -> np.ndarray:
         _, labels = kmeans2(scores, styles, minit="++", iter=50, rng=rng, missing="raise")
     except ClusterError as error:
         raise ValueError(
-            f"styles is {styles}, but the windows of the clips fall into fewer clusters, expected "
-            "a smaller number or clips that differ more"
+            f"styles must be at most the number of clusters in the windows, got {styles}; use "
+            "fewer styles or clips that differ more"
         ) from error
     order = np.argsort(-np.bincount(labels, minlength=styles), kind="stable")
     return np.argsort(order)[labels]

@@ -1,7 +1,7 @@
-"""`GaussianMixtureMotion`: a prior for which everything is known exactly.
+"""Gaussian mixture prior over motions, with exact density, denoisers and posterior.
 
-K gait styles, each a probabilistic PCA, turned about the vertical by a yaw that is uniform on a
-grid of A azimuths: K·A Gaussian components with covariance W Wᵀ + δ² I.
+K styles, each a probabilistic PCA, rotated about the vertical by a yaw that is uniform on a grid of
+A azimuths: K·A Gaussian components with covariance W Wᵀ + δ² I.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ class GaussianMixtureMotion:
     means : ndarray, (K, L, J, 3)
         Mean motion of each style, metres.
     factors : ndarray, (K, r, L, J, 3)
-        W: what one standard deviation of each latent coordinate adds, metres.
+        W: displacement per unit of each latent coordinate, metres.
     weights : ndarray, (K,)
         Probabilities of the styles, summing to 1.
     noise : float
-        δ: standard deviation of every coordinate around the subspaces, metres.
+        δ: standard deviation of the isotropic noise around the subspaces, metres.
     azimuths : int
         A: number of yaws ψ_a = 2π a / A.
     styles : sequence of str, optional
         Names of the styles.
     coordinates : {"latent", "positions"}
-        What θ is: the latent z of r numbers, style, yaw and small noise integrated out; or all
+        Definition of θ: the latent z of length r, with style, yaw and noise integrated out, or all
         3·L·J positions.
 
     Raises
     ------
     ValueError
-        If shapes disagree or a number is out of range.
+        If shapes are inconsistent or a number is out of range.
     """
 
     skeleton: Skeleton
@@ -90,7 +90,7 @@ class GaussianMixtureMotion:
             raise ValueError(f"weights must be numbers above 0 that sum to 1, got {self.weights}")
         names = tuple(self.styles) or tuple(f"style-{k}" for k in range(K))
         if len(names) != K:
-            raise ValueError(f"styles has {len(names)} names, expected {K}, one per mean")
+            raise ValueError(f"styles must contain {K} names, one per mean, got {len(names)}")
         if self.coordinates not in ("latent", "positions"):
             raise ValueError(
                 f"coordinates must be 'latent' or 'positions', got {self.coordinates!r}"
@@ -98,7 +98,7 @@ class GaussianMixtureMotion:
         object.__setattr__(self, "styles", names)
 
     def __getstate__(self) -> dict:
-        # Caches are rebuilt where they are used; weak references cannot travel.
+        # Weak references cannot be pickled; the caches are rebuilt on demand.
         return self.__dict__ | {"_posteriors": None, "_views": None}
 
     def __setstate__(self, state: dict) -> None:
@@ -118,48 +118,45 @@ class GaussianMixtureMotion:
         coordinates: Literal["latent", "positions"] = "latent",
         seed: int = 0,
     ) -> GaussianMixtureMotion:
-        """Fit the mixture to clips: windows, a common heading, then one PCA per style.
+        """Fit the mixture to windows of clips: align headings, then one PCA per style.
 
         Parameters
         ----------
         motions : sequence of Motion
             Clips of one skeleton and frame rate.
         frames : int
-            Length L of the motions the prior is over.
+            Length L of the prior's motions.
         rank : int
             r: latent dimensions per style.
         styles : int or sequence of str
             Number of styles to find by k-means, or one label per clip.
         weights : sequence of float, optional
-            Probabilities of the styles, in the order of their sorted names; their shares of the
-            windows by default.
+            Probabilities of the styles, in the order of their sorted names; by default their
+            proportions among the windows.
         azimuths : int
             A: number of yaws.
         stride : int, optional
-            Frames from one window's start to the next; a quarter of ``frames`` by default.
+            Frames between the starts of successive windows; default ``frames // 4``.
         coordinates : {"latent", "positions"}
-            What θ is.
+            Definition of θ.
         seed : int
             Seed of the k-means.
 
         Raises
         ------
         ValueError
-            If the clips do not share a skeleton and frame rate, all are shorter than ``frames``,
-            or a style has too few windows for ``rank``.
+            If clips differ in skeleton or frame rate, all are shorter than ``frames``, or a style
+            has too few windows for ``rank``.
         """
         fitted = fit_styles(motions, frames, rank, styles, stride, seed)
-        shares = fitted.shares if weights is None else np.asarray(weights, dtype=np.float64)
+        if weights is not None:
+            fitted["weights"] = np.asarray(weights, dtype=np.float64)
         return cls(
             skeleton=motions[0].skeleton,
             fps=motions[0].fps,
-            means=fitted.means,
-            factors=fitted.factors,
-            weights=shares,
-            noise=fitted.noise,
             azimuths=azimuths,
-            styles=fitted.names,
             coordinates=coordinates,
+            **fitted,
         )
 
     @property
@@ -195,17 +192,17 @@ class GaussianMixtureMotion:
         fields = np.concatenate([self.means[:, None], self.factors], axis=1)
         return turning_fields(fields.reshape(*fields.shape[:2], -1, 3))
 
-    # What the prior can do. Each method is one protocol of probmotion.posteriors.protocols.
+    # Protocols of probmotion.posteriors.protocols.
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n independent motions, (n, L, J, 3), metres."""
         return self.exact_posterior(None).sample(rng, n)
 
     def motion(self, theta: Array) -> Array:
-        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; only in ``positions``."""
+        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; ``positions`` only."""
         if self.coordinates == "latent":
             raise ValueError(
-                "coordinates is 'latent', where a motion at θ is a draw; expected 'positions', or "
+                "coordinates must be 'positions', got 'latent', where the motion at θ is random; "
                 "use complete(rng, theta, likelihood)"
             )
         xp = array_namespace(theta)
@@ -240,13 +237,13 @@ class GaussianMixtureMotion:
     def complete(
         self, rng: RandomNumbers, theta: np.ndarray, likelihood: Likelihood | None
     ) -> np.ndarray:
-        """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres."""
+        """Return one draw from p(X | θ, y) for each θ: ``(n, dim) → (n, L, J, 3)``, metres."""
         if self.coordinates == "latent":
             return self.exact_posterior(likelihood).complete(rng, theta)
         return np.asarray(self.motion(theta))
 
     def exact_posterior(self, likelihood: Likelihood | None) -> MixturePosterior:
-        """Return p(X | y), again a Gaussian mixture.
+        """Return p(X | y), also a Gaussian mixture.
 
         Raises
         ------
@@ -266,12 +263,12 @@ class GaussianMixtureMotion:
         return self._posteriors[key]
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
-        """Return E[x₀ | x_t] view by view, all arrays (B, V, L, J, 2), normalised units.
+        """Return E[x₀ | x_t] for each view, arrays (B, V, L, J, 2), normalised units.
 
         Raises
         ------
         ValueError
-            If a camera is perspective: its marginals are no Gaussian mixtures.
+            If a camera is perspective: its marginals are not Gaussian mixtures.
         """
         out = np.empty_like(x_t)
         for view, mixture in enumerate(self._seen_by(cameras, x_t)):
@@ -309,7 +306,7 @@ class GaussianMixtureMotion:
         )
         return product.reshape(x_t.shape)
 
-    # What is known of a motion because the prior is a mixture.
+    # Properties specific to the mixture.
 
     def style_responsibilities(self, positions: np.ndarray) -> np.ndarray:
         """Return the probability of each style given a motion: ``(n, L, J, 3) → (n, K)``."""
@@ -317,9 +314,9 @@ class GaussianMixtureMotion:
         return self._metres.responsibilities(flat).sum(axis=2)
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
-        """Return the variance outside the likeliest component's subspace over δ², (n,).
+        """Return the variance outside the most likely component's subspace, over δ²: (n,).
 
-        1 in expectation for draws from the prior.
+        The expectation under the prior is 1.
         """
         flat = np.asarray(positions).reshape(len(positions), self._metres.dim)
         return self._metres.residual_variance(flat) / self.noise**2
@@ -333,18 +330,18 @@ class GaussianMixtureMotion:
         )
 
     def reduced(self) -> tuple[GaussianMixtureMotion, np.ndarray]:
-        """Return the same prior on the span of its scalar fields, and that span's basis.
+        """Return the same prior on the span of its scalar fields, and a basis of that span.
 
-        Frames and joints enter only through the x, y and z fields of the means and factors; on
-        their span everything that is linear and treats all entries alike (turning, orthographic
-        projection, triangulation, isotropic noise) is unchanged.
+        Frames and joints enter only through the x, y and z fields of the means and factors.
+        Operations that are linear and treat all entries alike (rotation, orthographic projection,
+        triangulation, isotropic noise) are unchanged on the span of these fields.
 
         Returns
         -------
         prior : GaussianMixtureMotion
-            One frame of M anonymous "joints", M the span's dimension.
+            One frame of M anonymous joints, M the dimension of the span.
         basis : ndarray, (L·J, M)
-            Orthonormal; a motion's coordinates are ``basis.T @ motion.reshape(-1, 3)``.
+            Orthonormal; the coordinates of a motion are ``basis.T @ motion.reshape(-1, 3)``.
         """
         K, L, J, _ = self.means.shape
         fields = np.concatenate([self.means[:, None], self.factors], axis=1)
@@ -364,32 +361,29 @@ class GaussianMixtureMotion:
             styles=self.styles,
             coordinates=self.coordinates,
         )
-        # The unit is part of the denoiser's contract and must be the full prior's.
+        # The denoiser's normalised unit must be that of the full prior.
         prior.__dict__["scale"] = self.scale
         return prior, basis
 
+    def _mixture(self, fields: np.ndarray, scale: float) -> TurnedMixture:
+        """Return the mixture of base fields (K, 1 + r, 3, L·J, M) divided by a scale."""
+        flat = fields.reshape(*fields.shape[:3], -1) / scale
+        return TurnedMixture(flat, self.yaws, self.weights, (self.noise / scale) ** 2)
+
     @cached_property
     def _metres(self) -> TurnedMixture:
-        fields = self.base_fields.reshape(*self.base_fields.shape[:3], -1)
-        return TurnedMixture(fields, self.yaws, self.weights, self.noise**2)
+        return self._mixture(self.base_fields, 1.0)
 
     @cached_property
     def _normalised(self) -> TurnedMixture:
-        fields = self.base_fields.reshape(*self.base_fields.shape[:3], -1) / self.scale
-        return TurnedMixture(fields, self.yaws, self.weights, (self.noise / self.scale) ** 2)
+        return self._mixture(self.base_fields, self.scale)
 
     def _seen_by(self, cameras: Cameras, x_t: np.ndarray) -> list[TurnedMixture]:
-        """The 2D marginals of the V views, which are mixtures with the same weights."""
+        """Return the 2D marginals of the V views, which are mixtures with the same weights."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic cameras, got perspective")
+            raise ValueError("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.means.shape[1:3], 2))
-        return [self._view(axes) for axes in cameras.image_axes]
-
-    def _view(self, axes: np.ndarray) -> TurnedMixture:
-        key = axes.tobytes()
-        if key not in self._views:
-            image = (self.base_fields @ axes.T) / self.scale
-            fields = image.reshape(*image.shape[:3], -1)
-            variance = (self.noise / self.scale) ** 2
-            self._views[key] = TurnedMixture(fields, self.yaws, self.weights, variance)
-        return self._views[key]
+        for axes in cameras.image_axes:
+            if axes.tobytes() not in self._views:
+                self._views[axes.tobytes()] = self._mixture(self.base_fields @ axes.T, self.scale)
+        return [self._views[axes.tobytes()] for axes in cameras.image_axes]

@@ -1,9 +1,9 @@
-"""The Gaussian-mixture prior after linear evidence with Gaussian noise: again a mixture.
+"""Exact posterior of the Gaussian-mixture prior under a linear Gaussian likelihood.
 
-At one joint and frame the evidence about a position x is exp(−½ xᵀΛx + ηᵀx). With the small noise
-δ ε integrated out it is the same in m_k + W_k z with Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Turning
-enters through the three base fields of each mean and factor (``turned_mixture``), so that the Gram
-matrices of all K·A components come from K small ones.
+The posterior is again a mixture. At one joint and frame the likelihood of a position x is
+exp(−½ xᵀΛx + ηᵀx). With the noise δ ε integrated out, it has the same form in m_k + W_k z with
+Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Rotations enter through the three base fields of each mean and
+factor (``turned_mixture``), so the Gram matrices of all K·A components follow from K small ones.
 """
 
 from __future__ import annotations
@@ -22,27 +22,11 @@ __all__ = ["MixturePosterior"]
 
 
 class MixturePosterior:
-    """p(X | y) for a turned Gaussian mixture; the prior itself where there is no evidence.
+    """p(X | y) of a rotated Gaussian mixture; without a likelihood, the prior itself.
 
-    Parameters
-    ----------
-    base_fields : ndarray, (K, 1 + r, 3, F, 3)
-        Base fields of means and factors, metres; F = L·J.
-    yaws : ndarray, (A,)
-        Azimuths, radians.
-    weights : ndarray, (K,)
-        Probabilities of the styles.
-    noise : float
-        δ, metres.
-    shape : tuple
-        (L, J, 3).
-    likelihood : Likelihood or None
-        The evidence; it must offer ``linear()``.
-
-    Raises
-    ------
-    NotConjugate
-        If the likelihood is not linear in the positions with Gaussian noise.
+    Created by :meth:`GaussianMixtureMotion.exact_posterior` from base fields (K, 1 + r, 3, L·J, 3),
+    yaws (A,), style probabilities (K,), noise δ, the shape (L, J, 3) and a likelihood with
+    ``linear()``; raises ``NotConjugate`` for other likelihoods.
     """
 
     def __init__(
@@ -58,11 +42,13 @@ class MixturePosterior:
         self.noise = noise
         self._fields = base_fields
         self._turns = turning_coefficients(yaws)
-        self._information, self._shift, constant_part = _evidence(likelihood, base_fields.shape[3])
+        self.information, self.shift, constant_part = _natural_parameters(
+            likelihood, base_fields.shape[3]
+        )
         variance = noise**2
-        self._shrink = np.linalg.inv(np.eye(3) + variance * self._information)
-        metric = self._shrink @ self._information
-        pull = np.einsum("fij,fj->fi", self._shrink, self._shift)
+        self._shrink = np.linalg.inv(np.eye(3) + variance * self.information)
+        metric = self._shrink @ self.information
+        pull = np.einsum("fij,fj->fi", self._shrink, self.shift)
         moved = np.einsum("fij,knefj->knefi", metric, base_fields)
         gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, moved, optimize=True)
         turns = self._turns
@@ -70,7 +56,7 @@ class MixturePosterior:
         linear = np.einsum("fx,kicfx->kic", pull, base_fields, optimize=True)
         self._linear = np.einsum("kic,ac->kai", linear, turns)
         constant_part -= 0.5 * np.linalg.slogdet(np.linalg.inv(self._shrink))[1].sum()
-        constant_part += 0.5 * variance * float((self._shift * pull).sum())
+        constant_part += 0.5 * variance * float((self.shift * pull).sum())
         log_weights = np.log(weights)[:, None] - math.log(len(yaws))
         # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z
         self._offset = (
@@ -125,14 +111,15 @@ class MixturePosterior:
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n independent draws, (n, L, J, 3), metres."""
         probabilities = self.component_probabilities
-        chosen = rng.choice(probabilities.size, size=n, p=_normalised(probabilities.reshape(-1)))
+        flat = probabilities.reshape(-1)
+        chosen = rng.choice(flat.size, size=n, p=flat / flat.sum())
         style, azimuth = np.divmod(chosen, probabilities.shape[1])
         unit = rng.standard_normal((n, self._slope.shape[-1]))
         spread = (self._latent_root[style, azimuth] @ unit[..., None])[..., 0]
         return self._motions(rng, style, azimuth, self._latent_mean[style, azimuth] + spread)
 
     def complete(self, rng: RandomNumbers, latent: np.ndarray) -> np.ndarray:
-        """Return one draw of p(X | z, y) per z: ``(n, r) → (n, L, J, 3)``, metres."""
+        """Return one draw from p(X | z, y) for each z: ``(n, r) → (n, L, J, 3)``, metres."""
         logits = np.asarray(self._log_terms(latent))
         logits = logits - logits.max(axis=-1, keepdims=True)
         cumulative = np.cumsum(np.exp(logits), axis=-1)
@@ -142,7 +129,7 @@ class MixturePosterior:
         return self._motions(rng, style, azimuth, latent)
 
     def log_likelihood(self, latent: Array) -> Array:
-        """Return log p(y | z), style, yaw and small noise integrated out: ``(…, r) → (…)``."""
+        """Return log p(y | z) with style, yaw and noise integrated out: ``(…, r) → (…)``."""
         return logsumexp(self._log_terms(latent))
 
     def log_density(self, positions: Array) -> Array:
@@ -154,7 +141,7 @@ class MixturePosterior:
         flat = xp.reshape(positions, (n, F, 3))
         # Given (k, a), X is Gaussian with precision Q = Λ + I/δ² around the latent subspace.
         centred = flat - constant(self._given_clean(np.zeros((F, 3))), flat)
-        precision = self._information + np.eye(3) / self.noise**2
+        precision = self.information + np.eye(3) / self.noise**2
         weighted = xp.sum(constant(precision, flat) * centred[:, :, None, :], axis=-1)
         square = xp.sum(weighted * centred, axis=(-2, -1))
         shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields)
@@ -200,7 +187,7 @@ class MixturePosterior:
 
     def _given_clean(self, clean: np.ndarray) -> np.ndarray:
         """E[X | m + W z = clean, y] = S (clean + δ² η): ``(…, F, 3) → (…, F, 3)``."""
-        return np.einsum("fij,...fj->...fi", self._shrink, clean + self.noise**2 * self._shift)
+        return np.einsum("fij,...fj->...fi", self._shrink, clean + self.noise**2 * self.shift)
 
     def _motions(
         self,
@@ -221,15 +208,16 @@ class MixturePosterior:
         return out.reshape(n, *self.shape)
 
 
-def _evidence(likelihood: Likelihood | None, F: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Λ (F, 3, 3), η (F, 3) and the part of log p(y | X) that does not depend on X."""
+def _natural_parameters(
+    likelihood: Likelihood | None, F: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return Λ (F, 3, 3), η (F, 3) and the terms of log p(y | X) that do not depend on X."""
     if likelihood is None:
         return np.zeros((F, 3, 3)), np.zeros((F, 3)), 0.0
     linear = getattr(likelihood, "linear", None)
     if linear is None:
         raise NotConjugate(
-            f"the likelihood {type(likelihood).__name__} has no linear(), which leaves no closed "
-            "form"
+            f"likelihood must have a linear() method, got {type(likelihood).__name__}"
         )
     axes, target, precision = linear()
     M = axes.shape[1]
@@ -241,7 +229,3 @@ def _evidence(likelihood: Likelihood | None, F: int) -> tuple[np.ndarray, np.nda
     log_norm = 0.5 * M * float(np.log(precision[seen] / (2 * math.pi)).sum())
     energy = float((precision[..., None] * target**2).sum())
     return information, shift, log_norm - 0.5 * energy
-
-
-def _normalised(probabilities: np.ndarray) -> np.ndarray:
-    return probabilities / probabilities.sum()

@@ -1,12 +1,12 @@
-"""A Gaussian mixture whose components are turned copies of a few: exact algebra, fast.
+"""Gaussian mixture of components rotated about the vertical, with exact algebra.
 
-Component (k, a) has mean R(ψ_a) m_k, factors R(ψ_a) W_k and isotropic noise δ². A turned field is
+Component (k, a) has mean R(ψ_a) m_k, factors R(ψ_a) W_k and isotropic noise δ². A rotated field is
 a trigonometric combination of three base fields,
 
     R(ψ) f = cos ψ (f_x, 0, f_z) + sin ψ (f_z, 0, −f_x) + (0, f_y, 0),
 
-and so is its image in any orthographic camera. Products with all K·A components are therefore
-products with 3·K·(1 + r) base fields, combined per azimuth.
+and so is its image in any orthographic camera. Products with all K·A components therefore reduce
+to products with 3·K·(1 + r) base fields, combined per azimuth.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from probmotion.arrays import Array, array_namespace, constant, logsumexp
 __all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
 
 _BLOCK = 64
-"""Points handled at once, along the last axis: their products stay in a core's cache.
+"""Points per block, along the last axis, so that products stay in a core's cache.
 
-Always as many, the last ones zeros: what a point's numbers are rounded to must not depend on how
-many others there are, because a sampler's hundred steps make a large difference of a small one.
+The last block is padded with zeros: rounding of a point must not depend on the batch size, because
+a sampler's many steps amplify small differences.
 """
 
 
@@ -49,10 +49,10 @@ def turning_coefficients(yaws: np.ndarray) -> np.ndarray:
 
 
 class _Level(NamedTuple):
-    """What depends on the noise level alone.
+    """Quantities that depend on the noise level alone.
 
     √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r);
-    and the matrices from base products and a 1 to whitened latents, (K, A r, 3 r + 1).
+    and the matrices from base products and a constant 1 to whitened latents, (K, A r, 3 r + 1).
     """
 
     signal: float
@@ -63,7 +63,7 @@ class _Level(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The mixture after one noisy observation of each of n points.
+    """Mixture conditioned on one noisy observation of each of n points.
 
     p(k, a | x), (K, A, n), and the whitened latents ``u`` = (1 + ᾱλ/τ)^(−½) Bᵀ W_kᵀ R(ψ_a)ᵀ
     (x − √ᾱ R(ψ_a) m_k), (K, A, r, n): E[z | x, k, a] = √ᾱ/τ B (1 + ᾱλ/τ)^(−½) u, with λ and B the
@@ -77,16 +77,8 @@ class _State(NamedTuple):
 class TurnedMixture:
     """x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε', in D dimensions.
 
-    Parameters
-    ----------
-    fields : ndarray, (K, 1 + r, 3, D)
-        Base fields of the mean (first) and the factors of each style.
-    yaws : ndarray, (A,)
-        Azimuths ψ, radians, equally likely.
-    weights : ndarray, (K,)
-        Probabilities of the styles.
-    variance : float
-        δ².
+    Given base fields of means (first) and factors (K, 1 + r, 3, D), equally likely azimuths ψ (A,),
+    style probabilities (K,) and the variance δ².
     """
 
     def __init__(
@@ -107,10 +99,10 @@ class TurnedMixture:
         self.eigenvalues = np.maximum(self.eigenvalues, 0.0)
         self.basis = basis
         self.mean_latent = np.einsum("kair,kai->kar", basis, gram[..., 1:, 0])
-        # Base products → products with every turned eigenvector: (K, A r, 3 r).
+        # Base products → products with every rotated eigenvector: (K, A r, 3 r).
         spread = np.einsum("ac,kair->karic", self.turns, basis, optimize=True)
         self.to_latent = np.ascontiguousarray(spread.reshape(K, A * self.rank, 3 * self.rank))
-        # One more row per style, of zeros, makes room for the 1 that shifts the latents.
+        # A row of zeros per style leaves room for the constant 1 that shifts the latents.
         rows = np.zeros((K, 3 * width + 1, D))
         rows[:, :-1] = fields.reshape(K, 3 * width, D)
         self._fields = rows.reshape(-1, D)
@@ -118,22 +110,19 @@ class TurnedMixture:
     def denoise(self, x: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[x₀ | x_t]: ``(n, D) → (n, D)``, with x_t = √ᾱ x₀ + √(1−ᾱ) ε."""
         level = self._level(alpha_bar)
-        own_share = level.signal * self.variance / level.total
+        own_factor = level.signal * self.variance / level.total
         out = np.empty_like(x)
-        latent_share = level.signal / level.total
+        latent_factor = level.signal / level.total
         for rows, n in _blocks(len(x)):
             weight, latent = self._condition(_filled(x[rows]), level)
             weight *= level.shrink
             latent *= weight[:, :, None]
-            means = np.matmul(*self._combined(weight, latent, latent_share, level))
-            np.add(means[:n], own_share * x[rows], out=out[rows])
+            means = np.matmul(*self._combined(weight, latent, latent_factor, level))
+            np.add(means[:n], own_factor * x[rows], out=out[rows])
         return out
 
     def covariance_product(self, x: np.ndarray, alpha_bar: float, v: np.ndarray) -> np.ndarray:
-        """Return Cov[x₀ | x_t] v row by row: ``(n, D), (n, D) → (n, D)``.
-
-        The mean of the components' covariances plus the covariance of their means.
-        """
+        """Return Cov[x₀ | x_t] v for each row: ``(n, D), (n, D) → (n, D)``."""
         level = self._level(alpha_bar)
         out = np.empty_like(v)
         for rows, n in _blocks(len(x)):
@@ -149,7 +138,7 @@ class TurnedMixture:
         return out
 
     def responsibilities(self, x: np.ndarray) -> np.ndarray:
-        """Return p(k, a | x₀) of clean points: ``(n, D) → (n, K, A)``."""
+        """Return p(k, a | x₀) for clean points: ``(n, D) → (n, K, A)``."""
         level = self._level(1.0)
         out = np.empty((len(x), *self.shape))
         for rows, n in _blocks(len(x)):
@@ -158,7 +147,7 @@ class TurnedMixture:
         return out
 
     def log_density(self, x: Array, alpha_bar: float = 1.0) -> Array:
-        """Return the normalised log density of x_t: ``(…, D) → (…)``, any array library."""
+        """Return the normalised log density of x_t: ``(…, D) → (…)``, for any array library."""
         xp = array_namespace(x)
         level = self._level(alpha_bar)
         K, A = self.shape
@@ -182,12 +171,12 @@ class TurnedMixture:
         return xp.reshape(logsumexp(logits) - 0.5 * norm, batch)
 
     def residual_variance(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean square of ``x`` outside its component's subspace: ``(n, D) → (n,)``.
+        """Return the mean square of x outside its most likely component's subspace: (n,).
 
-        The component is the one of highest responsibility; the expected value is δ².
+        The expectation is δ².
         """
         level = self._level(1.0)
-        # ‖x − m‖² less its part inside the subspace, Σ (Bᵀ Wᵀ (x − m))² / λ.
+        # ‖x − m‖² minus its component inside the subspace, Σ (Bᵀ Wᵀ (x − m))² / λ.
         present = self.eigenvalues > 0
         inverse = np.zeros_like(self.eigenvalues)
         inverse[present] = 1 / (level.root**2 * self.eigenvalues)[present]
@@ -215,7 +204,7 @@ class TurnedMixture:
         return _Level(signal, total, (1 - alpha_bar) / total, root, to_latent)
 
     def _offsets(self, level: _Level) -> np.ndarray:
-        """The part of log π p(x | k, a) that does not depend on x, (K, A)."""
+        """Return the terms of log π p(x | k, a) that do not depend on x, (K, A)."""
         energy = level.signal**2 * self.square_mean / level.total
         return self.log_weights[:, None] + np.log(level.root).sum(axis=-1) - 0.5 * energy
 
@@ -234,9 +223,9 @@ class TurnedMixture:
     def _products(
         self, x: np.ndarray, level: _Level, *, shifted: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Products with every turned mean (K, A, n) and whitened eigenvector (K, A, r, n).
+        """Return products with every rotated mean (K, A, n) and whitened eigenvector (K, A, r, n).
 
-        ``shifted``: the latter of x less the component's noisy mean.
+        With ``shifted``, the latter are products of x minus the component's noisy mean.
         """
         K, A = self.shape
         n = len(x)
@@ -246,31 +235,31 @@ class TurnedMixture:
         return self.turns @ base[:, :3], on_latent.reshape(K, A, self.rank, n)
 
     def _combined(
-        self, means: np.ndarray, latent: np.ndarray, latent_share: float, level: _Level
+        self, means: np.ndarray, latent: np.ndarray, latent_factor: float, level: _Level
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Σ_ka R (means m_k + latent_share W_k B (1 + ᾱλ/τ)^(−½) latent) as two factors.
+        """Return Σ_ka R (means m_k + latent_factor W_k B (1 + ᾱλ/τ)^(−½) latent) as two factors.
 
-        ``(K, A, n), (K, A, r, n)`` → ``(n, F), (F, D)``, whose product it is.
+        ``(K, A, n), (K, A, r, n) → (n, F), (F, D)``.
         """
         K, A, n = means.shape
         base = np.empty((K, 3 * (1 + self.rank) + 1, n))
         np.matmul(self.turns.T, means, out=base[:, :3])
         back = np.swapaxes(level.to_latent, 1, 2)
         np.matmul(back, latent.reshape(K, A * self.rank, n), out=base[:, 3:])
-        base[:, 3:] *= latent_share
-        # The last row meets a field of zeros.
+        base[:, 3:] *= latent_factor
+        # The last row multiplies a field of zeros.
         return base.reshape(-1, n).T, self._fields
 
 
 def _blocks(n: int) -> Iterator[tuple[slice, int]]:
-    """The rows of each block, and how many they are."""
+    """Yield the rows of each block and their number."""
     for start in range(0, n, _BLOCK):
         stop = min(n, start + _BLOCK)
         yield slice(start, stop), stop - start
 
 
 def _filled(rows: np.ndarray) -> np.ndarray:
-    """``rows`` with rows of zeros behind them up to ``_BLOCK``."""
+    """Return ``rows`` padded with zeros to ``_BLOCK`` rows."""
     if len(rows) == _BLOCK:
         return rows
     block = np.zeros((_BLOCK, rows.shape[1]))

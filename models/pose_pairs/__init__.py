@@ -1,4 +1,4 @@
-"""The physical prior over pairs of poses: joint limits and penetration."""
+"""Physical prior of pose-pairs with joint limits and penetration."""
 
 import lazy_loader
 

@@ -1,18 +1,19 @@
-"""Joint-angle limits: the directions in which each bone of a person has been seen.
+"""Pose-conditioned joint-angle limits (Akhter and Black 2015).
 
-A limit is conditioned on pose (Akhter and Black 2015): where a bone may point depends on where its
-parent points. Both are directions, as joint positions tell nothing of a bone's own twist. Parent
-directions fall into coarse bins of the sphere, bone directions into fine cells, and a table has one
-bit for each pair: seen in real motion, or near something seen (:mod:`.joint_limits_learning`).
+The directions allowed for a bone depend on the direction of its parent. Twist is not limited, as
+joint positions do not determine it. Parent directions are binned coarsely, bone directions finely,
+and a table has one bit per pair, set if it occurs in or close to motion capture data
+(:mod:`.joint_limits_learning`).
 
-Frames. The pelvis has left from hip to hip and up nearest the spine; neck and arms have left from
-shoulder to shoulder and up nearest the chest's bone. Below those, a bone's frame is its parent's
-frame turned by the least rotation that takes the bone from its mean direction, which puts the
-singularity opposite to where bones point.
+The frame of the pelvis has its left axis from hip to hip and its up axis closest to the spine; that
+of the neck and arms its left axis from shoulder to shoulder and its up axis closest to the chest's
+bone. Other bones use their parent's frame, rotated by the minimal rotation from the parent's mean
+direction, which puts the singularity opposite to the usual directions.
 """
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -36,30 +37,24 @@ _PERSON = Skeleton.preset("person17")
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Where the bones of a person may point, for every person of a skeleton.
+    """Allowed bone directions for every person of a skeleton.
 
     Parameters
     ----------
     allowed : ndarray of bool, (9, bins, cells)
-        Which cells a bone may point into, per bin of its parent's direction. The nine are the
-        bones that end in hip, knee, ankle, chest, shoulder, elbow, wrist, neck and head; the two
-        sides share one. The spine has ``tilt`` instead.
+        Allowed direction cells per bin of the parent's direction; at least one per bin. The nine
+        parts are the bones ending in hip, knee, ankle, chest, shoulder, elbow, wrist, neck and
+        head, shared by both sides. The spine has ``tilt`` instead.
     rest : ndarray, (9, 3)
-        Mean direction of each bone in its frame.
+        Mean direction of each bone in its frame, unit vectors.
     tilt : float
-        Largest angle of the spine against the plane between the hips, radians.
+        Maximum angle of the spine to the plane between the hips, radians.
     bin_rings, cell_rings : int
-        Rings of the sphere's partition into bins and into cells; see :func:`sphere_rings`.
+        Number of rings of the sphere's partition into bins and cells; see :func:`sphere_rings`.
     provenance : mapping
-        What the limits were learnt from and how; anything that JSON can hold.
+        Training data and settings, JSON-serialisable.
     skeleton : Skeleton
-        The skeleton of the poses; each of its trees has the joints of ``person17``.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit each other, a bin allows nothing, or a tree of the skeleton is no
-        person.
+        Skeleton of the poses; each of its trees has the joints of ``person17``.
     """
 
     allowed: np.ndarray
@@ -80,68 +75,48 @@ class JointLimits:
         check_shape("rest", self.rest, (len(PARTS), 3))
         check_finite("rest", self.rest)
         if not np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max() < 1e-9:
-            raise ValueError("rest has vectors of another length than 1, expected unit vectors")
+            raise ValueError("rest must contain unit vectors")
         if not 0 < self.tilt < np.pi / 2:
-            raise ValueError(f"tilt must be an angle between 0 and π/2, got {self.tilt!r}")
+            raise ValueError(f"tilt must be between 0 and π/2, got {self.tilt!r}")
         empty = np.argwhere(~self.allowed.any(axis=-1))
         if len(empty):
             part, row = empty[0]
             raise ValueError(
-                f"allowed has no cell for {PARTS[part]} in bin {row}, expected at least one"
+                f"allowed must have a cell in every bin, got none for {PARTS[part]} in bin {row}"
             )
-        self.trees  # noqa: B018  A skeleton of others than people is refused here.
+        self.trees  # noqa: B018  Validates the skeleton.
 
     @classmethod
     def shipped(cls, skeleton: Skeleton | None = None) -> JointLimits:
-        """Return the limits that come with the package, for ``person17`` or another skeleton.
-
-        They are learnt from motion capture of CMU; ``provenance`` says from which clips.
-        """
+        """Return the limits shipped with the package, learnt from CMU motion capture."""
         source = files("probmotion.models") / "weights" / "joint_limits.npz"
         with as_file(source) as path:
             limits = cls.load(path)
         return limits if skeleton is None else limits.on(skeleton)
 
     def on(self, skeleton: Skeleton) -> JointLimits:
-        """Return the same limits for the poses of another skeleton of people."""
+        """Return the limits for another skeleton."""
         return replace(self, skeleton=skeleton)
 
     def is_valid(self, pose: np.ndarray) -> np.ndarray:
-        """Return which bones are within their limits, ``(…, J, 3) → (…, bones)``.
+        """Return a mask of the bones within their limits, ``(…, J, 3) → (…, bones)``.
 
-        Bones are those of ``skeleton.bones``, in that order. A bone is judged with its ancestors
-        already corrected, so that a wrong shoulder does not make the arm wrong.
+        In the order of ``skeleton.bones``. Ancestors are corrected first, so that an invalid
+        shoulder does not invalidate the arm.
         """
         return self.project(pose)[0]
 
     def nearest_valid(self, pose: np.ndarray) -> np.ndarray:
-        """Return the pose with each invalid bone turned to a valid direction near its own.
+        """Return the pose with each invalid bone rotated to a nearby valid direction.
 
-        ``(…, J, 3) → (…, J, 3)``, metres. The direction is where the way to the nearest allowed
-        cell enters allowed cells. Roots and lengths stay; what hangs from a corrected bone turns
-        along with it. The result is valid, and a valid pose is returned as it is.
+        ``(…, J, 3) → (…, J, 3)``, metres. The new direction is on the boundary of the allowed
+        cells, towards the nearest one. Roots and bone lengths are preserved, descendants rotate
+        along, and valid poses are unchanged.
         """
         return self.project(pose)[1]
 
     def project(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return :meth:`is_valid` and :meth:`nearest_valid` for the price of one.
-
-        Parameters
-        ----------
-        poses : ndarray, (…, J, 3)
-            Metres.
-
-        Returns
-        -------
-        valid : ndarray of bool, (…, bones)
-        nearest : ndarray, (…, J, 3)
-            Metres.
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit the skeleton or a value is NaN or infinite.
-        """
+        """Return :meth:`is_valid` and :meth:`nearest_valid` of poses, (…, J, 3) in metres."""
         given = np.asarray(poses, dtype=np.float64)
         check_shape("poses", given, ("…", self.skeleton.n_joints, 3))
         check_finite("poses", given)
@@ -152,12 +127,12 @@ class JointLimits:
 
     @cached_property
     def trees(self) -> np.ndarray:
-        """Joints of each tree in the order of ``person17``, (K, 17)."""
+        """Joints of each person in the order of ``person17``, (K, 17)."""
         return _people(self.skeleton)
 
     @cached_property
     def arrays(self) -> LimitArrays:
-        """What compiled code reads."""
+        """Arrays for compiled code."""
         cell_rings, centres = sphere_rings(self.cell_rings)
         return LimitArrays(
             allowed=np.ascontiguousarray(self.allowed, dtype=np.bool_),
@@ -169,7 +144,7 @@ class JointLimits:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the limits to an ``.npz`` archive; the same limits give the same bytes."""
+        """Write the limits to an ``.npz`` archive, byte-reproducibly."""
         with written_whole(Path(path)) as unfinished:
             np.savez_compressed(
                 unfinished,
@@ -182,17 +157,10 @@ class JointLimits:
 
     @classmethod
     def load(cls, path: str | Path) -> JointLimits:
-        """Return the limits that :meth:`save` wrote, for ``person17``.
-
-        Raises
-        ------
-        ValueError
-            If the file is not one that :meth:`save` wrote.
-        FileNotFoundError
-            If there is no such file.
-        """
+        """Read limits written by :meth:`save`; raise ``ValueError`` if the file is damaged."""
+        content = Path(path).read_bytes()
         try:
-            with np.load(path) as archive:
+            with np.load(io.BytesIO(content)) as archive:
                 bin_rings, cell_rings = (int(number) for number in archive["rings"])
                 n_cells = len(sphere_rings(cell_rings)[1])
                 return cls(
@@ -203,24 +171,21 @@ class JointLimits:
                     cell_rings=cell_rings,
                     provenance=json.loads(str(archive["provenance"])),
                 )
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # a damaged archive fails in a dozen ways
+        except Exception as error:  # damaged archives raise many types
             raise ValueError(
-                f"path is {str(path)!r}, which holds no joint limits, expected a file that save() "
-                "wrote"
+                f"path must be a file written by JointLimits.save, got {str(path)!r}"
             ) from error
 
 
 def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a sphere cut into ``n_rings`` rings of cells that are about as wide as high.
+    """Return a partition of the sphere into ``n_rings`` rings of nearly square cells.
 
-    Cells are symmetric about the plane across the first axis, as a body is.
+    Cells are mirror-symmetric in the first axis.
 
     Returns
     -------
     rings : ndarray of int, (n_rings, 2)
-        How many cells each ring has, and the index of its first; from the second axis downwards.
+        Number of cells and index of the first cell of each ring, from the positive second axis.
     centres : ndarray, (cells, 3)
         Unit vectors.
     """
@@ -237,7 +202,7 @@ def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _people(skeleton: Skeleton) -> np.ndarray:
-    """Return the joints of each tree in the order of ``person17``, (K, 17)."""
+    """Return the joints of each person in the order of ``person17``, (K, 17)."""
     people = []
     for root in skeleton.roots:
         joints = [root, *(j for j in range(skeleton.n_joints) if root in skeleton.ancestors(j))]
@@ -252,9 +217,8 @@ def _people(skeleton: Skeleton) -> np.ndarray:
         }
         if len(joints) != _PERSON.n_joints or parents != wanted:
             raise ValueError(
-                f"skeleton has a tree under {skeleton.joint_names[root]!r} of "
-                f"{', '.join(skeleton.joint_names[j] for j in joints)}, expected the joints of "
-                "'person17' and their parents"
+                "skeleton must have trees with the joints and parents of 'person17', got "
+                f"{', '.join(skeleton.joint_names[j] for j in joints)}"
             )
         people.append([names[name] for name in _PERSON.joint_names])
     return np.array(people)

@@ -1,7 +1,6 @@
-"""Compiled geometry of three numbers: frames from lines, least rotations, cells on a sphere.
+"""Compiled geometry of joint limits: frames, minimal rotations and cells of the sphere.
 
-Vectors are tuples, and matrices tuples of columns: they live in registers, where an array of three
-would take longer to make than to fill.
+Vectors are tuples and matrices are tuples of columns, which compile to registers.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _TINY = 1e-12
 
 @numba.njit(cache=True)
 def cell_of(direction: Vector, rings: np.ndarray) -> int:
-    """Return the cell of a unit vector on a sphere cut into rings about the second axis."""
+    """Return the cell of a unit vector on a sphere with rings about the second axis."""
     height = min(1.0, max(-1.0, direction[1]))
     ring = min(len(rings) - 1, int(np.arccos(height) / np.pi * len(rings)))
     cells = rings[ring, 0]
@@ -42,7 +41,7 @@ def cell_of(direction: Vector, rings: np.ndarray) -> int:
 
 @numba.njit(cache=True)
 def unit(v: Vector) -> Vector:
-    """Return ``v`` at length 1; ``NO_LENGTH`` where it has none."""
+    """Return ``v`` normalised, or ``NO_LENGTH`` if its length is 0."""
     length = np.sqrt(_dot(v, v))
     if length < _TINY:
         return NO_LENGTH
@@ -51,10 +50,9 @@ def unit(v: Vector) -> Vector:
 
 @numba.njit(cache=True)
 def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
-    """Return the frame whose left axis is left − right and whose up axis is nearest ``up``.
+    """Return the frame with left axis left − right and the up axis closest to ``up``.
 
-    Where the two lines have no direction or the same one, a fixed direction stands in: the bones
-    are then far from any that was seen, and are found invalid.
+    If an axis is undefined, a fixed direction replaces it; such poses are invalid.
     """
     x = unit((left[0] - right[0], left[1] - right[1], left[2] - right[2]))
     if x == NO_LENGTH:
@@ -68,13 +66,13 @@ def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
 
 @numba.njit(cache=True)
 def in_frame(frame: Frame, direction: Vector) -> Vector:
-    """Return a direction's components along the axes of a frame, which are its columns."""
+    """Return the components of a direction in a frame."""
     return (_dot(frame[0], direction), _dot(frame[1], direction), _dot(frame[2], direction))
 
 
 @numba.njit(cache=True)
 def from_frame(frame: Frame, local: Vector) -> Vector:
-    """Return the direction that has the components ``local`` in a frame."""
+    """Return the direction with components ``local`` in a frame."""
     x, y, z = frame
     return (
         x[0] * local[0] + y[0] * local[1] + z[0] * local[2],
@@ -85,10 +83,10 @@ def from_frame(frame: Frame, local: Vector) -> Vector:
 
 @numba.njit(cache=True)
 def least_rotation(a: Vector, b: Vector) -> Frame:
-    """Return the rotation by the least angle that takes the unit vector ``a`` to ``b``."""
+    """Return the minimal rotation of the unit vector ``a`` to ``b``."""
     c = _dot(a, b)
     if c < -1.0 + 1e-9:
-        # Half a turn about any axis across: the axis is fixed, so that the result is too.
+        # A half turn: the axis is arbitrary but deterministic.
         x, y, z = _any_across(a)
         return (
             (2.0 * x * x - 1.0, 2.0 * y * x, 2.0 * z * x),
@@ -126,7 +124,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 @numba.njit(cache=True)
 def _any_across(v: Vector) -> Vector:
-    """Return a unit vector across ``v``, always the same: near the axis that ``v`` has least of."""
+    """Return a deterministic unit vector orthogonal to ``v``."""
     x, y, z = abs(v[0]), abs(v[1]), abs(v[2])
     if x <= y and x <= z:
         return unit((1.0 - v[0] * v[0], -v[0] * v[1], -v[0] * v[2]))
@@ -145,11 +143,11 @@ def closeness_of(
     centres: np.ndarray,
     bin_reach: float,
 ) -> np.ndarray:
-    """Return the cosine of each cell's centre to the nearest direction seen, (bins, cells).
+    """Return the cosine between each cell's centre and the nearest sample, (bins, cells).
 
-    A row counts the directions whose parent is in the bin, or at a cosine of ``bin_reach`` or more
-    to its centre. A cell into which a direction fell has 1, and one without any has -2. It is
-    compiled not for speed alone: sums are taken in one order on every machine.
+    A bin uses the samples whose parent is in the bin or has a cosine of at least ``bin_reach`` to
+    its centre. Cells that contain a sample get 1, bins without samples -2. Compiled also for a
+    fixed order of summation.
     """
     closeness = np.full((len(bins), len(centres)), -2.0)
     for sample in range(len(parents)):

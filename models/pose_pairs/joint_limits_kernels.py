@@ -1,8 +1,7 @@
-"""Compiled: the walk over one person's bones that checks each and corrects it.
+"""Compiled traversal of a person's bones that checks and corrects joint limits.
 
-Joints are in the order of ``person17``. A frame's columns are a body's left, up and forward axes;
-for bones of the right side the left axis is turned about, so that one table serves both sides and a
-mirrored pose is judged as its mirror image.
+Joints are in the order of ``person17``. The columns of a frame are the body's left, up and forward
+axes. The left axis is reversed for bones of the right side, so that both sides share one table.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from probmotion.motion.skeleton import Skeleton
 __all__ = ["PARTS", "LimitArrays", "local_directions", "project_poses"]
 
 PARTS = ("hip", "knee", "ankle", "chest", "shoulder", "elbow", "wrist", "neck", "head")
-"""Bones that have a table, by the joint they end in; the two sides share one."""
+"""Bones with a table, by end joint; shared by both sides."""
 HIP, KNEE, ANKLE, CHEST, SHOULDER, ELBOW, WRIST, NECK, HEAD = range(9)
 
-# Joints of `person17`, and the last joint of what hangs from the spine.
+# Joints of `person17`, and the last descendant of the spine.
 PELVIS, SPINE, CHEST_JOINT, NECK_JOINT, HEAD_JOINT = range(5)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_HIP, RIGHT_HIP = 5, 8, 11, 14
 LAST_OF_TRUNK = 10
@@ -44,11 +43,11 @@ _BISECTIONS = 12
 
 
 class LimitArrays(NamedTuple):
-    """What the compiled walk reads of a table of limits.
+    """Arrays of :class:`~.joint_limits.JointLimits`.
 
-    ``allowed`` (parts, bins, cells) bool; ``bin_rings`` and ``cell_rings`` (rings, 2): how many
-    cells each ring has and the index of its first; ``centres`` (cells, 3); ``rest`` (parts, 3);
-    ``tilt``: sine of the largest sideways tilt of the spine against the hips.
+    ``allowed`` (parts, bins, cells) bool; ``bin_rings`` and ``cell_rings`` (rings, 2) and
+    ``centres`` (cells, 3) from ``sphere_rings``; ``rest`` (parts, 3); ``tilt``, the sine of the
+    maximum tilt of the spine.
     """
 
     allowed: np.ndarray
@@ -57,6 +56,16 @@ class LimitArrays(NamedTuple):
     centres: np.ndarray
     rest: np.ndarray
     tilt: float
+
+
+class Walk(NamedTuple):
+    """State of the traversal of one person; ``correct`` enables corrections."""
+
+    limits: LimitArrays
+    correct: bool
+    directions: np.ndarray
+    valid: np.ndarray
+    local: np.ndarray
 
 
 @numba.njit(cache=True)
@@ -76,14 +85,14 @@ def _mirrored(v: Vector) -> Vector:
 
 @numba.njit(cache=True)
 def _of_side(frame: Frame, side: int) -> Frame:
-    """Return the frame in which bones of the left side, 0, or of the right, 1, are judged."""
+    """Return the frame for bones of the left (0) or right (1) side."""
     left, up, forward = frame
     return frame if side == 0 else ((-left[0], -left[1], -left[2]), up, forward)
 
 
 @numba.njit(cache=True)
 def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
-    """Give a bone a new direction; bones up to ``last``, which hang from it, turn along."""
+    """Set the direction of a bone and rotate its descendants, up to joint ``last``."""
     old = _row(directions, joint)
     _put(directions, joint, new)
     if old == NO_LENGTH:
@@ -95,7 +104,7 @@ def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) ->
 
 @numba.njit(cache=True)
 def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) -> Vector:
-    """Return where the way from ``u`` to the nearest allowed cell's centre enters allowed cells."""
+    """Return the point at which the path from ``u`` to the nearest allowed centre becomes valid."""
     best, closest = 0, -2.0
     for cell in range(len(limits.centres)):
         if limits.allowed[part, condition, cell]:
@@ -118,7 +127,7 @@ def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) 
 
 @numba.njit(cache=True)
 def _between(a: Vector, b: Vector, share: float) -> Vector:
-    """Return the unit vector on the way from one to another."""
+    """Return the normalised linear interpolation of two unit vectors."""
     return unit(
         (
             (1.0 - share) * a[0] + share * b[0],
@@ -129,22 +138,12 @@ def _between(a: Vector, b: Vector, share: float) -> Vector:
 
 
 @numba.njit(cache=True)
-def _check(
-    part: int,
-    joint: int,
-    last: int,
-    frame: Frame,
-    condition: Vector,
-    limits: LimitArrays,
-    correct: bool,
-    directions: np.ndarray,
-    valid: np.ndarray,
-    local: np.ndarray,
-) -> Vector:
-    """Judge one bone in ``frame`` given its condition; correct it where asked; return it there.
+def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, walk: Walk) -> Vector:
+    """Check one bone given its parent's direction, correct it, and return it in ``frame``.
 
-    A bone without length is valid, and stands in its mean direction for what hangs from it.
+    A bone of length 0 is valid and gets its mean direction.
     """
+    limits, correct, directions, valid, local = walk
     direction = _row(directions, joint)
     valid[joint] = True
     if direction == NO_LENGTH:
@@ -163,77 +162,61 @@ def _check(
 
 
 @numba.njit(cache=True)
-def _walk_person(
-    limits: LimitArrays,
-    correct: bool,
-    directions: np.ndarray,
-    valid: np.ndarray,
-    local: np.ndarray,
-) -> None:
-    """Judge the 16 bones, each parent before its children, correcting ``directions`` in place.
+def _walk_person(walk: Walk) -> None:
+    """Check the 16 bones, parents first, correcting ``directions`` in place.
 
-    ``local`` (17, 2, 3) gets each bone's condition and direction. The frame in which a bone is
-    judged depends on bones that are already right, and no correction changes a frame that was
-    used before it; therefore the result is valid throughout.
+    ``local`` (17, 2, 3) receives the parent's and the bone's direction. Frames depend only on bones
+    already corrected, and corrections do not change frames already used, so the result is valid.
     """
-    given = (limits, correct, directions, valid, local)
+    limits, correct, directions, valid, local = walk
     pelvis = line_frame(
         _row(directions, LEFT_HIP), _row(directions, RIGHT_HIP), _row(directions, SPINE)
     )
-    spine = _check_spine(pelvis, *given)
+    spine = _check_spine(pelvis, walk)
 
-    # In that frame the hips are mirror images of each other: one is judged, both are moved.
-    hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, *given)
+    # In this frame the hips are mirror images: check one, correct both.
+    hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, walk)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
     local[RIGHT_HIP] = local[LEFT_HIP]
     if correct and not valid[LEFT_HIP]:
         _set_and_turn(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
     for side in range(2):
         joint = LEFT_HIP if side == 0 else RIGHT_HIP
-        _limb(KNEE, joint, _of_side(pelvis, side), hip, *given)
+        _limb(KNEE, joint, _of_side(pelvis, side), hip, walk)
 
     trunk = product(pelvis, least_rotation(_UP, spine))
-    chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, *given)
+    chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, walk)
     below = product(trunk, least_rotation(_row(limits.rest, CHEST), chest))
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
         condition = chest if side == 0 else _mirrored(chest)
-        _check(SHOULDER, joint, joint + 2, _of_side(below, side), condition, *given)
+        _check(SHOULDER, joint, joint + 2, _of_side(below, side), condition, walk)
 
-    # The line of the shoulders tells how the trunk is twisted, which its bones do not.
+    # The line of the shoulders determines the twist of the trunk.
     trunk = line_frame(
         _row(directions, LEFT_SHOULDER),
         _row(directions, RIGHT_SHOULDER),
         _row(directions, CHEST_JOINT),
     )
-    neck = _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, chest, *given)
+    neck = _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, chest, walk)
     below = product(trunk, least_rotation(_row(limits.rest, NECK), neck))
-    _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, *given)
+    _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, walk)
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
         sided = _of_side(trunk, side)
-        _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), *given)
+        _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), walk)
 
 
 @numba.njit(cache=True)
-def _check_spine(
-    pelvis: Frame,
-    limits: LimitArrays,
-    correct: bool,
-    directions: np.ndarray,
-    valid: np.ndarray,
-    local: np.ndarray,
-) -> Vector:
-    """Judge the spine; return it in the frame of the pelvis.
-
-    That frame holds the spine in its left-up plane: what is left to judge is one angle.
-    """
+def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
+    """Check the tilt of the spine in the left-up plane of the pelvis and return its direction."""
+    limits, correct, directions, valid, local = walk
     if _row(directions, SPINE) == NO_LENGTH:
         _put(directions, SPINE, pelvis[1])
     u = in_frame(pelvis, _row(directions, SPINE))
     valid[SPINE] = abs(u[0]) <= limits.tilt
     if correct and not valid[SPINE]:
-        # A hair inside, so that rounding does not undo it.
+        # Slightly inside the limit, against rounding.
         tilt = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
         u = (tilt, np.sqrt(1.0 - tilt * tilt), 0.0)
         _set_and_turn(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
@@ -243,27 +226,16 @@ def _check_spine(
 
 
 @numba.njit(cache=True)
-def _limb(
-    part: int,
-    joint: int,
-    frame: Frame,
-    condition: Vector,
-    limits: LimitArrays,
-    correct: bool,
-    directions: np.ndarray,
-    valid: np.ndarray,
-    local: np.ndarray,
-) -> None:
-    """Judge the two bones that hang from ``joint``: thigh and shin, or upper arm and forearm."""
-    given = (limits, correct, directions, valid, local)
-    first = _check(part, joint + 1, joint + 2, frame, condition, *given)
-    below = product(frame, least_rotation(_row(limits.rest, part), first))
-    _check(part + 1, joint + 2, joint + 2, below, first, *given)
+def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) -> None:
+    """Check the two bones below ``joint``: thigh and shin, or upper arm and forearm."""
+    first = _check(part, joint + 1, joint + 2, frame, condition, walk)
+    below = product(frame, least_rotation(_row(walk.limits.rest, part), first))
+    _check(part + 1, joint + 2, joint + 2, below, first, walk)
 
 
 @numba.njit(cache=True)
 def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
-    """Write each bone's unit vector; that of a bone without length is 0."""
+    """Write the unit vector of each bone; 0 for bones of length 0."""
     for joint in range(1, N_JOINTS):
         here, above = tree[joint], tree[_PARENTS[joint]]
         bone = (
@@ -278,9 +250,9 @@ def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> N
 def project_poses(
     poses: np.ndarray, trees: np.ndarray, limits: LimitArrays
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which joints' bones are valid, (n, J), and the nearest valid poses, (n, J, 3).
+    """Return a mask of joints with valid bones, (n, J), and the nearest valid poses, (n, J, 3).
 
-    ``trees`` (K, 17) are the joints of each person in the order of ``person17``.
+    ``trees`` (K, 17) contains the joints of each person in the order of ``person17``.
     """
     n = len(poses)
     nearest = poses.copy()
@@ -291,7 +263,7 @@ def project_poses(
         for tree in trees:
             _directions(poses[pose], tree, directions)
             before[:] = directions
-            _walk_person(limits, True, directions, judged, local)
+            _walk_person(Walk(limits, True, directions, judged, local))
             if judged.all():
                 continue
             for joint in range(1, N_JOINTS):
@@ -300,7 +272,7 @@ def project_poses(
                 length = 0.0
                 for i in range(3):
                     length += (poses[pose, here, i] - poses[pose, above, i]) ** 2
-                # What a bone adds is its turning alone, so that what is not turned is not rounded.
+                # Add only the change of direction, so that unchanged bones are not rounded.
                 for i in range(3):
                     turned = np.sqrt(length) * (directions[joint, i] - before[joint, i])
                     moved = nearest[pose, above, i] - poses[pose, above, i]
@@ -310,11 +282,11 @@ def project_poses(
 
 @numba.njit(cache=True)
 def local_directions(poses: np.ndarray, limits: LimitArrays) -> np.ndarray:
-    """Return each bone's condition and direction in its frame, (n, 17, 2, 3), uncorrected."""
+    """Return the parent's and the bone's direction in each bone's frame, (n, 17, 2, 3)."""
     local = np.zeros((len(poses), N_JOINTS, 2, 3))
     directions, judged = np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.bool_)
     tree = np.arange(N_JOINTS)
     for pose in range(len(poses)):
         _directions(poses[pose], tree, directions)
-        _walk_person(limits, False, directions, judged, local[pose])
+        _walk_person(Walk(limits, False, directions, judged, local[pose]))
     return local

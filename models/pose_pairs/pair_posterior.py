@@ -1,4 +1,4 @@
-"""Pose-pairs after annotations: prior, likelihood and truncation under one set of names."""
+"""Posterior of pose-pairs given 2D annotations (Yin et al. 2018)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,19 @@ from probmotion.posteriors.truncation import TruncatedPosterior
 
 __all__ = ["PairSettings", "pair_posterior"]
 
+_PRIOR = ("penetration_weight", "position_noise", "max_invalid", "bone_noise", "root_noise")
+_LIKELIHOOD = (
+    "n_views", "n_near", "noise", "view_bandwidth", "measure", "graph", "shortest_edge"
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class PairSettings:
-    """Every number of the posterior over pose-pairs.
+    """Settings of the pose-pair posterior.
 
-    The published ones, but for ``limit``: a density that is cut at 100 times the seed's is flat
-    where most draws are. ``noise``, of which the paper does not say the unit, does in metres: draws
-    cover better than the seed alone up to .01 and worse from .02 on, and below .01 real pairs are
-    far less likely than draws (``notebooks/ablations/pose_pairs.py``, parts noise and calibration).
+    Defaults are those of the paper except for ``limit``: truncation at 100 times the seed's density
+    is flat over most draws. The paper gives no unit for ``noise``; 0.01 m was chosen in
+    ``notebooks/ablations/pose_pairs.py`` (parts noise and calibration).
 
     Parameters
     ----------
@@ -33,22 +37,21 @@ class PairSettings:
     position_noise : float
         σ_p of eq. 2, metres.
     max_invalid : int
-        Most joint angles beyond the limits.
+        Maximum number of joint angles beyond the limits.
     view_bandwidth : float
         σ_v of eq. 5, radians.
     shortest_edge : float
         ε of eq. 8, metres.
     noise : float
-        σ_l of eq. 9, in the unit of the measure: metres, but for shape contexts, which have none.
+        σ_l of eq. 9, metres (dimensionless for shape contexts).
     limit : float
-        c of eq. 11; infinity does not truncate.
+        c of eq. 11; infinity for no truncation.
     n_views, n_near : int
-        Views m, and annotations that each is compared with.
+        Number of views m, and of annotations compared per view.
     measure, graph : str
-        What projections are compared in; see
-        :class:`~probmotion.interaction.annotated_pairs.AnnotatedPairs`.
+        See :class:`~probmotion.interaction.annotated_pairs.AnnotatedPairs`.
     bone_noise, root_noise : float
-        How far bones' log lengths and the people's places are free, which the paper leaves open.
+        See :class:`~probmotion.models.pose_pairs.pose_chart.PoseChart`; not in the paper.
     """
 
     penetration_weight: float = 10.0
@@ -67,7 +70,7 @@ class PairSettings:
 
     @classmethod
     def paper(cls) -> PairSettings:
-        """Return the published numbers."""
+        """Return the settings of the paper."""
         return cls(limit=100.0)
 
 
@@ -81,30 +84,29 @@ def pair_posterior(
     limits: JointLimits | None = None,
     view_seed: int = 0,
 ) -> TruncatedPosterior:
-    """Return the posterior over pose-pairs around a seed (Yin et al. 2018, eqs. 1-11).
+    """Return the posterior of pose-pairs around a seed (Yin et al. 2018, eqs. 1-11).
 
     Parameters
     ----------
     seed : ndarray, (J, 3) or (S, J, 3)
-        One 3D pose-pair, metres, or several; the first is θ = 0 and the reference of truncation.
+        One or several 3D pose-pairs, metres; the first is θ = 0 and the reference of truncation.
     annotations : Annotations or None
-        The annotated pairs; their views are estimated from the seed where they are not known.
-        ``None`` leaves the prior alone.
+        Annotated pairs; unknown views are estimated from the seed. ``None`` for the prior alone.
     settings : PairSettings, optional
-        The numbers.
+        Settings of the prior and the likelihood.
     skeleton : Skeleton, optional
-        Of the seed; ``pair17`` by default.
+        Skeleton of the seed; ``pair17`` by default.
     fps : float
-        Frames per second of the motion; the annotations', where there are any.
+        Frames per second, if there are no annotations.
     limits : JointLimits, optional
-        What joints can do; the table that is shipped by default.
+        Joint limits; the shipped ones by default.
     view_seed : int
         Seed of the fixed views.
 
     Raises
     ------
     ValueError
-        If the seed is outside the prior's support or has density 0.
+        If a seed is outside the support of the prior or of the truncated posterior.
     """
     settings = PairSettings() if settings is None else settings
     prior = PosePairPrior(
@@ -112,34 +114,21 @@ def pair_posterior(
         Skeleton.preset("pair17") if skeleton is None else skeleton,
         fps=fps if annotations is None else annotations.fps,
         limits=limits,
-        penetration_weight=settings.penetration_weight,
-        position_noise=settings.position_noise,
-        max_invalid=settings.max_invalid,
-        bone_noise=settings.bone_noise,
-        root_noise=settings.root_noise,
+        **{name: getattr(settings, name) for name in _PRIOR},
     )
     likelihood = None
     if annotations is not None:
-        numbers = {
-            "n_views": settings.n_views,
-            "n_near": settings.n_near,
-            "noise": settings.noise,
-            "view_bandwidth": settings.view_bandwidth,
-            "measure": settings.measure,
-            "graph": settings.graph,
-            "shortest_edge": settings.shortest_edge,
-            "seed": view_seed,
-        }
+        options = {name: getattr(settings, name) for name in _LIKELIHOOD} | {"seed": view_seed}
         if annotations.views is None:
-            likelihood = AnnotatedPairs.estimated(annotations, prior.seed[0], **numbers)
+            likelihood = AnnotatedPairs.estimated(annotations, prior.seed[0], **options)
         else:
-            likelihood = AnnotatedPairs(annotations, **numbers)  # type: ignore[arg-type]
+            likelihood = AnnotatedPairs(annotations, **options)
     posterior = TruncatedPosterior(prior, likelihood, limit=settings.limit)
     log_density = posterior.log_density(prior.seed_coordinates())
     if not np.isfinite(log_density).all():
         worst = int(log_density.argmin())
         raise ValueError(
-            f"seed {worst} is below 1/{settings.limit:g} of the first seed's density, where "
-            "truncation leaves nothing: expected seeds of like density, or a greater limit"
+            f"seed {worst} must have at least 1/{settings.limit:g} of the first seed's density, "
+            "got less: increase limit or choose another seed"
         )
     return posterior

@@ -1,7 +1,7 @@
-"""Penetration: how deep the bones of rigged characters stand in one another.
+"""Penetration depth of skeletons with bone radii (Yin et al. 2018, eq. 2).
 
-Every bone is a capsule: the points within its radius (``skeleton.radii``) of the segment from
-joint to parent.
+Each bone is a capsule: the points within its radius (``skeleton.radii``) of the segment from joint
+to parent.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ __all__ = ["Capsules", "capsules_of", "penetrating_bones", "penetration_depth"]
 
 
 class Capsules(NamedTuple):
-    """What compiled code reads: ``bones`` (B, 2) joints, ``radii`` (B,) metres, ``pairs`` (P, 2).
+    """Arrays for compiled code.
 
-    ``pairs`` are indices of bones that may not stand in each other.
+    ``bones`` (B, 2), joints; ``radii`` (B,), metres; ``pairs`` (P, 2), indices of the bones tested.
     """
 
     bones: np.ndarray
@@ -32,70 +32,52 @@ class Capsules(NamedTuple):
 
 
 def capsules_of(skeleton: Skeleton) -> Capsules:
-    """Return a skeleton's capsules and the pairs of them that may not stand in each other.
+    """Return a skeleton's capsules and the pairs tested for penetration.
 
-    These are all pairs of different trees and, within a tree, bones that neither share a joint nor
-    are joined by one other bone: an upper arm cannot be drawn out of the chest it hangs at, nor a
-    thigh out of the spine's lower end, and how far those fold is the joint limits' to say.
-
-    Raises
-    ------
-    ValueError
-        If the skeleton has no radii.
+    Tested are all pairs of bones of different trees and, within a tree, bones that neither share a
+    joint nor have a common neighbour: neighbouring capsules overlap at rest, and their folding is
+    subject to the joint limits.
     """
     if skeleton.radii is None:
-        raise ValueError(
-            f"skeleton of {skeleton.n_joints} joints has no radii, expected one per joint"
-        )
-    # A skeleton's equality leaves radii out, so that it cannot be the key itself.
+        raise ValueError("skeleton must have radii, one per joint, got none")
+    # Skeletons compare equal regardless of radii, so a skeleton cannot be the cache key.
     return _capsules(skeleton.bones, skeleton.radii)
 
 
 def penetration_depth(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return ρ, the sum over pairs of bones of how deep they stand in each other, metres.
+    """Return the total penetration depth ρ = Σ max(0, r_a + r_b − d_ab), metres.
 
-    ρ = Σ max(0, r_a + r_b − distance of the two segments); pairs as in :func:`capsules_of`.
+    d_ab is the distance of the segments of bones a and b; pairs as in :func:`capsules_of`.
 
     Parameters
     ----------
     positions : ndarray, (…, J, 3)
         Metres.
     skeleton : Skeleton
-        With radii.
+        Skeleton with radii.
 
     Returns
     -------
     ndarray, (…)
-
-    Raises
-    ------
-    ValueError
-        If the skeleton has no radii, the shape does not fit it or a value is not finite.
-
-    References
-    ----------
-    Yin, Huang, Ho et al. (2018), "A Sampling Approach to Generating Closely Interacting 3D
-    Pose-Pairs from 2D Annotations", eq. 2.
     """
     capsules = capsules_of(skeleton)
-    given = _checked(positions, ("…", skeleton.n_joints, 3))
+    given = np.asarray(positions, dtype=np.float64)
+    check_shape("positions", given, ("…", skeleton.n_joints, 3))
+    check_finite("positions", given)
     flat = np.ascontiguousarray(given.reshape(prod(given.shape[:-2]), *given.shape[-2:]))
     return total_depths(flat, *capsules).reshape(given.shape[:-2])
 
 
 def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, str, float]]:
-    """Return the bones that stand in each other, deepest first.
+    """Return the penetrating bones of a pose (J, 3), deepest first.
 
-    Each is (joint, joint, depth in metres), a bone called by the joint it ends in; the depths add
-    up to :func:`penetration_depth`. ``pose`` is (J, 3), metres.
-
-    Raises
-    ------
-    ValueError
-        As :func:`penetration_depth`.
+    Each is (joint, joint, depth in metres), named by end joints; the depths sum to
+    :func:`penetration_depth`.
     """
     capsules = capsules_of(skeleton)
-    given = np.ascontiguousarray(_checked(pose, (skeleton.n_joints, 3)))
+    given = np.ascontiguousarray(pose, dtype=np.float64)
+    check_shape("pose", given, (skeleton.n_joints, 3))
+    check_finite("pose", given)
     depths = depths_of_pairs(given, *capsules)
     found = []
     for pair in np.argsort(-depths, kind="stable")[: np.count_nonzero(depths)]:
@@ -104,16 +86,10 @@ def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, s
     return found
 
 
-def _checked(positions: np.ndarray, shape: tuple[int | str, ...]) -> np.ndarray:
-    given = np.asarray(positions, dtype=np.float64)
-    check_shape("positions" if shape[0] == "…" else "pose", given, shape)
-    check_finite("positions" if shape[0] == "…" else "pose", given)
-    return given
-
-
 @lru_cache(maxsize=64)
 def _capsules(bones: tuple[tuple[int, int], ...], radii: tuple[float, ...]) -> Capsules:
-    touching = {pair: bool(set(bones[pair[0]]) & set(bones[pair[1]])) for pair in _pairs(bones)}
+    all_pairs = combinations(range(len(bones)), 2)
+    touching = {pair: bool(set(bones[pair[0]]) & set(bones[pair[1]])) for pair in all_pairs}
     beside: list[set[int]] = [set() for _ in bones]
     for (first, second), shared in touching.items():
         if shared:
@@ -129,7 +105,3 @@ def _capsules(bones: tuple[tuple[int, int], ...], radii: tuple[float, ...]) -> C
         radii=np.array([radii[joint] for joint, _ in bones]),
         pairs=np.array(apart, dtype=np.int64).reshape(-1, 2),
     )
-
-
-def _pairs(bones: tuple[tuple[int, int], ...]) -> list[tuple[int, int]]:
-    return list(combinations(range(len(bones)), 2))

@@ -1,4 +1,4 @@
-"""Compiled: distances between segments, and how deep capsules stand in one another."""
+"""Compiled distances of segments and penetration depths of capsules."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ def _within(x: float) -> float:
 
 @numba.njit(cache=True)
 def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray) -> float:
-    """Return the least distance of the segments p–q and r–s, metres; a point is a segment too.
+    """Return the distance of the segments p–q and r–s, metres; segments may have length 0.
 
-    Closest points as in Ericson, Real-Time Collision Detection (2005), section 5.1.9: the nearest
-    points of the lines, clamped to one segment, then to the other.
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9.
     """
     a = e = f = b = c = 0.0
     for i in range(3):
@@ -36,7 +35,7 @@ def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray)
     elif a > _TINY and e <= _TINY:
         along = _within(-c / a)
     elif a > _TINY and e > _TINY:
-        # Parallel lines are equally near everywhere: any start will do.
+        # Parallel lines: any starting point will do.
         volume = a * e - b * b
         along = _within((b * f - c * e) / volume) if volume > 1e-12 * a * e else 0.0
         across = (b * along + f) / e
@@ -55,7 +54,7 @@ def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray)
 def _depth(
     pose: np.ndarray, bones: np.ndarray, radii: np.ndarray, first: int, second: int
 ) -> float:
-    """Return r_a + r_b − distance of two capsules, or 0 where they are apart, metres."""
+    """Return the penetration depth of two capsules, metres; 0 if they are apart."""
     p, q = pose[bones[first, 0]], pose[bones[first, 1]]
     r, s = pose[bones[second, 0]], pose[bones[second, 1]]
     return max(0.0, radii[first] + radii[second] - segment_distance(p, q, r, s))
@@ -76,10 +75,7 @@ def depths_of_pairs(
 def total_depths(
     poses: np.ndarray, bones: np.ndarray, radii: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:
-    """Return ρ, the sum of the depths of all pairs, (n,).
-
-    Pairs whose bounding balls are apart are passed over.
-    """
+    """Return the total depth ρ of each pose, (n,), skipping pairs with disjoint bounding balls."""
     total = np.zeros(len(poses))
     middles, reach = np.empty((len(bones), 3)), np.empty(len(bones))
     for n in range(len(poses)):

@@ -1,8 +1,4 @@
-"""Coordinates of a pose around a seed: turns and lengths of bones, turns and places of roots.
-
-A joint's bone turns about its parent joint by two angles and changes its length; what hangs from it
-turns along. Everything is 0 at the seed.
-"""
+"""Coordinates of poses relative to a seed: rotations and log lengths of bones, and root motion."""
 
 from __future__ import annotations
 
@@ -21,29 +17,23 @@ __all__ = ["PoseChart"]
 
 @dataclass(frozen=True, eq=False)
 class PoseChart:
-    """θ of the poses of K trees, in order: root turns, root places, then three numbers per bone.
+    """Coordinates θ of poses of K trees, 0 at the seed.
 
-    With the seed's bone vectors ``b_j``, bases ``E_j`` (3, 2) square to them and the parent's
+    With the seed's bone vectors ``b_j``, bases ``E_j`` (3, 2) orthogonal to them and the parent's
     rotation ``G``: ``G_j = G exp(E_j α_j)`` and ``x_j = x_parent + e^{λ_j} G_j b_j``. A root has
-    ``G = exp(ω)`` and ``x = x_seed + t``. θ holds ω and t of every root, then (α₁, α₂, λ) of every
-    bone in the order of ``skeleton.bones``: 6 K + 3 (J − K) numbers, 108 for two people of 17
-    joints.
+    ``G = exp(ω)`` and ``x = x_seed + t``. θ contains ω of every root, t of every root, then
+    (α₁, α₂, λ) of every bone in the order of ``skeleton.bones``.
 
     Parameters
     ----------
     seed : ndarray, (J, 3)
-        The pose that is θ = 0, metres.
+        Pose at θ = 0, metres.
     skeleton : Skeleton
-        Its J joints.
+        Skeleton of the J joints.
     bone_noise : float
-        Standard deviation of a bone's log length.
+        Standard deviation of the log bone lengths.
     root_noise : float
-        Standard deviation of a root's coordinate, metres.
-
-    Raises
-    ------
-    ValueError
-        If the shape does not fit, a value is not finite or a bone of the seed has no length.
+        Standard deviation of the root coordinates, metres.
     """
 
     seed: np.ndarray
@@ -65,8 +55,8 @@ class PoseChart:
         if (lengths < 1e-6).any():
             short = self.skeleton.joint_names[ends[int(lengths.argmin())]]
             raise ValueError(
-                f"seed has the bone to {short} of length {lengths.min():g} m, expected bones of "
-                "some length"
+                f"seed must have bones longer than 1e-6 m, got {lengths.min():g} m for the bone "
+                f"to {short}"
             )
         object.__setattr__(self, "seed", seed)
         object.__setattr__(self, "_bones", bones)
@@ -74,16 +64,16 @@ class PoseChart:
 
     @property
     def _ends(self) -> tuple[list[int], list[int]]:
-        """Indices of the bones' joints, and of those joints' parents."""
+        """End and start joints of the bones."""
         return [j for j, _ in self.skeleton.bones], [p for _, p in self.skeleton.bones]
 
     @property
     def dim(self) -> int:
-        """6 K + 3 (J − K)."""
+        """Number of coordinates, 6 K + 3 (J − K)."""
         return 6 * len(self.skeleton.roots) + 3 * len(self.skeleton.bones)
 
     def positions(self, theta: Array) -> Array:
-        """Return the pose at θ: ``(…, dim) → (…, J, 3)``, metres; NumPy, torch and JAX alike."""
+        """Return the pose at θ: ``(…, dim) → (…, J, 3)``, metres; NumPy, torch or JAX."""
         check_shape("theta", theta, ("…", self.dim))
         xp = array_namespace(theta)
         turns, places, bends, stretches = self._parts(theta)
@@ -94,7 +84,7 @@ class PoseChart:
         frames = vector_to_matrix(turns)
         joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
         found = [joints]
-        # A generation of bones at a time: few large products are faster than many small ones.
+        # Process one generation of bones at a time, for few large matrix products.
         for bones, above in self._generations:
             frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
             joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
@@ -102,15 +92,10 @@ class PoseChart:
         return xp.concat(found, axis=-2)[..., self._places, :]
 
     def coordinates(self, positions: np.ndarray) -> np.ndarray:
-        """Return a θ at which the pose is ``positions``: ``(…, J, 3) → (…, dim)``.
+        """Return coordinates θ of poses: ``(…, J, 3) → (…, dim)``.
 
-        A root turns as its bones do on the whole (Kabsch 1976); every bone turns the rest of the
-        way by the least angle.
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit, a value is not finite or a bone has no length.
+        Root rotations are least-squares fits to the root's bones (Kabsch 1976); bones then rotate
+        by the smallest angle. All bones must have a length above 1e-6 m.
         """
         positions = to_numpy(positions).astype(np.float64)
         check_shape("positions", positions, ("…", self.skeleton.n_joints, 3))
@@ -119,7 +104,9 @@ class PoseChart:
         vectors = positions[..., ends, :] - positions[..., starts, :]
         lengths = np.linalg.norm(vectors, axis=-1)
         if (lengths < 1e-6).any():
-            raise ValueError("positions has a bone without length, expected bones of some length")
+            raise ValueError(
+                f"positions must have bones longer than 1e-6 m, got {lengths.min():g} m"
+            )
         rest = np.linalg.norm(self._bones, axis=-1)
         theta = np.zeros((*positions.shape[:-2], self.dim))
         turns, places, bends, stretches = self._parts(theta)
@@ -139,18 +126,17 @@ class PoseChart:
         return theta
 
     def log_measure(self, theta: Array) -> Array:
-        """Return the log density of the measure that a density of poses is relative to.
+        """Return the log density of the base measure of poses: ``(…, dim) → (…)``, NumPy.
 
-        Uniform turns of roots (Haar) and directions of bones (area on the sphere), normal places
-        of roots and log lengths, all normalised: ``(…, dim) → (…)``. Turns beyond π have density
-        0, so that every direction counts once. NumPy arrays.
+        Uniform root rotations (Haar) and bone directions, Gaussian root positions and log lengths,
+        all normalised. Rotations beyond π have density 0, so that each direction counts once.
         """
         theta = to_numpy(theta)
         turns, places, bends, stretches = self._parts(theta)
         angle = np.linalg.norm(turns, axis=-1)
         bend = np.linalg.norm(bends, axis=-1)
         inside = (angle < np.pi).all(axis=-1) & (bend < np.pi).all(axis=-1)
-        # (1 − cos ω)/ω² = 2 (sin(ω/2)/ω)²; np.sinc has π in it.
+        # (1 − cos ω)/ω² = 2 (sin(ω/2)/ω)², and np.sinc(x) = sin(πx)/(πx).
         haar = 2 * np.log(np.sinc(angle / (2 * np.pi)) / 2) + np.log(1 / (2 * np.pi**2))
         with np.errstate(divide="ignore", invalid="ignore"):
             area = np.log(np.sinc(bend / np.pi) / (4 * np.pi))
@@ -159,18 +145,14 @@ class PoseChart:
         return np.where(inside, total, -np.inf)
 
     def speeds(self, turn: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-        """Return each coordinate's mean squared step from those of joints (eq. 12).
+        """Return the mean squared step of each coordinate, (…, dim), from those of joints (eq. 12).
 
         Parameters
         ----------
         turn : ndarray, (…, J)
-            Squared change of the bone's direction (a root: of the tree's backbone), radians².
+            Squared change of the bone's direction (at a root: of the backbone), radians².
         stretch : ndarray, (…, J)
-            Squared change of the bone's length (a root: of its place), metres².
-
-        Returns
-        -------
-        speeds : ndarray, (…, dim)
+            Squared change of the bone's length (at a root: of its position), metres².
         """
         speeds = np.empty((*turn.shape[:-1], self.dim))
         turns, places, bends, stretches = self._parts(speeds)
@@ -192,7 +174,7 @@ class PoseChart:
 
     @cached_property
     def _generations(self) -> list[tuple[list[int], list[int]]]:
-        """Bones by their distance from a root, and each one's parent among the joints before."""
+        """Bones by depth, with the index of each parent in the previous generation."""
         before, generations = list(self.skeleton.roots), []
         while bones := [k for k, (_, parent) in enumerate(self.skeleton.bones) if parent in before]:
             above = [before.index(self.skeleton.bones[k][1]) for k in bones]
@@ -202,14 +184,14 @@ class PoseChart:
 
     @cached_property
     def _places(self) -> list[int]:
-        """Where each joint is in the order of roots, first generation, second, …"""
+        """Position of each joint in the order of generations."""
         order = list(self.skeleton.roots)
         order += [self.skeleton.bones[k][0] for bones, _ in self._generations for k in bones]
         return [order.index(joint) for joint in range(self.skeleton.n_joints)]
 
 
 def _square_to(directions: np.ndarray) -> np.ndarray:
-    """Return two unit vectors square to each direction and to each other: (n, 3) → (n, 3, 2)."""
+    """Return an orthonormal basis of the plane orthogonal to each vector: (n, 3) → (n, 3, 2)."""
     other = np.eye(3)[np.abs(directions).argmin(axis=-1)]
     first = np.cross(directions, other)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -217,7 +199,7 @@ def _square_to(directions: np.ndarray) -> np.ndarray:
 
 
 def _best_rotation(rest: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the rotations that take ``rest`` (C, 3) nearest to ``vectors``, (…, C, 3)."""
+    """Return the least-squares rotations of ``rest`` (C, 3) to ``vectors`` (…, C, 3)."""
     left, _, right = np.linalg.svd(np.einsum("...ci,cj->...ij", vectors, rest))
     signs = np.ones((*vectors.shape[:-2], 1, 3))
     signs[..., 0, 2] = np.sign(np.linalg.det(left @ right))
@@ -229,7 +211,7 @@ def _least_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     axis = np.cross(start, end)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
     angle = np.arctan2(sine, (end @ start)[..., None])
-    # Opposite directions leave the axis open; any square to the start will do.
+    # For opposite directions any orthogonal axis will do.
     opposite = _square_to(start[None])[0, :, 0]
     return angle * np.where(sine > 1e-12, axis / np.where(sine > 0, sine, 1.0), opposite)
 

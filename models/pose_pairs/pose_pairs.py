@@ -1,4 +1,4 @@
-"""The physical prior over poses of people who interact closely (Yin et al. 2018, eq. 2)."""
+"""Physical prior of poses of closely interacting people (Yin et al. 2018, eq. 2)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["PosePairPrior"]
 
-# Walkers of an ensemble that start at one pose start this far apart, so that no two are the same.
+# Standard deviation of initial points around a seed, so that ensemble walkers are distinct.
 _JITTER = 1e-3
 
 
@@ -24,37 +24,29 @@ _JITTER = 1e-3
 class PosePairPrior:
     """f(Θ) = 0 with more than ``max_invalid`` invalid joint angles, else exp(−E(X(Θ))/2σ_p²).
 
-    ``E = ‖X − X̂‖² + w ρ²`` (eq. 2): X̂ is the nearest pose within the joint limits, ρ the sum of
-    penetration depths, both in metres. The density is relative to uniform turns and directions,
-    normal bone lengths and places (:meth:`PoseChart.log_measure`): the published prior says
-    nothing of where the pair stands or how long its bones are, and alone would not be a density.
-    It is known up to a constant.
+    ``E = ‖X − X̂‖² + w ρ²`` (eq. 2), with X̂ the nearest pose within the joint limits and ρ the total
+    penetration depth, metres. The unnormalised density is relative to the base measure
+    :meth:`PoseChart.log_measure`, as eq. 2 alone is improper in position and bone lengths.
 
     Parameters
     ----------
     seed : ndarray, (J, 3) or (S, J, 3)
-        The pose that θ = 0 stands for, metres; with S poses the first, and all are where chains
-        start.
+        Initial poses of chains, metres; the first is θ = 0. Must be close people in metres, within
+        the support.
     skeleton : Skeleton
-        Its J joints, with bone radii: K trees.
+        Skeleton of the J joints, K trees, with bone radii.
     fps : float
-        Frames per second of the motion that the poses are from.
+        Frames per second of the motion.
     limits : JointLimits, optional
-        What joints can do; the table that is shipped by default.
+        Joint limits; the shipped ones by default.
     penetration_weight : float
         w.
     position_noise : float
         σ_p, metres.
     max_invalid : int
-        Most joint angles beyond the limits.
+        Maximum number of joint angles beyond the limits.
     bone_noise, root_noise : float
         See :class:`~probmotion.models.pose_pairs.pose_chart.PoseChart`.
-
-    Raises
-    ------
-    ValueError
-        If a seed is not of people in metres within reach of each other, or is outside the prior's
-        support; the message names the joints.
     """
 
     seed: np.ndarray
@@ -81,9 +73,9 @@ class PosePairPrior:
         poses = poses[None] if poses.ndim == 2 else poses
         check_shape("seed", poses, ("S", self.skeleton.n_joints, 3))
         if len(poses) == 0:
-            raise ValueError("seed has no pose, expected at least one")
+            raise ValueError("seed must contain at least one pose, got none")
         if self.skeleton.radii is None:
-            raise ValueError("skeleton has no bone radii, expected one per joint for penetration")
+            raise ValueError("skeleton must have bone radii, one per joint, got none")
         for number, pose in enumerate(poses):
             check_close_people(f"seed {number}", pose, self.skeleton)
         chart = PoseChart(poses[0], self.skeleton, self.bone_noise, self.root_noise)
@@ -95,25 +87,25 @@ class PosePairPrior:
             invalid = self.invalid_joints(pose)
             if len(invalid) > self.max_invalid:
                 raise ValueError(
-                    f"seed {number} has {len(invalid)} joint angles beyond the limits "
-                    f"({', '.join(invalid)}), expected at most max_invalid={self.max_invalid}"
+                    f"seed {number} must have at most {self.max_invalid} joint angles beyond the "
+                    f"limits (max_invalid), got {len(invalid)}: {', '.join(invalid)}"
                 )
 
     @property
     def dim(self) -> int:
-        """6 K + 3 (J − K): 108 for two people of 17 joints."""
+        """Number of coordinates, 6 K + 3 (J − K): 108 for ``pair17``."""
         return self.chart.dim
 
     def motion(self, theta: Array) -> Array:
-        """Return the pose at θ as a motion of one frame: ``(…, dim) → (…, 1, J, 3)``, metres."""
+        """Return the pose at θ as a one-frame motion: ``(…, dim) → (…, 1, J, 3)``, metres."""
         return self.chart.positions(theta)[..., None, :, :]
 
     def coordinates(self, poses: np.ndarray) -> np.ndarray:
-        """Return a θ of each pose: ``(…, J, 3) → (…, dim)``; for ``initial=`` of a sampler."""
+        """Return θ of each pose, e.g. for ``initial=`` of a sampler: ``(…, J, 3) → (…, dim)``."""
         return self.chart.coordinates(poses)
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n points to start at, (n, dim): seeds in turn, a millimetre off."""
+        """Return n initial points, (n, dim): the seeds in turn, with small noise."""
         chosen = self.seed_coordinates()[np.arange(n) % len(self.seed)]
         return chosen + _JITTER * rng.standard_normal((n, self.dim))
 
@@ -122,14 +114,11 @@ class PosePairPrior:
         return self.chart.coordinates(self.seed)
 
     def log_density(self, theta: Array) -> np.ndarray:
-        """Return log f(Θ) with the measure it is relative to, up to a constant: NumPy arrays.
-
-        ``(…, dim) → (…)``; −∞ outside the support.
-        """
+        """Return log f(Θ) plus the log base measure, up to a constant: ``(…, dim) → (…)``."""
         theta = to_numpy(theta)
         log_measure = self.log_measure(theta)
         flat = theta.reshape(-1, self.dim)
-        # A bone can be longer than any number.
+        # Bone lengths can overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             positions = self.motion(flat)
         inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
@@ -140,11 +129,11 @@ class PosePairPrior:
         ) + log_f.reshape(log_measure.shape)
 
     def log_measure(self, theta: Array) -> np.ndarray:
-        """Return the log density of the measure that f is relative to: ``(…, dim) → (…)``."""
+        """Return the log base measure: ``(…, dim) → (…)``."""
         return self.chart.log_measure(theta)
 
     def log_plausibility(self, positions: Array) -> np.ndarray:
-        """Return log f of poses (eq. 2): ``(…, 1, J, 3) → (…)``; 0 at most."""
+        """Return log f of poses (eq. 2), at most 0: ``(…, 1, J, 3) → (…)``."""
         positions = to_numpy(positions)
         check_shape("positions", positions, ("…", 1, self.skeleton.n_joints, 3))
         poses = np.ascontiguousarray(positions.reshape(-1, self.skeleton.n_joints, 3))
@@ -156,14 +145,14 @@ class PosePairPrior:
         return log_f.reshape(positions.shape[:-3])
 
     def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
-        """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
+        """Return the mean squared step of each coordinate: ``(…, J, 2) → (…, dim)``.
 
-        ``joint_speeds`` holds the squared turns, radians², and stretches, metres², of joints.
+        ``joint_speeds`` contains the squared turns, radians², and stretches, metres², of joints.
         """
         return self.chart.speeds(joint_speeds[..., 0], joint_speeds[..., 1])
 
     def invalid_joints(self, pose: np.ndarray) -> list[str]:
-        """Return the joints of a pose (J, 3) whose bones are beyond the limits, by name."""
+        """Return the names of the joints of a pose (J, 3) beyond the limits."""
         valid, _ = self.joint_limits.project(np.asarray(pose, dtype=np.float64)[None])
         ends = [joint for joint, _ in self.skeleton.bones]
         return [

@@ -1,14 +1,11 @@
-"""Enhanced lifting: each person of a 2D pair alone, with joint limits (Yin et al. 2018, figure 10).
+"""Enhanced lifting of single people with joint limits, a baseline (Yin et al. 2018, figure 10).
 
-The baseline that knows nothing of other people. From a seed's pose it bends the joints until they
-project onto the annotation, with the seed's bone lengths kept, and pulls the bones into their
-limits:
+Minimises, for each person of a 2D pair separately and with the bone lengths of the seed,
 
     E = Σ_visible ‖x_j − p_j‖² + w_v ‖X − X̂‖² + w_s Σ ‖α‖²
 
-with x the orthographic picture of the pose X, X̂ the nearest valid pose to X, and α how far each
-joint is bent from the seed, which decides what no visible joint does. X̂ is found anew after each
-minimisation over X (alternating projections). Nothing is random.
+with x the orthographic projection of the pose X, X̂ the nearest valid pose, and α the joint angles
+relative to the seed. X̂ is updated after each minimisation over X (alternating projections).
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 __all__ = ["lift_people"]
 
 _STEP = 1e-5
-"""Of central differences, radians and metres."""
+"""Step of central differences, radians and metres."""
 
 
 def lift_people(
@@ -41,40 +38,34 @@ def lift_people(
     seed_weight: float = 1e-3,
     rounds: int = 4,
 ) -> np.ndarray:
-    """Return the 3D pose-pair of a 2D one, each person lifted alone.
+    """Lift a 2D pair to a 3D pose-pair, each person separately.
 
     Parameters
     ----------
     keypoints : ndarray, (J, 2)
-        2D pair, metres, x right, y up; hidden joints are never read.
+        2D pair, metres, x right, y up; occluded joints are ignored.
     visible : ndarray of bool, (J,)
-        Which are annotated; at least two.
+        Mask of annotated joints; at least two.
     seed : ndarray, (J, 3)
-        Where the search starts, metres; its bone lengths are kept.
+        Initial pose-pair, metres; determines the bone lengths.
     skeleton : Skeleton
-        The J joints; every tree has the joints of ``person17``.
+        Skeleton of the J joints; each tree has the joints of ``person17``.
     view : ndarray, (2,)
-        View (φ, θ) of the annotation in the pair's own frame, known or estimated: from there the
-        seed is looked at first.
+        View (φ, θ) of the annotation in the local frame, known or estimated.
     limits : JointLimits, optional
-        Those that come with the package by default.
+        Joint limits; the shipped ones by default.
     validity_weight : float
-        w_v. Greater ones made hidden joints of real dances worse, not better.
+        w_v.
     seed_weight : float
         w_s, m² per square radian.
     rounds : int
-        Minimisations over X; X̂ is that of the one before.
+        Number of minimisations over X.
 
     Returns
     -------
     positions : ndarray, (J, 3)
-        Metres in the annotation's axes: right, up, towards the viewer. Each person's depth is the
-        seed's, as no orthographic picture tells it.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, a visible value is not finite, or fewer than two joints are visible.
+        Metres in the annotation's axes: right, up, towards the viewer. Depths of the people are
+        those of the seed.
     """
     n_joints = skeleton.n_joints
     check_shape("keypoints", keypoints, (n_joints, 2))
@@ -86,11 +77,13 @@ def lift_people(
     check_count("rounds", rounds)
     visible = np.asarray(visible, dtype=bool)
     if visible.sum() < 2:
-        raise ValueError(f"visible has {visible.sum()} joints, expected at least 2")
+        raise ValueError(f"visible must mark at least 2 joints, got {visible.sum()}")
     keypoints = np.where(visible[:, None], keypoints, 0.0)
     check_finite("keypoints", keypoints)
     limits = JointLimits.shipped() if limits is None else limits
-    positions = _seen_from(np.asarray(seed, dtype=np.float64), keypoints, visible, skeleton, view)
+    positions = _initial_pose(
+        np.asarray(seed, dtype=np.float64), keypoints, visible, skeleton, view
+    )
     for root in skeleton.roots:
         joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
         person = skeleton.subset(joints)
@@ -101,14 +94,14 @@ def lift_people(
     return positions
 
 
-def _seen_from(
+def _initial_pose(
     seed: np.ndarray,
     keypoints: np.ndarray,
     visible: np.ndarray,
     skeleton: Skeleton,
     view: np.ndarray,
 ) -> np.ndarray:
-    """Return the seed in the axes of the picture, moved in its plane onto the visible joints."""
+    """Return the seed in image axes, aligned in the image plane to the visible joints."""
     right, up = image_axes(pair_frames(seed[None], skeleton), np.asarray(view)[None])[0, :, 0].T
     turned = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
     moved = align_rigidly(turned[:, :2], keypoints, visible)
@@ -116,7 +109,7 @@ def _seen_from(
 
 
 class _Lifting:
-    """Least squares over the angles and the place of one person, whose bones keep their lengths."""
+    """Least-squares problem over the joint angles and position of one person."""
 
     def __init__(self, chart: PoseChart, keypoints: np.ndarray, visible: np.ndarray) -> None:
         self.chart, self.keypoints, self.visible = chart, keypoints, visible
@@ -146,7 +139,7 @@ class _Lifting:
         return self.positions(point)
 
     def positions(self, point: np.ndarray) -> np.ndarray:
-        """Return poses in the picture's axes: ``(…, free) → (…, J, 3)``."""
+        """Return poses in image axes: ``(…, free) → (…, J, 3)``."""
         theta = np.zeros((*point.shape[:-1], self.chart.dim))
         theta[..., self.free] = point
         return self.chart.positions(theta)

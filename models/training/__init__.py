@@ -1,4 +1,4 @@
-"""Training of networks: settings, runs, checkpoints, batches."""
+"""Training of networks: trainer, settings, checkpoints and batches of 2D tracks."""
 
 import lazy_loader
 

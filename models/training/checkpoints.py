@@ -1,6 +1,6 @@
-"""Networks in files: one safetensors file whose header holds a JSON of what rebuilds it.
+"""Checkpoints of networks: safetensors files with a JSON header.
 
-Nothing in such a file can run code. The header's ``probmotion`` entry says the format's version,
+Loading such a file cannot run code. The header's ``probmotion`` entry contains the format version,
 the kind of network, its settings and the SHA-256 of settings and tensors.
 """
 
@@ -32,31 +32,21 @@ __all__ = [
 ]
 
 MODEL = "model.safetensors"
-"""The checkpoint in the folder of a training run."""
+"""File name of the checkpoint in the folder of a training run."""
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
-"""Where networks that come with the package lie."""
+"""Folder of the networks shipped with the package."""
 _FORMAT = 1
 _ENTRY = "probmotion"
 
 
 class CheckpointError(ValueError):
-    """A file is no checkpoint, is damaged, or is of another kind; the message says which."""
+    """A file is not a checkpoint, is damaged, or contains another kind of network."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What a checkpoint's file holds.
-
-    Parameters
-    ----------
-    kind : str
-        Of the network: ``"motion-diffusion"``, …
-    settings : mapping
-        JSON: all that rebuilds the network, and how it was trained.
-    tensors : mapping of str to Tensor
-        The weights.
-    """
+    """Kind of network, JSON settings (to rebuild it and describe its training) and weights."""
 
     kind: str
     settings: Mapping[str, Any]
@@ -64,39 +54,27 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint, *, half: bool = False) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file, ``.safetensors``.
-    checkpoint : Checkpoint
-        What to write.
-    half : bool
-        Store floating-point tensors in half precision: half the size, three digits.
+    """Write a checkpoint atomically; ``half`` stores tensors in half precision.
 
     Raises
     ------
     ValueError
-        If a tensor is not finite, or the settings are no JSON.
+        If a tensor is not finite, or the settings are not JSON.
     OSError
         If the file cannot be written.
     """
     tensors = {}
     for name, tensor in checkpoint.tensors.items():
-        kept = tensor.detach().cpu().contiguous()
-        if kept.is_floating_point():
-            if half:
-                kept = kept.half()
-            if not torch.isfinite(kept).all():
-                raise ValueError(
-                    f"tensors has {name}, which is not finite, expected finite weights"
-                )
-        tensors[name] = kept
+        stored = tensor.detach().cpu().contiguous()
+        if stored.is_floating_point():
+            stored = stored.half() if half else stored
+            if not torch.isfinite(stored).all():
+                raise ValueError(f"tensors must be finite, got NaN or infinity in {name}")
+        tensors[name] = stored
     try:
         settings = json.loads(json.dumps(checkpoint.settings, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"settings is no JSON, expected what JSON can hold: {error}") from error
+        raise ValueError(f"settings must be JSON data: {error}") from error
     header = {
         "format": _FORMAT,
         "kind": checkpoint.kind,
@@ -108,20 +86,19 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint, *, half: bool = Fa
 
 
 def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
-    """Return what a checkpoint's file holds; half-precision tensors come back in single.
+    """Return a checkpoint, with half-precision tensors converted to single precision.
 
     Parameters
     ----------
     source : str or Path
-        The file, the folder of a training run, or the name of a network that comes with the
-        package.
+        A file, the folder of a training run, or the name of a network shipped with the package.
     kind : str
-        The kind of network that is expected.
+        Expected kind of network.
 
     Raises
     ------
     CheckpointError
-        If the file is no checkpoint, is damaged, of another version or of another kind.
+        If the file is not a checkpoint, is damaged, or has another version or kind.
     FileNotFoundError
         If there is no such file, folder or name.
     """
@@ -132,18 +109,18 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         header = json.loads(words) if words is not None else None
     except (SafetensorError, json.JSONDecodeError, OSError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
-        raise CheckpointError(f"{path} holds tensors of another program, expected a checkpoint")
+        raise CheckpointError(f"{path} is not a checkpoint of probmotion")
     if header["format"] != _FORMAT:
         raise CheckpointError(
             f"{path} is a checkpoint of version {header['format']}, expected version {_FORMAT}"
         )
     if header.get("kind") != kind:
-        raise CheckpointError(f"{path} holds a {header.get('kind')}, expected a {kind}")
+        raise CheckpointError(f"{path} contains a {header.get('kind')}, expected a {kind}")
     settings = header.get("settings", {})
     if header.get("sha256") != _digest(settings, tensors):
-        raise CheckpointError(f"{path} is damaged: it does not hold what was written")
+        raise CheckpointError(f"{path} is damaged: the checksum does not match")
     single = {
         name: tensor.float() if tensor.dtype == torch.float16 else tensor
         for name, tensor in tensors.items()
@@ -152,23 +129,15 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Put a checkpoint's tensors into a network.
-
-    Raises
-    ------
-    CheckpointError
-        If the network has other weights: the checkpoint's settings are not those of its tensors.
-    """
+    """Load tensors into a network; raise ``CheckpointError`` if they are of another network."""
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:
-        raise CheckpointError(
-            "the checkpoint holds weights of another network than its settings say"
-        ) from error
+        raise CheckpointError("the checkpoint's weights do not match its settings") from error
 
 
 def weights_digest(network: nn.Module) -> str:
-    """Return what tells a network's weights from others', the same for half-precision copies."""
+    """Return a digest of a network's weights in half precision."""
     tensors = {
         name: tensor.detach().cpu().half() if tensor.is_floating_point() else tensor.cpu()
         for name, tensor in network.state_dict().items()
@@ -187,7 +156,7 @@ def _find(source: str | Path, kind: str) -> Path:
         return shipped
     known = [file.stem for file in sorted(WEIGHTS.glob("*.safetensors")) if _kind(file) == kind]
     raise FileNotFoundError(
-        f"there is no checkpoint {path}, expected a file, the folder of a training run or one of "
+        f"there is no checkpoint {path}; use a file, the folder of a training run or one of "
         f"{', '.join(known) or 'no names'}"
     )
 
@@ -198,9 +167,9 @@ def _kind(path: Path) -> str:
 
 
 def _digest(settings: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> str:
-    found = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
-        found.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        found.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-    return found.hexdigest()
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

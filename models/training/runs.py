@@ -1,4 +1,4 @@
-"""What changes while a network is trained, and how it is kept so that a run can go on."""
+"""State of a training run, and how it is saved and resumed."""
 
 from __future__ import annotations
 
@@ -25,15 +25,14 @@ from probmotion.models.training.settings import TrainingSettings
 __all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run", "steps_taken"]
 
 STATE, LOSSES = "state.safetensors", "losses.csv"
-"""Beside the model, in the folder of a run: what it goes on from, and its losses."""
-
+"""File names of the state to resume from and of the losses, in the folder of a run."""
 
 _READABLE = 200
 
 
 @dataclass(eq=False)
 class Run:
-    """Everything that changes from step to step."""
+    """State that changes from step to step."""
 
     network: nn.Module
     average: nn.Module
@@ -47,9 +46,9 @@ class Run:
 def keep_run(
     run: Run, kind: str, described: dict[str, Any], folder: Path, *, model: bool = True
 ) -> None:
-    """Write the model, its losses and, last, the state to go on from.
+    """Write the model, its losses and, last, the state to resume from.
 
-    ``model`` false leaves the model that is there, if there is one.
+    With ``model`` false an existing model is not overwritten.
     """
     card = described | {"step": run.step, "seconds": run.seconds, "history": run.history}
     if model or not (folder / MODEL).exists():
@@ -70,35 +69,26 @@ def keep_run(
 
 
 def steps_taken(folder: Path, kind: str) -> int:
-    """Return how many steps the run in a folder has taken; 0 where there is none.
-
-    Raises
-    ------
-    CheckpointError
-        If the run is of another kind of network, or what it goes on from is damaged.
-    """
+    """Return the number of steps of the run in a folder, 0 if there is none."""
     if (folder / STATE).exists():
         return int(load_checkpoint(folder / STATE, _state_of(kind)).settings["step"])
     return 0
 
 
 def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> None:
-    """Bring a run to where the one in the folder was stopped.
-
-    The state holds all that the model does: where the model is missing or damaged it is written
-    anew, as it was.
+    """Restore a run from its folder, and its model from the state if missing or damaged.
 
     Raises
     ------
     CheckpointError
         If the run is of another kind of network, or its state is damaged.
     ValueError
-        If the run has other settings or data; nothing is written then.
+        If the run has other settings or data; nothing is written.
     """
-    kept = load_checkpoint(folder / STATE, _state_of(kind))
-    check_same_run(kept.settings, described, folder)
+    saved = load_checkpoint(folder / STATE, _state_of(kind))
+    check_same_run(saved.settings, described, folder)
     parts: dict[str, dict[str, torch.Tensor]] = {}
-    for name, tensor in kept.tensors.items():
+    for name, tensor in saved.tensors.items():
         part, _, rest = name.partition(".")
         parts.setdefault(part, {})[rest] = tensor
     run.network.load_state_dict(parts["network"])
@@ -107,45 +97,38 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
     for name, tensor in parts.get("optimiser", {}).items():
         number, _, rest = name.partition(".")
         moments.setdefault(int(number), {})[rest] = tensor
-    held = run.optimiser.state_dict()
-    run.optimiser.load_state_dict({"state": moments, "param_groups": held["param_groups"]})
-    run.step = int(kept.settings["step"])
-    run.seconds = float(kept.settings["seconds"])
-    run.history = list(kept.settings["history"])
-    run.recent = list(kept.settings["recent"])
+    groups = run.optimiser.state_dict()["param_groups"]
+    run.optimiser.load_state_dict({"state": moments, "param_groups": groups})
+    run.step = int(saved.settings["step"])
+    run.seconds = float(saved.settings["seconds"])
+    run.history = list(saved.settings["history"])
+    run.recent = list(saved.settings["recent"])
     try:
         load_checkpoint(folder / MODEL, kind)
     except (CheckpointError, FileNotFoundError):
-        card = {name: value for name, value in kept.settings.items() if name != "recent"}
+        card = {name: value for name, value in saved.settings.items() if name != "recent"}
         save_checkpoint(folder / MODEL, Checkpoint(kind, card, parts["average"]))
 
 
 def check_same_run(
-    kept: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
+    saved: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> None:
-    """Raise ``ValueError`` unless the run in a folder is the one that is described.
+    """Raise ``ValueError`` unless the saved settings of a run are as described.
 
-    Parameters
-    ----------
-    kept : mapping
-        Settings of its checkpoint.
-    described : mapping of mapping
-        What it should be: its parts ``network`` and ``training``, or one of them.
-    folder : Path
-        Where it is.
+    ``described`` contains the expected parts: ``network``, ``training`` or both.
     """
-    # A run that was kept before there was a setting ran with what is now the usual one.
-    usual = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
+    # A run saved before a setting existed used what is now the default.
+    defaults = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part, settings in described.items():
         for name, wanted in settings.items():
-            got = kept[part].get(name, usual[part].get(name))
-            # Checkpoints may come more often and the end later: no step is changed by it.
+            got = saved[part].get(name, defaults[part].get(name))
+            # These two do not change any step.
             if got != wanted and name not in ("steps", "checkpoint_every"):
-                known = f"{name} {got}, expected {wanted}"
-                if len(known) > _READABLE:
-                    known = f"another {name}, expected the same"
+                difference = f"{name} {got}, expected {wanted}"
+                if len(difference) > _READABLE:
+                    difference = f"another {name}, expected the same"
                 raise ValueError(
-                    f"out is {folder}, which holds a run with {known}; give it a folder of its own"
+                    f"out is {folder}, which contains a run with {difference}; use another folder"
                 )
 
 

@@ -1,4 +1,4 @@
-"""How a network is trained."""
+"""Settings of a training run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["TrainingSettings"]
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a network is trained: at a constant rate after a linear warm-up, halved where asked.
+    """Settings of a training run: constant learning rate after a linear warm-up.
 
     Parameters
     ----------
@@ -22,26 +22,26 @@ class TrainingSettings:
     batch : int
         Sequences per step.
     learning_rate : float
-        Of the optimiser.
+        Learning rate of the optimiser.
     warmup : int
-        Steps over which the rate rises from 0.
+        Steps over which the learning rate rises from 0.
     weight_decay : float
-        Of the optimiser.
+        Weight decay of the optimiser.
     ema : float
-        Decay of the moving average of the weights, which is what is kept and validated; 0: none.
+        Decay of the moving average of the weights, which is validated and saved; 0 for none.
     clip : float
-        Greatest norm of the gradient; ``inf``: none.
+        Maximum norm of the gradient; ``inf`` for none.
     checkpoint_every : int
-        Steps between two checkpoints, each with a validation loss.
+        Steps between checkpoints, each with a validation loss.
     seed : int
-        Of weights, batches and noise.
+        Seed of weights, batches and noise.
     optimiser : {"adamw", "adamax"}
-        Adam's kind.
+        AdamW or Adamax.
     halve_at : tuple of int
-        Steps after which the rate is halved.
+        Steps after which the learning rate is halved.
     patience : int
-        Checkpoints without a lower validation loss after which a run ends; the model is then that
-        of the lowest. 0: it takes all steps, and the model is the last.
+        Early stopping: number of checkpoints without a lower validation loss, after which the run
+        ends with the best model. 0 disables it; the last model is then saved.
 
     Raises
     ------
@@ -73,22 +73,19 @@ class TrainingSettings:
             check_count(name, getattr(self, name), least=0)
         check_positive("learning_rate", self.learning_rate)
         if not 0 <= self.ema < 1:
-            raise ValueError(f"ema must be a decay of at least 0 and below 1, got {self.ema}")
+            raise ValueError(f"ema must be at least 0 and below 1, got {self.ema}")
         if not self.clip > 0:
-            raise ValueError(f"clip must be a number above 0, or inf for none, got {self.clip}")
+            raise ValueError(f"clip must be above 0, or inf for none, got {self.clip}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(
                 f"weight_decay must be a finite number of at least 0, got {self.weight_decay}"
             )
 
     def rate(self, step: int) -> float:
-        """Return the learning rate of a step, which counts from 1."""
+        """Return the learning rate of a step, counted from 1."""
         halved = 0.5 ** sum(step > mark for mark in self.halve_at)
         return self.learning_rate * halved * min(1.0, step / max(1, self.warmup))
 
     def decay(self, step: int) -> float:
-        """Return the moving average's decay after a step: smaller at first, so that it catches up.
-
-        The rule is TensorFlow's, min(decay, (1 + k)/(10 + k)).
-        """
+        """Return the decay of the moving average: min(ema, (1 + k)/(10 + k)), as in TensorFlow."""
         return min(self.ema, (1 + step) / (10 + step))

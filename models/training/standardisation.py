@@ -1,4 +1,4 @@
-"""Mean and deviation of 2D data, by which they are standardised at a network's door."""
+"""Mean and standard deviation of 2D data, for standardised network inputs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ __all__ = ["Standards"]
 
 @dataclass(frozen=True, eq=False)
 class Standards:
-    """Mean and deviation of every joint's coordinates in the data, metres, (J, 2) each.
+    """Mean and standard deviation of the joints' coordinates, metres, (J, 2) each.
 
-    A coordinate that never varies, such as those of a root that pictures are centred on, has
-    deviation 0 and is given back as its mean.
+    A coordinate that never varies, such as that of a centred root, has deviation 0.
     """
 
     mean: np.ndarray
@@ -28,14 +27,12 @@ class Standards:
         check_finite("mean", self.mean)
         check_finite("deviation", self.deviation)
         if self.deviation.min() < 0:
-            raise ValueError(
-                f"deviation is {self.deviation.min():g} at its least, expected 0 or more"
-            )
+            raise ValueError(f"deviation must be at least 0, got {self.deviation.min():g}")
         if not (self.deviation > 0).any():
-            raise ValueError("deviation is 0 everywhere, expected keypoints that move")
+            raise ValueError("deviation must be above 0 for a coordinate, got 0 everywhere")
 
     @property
     def scale(self) -> float:
-        """Root mean square of the deviations that are not 0, metres."""
+        """Root mean square of the nonzero deviations, metres."""
         moving = self.deviation[self.deviation > 0]
         return float(np.sqrt((moving**2).mean()))

@@ -1,4 +1,4 @@
-"""Batches of 2D tracks for learning: random sub-sequences, varied, padded to one length."""
+"""Training batches of 2D tracks: random windows, augmented and padded to one length."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ __all__ = ["Augmentation", "Batch", "TrackBatches", "describe_tracks", "learning
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How tracks are varied (MAS, section 6.1; the authors' training).
+    """Data augmentation of tracks (MAS, section 6.1; the authors' training).
 
     Parameters
     ----------
     shortest : float
-        Least share of the window that a random sub-sequence keeps, above 0 and at most 1.
+        Minimum length of a random window, as a fraction of the full length; in (0, 1].
     scale : float
         Tracks are scaled by a factor from 1 − scale to 1 + scale.
     shift : float
-        Tracks are moved by up to this much, metres; 0 where the root is at the origin.
+        Tracks are translated by up to this distance, metres.
     mirror : bool
-        Mirror every other track, left and right joints exchanged.
+        Mirror every other track, with left and right joints exchanged.
 
     Raises
     ------
@@ -53,7 +53,7 @@ class Augmentation:
 
     @classmethod
     def none(cls) -> Augmentation:
-        """Return the augmentation that changes nothing."""
+        """Return no augmentation."""
         return cls(1.0, 0.0, 0.0, False)
 
 
@@ -61,44 +61,44 @@ class Batch(NamedTuple):
     """Tracks padded to one length."""
 
     keypoints: np.ndarray
-    """(B, L, J, 2) float32, metres; 0 where not seen or not there."""
+    """(B, L, J, 2) float32, metres; 0 where occluded or padded."""
     confidence: np.ndarray
-    """(B, L, J) float32: the tracks' own, 0 where it is below the threshold."""
+    """(B, L, J) float32; 0 where below the threshold."""
     valid: np.ndarray
-    """(B, L) bool: frames that are there and in which something is seen."""
+    """(B, L) bool: frames with a visible joint, not padding."""
     frames: np.ndarray
-    """(B, L): which of :meth:`TrackBatches.all_frames` it shows; -1 where not there."""
+    """(B, L): index into :meth:`TrackBatches.all_frames`; -1 for padding."""
     scale: np.ndarray
-    """(B,) float32: by which its tracks are scaled."""
+    """(B,) float32: scale factor of each track."""
 
     @property
     def seen(self) -> np.ndarray:
-        """(B, L, J) bool: joints whose confidence is not below the threshold."""
+        """(B, L, J) bool: joints with a confidence at or above the threshold."""
         return self.confidence > 0
 
 
 class TrackBatches:
     """Random windows of tracks.
 
-    A frame is as likely to be in one whichever track it is of; frames near a track's ends are in
-    fewer windows than those between.
+    Tracks are drawn in proportion to their length. Frames near the ends of a track are in fewer
+    windows than the others.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Of one skeleton and frame rate, metres, centred.
+        Tracks of one skeleton and frame rate: metres, centred.
     frames : int
         Length L of a window; shorter tracks are padded.
     threshold : float
-        Least confidence of a joint that counts.
+        Minimum confidence of a visible joint.
     augmentation : Augmentation
-        How windows are varied.
+        Augmentation of windows.
 
     Raises
     ------
     ValueError
-        If there is no track, they differ in skeleton or frame rate, none has a confident joint, or
-        a number is out of range.
+        If there is no track, tracks differ in skeleton or frame rate, none has a confident joint,
+        or a number is out of range.
     """
 
     def __init__(
@@ -124,25 +124,24 @@ class TrackBatches:
         self._seen = [confidence > 0 for confidence in self._confidence]
         if not any(seen.any() for seen in self._seen):
             raise ValueError(
-                f"tracks has no joint of confidence {threshold:g} or more, expected some to learn "
-                "from"
+                f"tracks must contain joints with a confidence of {threshold:g} or more, got none"
             )
         self._keypoints = [
             np.where(seen[..., None], track.keypoints, 0.0).astype(np.float32)
             for track, seen in zip(tracks, self._seen, strict=True)
         ]
-        # A draw shows no more frames of a long track than a window's, and all of a short one's.
+        # Windows per track: a short track is one window.
         lengths = np.array([track.frames for track in tracks])
         windows = lengths / np.minimum(lengths, frames)
         windows *= [seen.any() for seen in self._seen]
-        self._share = windows / windows.sum()
+        self._probability = windows / windows.sum()
         self._first = np.concatenate([[0], np.cumsum(lengths)])
         self._order = list(self.skeleton.mirrored_order)
         self.description = describe_tracks(tracks)
 
     @property
     def never_seen(self) -> tuple[str, ...]:
-        """Names of the joints that no window shows, nor a mirror image if there are."""
+        """Names of the joints that no window shows, including mirrored ones."""
         seen = np.any([track.any(axis=0) for track in self._seen], axis=0)
         if self.augmentation.mirror:
             seen = seen | seen[self._order]
@@ -151,51 +150,40 @@ class TrackBatches:
         )
 
     def check_all_seen(self) -> None:
-        """Refuse tracks that never show one of the joints: nothing would say where it is.
-
-        Raises
-        ------
-        ValueError
-            If there is such a joint.
-        """
+        """Raise ``ValueError`` if a joint is never visible: its position could not be learnt."""
         if unseen := self.never_seen:
             raise ValueError(
-                f"tracks never shows {', '.join(unseen)} with a confidence of {self.threshold:g} "
-                "or more, expected every joint to be seen somewhere; choose a skeleton without them"
+                f"tracks must show every joint with a confidence of {self.threshold:g} or more, "
+                f"never got {', '.join(unseen)}; choose a skeleton without them"
             )
 
     @property
     def standards(self) -> Standards:
-        """Mean and deviation of the joints that are seen, as windows have them: mirrored, moved.
+        """Mean and standard deviation of visible joints, including mirroring and translation.
 
-        The scale's part is left out: with the usual factors of .95 to 1.05 its deviation is 3 % of
-        a joint's mean, which makes the variance of walks that are filmed a seventh larger.
+        Scaling is left out. With the usual factors of .95 to 1.05 its deviation is 3 % of a joint's
+        mean, which increases the variance of projected walks by a seventh.
         """
-        points = np.concatenate(self._keypoints).astype(np.float64)
-        seen = np.concatenate(self._seen)
-        if self.augmentation.mirror:
-            points = np.concatenate([points, self._mirrored(points)])
-            seen = np.concatenate([seen, seen[:, self._order]])
+        points, seen = self.all_frames()
+        points = points.astype(np.float64)
         count = np.maximum(seen.sum(axis=0), 1)[:, None]
         mean = (points * seen[..., None]).sum(axis=0) / count
         squares = ((points - mean) ** 2 * seen[..., None]).sum(axis=0) / count
-        # Rounding leaves a root that pictures are centred on with a hair's breadth.
+        # Remove the rounding error of a centred root.
         squares = np.where(squares > 1e-12, squares, 0.0)
-        # A window is moved by U(-shift, shift) along each axis, whatever the track does.
+        # Windows are translated by U(-shift, shift) along each axis.
         return Standards(mean, np.sqrt(squares + self.augmentation.shift**2 / 3))
 
     def all_frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the keypoints, (F, J, 2), and what is seen, (F, J), of all frames of all tracks.
+        """Return keypoints (F, J, 2) and visibility (F, J) of all frames of all tracks.
 
-        Where windows are mirrored, the mirror images of all frames come after them.
+        With mirroring, the mirror images of all frames follow.
         """
         points, seen = np.concatenate(self._keypoints), np.concatenate(self._seen)
-        if not self.augmentation.mirror:
-            return points, seen
-        return (
-            np.concatenate([points, self._mirrored(points)]),
-            np.concatenate([seen, seen[:, self._order]]),
-        )
+        if self.augmentation.mirror:
+            points = np.concatenate([points, self._mirrored(points)])
+            seen = np.concatenate([seen, seen[:, self._order]])
+        return points, seen
 
     def draw(self, rng: np.random.Generator, n: int) -> Batch:
         """Return n random windows."""
@@ -208,18 +196,18 @@ class TrackBatches:
             np.full((n, self.frames), -1),
             np.ones(n, np.float32),
         )
-        for row, track in enumerate(rng.choice(len(self._share), n, p=self._share)):
+        for row, track in enumerate(rng.choice(len(self._probability), n, p=self._probability)):
             self._show(rng, int(track), batch, row)
         return batch
 
     def _show(self, rng: np.random.Generator, track: int, batch: Batch, row: int) -> None:
-        """Put a random window of a track into a row of a batch."""
+        """Write a random window of a track into a row of a batch."""
         keypoints, confidence = self._keypoints[track], self._confidence[track]
         longest = min(self.frames, len(keypoints))
         shortest = max(1, int(np.ceil(self.augmentation.shortest * longest)))
         length = int(rng.integers(shortest, longest + 1))
         start = int(rng.integers(0, len(keypoints) - length + 1))
-        # Attention needs a frame to look at; a pause in which nothing is seen is no motion.
+        # Attention requires at least one frame with a visible joint.
         while not confidence[start : start + length].any():
             start = int(rng.integers(0, len(keypoints) - length + 1))
         keypoints = keypoints[start : start + length]
@@ -249,18 +237,7 @@ def learning_and_held_out(
     threshold: float,
     augmentation: Augmentation,
 ) -> tuple[TrackBatches, TrackBatches]:
-    """Return batches to learn from and batches to watch learning by, which are not varied.
-
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Of one skeleton and frame rate, metres, centred.
-    validation : sequence of KeypointTrack
-        As ``tracks``, of clips that are not among theirs.
-    frames, threshold
-        As for :class:`TrackBatches`.
-    augmentation : Augmentation
-        How ``tracks`` are varied.
+    """Return training batches and, without augmentation, validation batches.
 
     Raises
     ------
@@ -270,16 +247,16 @@ def learning_and_held_out(
     batches = TrackBatches(tracks, frames, threshold, augmentation)
     held_out = TrackBatches(validation, frames, threshold, Augmentation.none())
     if held_out.skeleton != batches.skeleton:
-        raise ValueError("validation has another skeleton than tracks, expected the same")
+        raise ValueError("validation must have the same skeleton as tracks")
     if held_out.fps != batches.fps:
         raise ValueError(
-            f"validation is at {held_out.fps:g} frames per second, expected tracks' {batches.fps:g}"
+            f"validation must have the frame rate of tracks, {batches.fps:g}, got {held_out.fps:g}"
         )
     return batches, held_out
 
 
 def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
-    """Return how many tracks, frames and clips there are, the clips' names and a digest of all."""
+    """Return the numbers of tracks and frames, the names of clips and a digest of the data."""
     digest = hashlib.sha256()
     for track in tracks:
         digest.update(np.nan_to_num(track.keypoints, nan=0.0).tobytes())
@@ -300,11 +277,11 @@ def _check_alike(tracks: Sequence[KeypointTrack]) -> None:
     for track in tracks:
         if track.skeleton != first.skeleton:
             raise ValueError(
-                f"tracks has {track.name or 'one'} with other joints than "
-                f"{first.name or 'the first'}, expected one skeleton"
+                f"tracks must have one skeleton, {track.name or 'one'} differs from "
+                f"{first.name or 'the first'}"
             )
         if track.fps != first.fps:
             raise ValueError(
-                f"tracks has {track.name or 'one'} at {track.fps:g} frames per second and "
-                f"{first.name or 'the first'} at {first.fps:g}, expected one rate"
+                f"tracks must have one frame rate, got {track.fps:g} for {track.name or 'one'} and "
+                f"{first.fps:g} for {first.name or 'the first'}"
             )

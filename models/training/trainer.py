@@ -1,7 +1,7 @@
-"""One trainer for every network: resumes exactly, keeps what it has, says when it diverges.
+"""Trainer of all networks, with exact resumption and detection of divergence.
 
-The batch and the noise of step k are addressed by (seed, k), never drawn from a running state, so
-that a run which was stopped and goes on takes the same steps as one that was not.
+Batch and noise of step k are derived from (seed, k) rather than from a running state, so a run that
+was stopped and resumed takes the same steps as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ __all__ = [
 ]
 
 
-class Diverged(ValueError):  # noqa: N818 (what happened, in a word)
-    """A loss or gradient is not finite; the message names the last good checkpoint."""
+class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
+    """The loss or gradient is not finite; the message names the last good checkpoint."""
 
 
 class Trainee(Protocol):
-    """A network, and what it learns from.
+    """A network with its loss and data.
 
-    ``kind`` names its checkpoints; ``settings`` is JSON that rebuilds it and says what it learnt
-    from, so that a run cannot go on with other data.
+    ``kind`` names its checkpoints. ``settings`` is JSON data that rebuilds the network and
+    describes its data, so that a run is not resumed with other data.
     """
 
     kind: str
@@ -56,35 +56,35 @@ class Trainee(Protocol):
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
-        """Return the loss of a fresh batch; all random numbers but dropout come from ``rng``."""
+        """Return the loss of a fresh batch; all random numbers except dropout come from ``rng``."""
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on data that is not learnt from; the same call gives the same number."""
+        """Return the loss on held-out data; deterministic."""
 
 
 @runtime_checkable
 class Anneals(Protocol):
-    """A trainee whose loss changes over a run."""
+    """A trainee with a loss that changes during the run."""
 
     def anneal(self, step: int) -> None:
-        """Be at a step, counted from 1; called before its loss is asked for."""
+        """Set the current step, counted from 1; called before each training loss."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingResult:
-    """What a run left.
+    """Result of a training run.
 
     Parameters
     ----------
     model : Path
-        The network's checkpoint, with the moving average of the weights.
+        Checkpoint of the network, with the moving average of the weights.
     history : list of dict
-        Per checkpoint: step, loss (mean since the last), validation_loss, seconds.
+        Per checkpoint: step, loss (mean since the last one), validation_loss, seconds.
     kept : dict
-        The checkpoint's row whose weights the model has: with ``patience`` the one of the lowest
-        validation loss, else the last.
+        Entry of ``history`` whose weights were saved: that of the lowest validation loss with
+        ``patience``, else the last.
     steps : int
-        Steps that this call took: 0 where the run had ended before.
+        Steps taken by this call, 0 if the run was already finished.
     """
 
     model: Path
@@ -94,17 +94,11 @@ class TrainingResult:
 
 
 def check_device(device: str) -> torch.device:
-    """Return the device ``cpu`` or ``cuda``.
-
-    Raises
-    ------
-    ValueError
-        If it is another one, or there is no CUDA.
-    """
+    """Return the device; raise ``ValueError`` unless it is ``cpu`` or an available ``cuda``."""
     if device not in ("cpu", "cuda"):
         raise ValueError(f"device must be cpu or cuda, got {device!r}")
     if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device is 'cuda', but this machine has no CUDA; expected 'cpu'")
+        raise ValueError("device must be cpu, got cuda, which is not available")
     return torch.device(device)
 
 
@@ -116,68 +110,67 @@ def train(
     device: str = "cpu",
     progress: bool = True,
 ) -> TrainingResult:
-    """Train a network; the same call goes on where an earlier one was stopped.
+    """Train a network; the same call resumes an interrupted run.
 
-    Networks compute in mixed precision (bfloat16) on CUDA, in single precision on the CPU.
+    Networks compute in mixed precision (bfloat16) on CUDA and in single precision on the CPU.
 
     Parameters
     ----------
     trainee : Trainee
-        The network and its data.
+        Network, loss and data.
     settings : TrainingSettings
-        How to train. A finished run goes on with more ``steps``, all else equal.
+        Training settings. A finished run is continued if only ``steps`` is larger.
     out : str or Path
-        Folder for ``model.safetensors``, ``state.safetensors`` (to go on from) and
-        ``losses.csv``; made where it is missing. A model that is missing or damaged beside a
-        state is written anew from it.
+        Folder of ``model.safetensors``, ``state.safetensors`` (to resume from) and ``losses.csv``;
+        created if missing. A missing or damaged model is restored from the state.
     device : str
         ``cpu`` or ``cuda``.
     progress : bool
-        Show a bar with loss and speed.
+        Whether to show a progress bar.
 
     Raises
     ------
     Diverged
-        If a loss or gradient is not finite; the last good checkpoint stays.
+        If the loss or gradient is not finite; the last good checkpoint remains.
     ValueError
-        If ``out`` holds a run with other settings or data, or the device is not there.
+        If ``out`` contains a run with other settings or data, or the device is not available.
     KeyboardInterrupt
-        At Ctrl-C or SIGTERM, once the step is finished and kept; the message says where.
+        On Ctrl-C or SIGTERM, after the current step has been finished and saved.
     """
-    place = check_device(device)
+    target = check_device(device)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    run = _start(trainee, settings, place)
+    run = _start(trainee, settings, target)
     described = {"network": dict(trainee.settings), "training": asdict(settings)}
-    # As JSON gives them back.
+    # As JSON represents them.
     described["training"]["halve_at"] = list(settings.halve_at)
     if math.isinf(settings.clip):
         described["training"]["clip"] = None
     if (folder / STATE).exists():
         resume_run(run, folder, trainee.kind, described)
     with (
-        _asked_to_stop() as stop,
+        _stop_requested() as stop,
         progress_bar(settings.steps, f"train {trainee.kind}", progress) as bar,
     ):
         before = run.step
         bar.update(min(before, settings.steps))
-        while run.step < settings.steps and not _waited_enough(run, settings):
-            begun = time.perf_counter()
-            loss = _take_step(run, trainee, settings, place, folder)
-            run.seconds += time.perf_counter() - begun
+        while run.step < settings.steps and not _out_of_patience(run, settings):
+            start = time.perf_counter()
+            loss = _take_step(run, trainee, settings, target, folder)
+            run.seconds += time.perf_counter() - start
             run.recent.append(loss)
             bar.update(1)
             if progress and run.step % 20 == 0:
                 bar.set_postfix(loss=f"{np.mean(run.recent[-100:]):.4f}", refresh=False)
             if run.step % settings.checkpoint_every == 0 or run.step == settings.steps:
-                _validate(run, trainee, place, folder)
+                _validate(run, trainee, target, folder)
                 best = settings.patience == 0 or _since_best(run) == 0
                 keep_run(run, trainee.kind, described, folder, model=best)
             if stop():
                 keep_run(run, trainee.kind, described, folder, model=settings.patience == 0)
                 raise KeyboardInterrupt(
-                    f"stopped at step {run.step} of {settings.steps}, which is kept in {folder}; "
-                    "the same command goes on from there"
+                    f"stopped at step {run.step} of {settings.steps}, saved in {folder}; run the "
+                    "same command to resume"
                 )
     kept = run.history[-1 - _since_best(run)] if settings.patience else run.history[-1]
     return TrainingResult(folder / MODEL, run.history, kept, run.step - before)
@@ -186,10 +179,10 @@ def train(
 def _start(trainee: Trainee, settings: TrainingSettings, device: torch.device) -> Run:
     network = trainee.network.to(device)
     average = copy.deepcopy(network).requires_grad_(False)
-    kinds = {"adamw": partial(torch.optim.AdamW, fused=True), "adamax": torch.optim.Adamax}
-    learnt = [weights for weights in network.parameters() if weights.requires_grad]
-    optimiser = kinds[settings.optimiser](
-        learnt, lr=settings.learning_rate, weight_decay=settings.weight_decay
+    optimisers = {"adamw": partial(torch.optim.AdamW, fused=True), "adamax": torch.optim.Adamax}
+    trained = [weights for weights in network.parameters() if weights.requires_grad]
+    optimiser = optimisers[settings.optimiser](
+        trained, lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     return Run(network, average, optimiser)
 
@@ -215,10 +208,8 @@ def _take_step(
     size = nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
     value = float(loss.detach())
     if not (math.isfinite(value) and math.isfinite(float(size))):
-        what = f"the loss is {value:g}"
-        if math.isfinite(value):
-            what = "the gradient is not finite"
-        raise Diverged(_diverged(step, what, folder))
+        what = "the gradient is not finite" if math.isfinite(value) else f"the loss is {value:g}"
+        raise _diverged(step, what, folder)
     run.optimiser.step()
     decay = settings.decay(step) if settings.ema else 0.0
     with torch.no_grad():
@@ -236,16 +227,18 @@ def _since_best(run: Run) -> int:
     return len(losses) - 1 - int(np.argmin(losses))
 
 
-def _waited_enough(run: Run, settings: TrainingSettings) -> bool:
+def _out_of_patience(run: Run, settings: TrainingSettings) -> bool:
     return 0 < settings.patience <= len(run.history) and _since_best(run) >= settings.patience
 
 
-def _diverged(step: int, what: str, folder: Path) -> str:
-    kept, where = "there is no checkpoint yet", ""
+def _diverged(step: int, what: str, folder: Path) -> Diverged:
+    last, where = "there is no checkpoint yet", ""
     if (folder / STATE).exists():
-        # A folder holds a run of one rate.
-        kept, where = f"the last good checkpoint is {folder / MODEL}", " in another folder"
-    return f"training diverged at step {step}: {what}; {kept}; try a smaller learning_rate{where}"
+        # A run in a folder cannot change its learning rate.
+        last, where = f"the last good checkpoint is {folder / MODEL}", " in another folder"
+    return Diverged(
+        f"training diverged at step {step}: {what}; {last}; try a smaller learning_rate{where}"
+    )
 
 
 def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) -> None:
@@ -253,10 +246,10 @@ def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) ->
     with torch.no_grad():
         loss = trainee.validation_loss(run.average, device)
     if not math.isfinite(loss):
-        raise Diverged(_diverged(run.step, f"the validation loss is {loss:g}", folder))
+        raise _diverged(run.step, f"the validation loss is {loss:g}", folder)
     for network in (run.network, run.average):
         if not all(torch.isfinite(weights).all() for weights in network.parameters()):
-            raise Diverged(_diverged(run.step, "a weight is not finite", folder))
+            raise _diverged(run.step, "a weight is not finite", folder)
     row = {"step": run.step, "loss": float(np.mean(run.recent)), "validation_loss": loss}
     run.history.append(row | {"seconds": run.seconds})
     run.recent.clear()
@@ -264,7 +257,7 @@ def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) ->
 
 @contextmanager
 def _dropout_of(seed: int, step: int, device: torch.device) -> Iterator[None]:
-    """Dropout knows no generator but torch's own: lend it one of this step, and put it back."""
+    """Seed torch's global generator, which dropout uses, for one step; then restore it."""
     devices = [torch.cuda.current_device()] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seeds.integer(seed, "dropout", step))
@@ -272,21 +265,21 @@ def _dropout_of(seed: int, step: int, device: torch.device) -> Iterator[None]:
 
 
 @contextmanager
-def _asked_to_stop() -> Iterator[Any]:
-    """Yield a function: whether Ctrl-C or SIGTERM came. A second one stops at once."""
-    asked: list[int] = []
+def _stop_requested() -> Iterator[Any]:
+    """Yield a function that tells whether Ctrl-C or SIGTERM arrived; a second one raises."""
+    received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
 
     def note(number: int, frame: Any) -> None:
-        if asked:
-            raise KeyboardInterrupt("stopped within a step; the last checkpoint is kept")
-        asked.append(number)
+        if received:
+            raise KeyboardInterrupt("stopped within a step; the last checkpoint remains")
+        received.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""The motion VAE learnt from 2D tracks."""
+"""Motion VAE prior learnt from 2D tracks."""
 
 import lazy_loader
 

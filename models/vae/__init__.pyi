@@ -1,42 +1,21 @@
-from .inference import SeenLatent as SeenLatent, VAEEncoder as VAEEncoder
-from .layers import (
-    FRAMES_AT_ONCE as FRAMES_AT_ONCE,
-    BoneDecoder as BoneDecoder,
-    FrameEncoder as FrameEncoder,
-    ImageFeatures as ImageFeatures,
-    Readout as Readout,
-    TransformerLayer as TransformerLayer,
-    body_size as body_size,
-    check_frames as check_frames,
-    mixed_precision as mixed_precision,
-)
+from .inference import VAEEncoder as VAEEncoder
 from .losses import (
-    best_guess as best_guess,
-    guess_terms as guess_terms,
-    pictured as pictured,
-    reconstruction as reconstruction,
-    roughness as roughness,
+    best_hypothesis as best_hypothesis,
+    hypothesis_losses as hypothesis_losses,
+    project_to_image as project_to_image,
     weighted_sum as weighted_sum,
 )
-from .model import (
-    KIND as KIND,
-    MotionVAEModel as MotionVAEModel,
-    ReadModel as ReadModel,
-    description_of as description_of,
-    read_model as read_model,
-)
+from .model import MotionVAEModel as MotionVAEModel
 from .motion_vae import MotionVAE as MotionVAE
-from .network import (
-    FrameMap as FrameMap,
-    MotionVAENetwork as MotionVAENetwork,
-    TimeDecoder as TimeDecoder,
-    TimeEncoder as TimeEncoder,
+from .network import MotionVAENetwork as MotionVAENetwork
+from .pose_network import PoseHypotheses as PoseHypotheses, PoseNetwork as PoseNetwork
+from .rigid_paths import (
+    BodyEstimate as BodyEstimate,
+    RigidPath as RigidPath,
+    estimate_body as estimate_body,
 )
-from .observed_views import ObservedView as ObservedView, picture_of as picture_of
-from .pose_network import PoseGuesses as PoseGuesses, PoseNetwork as PoseNetwork
-from .rigid_paths import RigidPath as RigidPath, SeenBody as SeenBody, see_body as see_body
-from .settings import USUAL_THRESHOLD as USUAL_THRESHOLD, MotionVAESettings as MotionVAESettings
-from .teacher_forcing import TeacherForcedPoses as TeacherForcedPoses, scaled as scaled
+from .settings import MotionVAESettings as MotionVAESettings
+from .teacher_forcing import TeacherForcedPoses as TeacherForcedPoses
 from .training import (
     MotionVAETrainee as MotionVAETrainee,
     PoseTrainee as PoseTrainee,
@@ -47,6 +26,6 @@ from .transition_latents import (
     long_motion as long_motion,
 )
 from .view_hypotheses import (
-    JudgedHypotheses as JudgedHypotheses,
-    judge_hypotheses as judge_hypotheses,
+    HypothesisAccuracy as HypothesisAccuracy,
+    evaluate_hypotheses as evaluate_hypotheses,
 )

@@ -1,4 +1,4 @@
-"""`VAEEncoder`: a motion VAE's encoder as the network that infers a motion from keypoints."""
+"""`VAEEncoder`: amortised inference of motion from keypoints with the encoder of a motion VAE."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import torch
 
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.model import MotionVAEModel
-from probmotion.models.vae.observed_views import picture_of
+from probmotion.models.vae.observed_views import observed_view
 from probmotion.models.vae.rigid_paths import RigidPath
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.protocols import Likelihood
 from probmotion.seeds import RandomNumbers
 
-__all__ = ["SeenLatent", "VAEEncoder"]
+__all__ = ["EncodedLatent", "VAEEncoder"]
 
 _AVERAGED = 64
 
 
 @runtime_checkable
 class EncodesKeypoints(Protocol):
-    """What the encoder reads of its :class:`~probmotion.models.vae.motion_vae.MotionVAE`."""
+    """Interface of :class:`~probmotion.models.vae.motion_vae.MotionVAE` used by the encoder."""
 
     skeleton: Skeleton
     frames: int
@@ -34,26 +34,24 @@ class EncodesKeypoints(Protocol):
     model: MotionVAEModel
     rigid: RigidPath
 
-    def motion(self, theta: Any) -> Any:
-        """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
+    def motion(self, theta: Any) -> Any: ...
 
-    def row_by_row(self, theta: np.ndarray) -> np.ndarray:
-        """Return the positions of each row of θ, decoded alone: the same bits in any batch."""
+    def row_by_row(self, theta: np.ndarray) -> np.ndarray: ...
 
 
 class VAEEncoder:
-    """The encoder q(z | keypoints) of a motion VAE; it has no weights but the prior's.
+    """Encoder q(z | keypoints) of a motion VAE, for keypoints of one view.
 
-    It reads keypoints of one view. The prior's rigid path says where the subject is: see
+    It has no weights of its own. The rigid path of the prior gives the subject's position; see
     :meth:`~probmotion.models.vae.motion_vae.MotionVAE.placed_by`.
     """
 
     def __repr__(self) -> str:
-        """What tables and saved draws say of it."""
+        """Summary for tables and stored draws."""
         return f"{type(self).__name__}()"
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether the network can read some evidence: keypoints of one view."""
+        """Whether the observations are keypoints of one view."""
         return isinstance(likelihood, Keypoints2D) and likelihood.cameras.n_views == 1
 
     def on(
@@ -63,48 +61,30 @@ class VAEEncoder:
         *,
         degrees_of_freedom: float | None = None,
         overlap: int = 0,
-    ) -> SeenLatent:
+    ) -> EncodedLatent:
         """Return the inference of one track.
 
-        Parameters
-        ----------
-        prior : MotionVAE
-            The posterior's prior.
-        likelihood : Keypoints2D
-            Keypoints of one view.
-        degrees_of_freedom : float, optional
-            Of the noise that is supposed in a fit; ``inf`` for Gaussian. By default the evidence's
-            own.
-        overlap : int
-            Not used: a motion of the prior is one window.
+        ``degrees_of_freedom`` overrides those of the likelihood (``inf``: Gaussian noise);
+        ``overlap`` is ignored, as a motion is one window.
 
         Raises
         ------
         ValueError
-            If the prior is no motion VAE, the evidence cannot be read, a whole frame of it is
-            hidden, or the prior's rigid path is beside or behind the camera.
+            If the prior is not a motion VAE, the observations are unsuitable, a whole frame is
+            occluded, or the rigid path is beside or behind the camera.
         """
         if not isinstance(prior, EncodesKeypoints):
-            raise ValueError(
-                f"prior must be the MotionVAE whose encoder this is, got {type(prior).__name__}"
-            )
+            raise ValueError(f"prior must be a MotionVAE, got {type(prior).__name__}")
         if degrees_of_freedom is not None:
             freedom = None if math.isinf(degrees_of_freedom) else degrees_of_freedom
             likelihood = replace(likelihood, degrees_of_freedom=freedom)
-        return SeenLatent(prior, likelihood, *_encoded(prior, likelihood))
+        return EncodedLatent(prior, likelihood, *_encoded(prior, likelihood))
 
 
-class SeenLatent:
-    """q(z) = N(μ, diag σ²) of one track, as the encoder answers or fitted to it alone.
+class EncodedLatent:
+    """q(z) = N(μ, diag σ²) of one track, from the encoder or optimised for the track.
 
-    Parameters
-    ----------
-    prior : MotionVAE
-        Decodes.
-    likelihood : Keypoints2D
-        What was seen.
-    mean, log_deviation : Tensor, (Z,)
-        μ and log σ, double precision.
+    ``mean`` and ``log_deviation`` are μ and log σ, (Z,), in double precision.
     """
 
     def __init__(
@@ -120,7 +100,7 @@ class SeenLatent:
         self.log_deviation = log_deviation.detach().clone()
 
     def parameters(self) -> list[torch.Tensor]:
-        """Return μ and log σ, from now on with gradients; the networks stay as they are."""
+        """Enable gradients and return μ and log σ; the networks stay fixed."""
         return [self.mean.requires_grad_(True), self.log_deviation.requires_grad_(True)]
 
     def loss(
@@ -128,14 +108,7 @@ class SeenLatent:
     ) -> torch.Tensor:
         """Return minus the evidence lower bound at one draw: −log p(y | X(z)) + w KL(q ‖ N(0, I)).
 
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Of the draw.
-        initial_entropy : bool
-            Not used: one code is of all frames, there is no first pose apart.
-        latent_weight : float
-            w, of the divergence.
+        ``latent_weight`` is w; ``initial_entropy`` is ignored: there is no separate first pose.
         """
         noise = torch.as_tensor(rng.standard_normal(self.prior.dim))
         z = self.mean + torch.exp(self.log_deviation) * noise
@@ -154,9 +127,9 @@ class SeenLatent:
         return self.prior.row_by_row(theta), theta
 
     def predict(self, rng: np.random.Generator, *, average: bool = True) -> np.ndarray:
-        """Return the motion predicted, (L, J, 3), metres: the mean over draws, or that of μ.
+        """Return the predicted motion, (L, J, 3), metres: the mean over draws, or the motion at μ.
 
-        A mean of motions has shorter bones where they disagree; that of μ has the body's.
+        Averaging shortens bones where draws disagree; the motion at μ has the body's lengths.
         """
         if average:
             return self.draw(rng, _AVERAGED)[0].mean(axis=0)
@@ -164,17 +137,16 @@ class SeenLatent:
 
 
 def _encoded(prior: EncodesKeypoints, likelihood: Keypoints2D) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return μ and log σ of q(z | keypoints), (Z,), double precision."""
+    """Return μ and log σ of q(z | keypoints), (Z,), in double precision."""
     camera = likelihood.cameras
     distance = None
     if not camera.orthographic:
-        # The root's own distance, on average over frames, as in the pictures that it learnt from.
+        # Training tracks are scaled to the mean root distance.
         distance = float(camera.depth(prior.rigid.translations[:, None]).mean())
-    picture = picture_of(likelihood, prior.skeleton, distance=distance)
-    if picture.keypoints.shape[0] != prior.frames:
+    view = observed_view(likelihood, prior.skeleton, distance=distance)
+    if view.keypoints.shape[0] != prior.frames:
         raise ValueError(
-            f"likelihood has {picture.keypoints.shape[0]} frames, expected the prior's "
-            f"{prior.frames}"
+            f"likelihood must have the prior's {prior.frames} frames, got {view.keypoints.shape[0]}"
         )
 
     def tensor(values: np.ndarray) -> torch.Tensor:
@@ -182,8 +154,8 @@ def _encoded(prior: EncodesKeypoints, likelihood: Keypoints2D) -> tuple[torch.Te
 
     with torch.no_grad():
         mean, log_variance = prior.model.vae.encode(
-            tensor(picture.keypoints)[None],
-            tensor(picture.confidence)[None],
+            tensor(view.keypoints)[None],
+            tensor(view.confidence)[None],
             tensor(prior.body.rest_positions),
         )
     return mean[0].double(), 0.5 * log_variance[0].double()

@@ -1,4 +1,4 @@
-"""Both networks of a motion VAE, and what a checkpoint holds of them."""
+"""Checkpointed model of the motion VAE: both networks, settings and body."""
 
 from __future__ import annotations
 
@@ -23,15 +23,7 @@ KIND = "motion-vae"
 
 
 class MotionVAEModel(nn.Module):
-    """Both networks of a motion VAE: what a body does, and where it is.
-
-    Parameters
-    ----------
-    vae : MotionVAENetwork
-        Encoder and decoder of the latent code.
-    pose : PoseNetwork
-        Of the rigid pose.
-    """
+    """Motion VAE network and pose network."""
 
     def __init__(self, vae: MotionVAENetwork, pose: PoseNetwork) -> None:
         super().__init__()
@@ -40,7 +32,7 @@ class MotionVAEModel(nn.Module):
 
     @classmethod
     def of(cls, settings: MotionVAESettings, body: ArticulatedBody) -> MotionVAEModel:
-        """Return networks of a size for a body, with fresh weights."""
+        """Return randomly initialised networks for a body."""
         joints, bones = body.skeleton.n_joints, len(body.bones)
         return cls(
             MotionVAENetwork(settings, joints, bones),
@@ -50,21 +42,7 @@ class MotionVAEModel(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class ReadModel:
-    """What :func:`read_model` finds in a checkpoint.
-
-    Parameters
-    ----------
-    model : MotionVAEModel
-        With its weights.
-    settings : MotionVAESettings
-        Its size.
-    body : ArticulatedBody
-        What moves.
-    fps : float
-        Frames per second.
-    card : mapping
-        What is known of its training.
-    """
+    """Contents of a checkpoint; ``fps`` in frames per second, ``card``: training record."""
 
     model: MotionVAEModel
     settings: MotionVAESettings
@@ -74,31 +52,33 @@ class ReadModel:
 
 
 def read_model(source: str | Path) -> ReadModel:
-    """Return the networks of a checkpoint: a file, a run's folder or a name in the package.
+    """Load the networks of a checkpoint: a file, the folder of a run or a shipped name.
 
     Raises
     ------
     CheckpointError
-        If the file is damaged, of another version or no motion VAE.
+        If the file is damaged or not a motion VAE of this version.
     FileNotFoundError
-        If there is no such file and no such name.
+        If there is no such file or name.
     """
     checkpoint = load_checkpoint(source, KIND)
     try:
-        kept = checkpoint.settings["network"]
-        settings = MotionVAESettings(**kept["size"])
-        skeleton = Skeleton(kept["joint_names"], kept["parents"])
-        body = ArticulatedBody(skeleton, np.array(kept["rest"], dtype=np.float64))
+        stored = checkpoint.settings["network"]
+        settings = MotionVAESettings(**stored["size"])
+        skeleton = Skeleton(stored["joint_names"], stored["parents"])
+        body = ArticulatedBody(skeleton, np.array(stored["rest"], dtype=np.float64))
         model = MotionVAEModel.of(settings, body)
-        fps = kept["fps"]
+        fps = stored["fps"]
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{source} has settings that are no motion VAE's: {error}") from error
+        raise CheckpointError(
+            f"{source} does not contain valid motion VAE settings: {error}"
+        ) from error
     load_weights(model, checkpoint.tensors)
     return ReadModel(model, settings, body, fps, checkpoint.settings)
 
 
 def description_of(size: MotionVAESettings, body: ArticulatedBody, fps: float) -> dict[str, Any]:
-    """Return what a checkpoint says of a motion VAE, as JSON: :func:`read_model` reads it."""
+    """Return the checkpoint settings of a motion VAE, JSON-compatible."""
     return {
         "size": asdict(size),
         "joint_names": list(body.skeleton.joint_names),

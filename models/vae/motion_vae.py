@@ -1,7 +1,7 @@
 """`MotionVAE`: a prior over articulated motion with one latent code per sequence (Ponymation).
 
-z ~ N(0, I); bones' rotations ξ = D(z); joints X = FK(ξ). All was learnt from 2D tracks. The rigid
-pose, where the body is and how it is turned, is not in the code: it is a path beside it.
+z ~ N(0, I); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. The rigid path, the
+position and orientation of the body, is not part of the code and is given separately.
 """
 
 from __future__ import annotations
@@ -21,50 +21,47 @@ from probmotion.models.latent.row_decoding import decode_rows
 from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.models.training.checkpoints import Checkpoint, save_checkpoint
 from probmotion.models.vae.inference import VAEEncoder
-from probmotion.models.vae.model import KIND, MotionVAEModel, description_of, read_model
+from probmotion.models.vae.model import KIND, MotionVAEModel, read_model
 from probmotion.models.vae.network import MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseNetwork
-from probmotion.models.vae.rigid_paths import RigidPath, see_body
+from probmotion.models.vae.rigid_paths import RigidPath, estimate_body
 from probmotion.models.vae.settings import MotionVAESettings
-from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.protocols import InferenceNetwork, Likelihood
 from probmotion.validation import check_finite, check_positive, check_shape
 
-__all__ = ["KIND", "MotionVAE", "MotionVAEModel", "description_of"]
+__all__ = ["MotionVAE"]
 
 _ROWS = 64
 
 
 class MotionVAE(StandardNormalPrior):
-    """Motions of an articulated body, as learnt from 2D tracks alone.
+    """Motions of an articulated body, learnt from 2D tracks.
 
-    θ is the latent code z, all of it N(0, 1). The rigid path is given: by default the body stands
-    at the origin, upright, and looks along +Z, which will do where there is no evidence.
-    Evidence is of a body that was placed: with keypoints of a known camera, :meth:`placed_by` puts
-    it where the pose network sees it.
+    θ is the latent code z ~ N(0, I). The rigid path is fixed: by default the body is upright at the
+    origin and faces +Z, which suffices without observations. :meth:`placed_by` estimates it from
+    keypoints of a known camera.
 
     Parameters
     ----------
     network : MotionVAENetwork
-        The trained encoder and decoder.
+        Trained encoder and decoder.
     pose_network : PoseNetwork
-        The trained network of rigid poses.
+        Trained network of rigid poses.
     settings : MotionVAESettings
         Their size.
     body : ArticulatedBody
-        The skeleton, its rest pose and what its joints can do.
+        Skeleton, rest pose and joint ranges.
     fps : float
         Frames per second.
     rigid : RigidPath, optional
-        Where the body is, one pose per frame; see above.
+        Root pose per frame.
     log_lengths : ndarray, (G,), optional
-        Logarithms of bones' lengths relative to the rest pose's, one number for a bone and its
-        mirror image; 0 by default.
+        Log bone lengths relative to the rest pose, shared by mirrored bones; 0 by default.
     card : mapping, optional
-        What is known of its training.
+        Training record.
     inference_network : InferenceNetwork, optional
-        What infers motion in this prior; the prior's own encoder by default.
+        Network for amortised inference; the prior's encoder by default.
 
     Raises
     ------
@@ -73,10 +70,10 @@ class MotionVAE(StandardNormalPrior):
     """
 
     stand_ins: ClassVar[Mapping[str, str]] = {
-        "Denoises2D": "probmotion.models.diffusion.projected_denoiser.denoiser_of makes a prior of "
-        "its pictures that is"
+        "Denoises2D": "probmotion.models.diffusion.projected_denoiser.denoiser_of trains a 2D "
+        "prior on its projections"
     }
-    """How to get what the prior lacks, as samplers that need it say when they refuse."""
+    """Alternatives to unsupported protocols, for error messages of samplers."""
 
     def __init__(
         self,
@@ -99,76 +96,61 @@ class MotionVAE(StandardNormalPrior):
         self._placed = rigid is not None
         if self.rigid.frames != settings.frames:
             raise ValueError(
-                f"rigid has {self.rigid.frames} frames, expected {settings.frames}, as many as a "
-                "code's motion"
+                f"rigid must have the prior's {settings.frames} frames, got {self.rigid.frames}"
             )
         self.log_lengths = np.zeros(body.n_groups) if log_lengths is None else log_lengths
         check_shape("log_lengths", self.log_lengths, (body.n_groups,))
         check_finite("log_lengths", self.log_lengths)
         self.inference_network = VAEEncoder() if inference_network is None else inference_network
-        self._fps = float(fps)
+        self.skeleton, self.frames, self.fps = body.skeleton, settings.frames, float(fps)
         self.model = MotionVAEModel(network, pose_network).eval().requires_grad_(False)
 
     @classmethod
     def load(cls, source: str | Path, **options: Any) -> MotionVAE:
-        """Return a trained prior.
+        """Load a trained prior.
 
         Parameters
         ----------
         source : str or Path
-            A checkpoint's file, the folder of a training run, or the name of a prior that comes
-            with the package.
+            Checkpoint file, folder of a training run, or name of a shipped prior.
         **options
-            ``rigid``, ``log_lengths`` and ``inference_network``, as above.
+            ``rigid``, ``log_lengths`` and ``inference_network`` of :class:`MotionVAE`.
 
         Raises
         ------
         CheckpointError
-            If the file is damaged, of another version or no motion VAE.
+            If the file is damaged or not a motion VAE of this version.
         FileNotFoundError
-            If there is no such file and no such name.
+            If there is no such file or name.
         """
-        found = read_model(source)
+        result = read_model(source)
         return cls(
-            found.model.vae,
-            found.model.pose,
-            found.settings,
-            found.body,
-            found.fps,
-            card=found.card,
+            result.model.vae,
+            result.model.pose,
+            result.settings,
+            result.body,
+            result.fps,
+            card=result.card,
             **options,
         )
 
     def save(self, path: str | Path, *, half: bool = False) -> None:
-        """Write the prior as a checkpoint, which :meth:`load` reads; ``half`` precision if asked.
+        """Save the prior as a checkpoint for :meth:`load`, optionally in half precision.
 
-        The path it is placed on is not in it.
-
-        Raises
-        ------
-        ValueError
-            If the prior has no card to rebuild it by: only trained ones have.
-        OSError
-            If the file cannot be written.
+        The rigid path is not stored. Raises ``ValueError`` if there is no training record.
         """
         if "network" not in self.card:
-            raise ValueError("the prior has no card, expected one that was trained or loaded")
+            raise ValueError("prior must have a training record to be saved; train or load it")
         save_checkpoint(path, Checkpoint(KIND, self.card, self.model.state_dict()), half=half)
 
     def placed(self, rigid: RigidPath, log_lengths: np.ndarray | None = None) -> MotionVAE:
-        """Return the same prior on another rigid path, and with other bones where they are given.
-
-        Raises
-        ------
-        ValueError
-            If the path is not as long as the prior's motions.
-        """
+        """Return the prior on another rigid path and, if given, with other log bone lengths."""
         return MotionVAE(
             self.model.vae,
             self.model.pose,
             self.settings,
             self.body,
-            self._fps,
+            self.fps,
             rigid=rigid,
             log_lengths=self.log_lengths if log_lengths is None else log_lengths,
             card=self.card,
@@ -176,61 +158,41 @@ class MotionVAE(StandardNormalPrior):
         )
 
     def placed_by(self, likelihood: Likelihood) -> MotionVAE:
-        """Return the same prior where its pose network sees the subject in keypoints of one view.
+        """Return the prior on the rigid path that its pose network estimates from one view.
 
-        The path, and the body's bone lengths, are those of the best view hypothesis
-        (:func:`~probmotion.models.vae.rigid_paths.see_body`); the bones' rotations stay the code's.
+        Path and bone lengths are those of the best view hypothesis
+        (:func:`~probmotion.models.vae.rigid_paths.estimate_body`); z sets the bone rotations.
 
         Raises
         ------
         ValueError
-            If the evidence is no keypoints of one view, of another number of frames, another frame
-            rate or other joints, or a whole frame of it is hidden.
+            If the likelihood is not keypoints of one view with matching frames, frame rate and
+            joints, or a whole frame is occluded.
         """
         if not isinstance(likelihood, Keypoints2D):
-            raise ValueError(
-                f"likelihood is {type(likelihood).__name__}, expected Keypoints2D, which the pose "
-                "network sees"
-            )
+            raise ValueError(f"likelihood must be Keypoints2D, got {type(likelihood).__name__}")
         if likelihood.frames != self.frames:
             raise ValueError(
-                f"likelihood has {likelihood.frames} frames, expected the prior's {self.frames}"
+                f"likelihood must have the prior's {self.frames} frames, got {likelihood.frames}"
             )
         fps = likelihood.fps
         if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
             raise ValueError(
-                f"likelihood is at {fps:g} frames per second, expected the prior's {self.fps:g}"
+                f"likelihood must have the prior's {self.fps:g} frames per second, got {fps:g}"
             )
-        seen = see_body(self.model.pose, self.settings, self.body, likelihood)
-        return self.placed(seen.path, seen.log_lengths)
+        estimate = estimate_body(self.model.pose, self.settings, self.body, likelihood)
+        return self.placed(estimate.path, estimate.log_lengths)
 
     def check_observations(self, likelihood: Likelihood) -> None:
-        """Raise ``ValueError`` if no one has said where the body is that the evidence is of.
+        """Raise ``ValueError`` if the rigid path was not set.
 
-        No code can move or turn the body: of one that stands elsewhere, codes would be bent to
-        explain where it is.
+        Codes cannot move or turn the body, so observations of a body elsewhere would distort them.
         """
         if not self._placed:
             raise ValueError(
-                "prior has a body that no one has placed: it stands at the origin and looks along "
-                "+Z; expected MotionVAE.placed_by(likelihood), or MotionVAE.placed(path) where its "
-                "path is known"
+                "prior must have a rigid path for observations; set it with "
+                "MotionVAE.placed_by(likelihood), or MotionVAE.placed(path) if it is known"
             )
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The J joints."""
-        return self.body.skeleton
-
-    @property
-    def frames(self) -> int:
-        """Number of frames L."""
-        return self.settings.frames
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self._fps
 
     @property
     def dim(self) -> int:
@@ -238,39 +200,39 @@ class MotionVAE(StandardNormalPrior):
         return self.settings.latent
 
     def motion(self, theta: Array) -> Array:
-        """Return FK(D(θ)), ``(…, dim) → (…, L, J, 3)``, metres, world Y up; NumPy or torch."""
+        """Return FK(D(θ)), ``(…, dim) → (…, L, J, 3)``, metres, Y up; NumPy or torch."""
         shape = (self.frames, self.skeleton.n_joints, 3)
         return decode_rows(self._motion, theta, self.dim, shape, _ROWS)
 
     def turns(self, theta: Array) -> Array:
-        """Return D(θ), ``(…, dim) → (…, L, bones, 3)``: rotation vectors in parents' frames."""
+        """Return D(θ), ``(…, dim) → (…, L, bones, 3)``: rotation vectors relative to parents."""
         shape = (self.frames, len(self.body.bones), 3)
         return decode_rows(self._turns, theta, self.dim, shape, _ROWS)
 
     def row_by_row(self, theta: np.ndarray) -> np.ndarray:
-        """Return :meth:`motion`, ``(n, dim) → (n, L, J, 3)``, whose bits are each row's own.
+        """Return :meth:`motion`, ``(n, dim) → (n, L, J, 3)``, bit-identical in any batch.
 
-        Rounding depends on the shape of a product: here every batch is of the same shape.
+        The rounding of a product depends on its shape, so all batches have the same shape.
         """
-        found = []
+        result = []
         for at in range(0, len(theta), _ROWS):
             some = theta[at : at + _ROWS]
             rows = np.zeros((_ROWS, self.dim), dtype=theta.dtype)
             rows[: len(some)] = some
-            found.append(self.motion(rows)[: len(some)])
-        return np.concatenate(found)
+            result.append(self.motion(rows)[: len(some)])
+        return np.concatenate(result)
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n motions, (n, L, J, 3), metres; decoded in single precision."""
         return self.row_by_row(self.initial(rng, n).astype(np.float32)).astype(np.float64)
 
     def _turns(self, theta: torch.Tensor) -> torch.Tensor:
-        """Return the turns of rows, ``(B, dim) → (B, L, bones, 3)``."""
+        """Decode rows, ``(B, dim) → (B, L, bones, 3)``."""
         model = self.model if theta.dtype == torch.float32 else self._double
         return model.vae.decode(theta)
 
     def _motion(self, theta: torch.Tensor) -> torch.Tensor:
-        """Return the motions of rows, ``(B, dim) → (B, L, J, 3)``."""
+        """Decode rows, ``(B, dim) → (B, L, J, 3)``."""
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values, dtype=theta.dtype)
@@ -284,5 +246,5 @@ class MotionVAE(StandardNormalPrior):
 
     @cached_property
     def _double(self) -> MotionVAEModel:
-        # Densities want double precision, training single.
+        # Densities use double precision.
         return copy.deepcopy(self.model).double()

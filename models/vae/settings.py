@@ -1,4 +1,4 @@
-"""Sizes of the motion VAE, by name, and the weights of what it is trained on."""
+"""Network sizes and loss weights of the motion VAE."""
 
 from __future__ import annotations
 
@@ -8,64 +8,59 @@ import numpy as np
 
 from probmotion.validation import check_count
 
-__all__ = ["USUAL_THRESHOLD", "MotionVAESettings"]
+__all__ = ["CONFIDENCE_THRESHOLD", "MotionVAESettings"]
 
-USUAL_THRESHOLD = 0.3
-"""Least confidence of a joint that is learnt from, and that networks are shown."""
+CONFIDENCE_THRESHOLD = 0.3
+"""Smallest confidence of a joint that is used in training and by the networks."""
 
 _WEIGHTS = ("reconstruction", "smoothness", "ranges", "lengths", "kl", "teacher")
 
 
 @dataclass(frozen=True)
 class MotionVAESettings:
-    """Size of the motion VAE and of its pose network, and the weights of their losses.
+    """Network size and loss weights of the motion VAE and its pose network.
 
     Parameters
     ----------
     frames : int
         T, frames of a motion.
     width : int
-        Numbers of a token in every transformer.
-    layers : int
-        Of each of E_s, E_t, D_t and D_s.
-    heads : int
-        Of each layer.
+        Token width of all transformers.
+    layers, heads : int
+        Layers of each of E_s, E_t, D_t and D_s, and heads per layer.
     feedforward : int
-        Width of each layer's hidden layer. It is not published; ours is a quarter of the tokens'
-        because a training step of 64 sequences should take half a second on two cores. At size
-        ``small`` a quarter reconstructs as well as the tokens' width and generates 3 % farther from
-        held-out clips (Motion Chamfer Distance, two seeds).
+        Hidden width of each layer. It is not published; the default, a quarter of ``width``, gives
+        a training step of 64 sequences in .5 s on two cores. At size ``small`` a quarter
+        reconstructs as well as the full width and generates 3 % farther from held-out clips (Motion
+        Chamfer Distance, two seeds).
     latent : int
-        Numbers of z.
+        Dimension of z.
     spatial : bool
-        Whether there are E_s and D_s; without them, linear maps of all joints and of all bones at
-        once take their place (table 7).
+        Use E_s and D_s; otherwise linear maps of all joints and bones (ablation, table 7).
     hypotheses : int
-        H, views that the pose network supposes, 1 to 4: a quarter turn apart.
+        H, view hypotheses of the pose network, 1 to 4, a quarter turn apart.
     image_features : int
-        F, numbers of an image feature of a frame and of a joint; 0: tracks alone.
+        F, size of image features per frame and per joint; 0 for tracks alone.
     mixed_precision : bool
-        Whether a network in training multiplies matrices in bfloat16. Weights, sums of layers,
-        results and losses stay in single precision, and so does all of a network that is used.
-        Worth it on processors with bfloat16 products (AVX-512 BF16, AMX), where it is several times
-        as fast.
+        Multiply in bfloat16 during training; weights, sums, outputs and losses stay in single
+        precision. Several times as fast on processors with AVX-512 BF16 or AMX.
     reconstruction : float
-        Weight of the squared distance of reprojected joints to seen ones, metres squared.
+        Weight of the squared reprojection error, m².
     smoothness : float
-        Of squared differences of neighbouring frames, λ of R_temp.
+        Weight λ of the temporal regulariser R_temp.
     ranges : float
-        Of squared angles beyond the joints' ranges.
+        Weight of squared angles beyond the joint ranges.
     lengths : float
-        Of squared logarithms of bone lengths over the rest pose's.
+        Weight of squared log ratios of bone lengths to the rest pose.
     kl : float
-        λ_KL, of the divergence of q(z) from N(0, I).
+        λ_KL, weight of the divergence of q(z) from N(0, I).
     teacher : float
-        Of the squared distance to the pose network's poses.
+        Weight of the squared distance to the pose network's poses.
 
     Raises
     ------
     ValueError
-        If a number is out of range, or ``width`` is no even multiple of ``heads``.
+        If a number is out of range, or ``width`` is not an even multiple of ``heads``.
     """
 
     frames: int = 10
@@ -92,11 +87,11 @@ class MotionVAESettings:
         check_count("image_features", self.image_features, least=0)
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
+                f"width must be an even multiple of heads={self.heads}, got {self.width}"
             )
         if self.hypotheses > 4:
             raise ValueError(
-                f"hypotheses is {self.hypotheses}, expected 1 to 4: they are a quarter turn apart"
+                f"hypotheses must be 1 to 4, a quarter turn apart, got {self.hypotheses}"
             )
         for name in ("spatial", "mixed_precision"):
             if not isinstance(getattr(self, name), bool):
@@ -106,7 +101,7 @@ class MotionVAESettings:
 
     @classmethod
     def tiny(cls) -> MotionVAESettings:
-        """Return the size for tests: learns a toy in seconds."""
+        """Return a size for tests that trains in seconds."""
         return cls(
             width=32,
             layers=1,
@@ -120,32 +115,26 @@ class MotionVAESettings:
 
     @classmethod
     def small(cls) -> MotionVAESettings:
-        """Return the size that two cores train in minutes, and that ships.
+        """Return the size of the shipped priors, which trains in minutes on two cores.
 
-        Smoothness and teacher weigh .01 and .1, not the published 1: reconstruction is in squared
-        metres here, some hundredths, beside which a weight of 1 left bodies still.
+        Smoothness and teacher weights are .01 and .1 instead of the published 1: reconstruction
+        is in m² here, some hundredths, and a weight of 1 suppressed all motion.
         """
         return cls(
-            width=96,
-            layers=2,
-            heads=2,
-            feedforward=96,
-            latent=48,
-            smoothness=0.01,
-            teacher=0.1,
+            width=96, layers=2, heads=2, feedforward=96, latent=48, smoothness=0.01, teacher=0.1
         )
 
     @classmethod
     def paper(cls) -> MotionVAESettings:
         """Return the published size and weights (section 3.3, table 5).
 
-        The published reconstruction is that of images; ours is of joints, in metres.
+        The published reconstruction loss is on images; ours is on joints, in metres.
         """
         return cls()
 
 
 def _check_weight(name: str, value: float) -> None:
-    """Raise ``ValueError`` unless a loss's weight is a finite number of at least 0."""
+    """Raise ``ValueError`` unless a loss weight is finite and at least 0."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and np.isfinite(value) and value >= 0):
         raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")

@@ -1,4 +1,4 @@
-"""What a pose network says of the frames that it teaches with, asked once for each of them."""
+"""Pseudo-labels of a fixed pose network, computed once per frame."""
 
 from __future__ import annotations
 
@@ -6,95 +6,70 @@ import torch
 
 from probmotion.models.training.track_batches import Batch, TrackBatches
 from probmotion.models.vae.layers import FRAMES_AT_ONCE
-from probmotion.models.vae.pose_network import PoseGuesses, PoseNetwork
+from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork
 
 __all__ = ["TeacherForcedPoses", "scaled"]
 
 
 class TeacherForcedPoses:
-    """The poses of all frames of tracks, and of their mirror images, under every view.
+    """Teacher poses of all frames of tracks and their mirror images, under every view hypothesis.
 
-    Frames do not look at each other and a teacher does not learn: what it says of a frame is the
-    same in every window that shows it. A window that is scaled shows the same poses of a larger
-    body, see :func:`scaled`. It takes some 3 kB for a frame of a person, and its mirror image's.
-
-    Parameters
-    ----------
-    network : PoseNetwork
-        The teacher, as it is now.
-    batches : TrackBatches
-        Whose frames; their augmentation has no shift.
-    rest : Tensor, (J, 3)
-        The rest pose, as for :meth:`PoseNetwork.forward`; the poses are where it is.
-
-    Raises
-    ------
-    ValueError
-        If the batches move their windows.
+    The teacher is fixed and treats frames independently, so its output for a frame can be reused
+    in every window; scaled windows use :func:`scaled`. Takes about 3 kB per frame of a person. The
+    rest pose (J, 3) also sets the device. Raises ``ValueError`` if ``batches`` shifts windows.
     """
 
     @torch.no_grad()
     def __init__(self, network: PoseNetwork, batches: TrackBatches, rest: torch.Tensor) -> None:
         if batches.augmentation.shift:
             raise ValueError(
-                f"batches has shift={batches.augmentation.shift:g}, expected 0: windows that are "
-                "moved have poses of their own"
+                "augmentation of batches must have shift=0 for precomputed teacher poses, got "
+                f"{batches.augmentation.shift:g}"
             )
         keypoints, seen = (
             torch.as_tensor(values, device=rest.device) for values in batches.all_frames()
         )
         network.eval()
-        # In full precision, whichever step asks first.
+        # Full precision, even if the first training step uses autocast.
         with torch.autocast(rest.device.type, enabled=False):
-            found = [
+            outputs = [
                 network(some[:, None], looked_at[:, None].to(some.dtype), rest)
                 for some, looked_at in zip(
                     keypoints.split(FRAMES_AT_ONCE), seen.split(FRAMES_AT_ONCE), strict=True
                 )
             ]
-        self._rotation = torch.cat([guesses.rotation[:, :, 0] for guesses in found])
-        self._translation = torch.cat([guesses.translation[:, :, 0] for guesses in found])
-        self._turns = torch.cat([guesses.turns[:, :, 0] for guesses in found])
-        self._log_lengths = torch.cat([guesses.log_lengths for guesses in found])
+        self._poses = PoseHypotheses(
+            torch.cat([some.rotation[:, :, 0] for some in outputs]),
+            torch.cat([some.translation[:, :, 0] for some in outputs]),
+            torch.cat([some.turns[:, :, 0] for some in outputs]),
+            torch.cat([some.log_lengths for some in outputs]),
+        )
 
-    def of(self, drawn: Batch) -> PoseGuesses:
-        """Return what the teacher says of windows that the batches have drawn, before scaling.
-
-        Raises
-        ------
-        ValueError
-            If a window is longer than its track.
-        """
+    def of(self, drawn: Batch) -> PoseHypotheses:
+        """Return the teacher poses of drawn windows, before scaling; none may be padded."""
         if (drawn.frames < 0).any():
-            raise ValueError("drawn has windows that are padded, expected frames of tracks only")
-        frames = torch.as_tensor(drawn.frames, device=self._turns.device)
-        return PoseGuesses(
-            self._rotation[frames].transpose(1, 2),
-            self._translation[frames].transpose(1, 2),
-            self._turns[frames].transpose(1, 2),
-            # Lengths are read from the mean of what frames say, linearly.
-            self._log_lengths[frames].mean(dim=1),
+            raise ValueError("drawn must not contain padded windows")
+        frames = torch.as_tensor(drawn.frames, device=self._poses.turns.device)
+        return PoseHypotheses(
+            self._poses.rotation[frames].transpose(1, 2),
+            self._poses.translation[frames].transpose(1, 2),
+            self._poses.turns[frames].transpose(1, 2),
+            # The network predicts lengths linearly from the mean over frames.
+            self._poses.log_lengths[frames].mean(dim=1),
         )
 
 
-def scaled(guesses: PoseGuesses, scale: torch.Tensor) -> PoseGuesses:
-    """Return poses whose pictures are larger: of a larger body, farther from the centre.
+def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:
+    """Return the poses of a larger body whose projections are scaled by ``scale``, (B,).
 
-    Exactly so where rays are parallel. A camera at 7 m sees a joint that is half a metre nearer
-    than the root, of a body a twentieth larger, 3 mm away from there.
-
-    Parameters
-    ----------
-    guesses : PoseGuesses
-        Of B windows.
-    scale : Tensor, (B,)
-        By which their pictures are scaled.
+    Exact for orthographic cameras. For a camera at 7 m and a body 5 % larger, a joint .5 m closer
+    than the root projects 3 mm off.
     """
-    factor = scale.reshape(-1, *[1] * (guesses.translation.ndim - 1))
-    longer = scale.log().reshape(-1, *[1] * (guesses.log_lengths.ndim - 1))
-    return PoseGuesses(
-        guesses.rotation,
-        factor * guesses.translation,
-        guesses.turns,
-        guesses.log_lengths + longer,
+    factor = scale.reshape(-1, *[1] * (hypotheses.translation.ndim - 1))
+    longer = scale.log().reshape(-1, *[1] * (hypotheses.log_lengths.ndim - 1))
+    return PoseHypotheses(
+        hypotheses.rotation,
+        factor * hypotheses.translation,
+        hypotheses.turns,
+        hypotheses.log_lengths + longer,
     )

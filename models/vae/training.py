@@ -1,13 +1,13 @@
-"""Learning a motion VAE from 2D tracks in two phases (Ponymation, sections 3.2 and 3.3).
+"""Two-phase training of the motion VAE from 2D tracks (Ponymation, sections 3.2 and 3.3).
 
-First a network that sees one frame at a time learns what bodies do in pictures; then the VAE learns
-to say it with one latent code a sequence, with the first network as its teacher.
+The first phase trains the pose network on single frames; the second trains the VAE, with one latent
+code per sequence, with the pose network as teacher.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,16 +29,16 @@ from probmotion.models.training.track_batches import (
     learning_and_held_out,
 )
 from probmotion.models.vae.losses import (
-    best_guess,
-    guess_terms,
+    best_hypothesis,
+    hypothesis_losses,
     reconstruction,
     roughness,
     weighted_sum,
 )
 from probmotion.models.vae.model import KIND, MotionVAEModel, description_of
 from probmotion.models.vae.network import MotionVAENetwork
-from probmotion.models.vae.pose_network import PoseGuesses, PoseNetwork
-from probmotion.models.vae.settings import USUAL_THRESHOLD, MotionVAESettings
+from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork
+from probmotion.models.vae.settings import CONFIDENCE_THRESHOLD, MotionVAESettings
 from probmotion.models.vae.teacher_forcing import TeacherForcedPoses, scaled
 from probmotion.motion.motion import KeypointTrack
 from probmotion.validation import check_positive
@@ -46,20 +46,21 @@ from probmotion.validation import check_positive
 __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 
 _VALIDATION_BATCH = 256
-# Of the hypotheses that are not chosen, so that none is left behind for good.
+# Loss weight of all hypotheses, so that none stops learning.
 _OTHERS = 0.05
-# Metres: rounding, and no motion.
+# Tolerance of the root position for rounding, metres.
 _CENTRED = 1e-3
-# Steps in which bones have no say in which hypothesis learns.
+# Initial steps that select the hypothesis with the rest pose.
 _AT_REST = 500
 
 
-class _LearnsFromTracks:
-    """What both phases share: 2D tracks cut into sequences of one length, and a body."""
+class _TrackTrainee:
+    """Data and checks shared by both phases."""
 
     kind: str
     network: nn.Module
     settings: Mapping[str, Any]
+    _loss: Callable[..., torch.Tensor]
 
     def __init__(
         self,
@@ -67,27 +68,26 @@ class _LearnsFromTracks:
         validation: Sequence[KeypointTrack],
         size: MotionVAESettings,
         body: ArticulatedBody,
-        distance: float | None,
-        threshold: float,
-        seed: int,
+        *,
+        distance: float | None = None,
+        threshold: float = CONFIDENCE_THRESHOLD,
+        seed: int = 0,
     ) -> None:
-        # The mirror image of a body without pairs is another body.
+        # An asymmetric body cannot be mirrored.
         whole = Augmentation(shortest=1.0, mirror=body.symmetric)
         if size.image_features:
             raise ValueError(
-                f"size has image_features={size.image_features}, expected 0: tracks have none; "
-                "networks read them, see MotionVAENetwork.encode"
+                "size must have image_features=0 for training on tracks, got "
+                f"{size.image_features}; see MotionVAENetwork.encode"
             )
         if not body.skeleton.bones:
-            raise ValueError(
-                f"body has the one joint {body.skeleton.joint_names[0]}, expected bones"
-            )
+            raise ValueError(f"body must have bones, got one joint {body.skeleton.joint_names[0]}")
         if distance is not None:
             check_positive("distance", distance)
             reach = float(np.linalg.norm(body.rest_positions, axis=-1).max())
             if distance <= reach:
                 raise ValueError(
-                    f"distance is {distance:g} m, expected more than the body's own {reach:.2g} m"
+                    f"distance must exceed the body's reach of {reach:.2g} m, got {distance:g} m"
                 )
         self.size = size
         self.body = body
@@ -101,20 +101,15 @@ class _LearnsFromTracks:
         )
         if self.batches.skeleton != body.skeleton:
             raise ValueError(
-                f"tracks has the joints {', '.join(self.batches.skeleton.joint_names)}, expected "
-                f"those of the body: {', '.join(body.skeleton.joint_names)}"
+                f"tracks must have the body's joints {', '.join(body.skeleton.joint_names)}, "
+                f"got {', '.join(self.batches.skeleton.joint_names)}"
             )
         self.batches.check_all_seen()
         _check_centred("tracks", tracks, threshold)
         _check_centred("validation", validation, threshold)
         if not body.symmetric:
-            lacks = (
-                "left-right pairs that hang from one joint or from a pair"
-                if body.skeleton.mirrored_pairs
-                else "left-right pairs"
-            )
             warnings.warn(
-                f"body has no {lacks}: no bone is as long as its mirror image, and no track is "
+                "body is not left-right symmetric: bone lengths are not shared and tracks are not "
                 "mirrored",
                 stacklevel=3,
             )
@@ -130,36 +125,24 @@ class _LearnsFromTracks:
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
-        """Return the loss of fresh sequences, a mean over them.
+        """Return the mean loss of random sequences.
 
-        Networks multiply as their settings say; where bodies are posed, and what is lost, stays in
-        single precision whatever the trainer asks for.
+        Networks use the precision of their settings; kinematics and losses use single precision.
         """
         with torch.autocast(device.type, enabled=False):
             return self._loss(network, self.batches, rng, batch, device)
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss on held-out sequences that never change."""
+        """Return the loss of fixed held-out sequences."""
         rng = seeds.generator(self._seed, "validation")
         return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
 
-    def _loss(
-        self,
-        network: nn.Module,
-        batches: TrackBatches,
-        rng: np.random.Generator,
-        n: int,
-        device: torch.device,
-    ) -> torch.Tensor:
-        raise NotImplementedError
-
-    def _shown(
+    def _inputs(
         self, drawn: Batch, device: torch.device
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return what networks are shown: keypoints (n, L, J, 2), seen (n, L, J), rest (J, 3).
+        """Return keypoints (n, L, J, 2), visibility (n, L, J) and rest pose (J, 3).
 
-        Of confidence no more than whether a joint is seen, 1 or 0: one detector's numbers are not
-        another's, and what networks learnt of the one they would misread in the other.
+        Networks read visibility instead of confidence, which differs between detectors.
         """
         return (
             torch.as_tensor(drawn.keypoints, device=device),
@@ -168,37 +151,36 @@ class _LearnsFromTracks:
         )
 
 
-class PoseTrainee(_LearnsFromTracks):
-    """The first phase: rigid poses and bones, frame by frame, under several view hypotheses.
+class PoseTrainee(_TrackTrainee):
+    """First phase: rigid poses and bone rotations per frame under several view hypotheses.
 
-    The loss is that of one hypothesis of each sequence: its pictures' squared error, and how far it
-    moves from frame to frame, bends joints beyond their ranges and stretches bones. It is the
-    hypothesis of the least loss, but for the first 500 steps, in which it is the one that fits best
-    with the body at rest.
+    The loss of a sequence is that of its best hypothesis: reprojection error, smoothness, joint
+    ranges and bone lengths. During the first 500 steps the hypothesis is selected with the body in
+    its rest pose.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Prepared: metres, centred, of one skeleton and frame rate. Nothing else is learnt from.
+        Prepared tracks: metres, centred, of one skeleton and frame rate.
     validation : sequence of KeypointTrack
-        Of clips that are not among those of ``tracks``.
+        Tracks of held-out clips.
     size : MotionVAESettings
-        The networks'.
+        Network size and loss weights.
     body : ArticulatedBody
-        What moves; its rest pose may be estimated from the tracks, see
+        Body; its rest pose may be estimated with
         :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
     distance : float, optional
-        Of the cameras from the subject, metres; by default rays are parallel.
+        Distance of the cameras from the subject, metres; orthographic by default.
     threshold : float
-        Least confidence of a joint that is learnt from.
+        Smallest confidence of a joint that is used.
     seed : int
-        Of the first weights and the validation's sequences.
+        Seed of the initial weights and the validation sequences.
 
     Raises
     ------
     ValueError
         If no track is as long as a sequence, tracks differ in skeleton or frame rate, their
-        skeleton is not the body's, or a joint is never seen.
+        skeleton is not the body's, or a joint is never visible.
     """
 
     kind = "motion-vae-poses"
@@ -209,39 +191,37 @@ class PoseTrainee(_LearnsFromTracks):
         validation: Sequence[KeypointTrack],
         size: MotionVAESettings,
         body: ArticulatedBody,
-        *,
-        distance: float | None = None,
-        threshold: float = USUAL_THRESHOLD,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(tracks, validation, size, body, distance, threshold, seed)
-        self.network = PoseNetwork(
-            size, body.skeleton.n_joints, len(body.bones), body.n_groups, seed
-        )
+        super().__init__(tracks, validation, size, body, **options)
+        self.network = self._fresh_network(self._seed)
         self._step = 1
 
+    def _fresh_network(self, seed: int = 0) -> PoseNetwork:
+        body = self.body
+        return PoseNetwork(self.size, body.skeleton.n_joints, len(body.bones), body.n_groups, seed)
+
     def anneal(self, step: int) -> None:
-        """Be at a step, counted from 1: how the hypothesis that learns is chosen depends on it."""
+        """Set the step, counted from 1, which determines how hypotheses are selected."""
         self._step = step
 
     def learnt(self, folder: str | Path) -> PoseNetwork:
-        """Return the network that a run has trained.
+        """Load the network of a training run.
 
         Raises
         ------
         CheckpointError
-            If the file is damaged or of another network.
+            If the file is damaged or contains another network.
         FileNotFoundError
             If there is none.
         ValueError
             If the run had other settings or data.
         """
-        size, body = self.size, self.body
-        found = PoseNetwork(size, body.skeleton.n_joints, len(body.bones), body.n_groups)
-        kept = load_checkpoint(folder, self.kind)
-        check_same_run(kept.settings, {"network": dict(self.settings)}, Path(folder))
-        load_weights(found, kept.tensors)
-        return found
+        network = self._fresh_network()
+        checkpoint = load_checkpoint(folder, self.kind)
+        check_same_run(checkpoint.settings, {"network": dict(self.settings)}, Path(folder))
+        load_weights(network, checkpoint.tensors)
+        return network
 
     def _loss(
         self,
@@ -252,52 +232,51 @@ class PoseTrainee(_LearnsFromTracks):
         device: torch.device,
     ) -> torch.Tensor:
         drawn = batches.draw(rng, n)
-        keypoints, seen, rest = self._shown(drawn, device)
-        guesses = network(keypoints, seen, rest)
+        keypoints, seen, rest = self._inputs(drawn, device)
+        hypotheses = network(keypoints, seen, rest)
         confidence = torch.as_tensor(drawn.confidence, device=device)
-        terms = guess_terms(self.body, guesses, keypoints, confidence, self.distance)
+        terms = hypothesis_losses(self.body, hypotheses, keypoints, confidence, self.distance)
         losses = weighted_sum(terms, self.size)
         at_rest = batches is self.batches and self._step <= _AT_REST
-        judged = self._at_rest(guesses, keypoints, confidence) if at_rest else losses
-        best = judged.argmin(dim=1, keepdim=True)
+        selection = self._rest_losses(hypotheses, keypoints, confidence) if at_rest else losses
+        best = selection.argmin(dim=1, keepdim=True)
         return losses.gather(1, best).mean() + _OTHERS * losses.mean()
 
     @torch.no_grad()
-    def _at_rest(
-        self, guesses: PoseGuesses, keypoints: torch.Tensor, confidence: torch.Tensor
+    def _rest_losses(
+        self, hypotheses: PoseHypotheses, keypoints: torch.Tensor, confidence: torch.Tensor
     ) -> torch.Tensor:
-        """Return the loss of every view if no bone turned or grew, (B, H).
+        """Return the losses of all views with rest-pose bones, (B, H).
 
-        Bones that bend can make up for a wrong view: chosen with them, whichever hypothesis learns
-        first wins pictures of other quarters and keeps them, and the rest are never chosen.
+        Bent bones can compensate for a wrong view: the first hypothesis to learn would win other
+        quadrants too, and the rest would never be selected.
         """
-        stiff = replace(
-            guesses,
-            turns=torch.zeros_like(guesses.turns),
-            log_lengths=torch.zeros_like(guesses.log_lengths),
+        rest_pose = replace(
+            hypotheses,
+            turns=torch.zeros_like(hypotheses.turns),
+            log_lengths=torch.zeros_like(hypotheses.log_lengths),
         )
-        terms = guess_terms(self.body, stiff, keypoints, confidence, self.distance)
+        terms = hypothesis_losses(self.body, rest_pose, keypoints, confidence, self.distance)
         return weighted_sum(terms, self.size)
 
 
-class MotionVAETrainee(_LearnsFromTracks):
-    """The second phase: one latent code for the bones of a whole sequence (equations 2 to 7).
+class MotionVAETrainee(_TrackTrainee):
+    """Second phase: one latent code for the bone rotations of a sequence (equations 2 to 7).
 
-    E_s and D_s begin as what the first phase has learnt: what a frame's picture says of its bones
-    has not to be found again from a code through which at first nothing comes. Rigid poses stay
-    those of the first phase's network, which is kept as it is.
+    E_s and D_s start from the pose network's weights. The pose network stays fixed and provides
+    the rigid poses.
 
     Parameters
     ----------
     tracks, validation, size, body, distance, threshold, seed
-        As for the first phase.
+        As for :class:`PoseTrainee`.
     pose_network : PoseNetwork
-        What the first phase has learnt.
+        Network of the first phase.
 
     Raises
     ------
     ValueError
-        As for the first phase, or if the pose network is of another size or body.
+        As for :class:`PoseTrainee`, or if the pose network has another size or body.
     """
 
     kind = KIND
@@ -309,29 +288,24 @@ class MotionVAETrainee(_LearnsFromTracks):
         size: MotionVAESettings,
         body: ArticulatedBody,
         pose_network: PoseNetwork,
-        *,
-        distance: float | None = None,
-        threshold: float = USUAL_THRESHOLD,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(tracks, validation, size, body, distance, threshold, seed)
-        vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), seed)
+        super().__init__(tracks, validation, size, body, **options)
+        vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), self._seed)
         own, theirs = (
             (one.width, one.layers, one.heads, one.feedforward, one.image_features)
             for one in (size, pose_network.settings)
         )
         if own != theirs:
             raise ValueError(
-                f"pose_network has width, layers, heads, feedforward and image_features {theirs}, "
-                f"expected the size's {own}"
+                "pose_network must have the width, layers, heads, feedforward and image_features "
+                f"of size, {own}, got {theirs}"
             )
-        of_body = (body.skeleton.n_joints, len(body.bones), body.n_groups)
-        found = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
-        if found != of_body:
+        own = (body.skeleton.n_joints, len(body.bones), body.n_groups)
+        theirs = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
+        if own != theirs:
             raise ValueError(
-                f"pose_network is of a body with {found[0]} joints, {found[1]} bones that turn and "
-                f"{found[2]} lengths, expected the body's {of_body[0]}, {of_body[1]} and "
-                f"{of_body[2]}"
+                f"pose_network must have the body's joints, bones and lengths, {own}, got {theirs}"
             )
         teacher = pose_network.eval().requires_grad_(False)
         if size.spatial:
@@ -351,14 +325,13 @@ class MotionVAETrainee(_LearnsFromTracks):
     ) -> torch.Tensor:
         assert isinstance(network, MotionVAEModel)
         drawn = batches.draw(rng, n)
-        keypoints, seen, rest = self._shown(drawn, device)
+        keypoints, seen, rest = self._inputs(drawn, device)
         confidence = torch.as_tensor(drawn.confidence, device=device)
-        guess = self._taught(batches, drawn, keypoints, confidence, rest)
-        vae = network.vae
-        mean, log_variance = vae.encode(keypoints, seen, rest)
+        guess = self._teacher_poses(batches, drawn, keypoints, confidence, rest)
+        mean, log_variance = network.vae.encode(keypoints, seen, rest)
         noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
         latent = mean + (0.5 * log_variance).exp() * torch.as_tensor(noise, device=device)
-        turns = vae.decode(latent)
+        turns = network.vae.decode(latent)
         translation = nn.functional.pad(guess.translation, (0, 1))
         positions = self.body.positions(turns, guess.rotation, translation, guess.log_lengths)
         zero = torch.zeros_like(mean)
@@ -366,36 +339,36 @@ class MotionVAETrainee(_LearnsFromTracks):
             "reconstruction": reconstruction(positions, keypoints, confidence, self.distance),
             "smoothness": roughness(turns, guess.rotation, guess.translation),
             "ranges": self.body.range_excess(turns).sum(dim=-1),
-            # Equation 6 prints it with σ where σ² belongs.
+            # Equation 6 is printed with σ instead of σ².
             "kl": gaussian_kl(mean, 0.5 * log_variance, zero, zero),
             "teacher": (turns - guess.turns).square().sum(dim=(-3, -2, -1)),
         }
         return weighted_sum(terms, self.size).mean()
 
     @torch.no_grad()
-    def _taught(
+    def _teacher_poses(
         self,
         batches: TrackBatches,
         drawn: Batch,
         keypoints: torch.Tensor,
         confidence: torch.Tensor,
         rest: torch.Tensor,
-    ) -> PoseGuesses:
+    ) -> PoseHypotheses:
         """Return the best view hypothesis of the first phase, (B, L, …)."""
         if batches not in self._poses:
             self._poses[batches] = TeacherForcedPoses(self._teacher, batches, rest)
-        guesses = self._poses[batches].of(drawn)
+        hypotheses = self._poses[batches].of(drawn)
         scale = torch.as_tensor(drawn.scale, device=keypoints.device)
-        # Which view is best does not depend on how a window is scaled.
+        # Undo the scaling, which must not affect the choice of the view.
         shown = keypoints / scale[:, None, None, None]
-        terms = guess_terms(self.body, guesses, shown, confidence, self.distance)
-        return scaled(best_guess(guesses, weighted_sum(terms, self.size)), scale)
+        terms = hypothesis_losses(self.body, hypotheses, shown, confidence, self.distance)
+        return scaled(best_hypothesis(hypotheses, weighted_sum(terms, self.size)), scale)
 
 
 def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSettings]:
-    """Return how the two phases of a size are trained: ``tiny``, ``small`` or ``paper``.
+    """Return the training settings of both phases of a size: ``tiny``, ``small`` or ``paper``.
 
-    The paper counts 120 and 180 epochs of its own data; ``paper`` is as many steps of ours.
+    The paper trains for 120 and 180 epochs of its data; ``paper`` counts 1000 steps per epoch.
 
     Raises
     ------
@@ -422,32 +395,32 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
 
 
 def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float) -> None:
-    """Refuse tracks whose root moves: networks that are asked later see it at the origin."""
+    """Raise ``ValueError`` for tracks with a moving root: inference centres the root."""
     root = tracks[0].skeleton.roots[0]
     for track in tracks:
         seen = (track.confidence[:, root] >= threshold) & (track.confidence[:, root] > 0)
         away = np.linalg.norm(track.keypoints[seen, root], axis=-1).max(initial=0.0)
         if away > _CENTRED:
             raise ValueError(
-                f"{name} has {track.name or 'one'} with its root {away:.2g} m from the origin, "
-                "expected it there in every frame, as prepare_tracks leaves it by default"
+                f"{name} must have the root at the origin in every frame, got {away:.2g} m in "
+                f"{track.name or 'one'}; use prepare_tracks"
             )
 
 
 def _long_enough(
     name: str, tracks: Sequence[KeypointTrack], frames: int
 ) -> Sequence[KeypointTrack]:
-    """Return the tracks that hold a sequence."""
-    found = [track for track in tracks if track.frames >= frames]
-    if tracks and not found:
+    """Return the tracks that contain a whole sequence."""
+    long = [track for track in tracks if track.frames >= frames]
+    if tracks and not long:
         raise ValueError(
-            f"{name} has at most {max(track.frames for track in tracks)} frames a track, expected "
-            f"a sequence's {frames} or more"
+            f"{name} must contain a track of at least {frames} frames, got at most "
+            f"{max(track.frames for track in tracks)}"
         )
-    if len(found) < len(tracks):
+    if len(long) < len(tracks):
         warnings.warn(
-            f"{len(tracks) - len(found)} of {len(tracks)} in {name} are shorter than a sequence's "
-            f"{frames} frames, and are left out",
+            f"{len(tracks) - len(long)} of {len(tracks)} {name} are shorter than {frames} frames "
+            "and are skipped",
             stacklevel=4,
         )
-    return found
+    return long

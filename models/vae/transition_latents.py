@@ -1,7 +1,7 @@
-"""Long motions from codes of short ones: segments, and transitions whose codes are optimised.
+"""Long motions from several latent codes, joined by optimised transitions (Ponymation, appendix A).
 
-Ponymation, appendix A: latents are drawn for consecutive segments, and transition latents are
-optimised so that their first and last frames agree with the neighbours.
+Latents are drawn for consecutive segments, and transition latents are optimised so that their
+first and last frames match the neighbours.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["greatest_acceleration", "long_motion"]
 
 _SHARED = 2
-"""Frames that neighbours have in common: two say where a bone is, and how fast it turns."""
+"""Frames shared by neighbours: two determine the pose and its velocity."""
 _MOST = 4
-"""Codes of a transition, at most: that is as long as four segments."""
+"""Largest number of codes in a transition."""
 _SMOOTH = 10.0
-"""Weight of squared accelerations in a transition, against squared angles that are missed."""
+"""Weight of squared accelerations relative to squared angle mismatches."""
 
 
 def long_motion(
@@ -35,47 +35,41 @@ def long_motion(
     transitions: int | None = None,
     prior_weight: float = 1e-3,
 ) -> np.ndarray:
-    """Return one long motion: the codes' segments in turn, with a transition between each two.
+    """Return one long motion: the segments of the codes with a transition between each pair.
 
-    A transition is one motion of the prior or several in a row. Its first two frames are the last
-    two of the segment before, its last two the first two of the segment after, so that poses and
-    velocities go on. Its codes minimise the squared angles between frames that are to be the same,
-    plus squared accelerations and a little ‖z‖², by L-BFGS.
-
-    What no code can meet is left as small rotations of the bones at the four frames, and is taken
-    off along the cubic in time through them: exact there, and spread over the whole transition
-    instead of a seam. Segments are not touched.
-
-    Codes know no rigid pose: the body stays where the prior's path begins.
+    A transition consists of one or more motions of the prior. Its first two frames match the last
+    two of the previous segment and its last two the first two of the next. L-BFGS minimises the
+    squared angles between these frames, plus squared accelerations and a weak ‖z‖² penalty. The
+    remaining mismatch is removed by small bone rotations, interpolated by the cubic in time through
+    the four frames. Segments are unchanged, and the body stays at the start of the prior's path.
 
     Parameters
     ----------
     prior : MotionVAE
-        Of motions of L ≥ 5 frames.
+        Prior of motions with L ≥ 5 frames.
     z : ndarray, (S, Z)
-        Codes of the segments, such as ``prior.initial(rng, S)``.
+        Segment codes, such as ``prior.initial(rng, S)``.
     iterations : int
-        Of the optimiser, per transition.
+        L-BFGS iterations per transition.
     transitions : int, optional
-        Codes of a transition. By default the fewest, at most four, with which no joint of it
-        accelerates more than joints of the segments do; where none is enough, those with the least
-        acceleration.
+        Codes per transition. By default the smallest number, up to four, for which no joint
+        accelerates more than in the segments, or else the one with the smallest acceleration.
     prior_weight : float
-        Of ‖z‖² against squared radians.
+        Weight of ‖z‖² relative to squared radians.
 
     Returns
     -------
     ndarray, (frames, J, 3)
-        Metres; each transition of M codes adds M (L − 2) − 2 frames to the S L of the segments.
+        Metres; a transition of M codes adds M (L − 2) − 2 frames to the S L of the segments.
 
     Raises
     ------
     ValueError
-        If the prior's motions are too short, or a shape or number is out of range.
+        If the prior's motions are too short, or an argument is out of range.
     """
     z = np.asarray(z, dtype=np.float64)
     _check(prior, z, iterations, transitions, prior_weight)
-    # One at a time, so that not even rounding depends on how many segments there are.
+    # Decode one at a time, so that rounding does not depend on the number of segments.
     segments = [torch.as_tensor(vector_to_matrix(prior.turns(code))) for code in z]
     allowed = max(greatest_acceleration(_positions(prior, part)) for part in segments)
     parts = [segments[0]]
@@ -84,7 +78,7 @@ def long_motion(
         for count in range(1, _MOST + 1) if transitions is None else [transitions]:
             between = np.linspace(*codes, count + 2)[1:-1]
             whole = _transition(prior, *neighbours, between, iterations, prior_weight)
-            # A segment's own frame before and after: the seams are in it.
+            # Include one frame of each segment to measure the acceleration at the seams.
             around = torch.cat([neighbours[0][-3:-2], whole, neighbours[1][2:3]])
             found.append((greatest_acceleration(_positions(prior, around)), whole))
             if found[-1][0] <= allowed:
@@ -92,9 +86,8 @@ def long_motion(
         least, whole = min(found, key=lambda one: one[0])
         if least > allowed:
             warnings.warn(
-                f"a joint accelerates {least / allowed:.2f} times as much at the seam after "
-                f"segment {len(parts) // 2} as within any segment: no transition between these "
-                "codes is smoother",
+                f"the transition after segment {len(parts) // 2} has {least / allowed:.2f} times "
+                "the largest acceleration of the segments; no smoother one was found",
                 stacklevel=2,
             )
         parts += [whole[_SHARED:-_SHARED], neighbours[1]]
@@ -114,8 +107,7 @@ def _check(
         raise ValueError(f"prior_weight must be a finite number of at least 0, got {weight}")
     if prior.frames <= 2 * _SHARED:
         raise ValueError(
-            f"prior has motions of {prior.frames} frames, expected at least {2 * _SHARED + 1}: "
-            f"neighbours share {_SHARED}"
+            f"prior must have motions of at least {2 * _SHARED + 1} frames, got {prior.frames}"
         )
 
 
@@ -126,7 +118,7 @@ def greatest_acceleration(positions: np.ndarray) -> float:
 
 
 def _positions(prior: MotionVAE, rotations: torch.Tensor) -> np.ndarray:
-    """Return the joints of rotations (frames, bones, 3, 3), with the rigid pose held."""
+    """Return joint positions of rotations (frames, bones, 3, 3) with a constant rigid pose."""
     turns = matrix_to_vector(rotations.numpy())
     rotation, translation = (
         np.repeat(part[:1], len(turns), axis=0)
@@ -143,15 +135,15 @@ def _transition(
     iterations: int,
     prior_weight: float,
 ) -> torch.Tensor:
-    """Return the rotations (frames, bones, 3, 3) of M codes' motions between two segments."""
+    """Optimise the codes between two segments; return rotations (frames, bones, 3, 3)."""
     codes = torch.tensor(start, requires_grad=True)
     optimiser = torch.optim.LBFGS([codes], max_iter=iterations, line_search_fn="strong_wolfe")
 
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
         whole, missed = _joined(vector_to_matrix(prior.turns(codes)), before, after)
-        felt = 0.5 * (whole.diff(n=2, dim=0) ** 2).sum()
-        total = missed + _SMOOTH * felt + prior_weight * (codes**2).sum()
+        acceleration = 0.5 * (whole.diff(n=2, dim=0) ** 2).sum()
+        total = missed + _SMOOTH * acceleration + prior_weight * (codes**2).sum()
         total.backward()
         return total
 
@@ -163,36 +155,36 @@ def _transition(
 def _joined(
     motions: Sequence[torch.Tensor] | torch.Tensor, before: torch.Tensor, after: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return motions in a row (frames, bones, 3, 3), from the end of one segment to the next.
+    """Join consecutive motions between two segments, (frames, bones, 3, 3).
 
-    Each begins as the last one ends. Also the squared angles, summed, by which they missed.
+    Also returns the summed squared angle mismatch before correction.
     """
     whole, missed = motions[0], motions[0].new_zeros(())
     for motion in motions[1:]:
         ends = torch.cat([whole[-_SHARED:], motion[-_SHARED:]])
         missed = missed + _missed(motion, ends)
         whole = torch.cat([whole, _corrected(motion, ends)[_SHARED:]])
-    # Over the whole length, where it is felt least.
+    # Spread this correction over the whole transition.
     ends = torch.cat([before[-_SHARED:], after[:_SHARED]])
     return _corrected(whole, ends), missed + _missed(whole, ends)
 
 
 def _missed(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
-    """Return half the squared difference of shared frames: squared angles, to second order."""
+    """Return half the squared difference of shared frames: squared angles to second order."""
     return 0.5 * ((rotations[_shared_frames(len(rotations))] - ends) ** 2).sum()
 
 
 def _shared_frames(frames: int) -> list[int]:
-    """Return the frames that a motion shares with its neighbours."""
+    """Return the indices of the frames shared with the neighbours."""
     return [*range(_SHARED), *range(frames - _SHARED, frames)]
 
 
 def _corrected(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
-    """Return rotations (L, bones, 3, 3) that are ``ends`` at the shared frames exactly."""
+    """Return rotations (L, bones, 3, 3) that equal ``ends`` at the shared frames."""
     times = np.arange(len(rotations), dtype=np.float64)
     known = _shared_frames(len(rotations))
     left = matrix_to_vector(rotations[known].mT @ ends)
-    # The cubic through four frames: Lagrange's polynomials, (L, 4).
+    # Lagrange polynomials of the cubic through four frames, (L, 4).
     cubic = np.stack(
         [
             np.prod([(times - other) / (at - other) for other in known if other != at], axis=0)

@@ -1,11 +1,11 @@
-"""What the error of MAS is made of where the truth is known: a table and a picture per setting.
+"""Decomposition of the error of MAS on problems with exact draws.
 
     python notebooks/ablations/error_decomposition.py --out budgets
     python notebooks/ablations/error_decomposition.py --quick --out quick  (short motions, 2 min)
 
-``--settings`` chooses among those below. What is measured is kept in ``--out``, so that what is
-interrupted goes on. The network of the setting ``network`` is trained here, on pictures of the
-problem's own prior.
+``--settings`` selects settings; each writes a table and a figure. Results are stored in ``--out``,
+and an interrupted study continues from there. The setting ``network`` trains a denoiser on 2D
+views of the problem's own prior.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from probmotion.problems import load_problem
 
 @dataclass(frozen=True)
 class Setting:
-    """A problem and how MAS is run on it; ``network`` trains a denoiser for it."""
+    """A problem and the settings of MAS; ``network`` trains a denoiser for it."""
 
     problem: str = "gait"
     steps: int = 100
@@ -53,13 +53,13 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Study:
-    """How much is drawn, and where it is kept."""
+    """Sizes of the study and its output folder."""
 
     out: Path
     quick: bool
 
     def budget(self, name: str) -> ErrorDecomposition:
-        """Return a setting's budget; write its table and picture."""
+        """Return a setting's error decomposition; write its table and figure."""
         asked = SETTINGS[name]
         scale = {"frames": 6, "components": 12} if self.quick else {}
         problem = load_problem(asked.problem, **scale)
@@ -78,7 +78,7 @@ class Study:
         return budget
 
     def network(self, problem: Problem, folder: Path) -> MotionDiffusion:
-        """Return a 2D denoiser that has learnt from pictures of the problem's prior."""
+        """Return a 2D denoiser trained on views of the problem's prior."""
         # As the exact denoiser sees them: orthographic, level, centred on average.
         filming = Filming(tilt=0.0, perspective=False, centre="sequence")
         steps = 60 if self.quick else 4000
@@ -94,7 +94,7 @@ class Study:
 
 
 def main() -> None:
-    """Make the budgets that are asked for, and one table of them all in ``--out``."""
+    """Run the selected settings and write one table of all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--quick", action="store_true", help="short motions, few draws")

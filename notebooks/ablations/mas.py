@@ -1,13 +1,12 @@
-"""3D motion from 2D data alone: the shape of MAS's tables 2 and 3 on our clips, and 3D truth.
+"""MAS on our clips: tables 2 and 3 of Kapon et al. (2024), and errors in 3D.
 
     python notebooks/ablations/mas.py --out mas
-    python notebooks/ablations/mas.py --quick --out quick     (made walks, tiny networks, a minute)
+    python notebooks/ablations/mas.py --quick --out quick     (synthetic walks, tiny networks, 1 min)
 
-Parts: table, strided, exact; ``--parts`` chooses. The networks of walk2d come with the package; the
-lifter is trained here, on the same tracks. Samplers draw through the grid, a comparison per part in
-``--out/comparisons``; what else is made, the 2D model's views and lifted motions, is kept in
-``--out/motions``. What is interrupted goes on. Clips are looked for in ``--data``, by default
-../shared/data beside the repository.
+``--parts`` selects table, strided and exact. The networks of walk2d come with the package; the
+lifter is trained here on the same tracks. Draws are stored in ``--out/comparisons``, views of the
+2D model and lifted motions in ``--out/motions``; an interrupted study continues from there. Clips
+are read from ``--data``, by default ../shared/data beside the repository.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ import pandas as pd
 
 from probmotion import seeds
 from probmotion.comparison import Comparison, compare
-from probmotion.comparison.results.cell_results import CellResult
 from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.comparison.results.run_results import RunResult
 from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
 from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import LearningTracks, film_clips, film_windows, split_tracks
@@ -75,7 +74,7 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Study:
-    """The data, the networks, and how much to draw."""
+    """Data, networks and numbers of draws."""
 
     out: Path
     data: Path
@@ -88,7 +87,7 @@ class Study:
 
     @cached_property
     def clips(self) -> dict[str, list[Motion]]:
-        """3D clips by part; of those to learn from only pictures are used."""
+        """3D clips by part; of training clips only 2D views are used."""
         if self.quick:
             walks = synthetic_walks(24, seconds=4)
             return {"train": walks[:16], "validation": walks[16:18], "test": walks[18:]}
@@ -96,7 +95,7 @@ class Study:
 
     @cached_property
     def tracks(self) -> LearningTracks:
-        """What cameras and a detector make of the clips."""
+        """Detected 2D tracks of the clips, by part."""
         every = [clip for clips in self.clips.values() for clip in clips]
         filmed = film_clips(every, PERSON, FPS, views=8 if self.quick else 64)
         names = {part: [clip.name for clip in clips] for part, clips in self.clips.items()}
@@ -109,7 +108,7 @@ class Study:
     def motions(self, part: str) -> np.ndarray:
         """Return all 3D windows of a part and their mirror images, (n, L, J, 3), metres.
 
-        They are the truth that nobody saw; models learn from pictures in a mirror, too.
+        Mirror images are included because models are trained on mirrored views too.
         """
         clips = [
             centre_motion(clip.retarget(PERSON).resample(FPS)).positions
@@ -131,7 +130,7 @@ class Study:
 
     @cached_property
     def reference(self) -> GenerationReference:
-        """Held-out real 2D motion, and the evaluator that makes its features."""
+        """Held-out real 2D motion and the evaluator of its features."""
         if not self.quick:
             found = load_problem("walk2d").generation
             assert found is not None
@@ -146,7 +145,7 @@ class Study:
 
     @cached_property
     def problem(self) -> Problem:
-        """What samplers draw from, and what they are to be like."""
+        """The problem that samplers draw from."""
         return Problem(
             "walks",
             "people who walk, a prior learnt from 2D tracks alone: generation",
@@ -156,17 +155,17 @@ class Study:
 
     @property
     def frames(self) -> int:
-        """Frames L of a motion."""
+        """Number of frames L of a motion."""
         return self.prior.frames
 
     def trained(self, name: str, trainee: object, settings: TrainingSettings) -> Path:
-        """Train a network, or go on; return its checkpoint."""
+        """Train a network, or continue; return its checkpoint."""
         return train(trainee, settings, self.out / name, progress=False).model
 
     def once(
         self, name: str, made_from: object, make: Callable[[], np.ndarray]
     ) -> tuple[np.ndarray, float]:
-        """Return motions or views and the seconds that they took; made where they are missing."""
+        """Return motions or views and their seconds; compute them if they are not stored."""
         path = self.out / "motions" / f"{name}.npz"
         origin = fingerprint(made_from)
         if not path.exists():
@@ -192,7 +191,7 @@ class Study:
         problems: Mapping[str, Problem | MotionPosterior],
         samplers: Mapping[str, Sampler],
     ) -> Comparison:
-        """Return the grid of a part; cells that are finished are not drawn again."""
+        """Return the comparison of a part; finished runs are not repeated."""
         return compare(
             problems,
             samplers,
@@ -205,7 +204,7 @@ class Study:
 
 
 def samplers(iterations: int) -> dict[str, Sampler]:
-    """Return what table 2 compares, and what this project adds."""
+    """Return the samplers of table 2 and those that this project adds."""
     return {
         "MAS": MultiViewAncestral(perspective=True),
         "MAS, orthographic": MultiViewAncestral(),
@@ -219,7 +218,7 @@ def samplers(iterations: int) -> dict[str, Sampler]:
 
 
 def table(study: Study) -> pd.DataFrame:
-    """Tables 2 and 3: 2D against held-out 2D, all around and from the side, and 3D against 3D."""
+    """Tables 2 and 3: 2D against held-out 2D, from all sides and from the side; 3D against 3D."""
     posterior = study.problem.posterior
     real = study.motions("test")
     rows: list[dict[str, object]] = []
@@ -282,7 +281,7 @@ def score(
     real: np.ndarray,
     seconds: float,
 ) -> dict[str, object]:
-    """Return one row; views alone have no side and no third dimension."""
+    """Return one row; 2D views have no side and no 3D errors."""
     row: dict[str, object] = {"name": name, "seconds": seconds}
     # Other halves of the draws in every repeat, so that the ± holds the chance of draws.
     asked = {"seed": SEED, "samples": study.draws // 2, "repeats": study.repeats}
@@ -313,9 +312,9 @@ def score(
 
 
 def score_cell(
-    study: Study, name: str, found: Comparison, cell: CellResult, real: np.ndarray
+    study: Study, name: str, found: Comparison, cell: RunResult, real: np.ndarray
 ) -> dict[str, object]:
-    """Return the row of a sampler that drew in the grid, or failed."""
+    """Return the row of a sampler of the comparison, or of its failure."""
     if cell.failure is not None:
         return {"name": name, "failed": str(cell.failure)}
     motions = found.draws(cell.problem, cell.sampler).flat()
@@ -331,12 +330,12 @@ def bone_changes(motions: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """What another lifter made of ``to_lift.npz``."""
+    """Predictions of another lifter for ``to_lift.npz``."""
 
     motions: np.ndarray
 
     def lift(self, views: np.ndarray) -> np.ndarray:
-        """Return its motions."""
+        """Return the lifted motions."""
         if len(self.motions) != len(views):
             raise SystemExit(
                 f"predictions are {len(self.motions)} motions, expected those of the {len(views)} "
@@ -346,16 +345,16 @@ class Predictions:
 
 
 class Flat:
-    """The negative control: a lifter to which everything is as far away as the root."""
+    """Negative control: a lifter that gives every joint the depth of the root."""
 
     def lift(self, views: np.ndarray) -> np.ndarray:
-        """Return pictures that stand in space, turned to the camera."""
+        """Return the lifted motions."""
         camera = Cameras.ring(1, elevation=math.pi / 16)
         return views @ camera.rotation[0, :2]
 
 
 def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
-    """Return what lifts pictures, (n, L, J, 2) → (n, L, J, 3)."""
+    """Return functions that lift 2D views, (n, L, J, 2) → (n, L, J, 3)."""
     flow_trainee = PoseFlowTrainee(
         study.tracks.train,
         study.tracks.validation,
@@ -379,7 +378,7 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
 
 
 def strided(study: Study) -> pd.DataFrame:
-    """MAS and mvpc with fewer levels than the network has learnt."""
+    """MAS and mvpc with fewer noise levels than the network was trained on."""
     real = study.motions("test")
     ways: dict[tuple[int, str], Sampler] = {}
     for steps in (10, 20, 50, 100):
@@ -396,10 +395,10 @@ def strided(study: Study) -> pd.DataFrame:
 
 
 def exact(study: Study) -> pd.DataFrame:
-    """How wrong the network makes a sampler: it learns from pictures of the prior of ``gait``.
+    """Error that a network adds to a sampler: it is trained on views of the prior of ``gait``.
 
-    There the right answer is known: each sampler draws with the exact 2D denoiser and with the
-    network, and both are compared with exact draws.
+    Each sampler draws with the exact 2D denoiser and with the network; both are compared with exact
+    draws.
     """
     problem = load_problem("gait")
     known = problem.posterior.prior
@@ -455,7 +454,7 @@ PARTS = {"table": table, "strided": strided, "exact": exact}
 
 
 def main() -> None:
-    """Make the parts that are asked for, each a table in ``--out``."""
+    """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")

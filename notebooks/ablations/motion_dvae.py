@@ -1,14 +1,13 @@
-"""Denoising by Motion-DVAE: its ablations (table 2 of the paper), filters, accuracy against speed.
+"""Denoising with Motion-DVAE: ablations (Fiche et al. 2023, table 2), filters, speed, calibration.
 
     python notebooks/ablations/motion_dvae.py --out dvae
-    python notebooks/ablations/motion_dvae.py --quick --out quick    (made clips, tiny networks)
+    python notebooks/ablations/motion_dvae.py --quick --out quick    (synthetic clips, tiny networks)
 
-Parts: table, speed, recording, posterior; ``--parts`` chooses. Recordings are made of clips that
-were held out whole: noise, outliers, limbs that hide. The prior and its denoiser come with the
-package; the networks of the ablations "no prior" and "no noisy training" are trained here, as long
-as the shipped one was. What the part posterior draws is drawn through the grid, comparisons in
-``--out/comparisons``. Clips are looked for in ``--data``, by default ../shared/data beside the
-repository.
+``--parts`` selects table, speed, recording and posterior. Recordings are simulated from held-out
+clips with noise, outliers and occluded limbs. The prior and its denoiser come with the package;
+the networks of the ablations "no prior" and "no noisy training" are trained here for as many
+steps. Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
+../shared/data beside the repository.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
-from probmotion.problems.denoising import body_of, body_prior, gaussian_noise, limbs_hidden
+from probmotion.problems.denoising import body_of, body_prior, gaussian_noise, limb_occlusions
 from probmotion.samplers import NUTS, DVAEInference
 
 FRAMES = 60
@@ -67,7 +66,7 @@ KINDS: Mapping[str, tuple[float, float | None, str]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Noisy joints of a held-out motion, and the motion."""
+    """A held-out motion and its noisy joints."""
 
     truth: Motion
     evidence: Joints3D
@@ -79,7 +78,7 @@ Estimate = Callable[[Recording], np.ndarray]
 
 @dataclass(frozen=True)
 class Study:
-    """The clips, the networks, and how many recordings of each."""
+    """Clips, networks and number of recordings."""
 
     out: Path
     data: Path
@@ -94,7 +93,7 @@ class Study:
 
     @cached_property
     def prior(self) -> MotionDVAE:
-        """The prior, with the denoiser that was trained beside it."""
+        """The prior with its denoiser."""
         if not self.quick:
             return body_prior()
         skeleton = self.clips["train"][0].skeleton
@@ -112,7 +111,7 @@ class Study:
         return prior.of(inference_network=self.trained("full", prior))
 
     def trained(self, name: str, prior: MotionDVAE, **changes: object) -> MotionDenoiser:
-        """Return a denoiser trained here, as long as the usual one of its size."""
+        """Return a denoiser trained here for as many steps as the shipped one."""
         settings, annealing = usual_denoiser_training("tiny" if self.quick else "small")
         trainee = DenoiserTrainee(
             self.clips["train"],
@@ -126,7 +125,7 @@ class Study:
         return MotionDenoiser.load(folder, prior)
 
     def recordings(self, kind: str) -> list[Recording]:
-        """Return recordings of a kind, evenly over every test clip."""
+        """Return recordings of a kind, spread evenly over the test clips."""
         noise, freedom, hides = KINDS[kind]
         made = []
         for clip in self.clips["test"]:
@@ -136,7 +135,7 @@ class Study:
             count = min(self.per_clip, room // (frames // 2) + 1)
             for start in np.linspace(0, room, count).astype(int):
                 truth = replace(clip.window(int(start), frames), name=f"{clip.name}/{start}")
-                hidden = limbs_hidden(truth, cut_off=hides == "from the ends")
+                hidden = limb_occlusions(truth, cut_off=hides == "from the ends")
                 hidden &= hides != "nothing"
                 evidence = Joints3D.observe(
                     truth,
@@ -151,7 +150,10 @@ class Study:
     def posterior(
         self, recording: Recording, network: MotionDenoiser | None = None
     ) -> MotionPosterior:
-        """Return what is believed after a recording; its body is estimated from it."""
+        """Return the calibration of draws: spread, error and coverage of central 90 % intervals.
+
+        One window of a held-out clip, short enough for NUTS, which starts at draws of the DVAE.
+        """
         prior = self.prior.of(
             frames=recording.truth.frames,
             body=body_of(recording.evidence, self.prior),
@@ -172,7 +174,7 @@ class Study:
 
 
 def noisy(recording: Recording) -> np.ndarray:
-    """Return the recording itself; what hides is between where it was seen."""
+    """Return the recording itself, occluded joints interpolated."""
     return filled_between(recording.evidence.joints, ~recording.hidden)
 
 
@@ -182,7 +184,7 @@ def filtered(recording: Recording) -> np.ndarray:
 
 
 def smoothed(recording: Recording) -> np.ndarray:
-    """Return a Kalman smoother's mean; heavy tails count as Gaussian noise of their variance."""
+    """Return a Kalman smoother's mean; heavy-tailed noise enters by its variance."""
     evidence = recording.evidence
     mean, _ = kalman_smooth(
         evidence.joints,
@@ -194,7 +196,7 @@ def smoothed(recording: Recording) -> np.ndarray:
 
 
 def mixture(study: Study) -> Estimate:
-    """Return the exact posterior mean under a Gaussian mixture of the learnt clips' windows."""
+    """Return the exact posterior mean under a Gaussian mixture fitted to the training clips."""
     frames = study.prior.settings.frames
     clips = [clip for clip in study.clips["train"] if clip.frames >= frames]
     order = list(clips[0].skeleton.mirrored_order)
@@ -223,12 +225,12 @@ def mixture(study: Study) -> Estimate:
 
 
 def estimates(study: Study) -> dict[str, Estimate]:
-    """Return every way of denoising, by name."""
+    """Return all methods, by name."""
     fit = DVAEInference(mode="optimization", iterations=50)
     regression = DVAEInference()
     known = mixture(study)
     blind = study.trained("no prior", study.prior, latent_weight=0.0)
-    clean = study.trained("no noisy training", study.prior, noise=JointNoise.hardly_any())
+    clean = study.trained("no noisy training", study.prior, noise=JointNoise.nearly_clean())
     free = replace(fit, latent_weight=0.0)
     return {
         "noisy input": noisy,
@@ -251,7 +253,7 @@ def estimates(study: Study) -> dict[str, Estimate]:
 
 
 def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
-    """Return errors of one estimate, mm, and its acceleration over the truth's."""
+    """Return errors of an estimate, mm, and its acceleration ratio."""
     truth = recording.truth.positions
     root = recording.truth.skeleton.roots[0]
     local = accuracy.joint_errors(
@@ -269,10 +271,10 @@ def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
 
 
 def table(study: Study) -> pd.DataFrame:
-    """Return mean errors of every way of denoising, by kind of recording.
+    """Return mean errors of every method, by kind of recording.
 
-    Rows that are left in ``--out/table.csv`` are not made again; those of other networks or
-    another number of recordings are refused.
+    Rows in ``--out/table.csv`` are reused; rows of other networks or another number of recordings
+    are refused.
     """
     place = study.out / "table.csv"
     rows = pd.read_csv(place).to_dict("records") if place.exists() else []
@@ -298,10 +300,9 @@ def table(study: Study) -> pd.DataFrame:
 
 
 def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, float]:
-    """Return mean errors of one way of denoising; a recording where it fails is counted, no more.
+    """Return mean errors of one method; if a recording fails, only the failures are counted.
 
-    What is compared with another row has to be compared on the same recordings: a row with
-    failures says nothing but that.
+    Rows are comparable only on the same recordings.
     """
     begun = time.perf_counter()
     found, failed = [], 0
@@ -328,7 +329,7 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
 
 
 def speed(study: Study) -> pd.DataFrame:
-    """Return errors and seconds by the number of iterations, of recordings with hidden limbs."""
+    """Return errors and seconds by number of iterations, for recordings with occluded limbs."""
     recordings = study.recordings("occluded")
     rows = []
     for iterations in (0, 10, 25, 50, 100) if study.quick else (0, 10, 25, 50, 100, 200):
@@ -368,10 +369,10 @@ def speed(study: Study) -> pd.DataFrame:
 
 
 def recording(study: Study) -> pd.DataFrame:
-    """Return distances to the filtered joints of the real recording of four cameras.
+    """Return distances to the filtered joints of the real four-camera recording.
 
-    Its noisy input is triangulated frame by frame; the filtered joints are the authors' and no
-    truth. Limbs hide as in the made recordings, because nothing does in this one.
+    The noisy input is triangulated frame by frame; the filtered joints are the authors' and not a
+    ground truth. Limbs are hidden as in the simulated recordings.
     """
     found = read_recording(study.data / "pose2sim_multiview" / BALANCING)
     # What is compared with says how large the noise is: the rms of a coordinate's difference is
@@ -380,7 +381,7 @@ def recording(study: Study) -> pd.DataFrame:
     rows = []
     for hides in (False, True):
         truth = Motion(found.filtered, found.skeleton, found.fps, name=found.name)
-        hidden = (limbs_hidden(truth) & hides) | ~found.seen
+        hidden = (limb_occlusions(truth) & hides) | ~found.seen
         evidence = Joints3D(
             found.joints, scale, (~hidden).astype(float), 4.0, found.skeleton, found.fps
         )
@@ -402,7 +403,7 @@ def recording(study: Study) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class StartedNUTS:
-    """NUTS from draws of Motion-DVAE; the seconds are those of NUTS alone."""
+    """NUTS started at draws of Motion-DVAE; the seconds are those of NUTS alone."""
 
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = NUTS.requires
@@ -413,21 +414,21 @@ class StartedNUTS:
     def sample(
         self, posterior: MotionPosterior, *, chains: int, seed: int, progress: bool, **how: Any
     ) -> MotionDraws:
-        """Return the draws of NUTS; its chains start at one draw each."""
+        """Return NUTS draws; each chain starts at one DVAE draw."""
         begun = self.start.sample(posterior, draws=1, chains=chains, seed=seed, progress=progress)
         how["initial"] = begun.dataset["theta"].values[:, 0]
         return self.nuts.sample(posterior, chains=chains, seed=seed, progress=progress, **how)
 
 
 def posterior(study: Study) -> pd.DataFrame:
-    """Return how honest draws are: spread against error, share of the truth inside 90 %.
+    """Return the calibration of draws: spread, error and coverage of central 90 % intervals.
 
-    Of one window of a held-out clip, where NUTS is affordable; it starts at draws of the DVAE.
+    One window of a held-out clip, short enough for NUTS, which starts at draws of the DVAE.
     """
     recording = study.recordings("occluded")[0]
     frames = study.prior.settings.frames
     truth = recording.truth.window(0, frames)
-    hidden = limbs_hidden(truth)
+    hidden = limb_occlusions(truth)
     evidence = Joints3D.observe(truth, KINDS["occluded"][0], study.seed, hidden=hidden)
     problem = Problem(
         "occluded",
@@ -468,7 +469,7 @@ def posterior(study: Study) -> pd.DataFrame:
 
 
 def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, float]:
-    """Return spread and error of draws, mm, and the share of the truth inside the central 90 %."""
+    """Return spread and error of draws, mm, and coverage of the central 90 % interval."""
     middle = drawn.mean(axis=0)
     spread = np.sqrt(((drawn - middle) ** 2).sum(axis=-1).mean(axis=0))
     error = np.linalg.norm(middle - truth.positions, axis=-1)
@@ -487,7 +488,7 @@ PARTS = {"table": table, "speed": speed, "recording": recording, "posterior": po
 
 
 def main() -> None:
-    """Make the parts that are asked for, each a table in ``--out``."""
+    """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")

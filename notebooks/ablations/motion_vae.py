@@ -1,16 +1,14 @@
-"""A motion VAE learnt from 2D alone: its ablations, and generation beside MAS and SDS.
+"""Motion VAE from 2D tracks: ablations (Sun et al. 2024), and generation beside MAS and SDS.
 
     python notebooks/ablations/motion_vae.py --out vae
-    python notebooks/ablations/motion_vae.py --quick --out quick    (made walks, tiny networks)
+    python notebooks/ablations/motion_vae.py --quick --out quick    (synthetic walks, tiny networks)
 
-Parts: views (how often the right view hypothesis wins), table (the shapes of tables 6, 7 and 8 of
-the paper), data (of tables 3 and 4: more clips, then smoothness), generation (beside MAS and SDS on
-the same 2D data); ``--parts`` chooses. All variants learn here, from the same tracks but where the
-part data leaves clips out, their second phase as long as ``--steps`` says; what is left in
-``--out/networks`` is not learnt again. The part generation draws through the grid; its comparisons
-are in ``--out/comparisons``, where what is finished is not drawn again. Clips are looked for in
-``--data``, by default ../shared/data beside the repository. 3D clips are filmed to be learnt from,
-and measured against.
+``--parts`` selects views (accuracy of view hypotheses), table (tables 6, 7 and 8 of the paper),
+data (tables 3 and 4: more clips, then smoothness) and generation. All variants are trained here
+on the same tracks, their second phase for ``--steps`` steps; networks in ``--out/networks`` are
+reused. Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
+../shared/data beside the repository; 3D clips are filmed for training and used as truth for
+evaluation.
 """
 
 from __future__ import annotations
@@ -42,12 +40,17 @@ from probmotion.metrics.keypoints import (
 from probmotion.metrics.motion_chamfer import motion_chamfer_distance
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.training.trainer import train
-from probmotion.models.vae.losses import best_guess, guess_terms, pictured, weighted_sum
+from probmotion.models.vae.losses import (
+    best_hypothesis,
+    hypothesis_losses,
+    project_to_image,
+    weighted_sum,
+)
 from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
-from probmotion.models.vae.view_hypotheses import judge_hypotheses
+from probmotion.models.vae.view_hypotheses import evaluate_hypotheses
 from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.rest_poses import estimate_rest_pose
@@ -84,7 +87,7 @@ SEEDS = 3
 
 @dataclass(frozen=True)
 class Study:
-    """The clips, how they are filmed, and how long networks learn: from one clip in ``every``."""
+    """Clips, cameras and training lengths; one clip in ``every`` is used for training."""
 
     out: Path
     data: Path
@@ -104,7 +107,7 @@ class Study:
 
     @cached_property
     def tracks(self) -> dict[str, list[KeypointTrack]]:
-        """What is learnt from, by part: prepared 2D tracks."""
+        """Prepared 2D tracks by part."""
         views = dict.fromkeys(("train", "validation"), 4 if self.quick else 64)
         some = self.clips | {"train": self.clips["train"][:: self.every]}
         return {
@@ -116,16 +119,16 @@ class Study:
 
     @cached_property
     def body(self) -> ArticulatedBody:
-        """The body that moves, known from the tracks."""
+        """The articulated body estimated from the tracks."""
         return ArticulatedBody(PERSON, estimate_rest_pose(self.tracks["train"]))
 
     def size(self, changes: Mapping[str, Any]) -> MotionVAESettings:
-        """Return the size of a variant."""
+        """Return the network size of a variant."""
         usual = MotionVAESettings.tiny() if self.quick else MotionVAESettings.small()
         return replace(usual, **changes)
 
     def poses(self, changes: Mapping[str, Any]) -> PoseNetwork:
-        """Return the first phase's network; variants share it unless its own loss is another's."""
+        """Return the first phase's network; variants with the same loss share it."""
         own = {name: value for name, value in changes.items() if name in OF_POSES}
         trainee = self._trainee(PoseTrainee, self.size(own))
         folder = self.out / "networks" / " ".join(["poses", *map(str, own.values())])
@@ -133,7 +136,7 @@ class Study:
         return trainee.learnt(folder)
 
     def variant(self, name: str) -> MotionVAE:
-        """Return the prior of a variant, learnt here."""
+        """Return the prior of a variant, trained here."""
         changes = VARIANTS[name]
         trainee = self._trainee(MotionVAETrainee, self.size(changes), self.poses(changes))
         folder = self.out / "networks" / name
@@ -174,14 +177,14 @@ class Study:
 
 
 def views(study: Study) -> pd.DataFrame:
-    """Return how often the right view hypothesis wins, by their number."""
+    """Return how often the correct view hypothesis wins, by number of views."""
     rows = []
     n = 100 if study.quick else 1000
     for hypotheses in (1, 2, 4):
         changes = {} if hypotheses == 4 else {"hypotheses": hypotheses}
         network, size = study.poses(changes), study.size(changes)
         for part in ("train", "test"):
-            judged = judge_hypotheses(network, size, study.body, study.clips[part], n=n, fps=FPS)
+            judged = evaluate_hypotheses(network, size, study.body, study.clips[part], n=n, fps=FPS)
             rows.append(
                 {
                     "hypotheses": hypotheses,
@@ -213,14 +216,14 @@ def reconstructed(
     distance = Filming().distance
     with torch.no_grad():
         guesses = poses.eval()(given, weight, rest)
-        terms = guess_terms(study.body, guesses, given, weight, distance)
-        guess = best_guess(guesses, weighted_sum(terms, size))
+        terms = hypothesis_losses(study.body, guesses, given, weight, distance)
+        guess = best_hypothesis(guesses, weighted_sum(terms, size))
         turns = guess.turns
         if prior is not None:
             turns = prior.model.vae.decode(prior.model.vae.encode(given, weight, rest)[0])
         place = torch.nn.functional.pad(guess.translation, (0, 1))
         joints = study.body.positions(turns, guess.rotation, place, guess.log_lengths)
-        found = pictured(joints, distance).numpy()
+        found = project_to_image(joints, distance).numpy()
     sizes = image_extent(shown, visible)
     return {
         "pck": percentage_of_correct_keypoints(found, shown, sizes, visible=visible),
@@ -232,13 +235,13 @@ def reconstructed(
 
 
 def pieces(values: np.ndarray, frames: int) -> np.ndarray:
-    """Return what fits of (L, …) as sequences one after the other, (n, frames, …)."""
+    """Return (L, …) cut into consecutive sequences, (n, frames, …)."""
     n = len(values) // frames
     return values[: n * frames].reshape(n, frames, *values.shape[1:])
 
 
 def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
-    """Return how near pictures of motions are to real ones, cm², and motions to real ones, mm."""
+    """Return distances of filmed motions to real views, cm², and of motions to real ones, mm."""
     rng = seeds.generator(study.seed, "film", seed)
     pictures = film_motions(motions, rng)
     row = {}
@@ -250,7 +253,7 @@ def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
 
 
 def measured(study: Study, name: str) -> dict[str, float]:
-    """Return what a variant reconstructs and generates."""
+    """Return reconstruction and generation metrics of a variant."""
     begun = time.perf_counter()
     prior = study.variant(name)
     row = {"seconds": time.perf_counter() - begun} | reconstructed(study, VARIANTS[name], prior)
@@ -264,7 +267,7 @@ def measured(study: Study, name: str) -> dict[str, float]:
 
 
 def table(study: Study) -> pd.DataFrame:
-    """Return what each variant reconstructs and generates."""
+    """Return the metrics of every variant."""
     rows: list[dict[str, Any]] = []
     for name in VARIANTS:
         rows.append({"variant": name} | measured(study, name))
@@ -280,7 +283,7 @@ def table(study: Study) -> pd.DataFrame:
 
 
 def data(study: Study) -> pd.DataFrame:
-    """Return what more clips, and then smoothness, are worth: to poses alone and to the VAE."""
+    """Return the effect of more clips and of smoothness, on poses alone and on the VAE."""
     rows: list[dict[str, Any]] = []
     for name, (every, variant) in DATA.items():
         some = study if every == 1 else replace(study, out=study.out / name, every=every)
@@ -347,7 +350,7 @@ def sequences(draws: MotionDraws) -> np.ndarray:
 
 
 def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
-    """Return how near motions and their pictures are to real ones, all about the root."""
+    """Return distances of motions and their views to real ones, root-centred."""
     centred = motions - motions[:, :, :1]
     row = generated(study, centred, 0)
     truth = {part: study.real_windows(part, FRAMES)[::3] for part in ("test", "train")}
@@ -361,7 +364,7 @@ PARTS = {"views": views, "table": table, "data": data, "generation": generation}
 
 
 def main() -> None:
-    """Make the parts that are asked for, each a table in ``--out``."""
+    """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")

@@ -1,13 +1,13 @@
-"""Ablations of pose-pair sampling on the salsa clips: Yin et al. (2018), section 6, figures 6 to 9.
+"""Ablations of pose-pair sampling on CMU salsa: Yin et al. (2018), section 6, figures 6 to 9.
 
     python notebooks/ablations/pose_pairs.py --out pose-pairs
-    python notebooks/ablations/pose_pairs.py --quick --out quick     (made dances, minutes)
+    python notebooks/ablations/pose_pairs.py --quick --out quick     (synthetic dances, minutes)
 
-Parts: noise, calibration, paired, truncation, velocity, coverage, embedding, completion;
-``--parts`` chooses. Each leaves a CSV file and pictures in ``--out``. What they look at is drawn
-through the grid, a comparison per part in ``--out/comparisons`` (3 GB in all), so that what is
-interrupted goes on. The parts embedding and completion look at the draws of the part coverage.
-Real data are looked for as in :func:`probmotion.data.downloads.salsa_pairs`.
+``--parts`` selects noise, calibration, paired, truncation, velocity, coverage, embedding and
+completion; each writes a CSV file and figures to ``--out``. Draws are stored in
+``--out/comparisons`` (3 GB in all), and an interrupted study continues from there. The parts
+embedding and completion use the draws of the part coverage. Data are located by
+:func:`probmotion.data.downloads.salsa_pairs`.
 """
 
 from __future__ import annotations
@@ -68,20 +68,20 @@ NOISE = {"interaction": 0.005, "cartesian": 0.01, "shape-context": 0.005}
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """What was changed for each problem, by its name, and the grid that was drawn of them."""
+    """Settings of each problem by name, and the comparison of their draws."""
 
     asked: Mapping[str, Mapping[str, Any]]
     found: Comparison
 
     def draws(self, problem: str, sampler: str = "isotropic") -> MotionDraws | None:
-        """Return the draws of a cell; None where it failed."""
+        """Return the draws of a run; None if it failed."""
         failed = {(cell.problem, cell.sampler) for cell in self.found.failures}
         return None if (problem, sampler) in failed else self.found.draws(problem, sampler)
 
 
 @dataclass(frozen=True)
 class Study:
-    """The data, and how much to draw."""
+    """Data and numbers of draws."""
 
     out: Path
     quick: bool
@@ -95,9 +95,9 @@ class Study:
 
     @cached_property
     def clips(self) -> tuple[list, list]:
-        """Clips that are shown, and clips that are held out whole.
+        """Training clips and held-out clips.
 
-        What is chosen is chosen on clips that are held out of those that are shown.
+        Validation clips, on which settings are chosen, are held out of the training clips.
         """
         if self.quick:
             shown, hidden = hold_out(synthetic_dances(8), ["dance-6", "dance-7"])
@@ -109,12 +109,12 @@ class Study:
 
     @cached_property
     def held_in(self) -> np.ndarray:
-        """All frames of the dance of the clips that are shown, (n, J, 3)."""
+        """All dance frames of the training clips, (n, J, 3)."""
         return ground_truth(self.clips[0])[0]
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Pose-pairs to cover, (G, J, 3)."""
+        """Held-out pose pairs, (G, J, 3)."""
         return ground_truth(self.clips[1], self.n_held_out)[0]
 
     @cached_property
@@ -123,7 +123,7 @@ class Study:
         return self.held_in[choose_seed(self.held_in)]
 
     def pictures(self, repeat: int) -> DrawnAnnotations:
-        """Frames that are annotated in 2D, and the truth behind them: others in every repeat."""
+        """Annotated 2D frames and the 3D poses behind them; different in every repeat."""
         frames = [dance_frames(clip) for clip in self.clips[0]]
         n = min(self.n_annotations, sum(int(some.sum()) for some in frames))
         return draw_annotations(self.clips[0], n, repeat, frames=frames)
@@ -145,9 +145,9 @@ class Study:
         proposals: Mapping[str, Proposal] | None = None,
         draws: int | None = None,
     ) -> Runs:
-        """Return every state after the warm-up of chains that start at the seed, side by side.
+        """Return all states after warm-up of chains that start at the seed, side by side.
 
-        A repeat has annotations and views of its own: in the grid it is another problem.
+        Each repeat has its own annotations and views, and is a separate problem of the comparison.
         """
         problems = {
             name: Problem(
@@ -177,7 +177,7 @@ class Study:
 
     @cached_property
     def by_density(self) -> Runs:
-        """All draws of four densities: the part "coverage", which others look at, too."""
+        """All draws of four densities (part "coverage", used by other parts too)."""
         asked = {
             f"{density}, repeat {repeat}": {"density": density, "repeat": repeat}
             for density in ("interaction", "cartesian", "prior", "shape-context")
@@ -189,9 +189,9 @@ class Study:
     def table(
         self, runs: Runs, fewer: Sequence[int] = (), also: Sequence[str] = ()
     ) -> pd.DataFrame:
-        """Return coverage by all draws of every cell, and by the first so many, step by step.
+        """Return coverage by all draws of every run, and by the first n, step by step.
 
-        ``also`` names what else is taken from what the grid measured.
+        ``also`` names further metrics of the comparison.
         """
         rows = []
         for cell in runs.found.results:
@@ -220,7 +220,7 @@ class Study:
         return pd.DataFrame(rows)
 
     def covered(self, poses: np.ndarray, counts: Sequence[int]) -> dict[tuple[str, int], float]:
-        """Return coverage by the first so many poses, by measure and number."""
+        """Return coverage by the first n poses, by dissimilarity and number."""
         if not counts:
             return {}
         return {
@@ -234,7 +234,7 @@ class Study:
     def draw_states(
         self, runs: Mapping[str, MotionDraws | None], path: Path, compared: str
     ) -> None:
-        """Draw the states that the paper shows of the first chain, turned to the seed."""
+        """Draw the states of the first chain that the paper shows, aligned to the seed."""
         rows = {}
         for label, draws in runs.items():
             if draws is not None:
@@ -259,12 +259,12 @@ def step_by_step(draws: MotionDraws) -> np.ndarray:
 
 
 def evenly(poses: np.ndarray, n: int) -> np.ndarray:
-    """Return about n of the poses, evenly apart."""
+    """Return about n of the poses, evenly spaced."""
     return poses[:: max(1, len(poses) // n)]
 
 
 def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return log prior, log likelihood and their sum of poses, (n, J, 3)."""
+    """Return log prior, log likelihood and their sum for poses (n, J, 3)."""
     motions = poses[:, None]
     prior = posterior.prior.log_plausibility(motions)
     likelihood = posterior.likelihood.log_density(motions)
@@ -272,7 +272,7 @@ def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.nda
 
 
 def calibration(study: Study) -> pd.DataFrame:
-    """What the density says of real pairs, of the seed and of draws, at several σ_l."""
+    """Log density of real pairs, of the seed and of draws, at several σ_l."""
     rng = seeds.generator(SEED, "calibration")
     real = study.held_in[rng.choice(len(study.held_in), min(400, len(study.held_in)), False)]
     sizes = {f"noise {size}": size for size in (0.005, PairSettings().noise, 0.02)}
@@ -296,7 +296,7 @@ def calibration(study: Study) -> pd.DataFrame:
 
 
 def noise(study: Study) -> pd.DataFrame:
-    """σ_l: acceptance, step and coverage of the validation clips; defaults are chosen from it."""
+    """σ_l: acceptance, step size and coverage of the validation clips, used to choose defaults."""
     study = replace(study, validating=True)
     scales = {
         "interaction": (0.003, 0.005, 0.01, 0.02, 0.05),
@@ -324,7 +324,7 @@ def paired(study: Study) -> pd.DataFrame:
 
 
 def truncation(study: Study) -> pd.DataFrame:
-    """c of eq. 11: shares of draws where the density is cut, and coverage."""
+    """c of eq. 11: proportion of draws where the density is truncated, and coverage."""
     asked = {
         f"limit {limit:.3g}, repeat {repeat}": {"limit": limit, "repeat": repeat}
         for repeat in range(study.repeats)
@@ -402,9 +402,9 @@ def embedding(study: Study) -> pd.DataFrame:
 
 
 def completion(study: Study) -> pd.DataFrame:
-    """Hidden joints of held-out pairs: error beside the two baselines, in the picture, metres.
+    """Error of occluded joints of held-out pairs, with two baselines, in the image plane, metres.
 
-    Every method gets the same estimate of the view, from the seed's torsos.
+    Every method gets the same estimate of the view, from the torsos.
     """
     frames = [dance_frames(clip) for clip in study.clips[1]]
     n = 10 if study.quick else 60
@@ -454,7 +454,7 @@ PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
 
 
 def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Return what is printed of a part: means over chains and pairs."""
+    """Return what is printed for a part: means over chains and pairs."""
     keys = [k for k in ("density", "proposal", "noise", "limit", "draws") if k in table]
     if name == "completion":
         return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
@@ -471,7 +471,7 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
 
 
 def main() -> None:
-    """Run the parts that are asked for; print every table."""
+    """Run the selected parts and print every table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose-pairs"))
     parser.add_argument("--parts", nargs="*", choices=list(PARTS), default=list(PARTS))

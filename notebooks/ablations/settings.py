@@ -1,10 +1,10 @@
-"""What a sampler's own settings are worth, through the same grid as everything else.
+"""Effect of each sampler's own settings.
 
     python notebooks/ablations/settings.py --out settings
     python notebooks/ablations/settings.py --out quick --draws 12 --seeds 1     (two minutes)
 
-``--studies`` chooses among those below. Every study is a comparison in a folder of ``--out``, with
-its table and its page; what is interrupted goes on.
+``--studies`` selects studies. Each is a comparison in a folder of ``--out`` with its table and
+report; an interrupted study continues from there.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from probmotion.samplers import (
 
 @dataclass(frozen=True)
 class Study:
-    """Variants of a sampler, and the problems that they are tried on."""
+    """Variants of a sampler and the problems they are run on."""
 
     about: str
     problems: tuple[str, ...]
@@ -67,7 +67,7 @@ STUDIES = {
 
 
 def main() -> None:
-    """Run the studies that are asked for and print their tables."""
+    """Run the selected studies and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--studies", nargs="+", choices=STUDIES, default=list(STUDIES))

@@ -1,19 +1,17 @@
-"""Decomposition of a multi-view sampler's error on a problem with known exact draws.
+"""Decomposition of a multi-view sampler's error on a problem with exact draws.
 
-A chain of samplers leads from exact draws to the sampler in question. Each differs from the one
-before in one thing, whose part of the error is the difference of what is measured of the two:
+A chain of samplers leads from exact draws to `mas`, changing one component at a time. The part of a
+component is the difference between neighbours:
 
-- ``remainder``: exact draws → `ancestral3d` with many steps. About 0 where all is right
-- ``discretisation``: → with T steps
-- ``single view``: → `mas`, which conditions on one view at a time, with the exact denoiser of a
-  view, given the evidence where there is any
-- ``noise sharing``: → with noise of each view's own
-- ``guidance``: where there is evidence, → with the denoiser that does not know of it, guided
-- ``network``: → with a learnt 2D denoiser
+- ``remainder``: exact draws → `ancestral3d` with 10 T steps; about 0 for a correct implementation
+- ``discretisation``: → T steps
+- ``single view``: → `mas` with the exact denoiser of each view, given the observations if any
+- ``noise sharing``: → independent noise in each view
+- ``guidance``: → unconditional denoiser with guidance, if there are observations
+- ``network``: → a learnt 2D denoiser
 
-A measure is one signed number of a set of draws (:mod:`~probmotion.calibration.error_measures`), so
-parts add up to the whole exactly, seed by seed. Samplers share their seeds, and with them noise:
-intervals are Student's, of differences within seeds.
+Measures are signed (:mod:`~probmotion.calibration.error_measures`), so the parts add up exactly,
+seed by seed. Samplers share seeds; intervals are Student's, of differences within seeds.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from probmotion import seeds as seeding
-from probmotion.calibration.error_measures import BiasMeasures, require_exact
+from probmotion.calibration.error_measures import ErrorMeasures, require_exact
 from probmotion.calibration.error_result import ErrorDecomposition, StoredValues
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
@@ -39,7 +37,7 @@ from probmotion.validation import check_count
 __all__ = ["decompose_error"]
 
 _MORE = 10
-# Settings in which `mas` and the samplers before it in the chain may be told apart by one thing.
+# Settings of `mas` for which the earlier samplers have a counterpart.
 _SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance", "batch")
 _SHARED = ("schedule_power", "batch")
 
@@ -56,73 +54,70 @@ def decompose_error(
     out: str | Path | None = None,
     progress: bool = True,
 ) -> ErrorDecomposition:
-    """Split the error of `mas` on a problem into parts.
+    """Decompose the error of `mas` on a problem.
 
     Parameters
     ----------
     problem : Problem
-        One with an exact posterior, whose prior has exact 3D and 2D denoisers; where there is
-        evidence, also given it (:func:`~probmotion.problems.conditioned.conditioned`).
+        A problem with an exact posterior and exact 3D and 2D denoisers; with observations, also
+        given them (:func:`~probmotion.problems.conditioned.conditioned`).
     steps : int
-        T. "Many" is ten times as many.
+        T.
     seeds : int
-        Replicates, at least 2: without a spread no part can be told from chance.
+        Replicates, at least 2.
     draws : int
-        Per sampler and seed.
+        Draws per sampler and seed, at least 10.
     settings : mapping, optional
-        Of `mas`: n_views, elevation, view_weights, schedule_power, guidance, batch; its defaults
-        where left out.
+        Settings of `mas`: n_views, elevation, view_weights, schedule_power, guidance, batch.
     shared_noise : bool, optional
-        Whether the sampler in question projects one 3D noise into all views; noise sharing is then
-        no part. By default it does where there is evidence, which guides `mas` only so.
+        Whether `mas` projects one 3D noise into all views, which removes the noise-sharing part. By
+        default only with observations, where guidance requires it.
     learnt : MotionPrior, optional
-        A prior with a learnt 2D denoiser of the same motions, such as
-        `probmotion.models.diffusion.projected_denoiser.denoiser_of` makes; without it the network
-        is no part. What its normalisation and its training views change is its part, too.
+        Prior of the same motions with a learnt 2D denoiser, e.g. from
+        `probmotion.models.diffusion.projected_denoiser.denoiser_of`, for the network part, which
+        includes effects of its normalisation and training views.
     out : str or Path, optional
-        Folder that keeps what is measured of every sampler and seed, so that the same call goes on
-        where it was stopped, and ``decompose_error.csv``.
+        Folder for intermediate values, to resume an interrupted call, and ``decompose_error.csv``.
     progress : bool
-        Show a bar.
+        Show a progress bar.
 
     Raises
     ------
     ValueError
-        If the problem is not known exactly, a number is out of range, a setting is not one of
-        those above, noise is not shared where there is evidence, ``learnt`` is of other motions,
-        or ``out`` holds another budget.
+        If the problem is not exact, an argument is invalid, ``learnt`` has other motions, or
+        ``out`` belongs to another decomposition.
     UnsupportedPosterior
-        If the problem's prior lacks a denoiser, or ``learnt`` does.
+        If the prior or ``learnt`` lacks a denoiser.
     """
     check_count("seeds", seeds, least=2)
     check_count("draws", draws, least=10)
     check_count("steps", steps, least=2)
     links, notes = _chain(problem, steps, dict(settings or {}), shared_noise, learnt)
     title = _title(problem, links, steps)
-    kept = StoredValues(None if out is None else Path(out), [[*links], draws])
-    measures: BiasMeasures | None = None
-    with progress_bar(seeds * len(links), "bias budget", progress) as bar:
+    stored = StoredValues(None if out is None else Path(out), [[*links], draws])
+    measures: ErrorMeasures | None = None
+    with progress_bar(seeds * len(links), "error decomposition", progress) as bar:
         for seed, link in itertools.product(range(seeds), links):
-            if kept.get(link.name, seed) is None:
-                measures = BiasMeasures(problem) if measures is None else measures
+            if stored.get(link.name, seed) is None:
+                measures = ErrorMeasures(problem) if measures is None else measures
                 number = seeding.integer(seed, "bias budget", link.stream)
                 drawn = link.sampler.sample(
                     link.posterior, draws=draws, seed=number, progress=False
                 )
-                kept.put(link.name, seed, measures.of(drawn.flat(), seed))
+                stored.put(link.name, seed, measures.of(drawn.flat(), seed))
             bar.update(1)
     values = {
-        link.name: [kept.get(link.name, seed) or {} for seed in range(seeds)] for link in links
+        link.name: [stored.get(link.name, seed) or {} for seed in range(seeds)] for link in links
     }
-    budget = ErrorDecomposition(title, values, notes)
+    decomposition = ErrorDecomposition(title, values, notes)
     if out is not None:
-        budget.write(Path(out) / "decompose_error.csv")
-    return budget
+        decomposition.write(Path(out) / "decompose_error.csv")
+    return decomposition
 
 
 @dataclass(frozen=True)
 class _Link:
-    """A sampler in the chain, called by the part that it adds; the first is exact draws."""
+    """A sampler in the chain, named by the part that it adds; the first is exact draws."""
 
     name: str
     sampler: Sampler
@@ -130,7 +125,7 @@ class _Link:
 
     @property
     def stream(self) -> str:
-        """Exact draws have random numbers of their own, all others the same."""
+        """Random stream: separate for exact draws, shared by the samplers."""
         return "exact" if self.name == "exact" else "samplers"
 
 
@@ -141,22 +136,19 @@ def _chain(
     shared_noise: bool | None,
     learnt: MotionPrior | None,
 ) -> tuple[list[_Link], list[str]]:
-    """Return the samplers in order, and which parts are absent and why."""
+    """Return the samplers in order, and notes on absent parts."""
     for name in settings:
         if name not in _SETTINGS:
-            raise ValueError(
-                f"settings has {name!r}, expected some of {', '.join(_SETTINGS)}: in others the "
-                "samplers before mas have no counterpart"
-            )
+            raise ValueError(f"settings must be among {', '.join(_SETTINGS)}, got {name!r}")
     require_exact(problem)
     Ancestral, Mas = load_sampler("ancestral3d"), load_sampler("mas")
     common = {name: settings[name] for name in _SHARED if name in settings}
-    evidence = problem.posterior.likelihood
+    likelihood = problem.posterior.likelihood
     inside = conditioned(problem.posterior)
-    shared = evidence is not None if shared_noise is None else shared_noise
-    if evidence is not None and not shared:
+    shared = likelihood is not None if shared_noise is None else shared_noise
+    if likelihood is not None and not shared:
         raise ValueError(
-            "shared_noise is False, expected True where there is evidence: mas is guided only so"
+            "shared_noise must be True with observations, because guidance requires it, got False"
         )
     links = [
         _Link("exact", load_sampler("exact")(), problem.posterior),
@@ -167,38 +159,37 @@ def _chain(
     notes = []
     last = links[-1].sampler
     if shared:
-        notes.append("noise sharing is no part: one 3D noise is projected into all views")
+        notes.append("no noise-sharing part: one 3D noise is projected into all views")
     else:
         last = Mas(steps=steps, shared_noise=False, **settings)
         links.append(_Link("noise sharing", last, inside))
-    if evidence is None:
-        notes.append("guidance is no part: there is no evidence")
+    if likelihood is None:
+        notes.append("no guidance part: there are no observations")
     else:
         links.append(_Link("guidance", last, problem.posterior))
     if learnt is None:
-        notes.append("network is no part: no learnt denoiser was given")
+        notes.append("no network part: no learnt denoiser was given")
     else:
         _check_learnt(learnt, problem)
-        links.append(_Link("network", last, MotionPosterior(learnt, evidence)))
-    for link in links:
-        # Said before an hour of the others.
+        links.append(_Link("network", last, MotionPosterior(learnt, likelihood)))
+    for link in links:  # fail before the first long run
         require(link.sampler, link.posterior)
     return links, notes
 
 
 def _check_learnt(learnt: MotionPrior, problem: Problem) -> None:
-    """Raise ``ValueError`` if a learnt denoiser is of other motions than the problem's."""
+    """Raise ``ValueError`` if frames or joints of a learnt denoiser differ from the problem's."""
     posterior = problem.posterior
     wanted = (posterior.frames, posterior.skeleton.joint_names)
     if (learnt.frames, learnt.skeleton.joint_names) != wanted:
         raise ValueError(
-            f"learnt is of {learnt.frames} frames of {learnt.skeleton.n_joints} joints, expected "
-            f"the problem's {posterior.frames} frames and its {len(wanted[1])} joints by name"
+            f"learnt must have the problem's {posterior.frames} frames and {len(wanted[1])} named "
+            f"joints, got {learnt.frames} frames and {learnt.skeleton.n_joints} joints"
         )
 
 
 def _title(problem: Problem, links: list[_Link], steps: int) -> str:
-    """Return what to call the setting."""
+    """Return a title of the setting."""
     sampler: Any = next(link.sampler for link in reversed(links) if link.sampler.name == "mas")
     words = [problem.name, f"V = {sampler.n_views}", f"T = {steps}"]
     if not np.isclose(sampler.elevation, load_sampler("mas")().elevation):

@@ -1,8 +1,4 @@
-"""How wrong a set of draws is, as signed numbers whose differences add up.
-
-Each measure is one number of one set of draws, so that along a chain of samplers the differences
-from one to the next add up to that from the first to the last, whatever the measure.
-"""
+"""Signed error measures of sets of draws, additive along a chain of samplers."""
 
 from __future__ import annotations
 
@@ -12,11 +8,12 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.metrics.distribution import random_directions, sliced_wasserstein
-from probmotion.metrics.structure import HasManifold
 from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.protocols import HasManifold
 
-__all__ = ["MEASURES", "BiasMeasures", "require_exact"]
+__all__ = ["MEASURES", "ErrorMeasures", "require_exact"]
 
+# Descriptions of the measures, by name.
 MEASURES: Mapping[str, str] = {
     "spread": "log total variance",
     "small": "log variance, small directions",
@@ -24,49 +21,35 @@ MEASURES: Mapping[str, str] = {
     "mean": "squared error of the mean / total variance",
     "distance": "squared sliced distance / mean variance",
 }
-"""What is measured, in words."""
 
 _SETS, _DIRECTIONS, _POOL = 8, 256, 4000
 _LARGE = 0.95
 
 
-class BiasMeasures:
-    """What is measured of draws from a problem that is known exactly.
+class ErrorMeasures:
+    """Error measures of draws from a problem with an exact posterior.
 
-    - ``spread``: log of the trace of the covariance over the exact one; negative is over-confident
-    - ``small``: mean over small principal directions of log(variance / exact variance): those of
-      the exact covariance beyond the ones that hold 95 % of it
-    - ``off``: log of the mean variance off the prior's manifold over exact draws', for a prior
-      that knows one
-    - ``mean``: squared distance of the mean from the exact one over the trace, less what chance
-      alone makes of it: 0 in expectation for exact draws
-    - ``distance``: squared sliced 2-Wasserstein distance to as many exact draws, over the mean
-      variance of a projection. It has a floor, what exact draws have.
+    - ``spread``: log of the trace of the covariance over the exact one; negative: overconfident
+    - ``small``: mean log(variance / exact variance) over the small principal directions, beyond
+      those that hold 95 % of the exact variance
+    - ``off``: log of the mean variance off the manifold over that of exact draws, if defined
+    - ``mean``: squared error of the mean over the trace, minus its expectation for exact draws
+    - ``distance``: squared sliced 2-Wasserstein distance to exact draws over the mean variance of
+      a projection; positive even for exact draws
 
-    Logarithms, because the steps of a sampler multiply variances; squares, because they add up
-    where errors are of unlike kinds.
-
-    Parameters
-    ----------
-    problem : Problem
-        One with an exact posterior.
-
-    Raises
-    ------
-    ValueError
-        If it has none.
+    Raises ``ValueError`` if the problem has no exact posterior.
     """
 
     def __init__(self, problem: Problem) -> None:
         require_exact(problem)
         self.problem = problem
-        # Of every budget of the problem alike: what is measured must not differ with its seeds.
+        # The same pool for every decomposition of the problem.
         pool = problem.reference(seeds.integer(0, "bias measures"), _POOL)
         flat = pool.reshape(_POOL, -1)
         variances, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
         self.total = float(variances.sum())
         held = np.cumsum(variances[::-1])[::-1]
-        # From the largest down: a direction is small if the larger ones hold enough without it.
+        # A direction is small if the larger ones hold 95 % of the variance.
         self.small = axes[:, held - variances >= _LARGE * self.total]
         self.small_variances = np.var(flat @ self.small, axis=0, ddof=1)
         prior = problem.posterior.prior
@@ -81,7 +64,7 @@ class BiasMeasures:
         positions : ndarray, (n, L, J, 3)
             Metres.
         seed : int
-            Of the exact draws and directions; the same for all samplers that are compared.
+            Seed of the exact draws and directions, shared by all samplers.
         """
         n = len(positions)
         flat = positions.reshape(n, -1)
@@ -112,7 +95,4 @@ class BiasMeasures:
 def require_exact(problem: Problem) -> None:
     """Raise ``ValueError`` if a problem has no exact posterior."""
     if problem.exact is None:
-        raise ValueError(
-            f"problem is {problem.name!r}, which nobody knows exactly, expected one with an exact "
-            "posterior: what is measured is how far samplers are from it"
-        )
+        raise ValueError(f"problem must have an exact posterior, got {problem.name!r}")

@@ -1,4 +1,4 @@
-"""`ErrorDecomposition`: the parts of a sampler's error, with their intervals."""
+"""Parts of a sampler's error, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class ErrorDecomposition:
     Parameters
     ----------
     setting : str
-        What it is called.
+        Title.
     values : mapping of str to sequence of mapping
-        What was measured, by sampler in the chain's order, exact draws first, then by seed. Each
-        sampler is called by the part that it adds.
+        Measures by sampler in the order of the chain (exact draws first), then by seed. A sampler
+        is named by the part that it adds.
     notes : sequence of str
-        Which parts are absent, and why.
+        Notes on absent parts.
     """
 
     def __init__(
@@ -57,13 +57,7 @@ class ErrorDecomposition:
         }
 
     def differences(self, measure: str) -> dict[str, np.ndarray]:
-        """Return each part seed by seed, (seeds,); they add up to the whole.
-
-        Raises
-        ------
-        ValueError
-            If it was not measured; the message lists what was.
-        """
+        """Return each part by seed, (seeds,); they add up to the whole."""
         if measure not in self.values:
             raise ValueError(f"measure must be one of {', '.join(self.values)}, got {measure!r}")
         links = list(self.values[measure].items())
@@ -72,10 +66,8 @@ class ErrorDecomposition:
     def table(self) -> pd.DataFrame:
         """Return the tidy table: setting, measure, part, mean, low, high.
 
-        A row per part; before them ``floor``, what is measured of exact draws, and after them
-        ``whole``, the sum of the parts. ``low`` to ``high`` is a 95 % interval of the mean over
-        seeds: a part whose interval holds 0 is not told from chance. Each interval is for itself:
-        of twenty parts that are nothing, one is told from chance.
+        Besides the parts there are ``floor``, the measure of exact draws, and ``whole``, the sum of
+        the parts. ``low`` to ``high`` is a pointwise 95 % interval of the mean over seeds.
         """
         import pandas as pd
 
@@ -91,38 +83,27 @@ class ErrorDecomposition:
 
     @property
     def findings(self) -> list[str]:
-        """A sentence per measure: the parts that are told from chance, the largest first."""
+        """A sentence per measure: its significant parts, the largest first."""
         sentences = []
         table = self.table().set_index(["measure", "part"])
         for measure in self.values:
             rows = {part: table.loc[(measure, part)] for part in [*self.parts, _WHOLE]}
-            told = {part: row for part, row in rows.items() if row["low"] > 0 or row["high"] < 0}
-            whole = told.pop(_WHOLE, None)
+            clear = {part: row for part, row in rows.items() if row["low"] > 0 or row["high"] < 0}
+            whole = clear.pop(_WHOLE, None)
             rows.pop(_WHOLE)
-            ordered = sorted(told, key=lambda part: -abs(told[part]["mean"]))
-            listed = [f"{part} {_in_words(told[part])}" for part in ordered]
-            quiet = [part for part in rows if part not in told]
-            words = f"{measure}: "
-            words += (
-                f"{_in_words(whole)} in all"
-                if whole is not None
-                else "in all not told from exact draws"
-            )
-            if listed:
-                words += f"; {', '.join(listed)}"
-            if quiet:
-                words += f"; not told from chance: {', '.join(quiet)}"
-            sentences.append(words)
+            words = [
+                f"{measure}: {'not significant' if whole is None else _in_words(whole)} in all"
+            ]
+            if clear:
+                ordered = sorted(clear, key=lambda part: -abs(clear[part]["mean"]))
+                words.append(", ".join(f"{part} {_in_words(clear[part])}" for part in ordered))
+            if quiet := [part for part in rows if part not in clear]:
+                words.append(f"not significant: {', '.join(quiet)}")
+            sentences.append("; ".join(words))
         return sentences
 
     def plot(self, path: str | Path) -> Path:
-        """Draw the parts, stacked from exact draws' floor, a panel per measure; return where.
-
-        Raises
-        ------
-        ValueError
-            If the path does not end in ``.png``.
-        """
+        """Draw the parts, a panel per measure, to a ``.png`` file; return its path."""
         from probmotion.plots.error_plots import draw_error_decomposition
 
         draw_error_decomposition(self.table(), path, words=MEASURES, notes=self.notes)
@@ -135,21 +116,9 @@ class ErrorDecomposition:
 
 
 class StoredValues:
-    """What was measured of each sampler and seed, kept in a folder if there is one.
+    """Measures of each sampler and seed, stored as JSON in ``folder`` if given.
 
-    Parameters
-    ----------
-    folder : Path or None
-        Where ``decompose_error.json`` is; it is made.
-    question : object
-        What was asked for: what is kept answers no other question.
-
-    Raises
-    ------
-    ValueError
-        If the folder holds the answer to another.
-    OSError
-        If it cannot be written to.
+    ``question`` identifies the decomposition; a folder with another one is a ``ValueError``.
     """
 
     def __init__(self, folder: Path | None, question: Any) -> None:
@@ -160,19 +129,19 @@ class StoredValues:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
-            kept = json.loads(self.path.read_text(encoding="utf-8"))
-            if kept["question"] != self.question:
+            stored = json.loads(self.path.read_text(encoding="utf-8"))
+            if stored["question"] != self.question:
                 raise ValueError(
-                    f"out is {str(folder)!r}, which holds another budget, expected a new folder"
+                    f"out must be a new folder, got {str(folder)!r} with another decomposition"
                 )
-            self._values = kept["values"]
+            self._values = stored["values"]
 
     def get(self, name: str, seed: int) -> dict[str, float] | None:
-        """Return what was measured, if it was."""
+        """Return the measures, if stored."""
         return self._values.get(f"{name} {seed}")
 
     def put(self, name: str, seed: int, values: dict[str, float]) -> None:
-        """Keep what was measured."""
+        """Store the measures."""
         self._values[f"{name} {seed}"] = values
         if self.path is None:
             return

@@ -1,4 +1,4 @@
-"""`Overconfident`: a sampler that is known to be wrong, which a test of calibration must find."""
+"""Negative control: a deliberately overconfident sampler that calibration must detect."""
 
 from __future__ import annotations
 
@@ -19,19 +19,14 @@ _CHANGED = ("positions", "theta", "log_density")
 
 @dataclass(frozen=True)
 class Overconfident:
-    """Draws of another sampler, pulled towards their mean: a posterior that is too narrow.
+    """Draws of another sampler, shrunk towards their mean.
 
     Parameters
     ----------
     sampler : Sampler
-        What draws; it decides which posteriors can be drawn from.
+        The sampler to shrink draws of.
     factor : float
-        What is left of a draw's distance from the mean of all, between 0 and 1.
-
-    Raises
-    ------
-    ValueError
-        If ``factor`` is not between 0 and 1.
+        Shrinkage factor, between 0 and 1.
     """
 
     name: ClassVar[str] = "overconfident"
@@ -43,7 +38,7 @@ class Overconfident:
     def __post_init__(self) -> None:
         check_positive("factor", self.factor)
         if self.factor >= 1:
-            raise ValueError(f"factor must be a number between 0 and 1, got {self.factor!r}")
+            raise ValueError(f"factor must be between 0 and 1, got {self.factor!r}")
 
     def sample(
         self,
@@ -55,24 +50,16 @@ class Overconfident:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` draws that lie too close together.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the other sampler cannot draw from the posterior.
-        Interrupted
-            On Ctrl-C, if the other sampler hands over what it had finished.
-        """
+        """Return ``chains`` × ``draws`` overconfident draws; raises as the other sampler."""
         try:
             right = self.sampler.sample(
                 posterior, draws=draws, chains=chains, seed=seed, initial=initial, progress=progress
             )
         except Interrupted as stop:
-            raise Interrupted(self._pulled(posterior, stop.draws, seed)) from stop
-        return self._pulled(posterior, right, seed)
+            raise Interrupted(self._shrunk(posterior, stop.draws, seed)) from stop
+        return self._shrunk(posterior, right, seed)
 
-    def _pulled(self, posterior: MotionPosterior, right: MotionDraws, seed: int) -> MotionDraws:
+    def _shrunk(self, posterior: MotionPosterior, right: MotionDraws, seed: int) -> MotionDraws:
         positions = right.positions.values
         mean = positions.mean(axis=(0, 1))
         return MotionDraws.of(

@@ -1,4 +1,4 @@
-"""The numbers by which a truth is ranked among draws, and the credible sets that they belong to."""
+"""Scalar quantities of motions in which the truth is ranked among draws."""
 
 from __future__ import annotations
 
@@ -22,25 +22,24 @@ _DIRECTIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """One number of a motion: ``evaluate`` is (n, L, J, 3), metres, → (n,)."""
+    """A scalar quantity of motions; ``evaluate`` maps (n, L, J, 3), metres, to (n,)."""
 
     name: str
     evaluate: Callable[[np.ndarray], np.ndarray]
 
 
 def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
-    """Return what is ranked of every motion of a posterior: the same for all samplers and draws.
+    """Return the quantities of a posterior's motions, the same for all samplers and draws.
 
-    - ``direction 1`` to ``3``: coordinates of the motion about its root along random directions
+    - ``direction 1`` to ``3``: root-relative motion projected on random directions
     - ``height of <joint>``: of a random joint in a random frame, metres
-    - ``hidden <joint>``: the same of a joint that the evidence does not see, along a random
-      direction about its root; only where some are hidden
-    - ``speed``: mean over joints and frames of the length of a step, metres; of several frames only
+    - ``hidden <joint>``: a random occluded joint, if any, along a random direction
+    - ``speed``: mean step length over joints and frames, metres, for several frames
 
     Parameters
     ----------
     posterior : MotionPosterior
-        Of the problem itself, not of a simulation.
+        Posterior of the problem, not of a simulation.
     seed : int
         Seed of the choice.
     """
@@ -55,10 +54,10 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
     frame, joint = int(rng.integers(shape[0])), _other_than(rng, root, shape[1])
     name = posterior.skeleton.joint_names[joint]
     found.append(Quantity(f"height of {name}", partial(_height, frame, joint)))
-    unseen = _hidden(posterior)
+    occluded = _occluded(posterior)
     direction = rng.standard_normal(3)
-    if unseen is not None and len(unseen):
-        frame, joint = (int(index) for index in unseen[rng.integers(len(unseen))])
+    if len(occluded):
+        frame, joint = (int(index) for index in occluded[rng.integers(len(occluded))])
         at = np.zeros(shape)
         at[frame, joint] = direction / np.sqrt((direction**2).sum())
         name = posterior.skeleton.joint_names[joint]
@@ -69,17 +68,16 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
 
 
 def log_densities(simulation: Problem, positions: np.ndarray) -> dict[str, np.ndarray]:
-    """Return ``log likelihood`` and ``log density`` of motions, as far as there are such.
+    """Return ``log likelihood`` and ``log density`` of motions, if defined.
 
-    A quantity that depends on the evidence finds what coordinates do not: draws from the prior
-    rank the truth uniformly in every coordinate (Modrák et al. 2023, "Simulation-based calibration
-    checking for Bayesian computation: the choice of test quantities shapes sensitivity"). The
-    density is the posterior's up to a constant, over positions.
+    Quantities that depend on the observations detect errors that coordinates miss, such as draws
+    from the prior (Modrák et al. 2023, "Simulation-based calibration checking for Bayesian
+    computation: the choice of test quantities shapes sensitivity").
 
     Parameters
     ----------
     simulation : Problem
-        With the evidence that was simulated.
+        Problem with simulated observations.
     positions : ndarray, (n, L, J, 3)
         Metres.
     """
@@ -112,10 +110,10 @@ def _other_than(rng: np.random.Generator, root: int, n_joints: int) -> int:
     return int(rng.choice(others))
 
 
-def _hidden(posterior: MotionPosterior) -> np.ndarray | None:
-    """Frames and joints that no view saw, (n, 2); None where the evidence does not say."""
+def _occluded(posterior: MotionPosterior) -> np.ndarray:
+    """Return frames and joints observed in no view, (n, 2); empty if unknown."""
     entries: Any = getattr(posterior.likelihood, "entries", None)
     if entries is None:
-        return None
+        return np.zeros((0, 2), dtype=int)
     seen = entries.visible.reshape(-1, *entries.visible.shape[-2:]).any(axis=0)
     return np.argwhere(~seen)

@@ -1,4 +1,4 @@
-"""Where the truth stands among draws: one number in [0, 1] per quantity, uniform if all is right.
+"""Ranks of the truth among draws, uniform on [0, 1] for a calibrated sampler.
 
 Talts et al. (2018), "Validating Bayesian inference algorithms with simulation-based calibration".
 """
@@ -22,15 +22,7 @@ _FEWEST = 4
 
 
 class Rank(NamedTuple):
-    """Where the truth stands.
-
-    Attributes
-    ----------
-    value : float
-        In [0, 1]: the share of draws below, spread over its step.
-    draws : int
-        Among how many draws.
-    """
+    """Randomised rank of the truth in [0, 1], and the number of draws that it is among."""
 
     value: float
     draws: int
@@ -39,29 +31,28 @@ class Rank(NamedTuple):
 def rank(truth: float, draws: np.ndarray, rng: np.random.Generator) -> float:
     """Return (r + U) / (L + 1), r the rank of the truth among L draws, ties broken at random.
 
-    It is uniform on [0, 1] whatever L is, if truth and draws are exchangeable; so that runs of
-    different lengths may be put together.
+    It is uniform on [0, 1] for every L if truth and draws are exchangeable, so that runs of
+    different lengths can be pooled.
 
     Parameters
     ----------
     truth : float
-        The quantity, of the truth.
+        The quantity of the truth.
     draws : ndarray, (L,)
-        The same, of draws that are independent.
+        The quantity of independent draws.
     rng : numpy.random.Generator
-        For ties, and for U.
+        For ties and U.
     """
     below, equal = int((draws < truth).sum()), int((draws == truth).sum())
     return float((below + (equal + 1) * rng.random()) / (len(draws) + 1))
 
 
 def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
-    """Return so many of a chain's values, evenly apart, as are about independent.
+    """Return values of a chain thinned evenly to about independent ones.
 
-    As many as the quantity's own effective sample size (bulk, Vehtari et al. 2021; an ensemble's
-    is draws / autocorrelation time), all if the draws are independent anyway; at least one. What
-    never moves, is not finite everywhere, has chains of fewer than 4 draws, or is of an ensemble
-    whose autocorrelation time is not known (NaN) is one draw.
+    Their number is the effective sample size of the quantity (bulk, Vehtari et al. 2021; of an
+    ensemble, draws / autocorrelation time), or all for independent draws; it is 1 if values are
+    constant or not finite, chains have fewer than 4 draws, or the autocorrelation time is NaN.
 
     Parameters
     ----------
@@ -81,9 +72,9 @@ def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
         from arviz_stats.base import array_stats
 
         size = float(array_stats.ess(values, method="bulk", chain_axis=0, draw_axis=1))
-    kept = min(len(flat), int(size)) if math.isfinite(size) and size >= 1 else 1
-    # The middles of equal stretches: never only where chains begin.
-    return flat[((np.arange(kept) + 0.5) * len(flat) / kept).astype(int)]
+    n = min(len(flat), int(size)) if math.isfinite(size) and size >= 1 else 1
+    # Midpoints of equal stretches, to avoid the starts of chains.
+    return flat[((np.arange(n) + 0.5) * len(flat) / n).astype(int)]
 
 
 def ranks_of_truth(
@@ -93,29 +84,24 @@ def ranks_of_truth(
     elsewhere: Problem,
     seed: int,
 ) -> dict[str, Rank]:
-    """Return the truth's rank by each quantity.
+    """Return the truth's rank in each quantity.
 
     Parameters
     ----------
     problem : Problem
-        What was simulated; it decides the quantities.
+        The simulated problem, which determines the quantities.
     simulation : Problem
         One simulation of it, with a truth.
     draws : MotionDraws
         A run on the simulation.
     elsewhere : Problem
-        Another simulation. Its truth has nothing to do with this one's evidence: the quantity
-        ``distance`` is the root mean square distance of joints from it, metres.
+        Another simulation; the quantity ``distance`` is the root mean square distance of joints
+        from its truth, metres.
     seed : int
         Seed of ties.
-
-    Raises
-    ------
-    ValueError
-        If a simulation has no truth, or a quantity is NaN.
     """
     if simulation.truth is None or elsewhere.truth is None:
-        raise ValueError(f"{problem.name} simulates no truth, expected one to be ranked")
+        raise ValueError(f"simulations of {problem.name} must have a truth")
     positions = np.concatenate([simulation.truth[None], draws.flat()])
     found = {one.name: one.evaluate(positions) for one in quantities(problem.posterior)}
     found |= log_densities(simulation, positions)
@@ -125,10 +111,9 @@ def ranks_of_truth(
     for name, values in found.items():
         if unknown := int(np.isnan(values).sum()):
             raise ValueError(
-                f"{name} is NaN for {unknown} of the truth and the draws, expected numbers, which "
-                "have ranks"
+                f"{name} must not be NaN, got NaN for {unknown} of the truth and the draws"
             )
-        kept = independent_draws(values[1:].reshape(shape), draws)
+        among = independent_draws(values[1:].reshape(shape), draws)
         rng = seeds.generator(seed, "ties", name)
-        ranks[name] = Rank(rank(float(values[0]), kept, rng), len(kept))
+        ranks[name] = Rank(rank(float(values[0]), among, rng), len(among))
     return ranks

@@ -1,4 +1,4 @@
-"""`Calibration`: the ranks of simulated truths, in a folder, and what they say."""
+"""Results of a calibration: ranks of simulated truths, stored in a folder."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import weakref
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import product
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.results.cell_results import CellResult, read_result, used_of_budget
 from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.results.run_results import RunResult, read_result, used_of_budget
 from probmotion.files import written_whole
 
 if TYPE_CHECKING:
@@ -25,58 +26,46 @@ if TYPE_CHECKING:
 
 __all__ = ["Calibration"]
 
-_TABLE, _FAILURES, _PICTURE = "table.csv", "failures.json", "ranks.png"
+_TABLE, _FAILURES, _FIGURE = "table.csv", "failures.json", "ranks.png"
 
 
 class Calibration:
-    """Where simulated truths stand among the draws of every sampler, on every problem.
+    """Ranks of simulated truths among the draws of every sampler on every problem.
 
     Parameters
     ----------
     folder : Path
-        Where the cells are.
+        Folder of the runs; unfinished ones are skipped.
     plan : Plan
-        What was asked for; its ``seeds`` are simulations. Those not finished are left out.
+        Plan of the grid; its ``seeds`` are simulations.
     temporary : bool
         Remove the folder with this object.
     """
 
+    # Subfolder of the ``out`` of calibrate().
     FOLDER = "calibration"
-    """Below what :func:`~probmotion.calibration.grid.calibrate` was given."""
 
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
         self.folder = folder
         self.plan = plan
-        found = [read_result(plan.cell_folder(folder, *address)) for address in plan.cells()]
-        self.results: list[CellResult] = [result for result in found if result is not None]
+        found = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
+        self.results: list[RunResult] = [result for result in found if result is not None]
         if temporary:
             weakref.finalize(self, shutil.rmtree, folder.parent, True)
 
     @classmethod
     def load(cls, out: str | Path, temporary: bool = False) -> Calibration:
-        """Return the calibration in a folder, as far as it is finished.
-
-        Raises
-        ------
-        ValueError
-            If the folder is none that :func:`~probmotion.calibration.grid.calibrate` wrote.
-        """
+        """Return the calibration in a folder, possibly unfinished."""
         folder = Path(out) / cls.FOLDER
         return cls(folder, Plan.load(folder), temporary)
 
     @property
-    def failures(self) -> list[CellResult]:
-        """The simulations without ranks: samplers that do not fit a problem, or failed on it."""
+    def failures(self) -> list[RunResult]:
+        """Runs without ranks: unsupported or failed."""
         return [result for result in self.results if result.failure is not None]
 
-    def cells(self, problem: str, sampler: str) -> list[CellResult]:
-        """Return what is finished of a sampler on a problem, in the order of simulations.
-
-        Raises
-        ------
-        ValueError
-            If one of the names is unknown; the message lists the known ones.
-        """
+    def runs(self, problem: str, sampler: str) -> list[RunResult]:
+        """Return the finished runs of a sampler on a problem, in the order of simulations."""
         for what, name, known in (
             ("problem", problem, self.plan.problems),
             ("sampler", sampler, self.plan.samplers),
@@ -90,41 +79,41 @@ class Calibration:
         ]
 
     def ranks(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
-        """Return the truth's ranks in [0, 1] by quantity, (n,), one per simulation that worked."""
-        return self._kept(problem, sampler, "rank ")
+        """Return the truth's ranks in [0, 1] by quantity, (n,), one per successful simulation."""
+        return self._values(problem, sampler, "rank ")
 
     def ranked_among(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
-        """Return by quantity among how many draws, about independent, each truth was ranked."""
-        return self._kept(problem, sampler, "draws ")
+        """Return by quantity the number of draws that each truth is ranked among."""
+        return self._values(problem, sampler, "draws ")
 
-    def _kept(self, problem: str, sampler: str, kind: str) -> dict[str, np.ndarray]:
-        worked = [cell.metrics for cell in self.cells(problem, sampler) if cell.failure is None]
-        # Where a caller's own simulations differ in kind, what all of them have can be judged.
-        names = [
-            name
-            for name in (worked[0] if worked else ())
-            if name.startswith(kind) and all(name in metrics for metrics in worked)
-        ]
+    def _values(self, problem: str, sampler: str, kind: str) -> dict[str, np.ndarray]:
+        """Return the values of a kind by quantity, if all successful simulations have it."""
+        rows = self._successful(problem, sampler)
+        names = [name for name in (rows[0] if rows else ()) if name.startswith(kind)]
         return {
-            name.removeprefix(kind): np.array([metrics[name] for metrics in worked])
+            name.removeprefix(kind): np.array([row[name] for row in rows])
             for name in names
+            if all(name in row for row in rows)
         }
 
-    def _of_some(self, problem: str, sampler: str) -> list[str]:
-        """Return the quantities that some simulations have and others have not."""
-        cells = self.cells(problem, sampler)
-        worked = [cell.metrics for cell in cells if cell.failure is None]
-        names = {name for metrics in worked for name in metrics if name.startswith("rank ")}
-        some = [name for name in names if not all(name in metrics for metrics in worked)]
-        return sorted(name.removeprefix("rank ") for name in some)
+    def _successful(self, problem: str, sampler: str) -> list[dict[str, float]]:
+        """Return the metrics of successful simulations."""
+        return [run.metrics for run in self.runs(problem, sampler) if run.failure is None]
+
+    def _partial(self, problem: str, sampler: str) -> list[str]:
+        """Return the quantities that only some simulations have."""
+        rows = self._successful(problem, sampler)
+        names = {name for row in rows for name in row if name.startswith("rank ")}
+        partial = [name for name in names if not all(name in row for row in rows)]
+        return sorted(name.removeprefix("rank ") for name in partial)
 
     @property
     def ranked(self) -> bool:
-        """Whether any sampler has ranks to draw."""
+        """Whether any sampler has ranks to plot."""
         return bool(self._blocks(self.plan.problems))
 
     def _blocks(self, problems: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Return the ranks of every sampler that has more than one, by its verdict."""
+        """Return the ranks of every sampler with more than one, by its verdict."""
         found = {}
         for problem, sampler in product(problems, self.plan.samplers):
             ranks = self.ranks(problem, sampler)
@@ -134,49 +123,40 @@ class Calibration:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences to read with the table: budget, failures, simulations, and thinning."""
+        """Notes on budget, failures, unfinished simulations and thinning."""
         notes = [*self.plan.notes]
-        places = product(self.plan.problems, self.plan.samplers)
-        if used := used_of_budget(result for place in places for result in self.cells(*place)):
+        places = list(product(self.plan.problems, self.plan.samplers))
+        if used := used_of_budget(result for place in places for result in self.runs(*place)):
             notes.append(f"used per simulation: {', '.join(used)}")
-        counted: dict[str, int] = {}
-        for result in self.failures:
-            assert result.failure is not None
-            sentence = f"{result.sampler} on {result.problem}: {result.failure.message}"
-            counted[sentence] = counted.get(sentence, 0) + 1
+        counted = Counter(
+            f"{result.sampler} on {result.problem}: {result.failure.message}"
+            for result in self.failures
+            if result.failure is not None
+        )
         for sentence, times in counted.items():
             notes.append(f"{sentence} ({times} of {self.plan.seeds} simulations)")
-        for problem in self.plan.problems:
-            for sampler in self.plan.samplers:
-                if (done := len(self.cells(problem, sampler))) < self.plan.seeds:
-                    notes.append(
-                        f"{sampler} on {problem}: {done} of {self.plan.seeds} simulations are "
-                        "finished"
-                    )
-                if only := self._of_some(problem, sampler):
-                    notes.append(
-                        f"{sampler} on {problem}: {', '.join(only)} is left out, which not all "
-                        "simulations have"
-                    )
-                among = self.ranked_among(problem, sampler)
-                fewest = min(
-                    (float(np.median(sizes)) for sizes in among.values()), default=math.inf
+        for problem, sampler in places:
+            where = f"{sampler} on {problem}"
+            if (done := len(self.runs(problem, sampler))) < self.plan.seeds:
+                notes.append(f"{where}: {done} of {self.plan.seeds} simulations finished")
+            if only := self._partial(problem, sampler):
+                notes.append(f"{where}: {', '.join(only)} skipped, not in all simulations")
+            among = self.ranked_among(problem, sampler)
+            fewest = min((float(np.median(sizes)) for sizes in among.values()), default=math.inf)
+            if fewest < self.plan.draws:
+                notes.append(
+                    f"{where}: ranks are among about {fewest:.0f} independent draws of "
+                    f"{self.plan.draws} for the slowest quantity"
                 )
-                if fewest < self.plan.draws:
-                    notes.append(
-                        f"{sampler} on {problem}: of {self.plan.draws} draws about {fewest:.0f} "
-                        "are independent for the quantity that moves slowest; ranks are among those"
-                    )
         return notes
 
     def table(self) -> CalibrationTable:
-        """Return the tidy data frame, a row per problem, sampler and quantity.
+        """Return a data frame with a row per problem, sampler and quantity; prints a summary.
 
-        ``quantity`` "all" is the sampler as a whole. Columns: ``p_value`` that ranks are uniform
-        (all: the least of those adjusted by Holm's method), ``coverage_90`` of 90 % credible sets
-        (all: mean over quantities whose sets are central intervals), ``coverage_error`` mean
-        |coverage − level| (all: mean over quantities), ``simulations`` that worked and ``failed``
-        ones. It prints a line per sampler and its verdict.
+        Quantity "all" is the sampler as a whole. Columns: ``p_value`` of uniform ranks (all:
+        smallest after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over
+        central intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over quantities),
+        ``simulations`` that succeeded and ``failed`` ones.
         """
         from probmotion.calibration.table import CalibrationTable
 
@@ -184,11 +164,10 @@ class Calibration:
         return CalibrationTable.of([self._ranked(*place) for place in places], self.notes)
 
     def coverage(self, problem: str, sampler: str) -> pd.DataFrame:
-        """Return by quantity and level the share of truths that credible sets hold.
+        """Return the coverage of credible sets by quantity and level.
 
-        Columns quantity, level, coverage, and ``lower``, ``upper``, a 95 % interval of it. Sets of
-        the log density are those of highest density, of the distance balls about random motions
-        (TARP), of other quantities central intervals.
+        Columns quantity, level, coverage, and ``lower``, ``upper``, its 95 % interval. Credible
+        sets are those of :func:`~probmotion.metrics.credible_sets.credible_level`.
         """
         from probmotion.calibration.table import coverage_frame
 
@@ -197,35 +176,30 @@ class Calibration:
     def _ranked(self, problem: str, sampler: str) -> Ranked:
         from probmotion.calibration.table import Ranked
 
-        cells = self.cells(problem, sampler)
-        failures = [cell.failure for cell in cells if cell.failure is not None]
+        runs = self.runs(problem, sampler)
+        failures = [run.failure for run in runs if run.failure is not None]
         ranks = self.ranks(problem, sampler)
-        return Ranked(problem, sampler, ranks, failures, len(cells), self.plan.seeds)
+        return Ranked(problem, sampler, ranks, failures, len(runs), self.plan.seeds)
 
     def verdict(self, problem: str, sampler: str) -> str:
-        """Return in one sentence whether a sampler is calibrated, and how it is not."""
+        """Return a one-sentence verdict on a sampler's calibration."""
         from probmotion.calibration.table import verdict
 
         return verdict(self._ranked(problem, sampler))
 
     def plot(self, path: str | Path | None = None, problem: str | None = None) -> Path:
-        """Draw ranks and coverage and return where; beside the cells by default.
+        """Plot ranks and coverage, a block per sampler, of one or all problems; return the path.
 
-        A block per sampler, of one problem or of all of them.
-
-        Raises
-        ------
-        ValueError
-            If the problem is unknown, or nothing was ranked.
+        Raises ``ValueError`` if the problem is unknown or there are no ranks.
         """
         from probmotion.plots.ranks import draw_ranks
 
-        target = self.folder / _PICTURE if path is None else Path(path)
+        target = self.folder / _FIGURE if path is None else Path(path)
         draw_ranks(self._blocks(self.plan.problems if problem is None else [problem]), target)
         return target
 
     def write(self) -> None:
-        """Write ``table.csv`` and ``failures.json`` beside the cells."""
+        """Write ``table.csv`` and ``failures.json`` to the folder."""
         with written_whole(self.folder / _TABLE) as unfinished:
             self.table().to_csv(unfinished, index=False)
         failures = [

@@ -1,4 +1,4 @@
-"""What ranks say: a tidy data frame that prints a line per sampler, and a verdict in words."""
+"""Table and verdicts of a calibration."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from probmotion.metrics.uniformity import adjusted_p_values, uniformity_p_value
 
 __all__ = ["LEVELS", "CalibrationTable", "Ranked", "coverage_curve", "coverage_frame", "verdict"]
 
+# Levels of credible sets: 0.05, 0.1, …, 0.95.
 LEVELS = np.arange(1, 20) / 20
-"""Of credible sets: 0.05, 0.1, …, 0.95."""
 
 _COLUMNS = [
     "problem", "sampler", "quantity", "p_value", "coverage_90", "coverage_error", "simulations",
@@ -27,10 +27,10 @@ _SHOWN = 0.9
 _SIGNIFICANT = 0.05
 _FEWEST = 2
 _LEGEND = """\
-p: that ranks are uniform, of all quantities together (Holm); worst: the quantity that is furthest
-from it; 90 % holds: share of central 90 % intervals that hold the truth, mean over quantities;
-density, distance: the same of the sets of highest density and of balls about random motions (TARP);
-error: mean |coverage − level|, mean over quantities; exact draws have about 0.3/√simulations."""
+p: p-value of uniform ranks, all quantities together (Holm); worst: quantity with the smallest p;
+90 % covers: fraction of truths in central 90 % intervals, mean over quantities; density, distance:
+the same for highest-density sets and balls around random motions (TARP); error: mean |coverage −
+level|, mean over quantities, about 0.3/√simulations for exact draws"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,11 @@ class Ranked:
     problem, sampler : str
         Their names.
     ranks : mapping of str to ndarray, (n,)
-        The truth's ranks in [0, 1] by quantity, of the simulations that worked.
+        The truth's ranks in [0, 1] by quantity, one per successful simulation.
     failures : sequence of Failure
-        Of the simulations that did not work.
+        Failures of the other simulations.
     simulations, planned : int
-        How many are finished, and how many were asked for.
+        Numbers of finished and planned simulations.
     """
 
     problem: str
@@ -58,19 +58,14 @@ class Ranked:
 
 
 class CalibrationTable(pd.DataFrame):
-    """A row per problem, sampler and quantity, as :meth:`Calibration.table` says.
-
-    ``print`` shows a line per sampler and the verdicts, which ``attrs`` hold beside notes.
-    Whatever is cut from it is a plain data frame.
-    """
+    """Data frame of :meth:`Calibration.table`, printed as a summary; slices are plain frames."""
 
     @classmethod
     def of(cls, ranked: Sequence[Ranked], notes: Sequence[str]) -> CalibrationTable:
         """Return the table of every sampler's ranks on every problem."""
         rows: list[tuple] = []
         for one in ranked:
-            worked = one.simulations - len(one.failures)
-            counts = (worked, len(one.failures))
+            counts = (one.simulations - len(one.failures), len(one.failures))
             rows += [(one.problem, one.sampler, *score, *counts) for score in _scores(one.ranks)]
         table = cls(rows, columns=_COLUMNS)
         table.attrs = {"verdicts": [verdict(one) for one in ranked], "notes": list(notes)}
@@ -90,11 +85,11 @@ class CalibrationTable(pd.DataFrame):
         return None
 
     def summary(self) -> str:
-        """Return the table as text: a block per problem, the verdicts, the notes."""
+        """Return the table as text, with verdicts and notes."""
         blocks = []
         for problem in dict.fromkeys(self["problem"]):
             rows = pd.DataFrame(self[self["problem"] == problem])
-            lines = [_line(str(name), cells) for name, cells in rows.groupby("sampler", sort=False)]
+            lines = [_line(str(name), some) for name, some in rows.groupby("sampler", sort=False)]
             blocks.append(f"{problem}\n{pd.DataFrame(lines).to_string(index=False)}")
         blocks.append("\n".join(self.attrs["verdicts"]))
         blocks.append(_LEGEND)
@@ -104,62 +99,61 @@ class CalibrationTable(pd.DataFrame):
 
 
 def coverage_curve(quantity: str, ranks: np.ndarray) -> np.ndarray:
-    """Return the share of truths that credible sets of each of :data:`LEVELS` hold, (19,)."""
+    """Return the fraction of truths in credible sets of each of :data:`LEVELS`, (19,)."""
     return (credible_level(quantity, ranks)[:, None] <= LEVELS).mean(axis=0)
 
 
 def coverage_frame(ranks: Mapping[str, np.ndarray]) -> pd.DataFrame:
-    """Return columns quantity, level, coverage, lower, upper: a 95 % interval (Wilson 1927)."""
+    """Return coverage by quantity and level with its 95 % interval (Wilson 1927)."""
     rows = []
     for name, values in ranks.items():
         n = len(values)
-        for level, share in zip(LEVELS, coverage_curve(name, values), strict=True):
-            interval = binomtest(round(share * n), n).proportion_ci(0.95, "wilson")
-            rows.append((name, float(level), float(share), interval.low, interval.high))
+        for level, fraction in zip(LEVELS, coverage_curve(name, values), strict=True):
+            interval = binomtest(round(fraction * n), n).proportion_ci(0.95, "wilson")
+            rows.append((name, float(level), float(fraction), interval.low, interval.high))
     return pd.DataFrame(rows, columns=["quantity", "level", "coverage", "lower", "upper"])
 
 
 def verdict(ranked: Ranked) -> str:
-    """Return in one sentence whether a sampler is calibrated on a problem, and how it is not."""
+    """Return a one-sentence verdict on a sampler's calibration on a problem."""
     failed, ranks, finished = ranked.failures, ranked.ranks, ranked.simulations
     worked = finished - len(failed)
     where = f"{ranked.sampler} on {ranked.problem}"
     but = ""
     if failed:
-        said = failed[0].message
+        first = failed[0].message
         if not worked and all(failure.unsupported for failure in failed):
-            return f"{where}: not supported, {said}"
-        more = f"{len(failed)} of {finished} simulations failed, the first: {said}"
-        but = f"; {more}"
+            return f"{where}: not supported, {first}"
+        but = f"; {len(failed)} of {finished} simulations failed, the first: {first}"
     if worked < _FEWEST:
-        return f"{where}: nothing to judge by, {worked} of {ranked.planned} worked{but}"
+        return f"{where}: too few simulations, {worked} of {ranked.planned} succeeded{but}"
     p_values = {name: uniformity_p_value(values) for name, values in ranks.items()}
     p = float(adjusted_p_values(np.array(list(p_values.values()))).min())
     if p >= _SIGNIFICANT:
-        found = f"no deviation found in {worked} simulations ({_probability(p)})"
+        result = f"no deviation found in {worked} simulations ({_probability(p)})"
     else:
-        found = f"{_deviation(ranks, p_values)} ({_probability(p)}, {worked} simulations)"
-    return f"{where}: {found}{but}"
+        result = f"{_deviation(ranks, p_values)} ({_probability(p)}, {worked} simulations)"
+    return f"{where}: {result}{but}"
 
 
 def _deviation(ranks: Mapping[str, np.ndarray], p_values: Mapping[str, float]) -> str:
-    """How ranks deviate: too few truths within central intervals, too many, or else where."""
-    holds = _central(ranks)
+    """Return how ranks deviate: overconfident, underconfident or biased."""
+    coverage = _central(ranks)
     n = len(next(iter(ranks.values())))
-    # Quantities of one motion hang together: no more sure than one of them.
-    doubt = 2 * math.sqrt(_SHOWN * (1 - _SHOWN) / n)
-    intervals = f"90 % intervals hold {100 * holds:.0f} %"
-    if holds < _SHOWN - doubt:
-        return f"too sure: {intervals}"
-    if holds > _SHOWN + doubt:
-        return f"too unsure: {intervals}"
+    # Quantities of one motion are correlated, so the error is that of a single one.
+    error = 2 * math.sqrt(_SHOWN * (1 - _SHOWN) / n)
+    intervals = f"90 % intervals cover {100 * coverage:.0f} %"
+    if coverage < _SHOWN - error:
+        return f"overconfident: {intervals}"
+    if coverage > _SHOWN + error:
+        return f"underconfident: {intervals}"
     worst = min(p_values, key=lambda name: p_values[name])
-    stands = 100 * float(ranks[worst].mean())
-    return f"wrong: {intervals}, but by {worst} the truth lies above {stands:.0f} % of draws"
+    mean = 100 * float(ranks[worst].mean())
+    return f"biased: {intervals}, but the truth's {worst} exceeds that of {mean:.0f} % of draws"
 
 
 def _central(ranks: Mapping[str, np.ndarray]) -> float:
-    """Mean coverage of central 90 % intervals over all quantities that have such."""
+    """Return the mean coverage of central 90 % intervals over quantities."""
     levels = [
         credible_level(name, values)
         for name, values in ranks.items()
@@ -169,31 +163,31 @@ def _central(ranks: Mapping[str, np.ndarray]) -> float:
 
 
 def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, float]]:
-    """Quantity, p-value, coverage of 90 % sets, mean error of coverage; first of all together."""
+    """Return quantity, p-value, 90 % coverage and coverage error, first of all together."""
     if not ranks or len(next(iter(ranks.values()))) < _FEWEST:
         return [("all", math.nan, math.nan, math.nan)]
     scores = []
     for name, values in ranks.items():
         error = float(np.abs(coverage_curve(name, values) - LEVELS).mean())
-        held = float((credible_level(name, values) <= _SHOWN).mean())
-        scores.append((name, uniformity_p_value(values), held, error))
+        covered = float((credible_level(name, values) <= _SHOWN).mean())
+        scores.append((name, uniformity_p_value(values), covered, error))
     p = float(adjusted_p_values(np.array([score[1] for score in scores])).min())
     error = float(np.mean([score[3] for score in scores]))
     return [("all", p, _central(ranks), error), *scores]
 
 
-def _line(sampler: str, cells: pd.DataFrame) -> dict[str, str]:
-    rows = cells.set_index("quantity")
+def _line(sampler: str, table: pd.DataFrame) -> dict[str, str]:
+    rows = table.set_index("quantity")
     whole = rows.loc["all"]
     others = rows.drop(index="all")["p_value"]
-    held = rows["coverage_90"]
+    covered = rows["coverage_90"]
     return {
         "sampler": sampler,
         "p": _number(float(whole["p_value"])),
         "worst": "-" if others.empty else str(others.idxmin()),
-        "90 % holds": _percent(float(whole["coverage_90"])),
-        "density": _percent(float(held.get(DENSITY, math.nan))),
-        "distance": _percent(float(held.get(DISTANCE, math.nan))),
+        "90 % covers": _percent(float(whole["coverage_90"])),
+        "density": _percent(float(covered.get(DENSITY, math.nan))),
+        "distance": _percent(float(covered.get(DISTANCE, math.nan))),
         "error": _number(float(whole["coverage_error"])),
         "simulations": f"{whole['simulations']:.0f}",
         "failed": f"{whole['failed']:.0f}",

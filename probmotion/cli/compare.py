@@ -1,15 +1,12 @@
-"""The command ``probmotion compare``: samplers on problems, of the library or of one's own.
-
-It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
-"""
+"""The command ``probmotion compare``: samplers on problems."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from probmotion.cli.files import file_called
 
@@ -21,120 +18,116 @@ __all__ = ["Clips", "Compare"]
 
 @dataclass(frozen=True)
 class Clips:
-    """Clips of your own to compare on, and what is seen of the one that is held out."""
+    """Clips of your own to compare on, one of which is held out and observed."""
 
-    clips: tuple[str, ...] = ()
-    """Motion files, .npz or .bvh, or quoted patterns of them: the prior is fitted to all but one,
-    and the evidence is of that one."""
+    clips: Annotated[tuple[str, ...], arg(metavar="FILE ...")] = ()
+    """Motion files (.npz, .bvh) or quoted patterns.
+    The prior is fitted to all but one clip, which is observed."""
 
     observe: str = "monocular"
-    """What is seen of the held-out clip: monocular, occluded, sparse or none."""
+    """Observations of the held-out clip: monocular, occluded, sparse or none."""
 
     fps: float | None = None
-    """Resample every clip to this frame rate; needed where their own rates differ."""
+    """Frame rate to resample the clips to, frames per second; required if their rates differ."""
 
     frames: int = 30
-    """Frames per motion."""
+    """Number of frames per motion."""
 
     rank: int = 10
-    """Latent dimensions of each style."""
+    """Number of latent dimensions per style."""
 
     styles: int = 3
-    """Number of styles, found by clustering."""
+    """Number of styles, assigned by clustering."""
 
     noise: float = 0.02
-    """Standard deviation of the keypoints, metres."""
+    """Standard deviation of the observed keypoints, metres."""
 
     held_out: str | None = None
-    """Name of the clip to hold out (its file's name without the ending); the last by default."""
+    """Name of the held-out clip (file name without extension); the last clip by default."""
 
 
 @dataclass(frozen=True)
 class Compare:
-    """Draw with several samplers from the same posteriors; print how far each of them is off.
+    """Run samplers on the same posteriors and print their errors.
 
-    The folder --out keeps every finished cell (problem, sampler, seed): the same command run again
-    goes on where it was stopped.
+    --out stores every finished run (problem x sampler x seed); repeating an interrupted command
+    continues from there.
     """
 
-    problems: Positional[tuple[str, ...]] = ()
-    """Names of problems (see probmotion list); all: every one whose data is at hand."""
+    problems: Annotated[Positional[tuple[str, ...]], arg(metavar="[PROBLEM ...]")] = ()
+    """Names of problems (see probmotion list), or all for every problem with available data."""
 
-    samplers: tuple[str, ...] = ()
-    """Names of samplers or their presets (see probmotion list); all samplers by default."""
+    samplers: Annotated[tuple[str, ...], arg(metavar="SAMPLER ...")] = ()
+    """Names of samplers or presets (see probmotion list); all samplers by default."""
 
     draws: int | None = None
-    """Draws of each sampler in all; 200, or 40 with --quick."""
+    """Number of posterior draws per sampler; 200, or 40 with --quick."""
 
     chains: int | None = None
-    """Chains that they are spread over; by default the most, up to 4, that divide the draws."""
+    """Number of chains; by default the largest divisor of the draws up to 4."""
 
     seeds: int = 1
-    """Independent repeats, with seeds 0, 1, …"""
+    """Number of independent repetitions, with seeds 0, 1, …"""
 
     workers: int = 1
-    """Processes; they never change the draws. 0: in this one."""
+    """Number of worker processes; 0 runs in this process. Draws do not depend on it."""
 
     out: Path = Path("comparison")
-    """Folder for table.csv and all draws; made where it is missing."""
+    """Output folder for table.csv and all draws."""
 
     quick: bool = False
-    """A look: 40 draws, six seconds a cell, ended after a minute, unless told otherwise, and
-    settings to begin from that cost less; the table says so."""
+    """Quick run: 40 draws and 6 s per run, 60 s limit, reduced settings; other options override."""
 
     evaluations: int | None = None
-    """What every sampler may spend on a cell: evaluations of a density or a denoiser, a gradient
-    counting as two. Pilot runs find the settings that do. By default samplers run as they are."""
+    """Budget per run: evaluations of the density or denoiser, a gradient counting as two.
+    Pilot runs choose matching settings. No budget by default."""
 
     seconds: float | None = None
-    """The same in seconds of this machine; 6 with --quick."""
+    """Budget per run in seconds of this machine; none, or 6 with --quick."""
 
     time_limit: float | None = None
-    """Seconds after which a cell is ended, and a row that says so; 60 with --quick."""
+    """Time limit per run, seconds; longer runs are recorded as failed. None, or 60 with --quick."""
 
     calibrate: int = 0
-    """Also simulate every problem that can be so many times, and rank the truth among each
-    sampler's draws. A simulation costs each sampler as much as a cell."""
+    """Number of simulations for simulation-based calibration, at least 10; 0 for none.
+    Each costs as much as a run."""
 
     report: bool = False
-    """Also write report.html: the table, the plots, and draws that play in a browser."""
+    """Also write report.html with the table, plots and animated draws."""
 
-    pictures: bool = False
-    """Also write one picture of skeletons per problem and, where quality can be measured,
-    quality_against_cost.png."""
+    figures: bool = False
+    """Also write skeletons_PROBLEM.png and, where quality is measured, quality_against_cost.png."""
 
     prior: str | None = None
-    """Also draw from a prior of your own: the folder of a run of probmotion train diffusion or
-    dvae. There is no evidence. Draws are compared with the prior's own where it can be drawn from;
-    else there is nothing to measure them by but what they cost."""
+    """Also sample your own prior: the folder of a run of probmotion train diffusion or dvae.
+    No observations. Draws are compared with exact draws of the prior if it has any."""
 
-    own: OmitArgPrefixes[Clips] = field(default_factory=Clips)
+    user_clips: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 
     settings: ClassVar[Any] = None
-    """The samplers' settings: a field of the class that the command line makes of this one."""
+    """Settings of the samplers; main.py adds the field."""
 
     def run(self) -> None:
-        """Run the comparison, write ``table.csv``, print the table."""
         from probmotion.comparison.grid import compare
 
         samplers = self._samplers()
         problems = self._problems()
         self._check_calibrate(problems)
-        asked = self._asked()
-        comparison = compare(problems, samplers, seeds=self.seeds, **asked)
+        options = self._options()
+        comparison = compare(problems, samplers, seeds=self.seeds, **options)
         comparison.write(self.out)
         print(comparison.table())
         print(f"\ntable and draws are in {self.out}")
-        calibration = self._calibration(problems, samplers, asked) if self.calibrate else None
+        calibration = self._calibration(problems, samplers, options) if self.calibrate else None
         if self.report:
             print(f"wrote {comparison.report(self.out / 'report.html', calibration)}")
-        if self.pictures:
+        if self.figures:
             from probmotion.comparison.figures import draw_comparison
 
             draw_comparison(comparison, problems, self.out)
 
-    def _asked(self) -> dict[str, Any]:
-        """Return what cells are given, of a comparison and of a calibration."""
+    def _options(self) -> dict[str, Any]:
+        """Return the options shared by comparison and calibration."""
         from probmotion.comparison.quick import QUICK_BUDGET, QUICK_DRAWS, QUICK_LIMIT
         from probmotion.comparison.results.budgets import Budget
 
@@ -157,32 +150,32 @@ class Compare:
         }
 
     def _calibration(
-        self, problems: list[Problem], samplers: dict[str, Any], asked: dict[str, Any]
+        self, problems: list[Problem], samplers: dict[str, Any], options: dict[str, Any]
     ) -> Any:
         from probmotion.calibration.grid import calibrate
 
         simulated = [problem for problem in problems if problem.simulate is not None]
         for problem in problems:
             if problem.simulate is None:
-                print(f"{problem.name} cannot be simulated: it is not calibrated")
-        found = calibrate(simulated, samplers, simulations=self.calibrate, **asked)
+                print(f"not calibrated, cannot be simulated: {problem.name}")
+        calibration = calibrate(simulated, samplers, simulations=self.calibrate, **options)
         for problem in simulated:
             for sampler in samplers:
-                print(found.verdict(problem.name, sampler))
-        return found
+                print(calibration.verdict(problem.name, sampler))
+        return calibration
 
     def _check_calibrate(self, problems: list[Problem]) -> None:
-        """Refuse what would fail after the comparison has run."""
+        """Raise early what would fail after the comparison."""
         from probmotion.calibration.grid import FEWEST_SIMULATIONS
 
         if not self.calibrate:
             return
         if self.calibrate < FEWEST_SIMULATIONS:
             raise ValueError(
-                f"calibrate must be {FEWEST_SIMULATIONS} simulations or more, got {self.calibrate}"
+                f"calibrate must be at least {FEWEST_SIMULATIONS}, got {self.calibrate}"
             )
         if all(problem.simulate is None for problem in problems):
-            raise ValueError("calibrate is given, but none of the problems can be simulated")
+            raise ValueError("calibrate requires a problem that can be simulated")
 
     def _samplers(self) -> dict[str, Any]:
         from probmotion.cli.settings_options import sampler_called
@@ -190,52 +183,47 @@ class Compare:
 
         names = self.samplers or tuple(importable_samplers())
         if len(set(names)) < len(names):
-            raise ValueError(f"samplers must be each once, got {' '.join(names)}")
+            raise ValueError(f"samplers must be unique, got {' '.join(names)}")
         return {name: sampler_called(name, self.settings) for name in names}
 
     def _problems(self) -> list[Problem]:
         from probmotion.problems.catalogue import load_problem
 
-        if not self.problems and not self.own.clips and self.prior is None:
+        if not self.problems and not self.user_clips.clips and self.prior is None:
             raise ValueError(
-                "no problem is given, expected names of problems (probmotion list shows them), "
-                "all, clips of your own (--clips FILE…) or a prior of your own (--prior FOLDER)"
+                "problems must not be empty: name problems (see probmotion list) or all, or pass "
+                "--clips FILE… or --prior FOLDER"
             )
-        if not self.own.clips and self.own != Clips():
-            changed = [entry.name for entry in fields(Clips) if self._differs(entry.name)]
-            raise ValueError(
-                f"{', '.join(changed)} is given without clips, expected --clips FILE… beside it"
-            )
+        if not self.user_clips.clips and self.user_clips != Clips():
+            names = [entry.name for entry in fields(Clips)]
+            changed = [n for n in names if getattr(self.user_clips, n) != getattr(Clips(), n)]
+            raise ValueError(f"{', '.join(changed)} requires --clips FILE…")
         problems = [load_problem(name) for name in self._names()]
-        if self.own.clips:
-            problems.append(_problem_of_clips(self.own))
+        if self.user_clips.clips:
+            problems.append(_problem_of_clips(self.user_clips))
         if self.prior is not None:
             problems.append(_problem_of_prior(self.prior))
         return problems
 
     def _names(self) -> tuple[str, ...]:
-        from probmotion.problems.catalogue import problems_at_hand
+        from probmotion.problems.catalogue import available_problems
 
         if "all" not in self.problems:
             return self.problems
         if len(self.problems) > 1:
-            raise ValueError(f"problems must be all, or some names, got {' '.join(self.problems)}")
-        found, left_out = problems_at_hand()
-        for name, reason in left_out.items():
-            print(f"left out: {name}: {reason}")
-        return tuple(found)
-
-    def _differs(self, option: str) -> bool:
-        return getattr(self.own, option) != getattr(Clips(), option)
+            raise ValueError(f"problems must be names or all, got {' '.join(self.problems)}")
+        available, skipped = available_problems()
+        for name, reason in skipped.items():
+            print(f"skipped: {name}: {reason}")
+        return tuple(available)
 
 
 def _problem_of_clips(own: Clips) -> Problem:
-    """Return the problem that a user's clips make."""
-    from probmotion.io.files import load_motions
+    from probmotion.io.files import load_all
     from probmotion.problems.clips import clips_problem
 
     return clips_problem(
-        load_motions(own.clips),
+        load_all(own.clips),
         observe=own.observe,
         fps=own.fps,
         frames=own.frames,
@@ -247,7 +235,7 @@ def _problem_of_clips(own: Clips) -> Problem:
 
 
 def _problem_of_prior(source: str) -> Problem:
-    """Return the problem to draw from a prior that a user trained, called as its folder."""
+    """Return the problem of sampling a user-trained prior, named by its folder."""
     from probmotion.cli.summaries import kind_of_network
     from probmotion.models.diffusion import motion_diffusion
     from probmotion.models.dvae import motion_dvae
@@ -260,11 +248,9 @@ def _problem_of_prior(source: str) -> Problem:
     }
     kind = kind_of_network(file_called(Path(source)))
     if kind not in known:
-        raise ValueError(
-            f"prior is {source}, which holds a {kind}, expected a {' or a '.join(known)}"
-        )
+        raise ValueError(f"prior must be a {' or a '.join(known)}, got a {kind} in {source}")
     posterior = MotionPosterior(known[kind].load(source))
     path = Path(source).resolve()
     name = path.parent.name if path.name == "model.safetensors" else path.name
     name = name.removesuffix(".safetensors")
-    return Problem(name, "a prior that was trained on data of one's own: generation", posterior)
+    return Problem(name, "user-trained prior: generation", posterior)

@@ -1,7 +1,4 @@
-"""The commands ``probmotion show | convert``: what is in a file, and files of other kinds of it.
-
-They are dataclasses whose fields are their options, as in :mod:`probmotion.cli`.
-"""
+"""The commands ``probmotion show`` and ``probmotion convert``."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ __all__ = ["Convert", "Show", "file_called"]
 
 
 def file_called(path: Path) -> Path:
-    """Return the file of the network that comes with the package, where a path is its name."""
+    """Return the shipped network named ``path``, or ``path`` itself."""
     if path.suffix or path.exists():
         return path
     from probmotion import models
@@ -29,55 +26,53 @@ def file_called(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Show:
-    """Say what is in a file of motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or
-    a trained network (.safetensors)."""
+    """Summarise a file of motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or a
+    trained network (.safetensors).
+    """
 
     file: Positional[Path]
-    """The file; of a network also the folder of its run, or the name of one in the package."""
+    """File, folder of a training run, or name of a network in the package."""
 
     fps: float | None = None
-    """Frames per second of keypoints in JSON or a table, which do not hold it."""
+    """Frames per second of keypoints in JSON or a table."""
 
     skeleton: str | None = None
-    """What keypoints in JSON are of (see probmotion list), where their number does not tell, or
-    which joints to take from a table."""
+    """Layout of JSON keypoints or joints to read from a table (see probmotion list)."""
 
-    picture: Path | None = None
-    """Also draw the motion, or the first draws, to this .png."""
+    figure: Path | None = None
+    """Also write a figure of the motion, or of the first draws, to this .png."""
 
     def run(self) -> None:
-        """Print a few lines about the file."""
         from probmotion.cli.summaries import summarise
 
         summary = summarise(file_called(self.file), self.fps, self.skeleton)
         print(summary.text)
-        if self.picture is not None:
-            summary.draw(self.picture)
-            print(f"wrote {self.picture}")
+        if self.figure is not None:
+            summary.draw(self.figure)
+            print(f"wrote {self.figure}")
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Write a motion to another format, frame rate or skeleton."""
+    """Convert a motion to another format, frame rate or skeleton."""
 
     source: Annotated[Positional[Path], arg(name="IN")]
-    """The motion (.bvh, .npz) or draws (.nc)."""
+    """Motion (.bvh, .npz) or draws (.nc)."""
 
     target: Annotated[Positional[Path], arg(name="OUT")]
-    """What to write; the ending chooses the format: .bvh or .npz."""
+    """Output file, .bvh or .npz."""
 
     fps: float | None = None
-    """Resample to this frame rate."""
+    """Frame rate to resample to, frames per second."""
 
     skeleton: str | None = None
-    """Retarget to this skeleton (see probmotion list)."""
+    """Skeleton to retarget to (see probmotion list)."""
 
     draw: int | None = None
-    """Which draw of the first chain, where IN holds draws; the first by default."""
+    """Index of the draw in the first chain of IN; 0 by default."""
 
     def run(self) -> None:
-        """Read, change, write."""
-        from probmotion.io.files import save_motion
+        from probmotion.io.files import save
 
         motion = self._read()
         if self.fps is not None:
@@ -86,17 +81,17 @@ class Convert:
             from probmotion.motion.skeleton import Skeleton
 
             motion = motion.retarget(Skeleton.preset(self.skeleton))
-        save_motion(motion, self.target)
+        save(motion, self.target)
         print(f"wrote {self.target}: {motion}")
 
     def _read(self) -> Motion:
-        from probmotion.io.files import load_motion
+        from probmotion.io.files import load
         from probmotion.posteriors.draws import MotionDraws
 
         if self.source.suffix != ".nc":
             if self.draw is not None:
-                raise ValueError(f"draw is {self.draw}, but {self.source} holds no draws (.nc)")
-            return load_motion(self.source)
+                raise ValueError(f"draw requires a file of draws (.nc), got {self.source}")
+            return load(self.source)
         draws = MotionDraws.load(self.source)
         count = draws.dataset.sizes["draw"]
         draw = 0 if self.draw is None else self.draw

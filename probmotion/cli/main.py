@@ -1,7 +1,7 @@
-"""The command line: ``probmotion compare | which | list | show | convert | train | reference``.
+"""Entry point of the command line: ``probmotion COMMAND [OPTIONS]``.
 
-Each command is a dataclass whose fields are its options. Libraries are imported by the command
-that needs them, so that help and mistakes answer at once.
+Each command is a dataclass whose fields are its options. Commands import libraries when they run,
+so that help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -22,26 +22,25 @@ __all__ = ["List", "main"]
 
 _OVERVIEW = """usage: probmotion COMMAND [OPTIONS]
 
-One posterior over 3D motion, many samplers, and how wrong each of them is.
+Sample posteriors over 3D motion and measure the errors of samplers.
 
 commands:
-  compare    draw with several samplers from the same posteriors; print how far each is off
-  which      say which sampler to take for a problem, by what was measured
-  list       the problems, the samplers and the skeletons that are known by name
-  show       say what is in a file of motion, keypoints, draws or a network; draw it
-  convert    write a motion to another format, frame rate or skeleton
-  train      learn a prior, or what priors are measured with
-  reference  make reference draws of a problem, with a certificate of how right they are
+  compare    run samplers on the same posteriors and measure their errors
+  which      recommend a sampler for a problem, from measurements
+  list       list the named problems, samplers and skeletons
+  show       summarise a file of motion, keypoints, draws or a network
+  convert    convert a motion to another format, frame rate or skeleton
+  train      train a prior, or a network for evaluating priors
+  reference  make certified reference draws of a problem
 
 probmotion COMMAND --help lists the options of a command."""
 
 
 @dataclass(frozen=True)
 class List:
-    """List the problems, the samplers and the skeletons that are known by name."""
+    """List the named problems, samplers and skeletons."""
 
     def run(self) -> None:
-        """Print three lists."""
         from probmotion.cli.settings_options import presets_of
         from probmotion.motion.presets import PRESETS
         from probmotion.motion.skeleton import Skeleton
@@ -56,7 +55,7 @@ class List:
             for name, kind in kinds.items()
             for preset in presets_of(kind)
         }
-        _print_list("presets of samplers", presets)
+        _print_list("sampler presets", presets)
         skeletons = {name: Skeleton.preset(name) for name in PRESETS}
         _print_list(
             "skeletons",
@@ -82,40 +81,40 @@ _COMMANDS: dict[str, type[Any]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status: 0, 2 for wrong input, 130 for Ctrl-C."""
+    """Run the command line and return its exit status: 0, 2 for invalid input, 130 for Ctrl-C."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if words else 2
     commands = [*_COMMANDS, "train"]
     if words[0] not in commands:
-        return _complain(f"command must be one of {', '.join(commands)}, got {words[0]!r}", 2)
+        return _fail(f"command must be one of {', '.join(commands)}, got {words[0]!r}", 2)
     with warnings.catch_warnings():
         warnings.showwarning = _note
         try:
             try:
                 _parse(words[0], words[1:]).run()
             finally:
-                # Here, where a reader that is gone is no error; not as Python ends.
+                # Flush here, so that a closed pipe is caught below.
                 sys.stdout.flush()
         except KeyboardInterrupt as error:
-            return _complain(str(error) or "interrupted; nothing was written", 130)
+            return _fail(str(error) or "interrupted; nothing was written", 130)
         except BrokenPipeError:
-            # Whoever read the output has had enough: `probmotion list | head`.
+            # The reader has closed the pipe: `probmotion list | head`.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except OSError as error:
             named = error.filename and error.strerror
-            return _complain(f"{error.filename}: {error.strerror}" if named else str(error), 2)
+            return _fail(f"{error.filename}: {error.strerror}" if named else str(error), 2)
         except ValueError as error:
-            return _complain(str(error), 2)
+            return _fail(str(error), 2)
         except MemoryError as error:
-            return _complain(f"there is not enough memory for this: {error}", 2)
+            return _fail(f"not enough memory: {error}", 2)
     return 0
 
 
 def _parse(name: str, words: Sequence[str]) -> Any:
-    """Return the command with its options; a wrong option ends the process with status 2."""
+    """Return the command with its options; an invalid option exits with status 2."""
     import tyro
 
     prog = f"probmotion {name}"
@@ -129,8 +128,8 @@ def _parse(name: str, words: Sequence[str]) -> Any:
             raise SystemExit(0)
         known = ", ".join(TRAINABLE)
         if not words or words[0] not in TRAINABLE:
-            got = repr(words[0]) if words else "missing"
-            raise ValueError(f"what to train must be one of {known}, got {got}")
+            got = repr(words[0]) if words else "none"
+            raise ValueError(f"kind must be one of {known}, got {got}")
         return tyro.cli(TRAINABLE[words[0]], prog=f"{prog} {words[0]}", args=words[1:])
     kind = _COMMANDS[name]
     if kind is not Compare:
@@ -148,6 +147,6 @@ def _note(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"probmotion: note: {message}", file=sys.stderr)
 
 
-def _complain(sentence: str, status: int) -> int:
-    print(f"probmotion: {sentence}", file=sys.stderr)
+def _fail(message: str, status: int) -> int:
+    print(f"probmotion: {message}", file=sys.stderr)
     return status

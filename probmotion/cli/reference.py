@@ -1,7 +1,4 @@
-"""The command ``probmotion reference``: reference draws of a problem, with their certificate.
-
-It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
-"""
+"""The command ``probmotion reference``: certified reference draws of a problem."""
 
 from __future__ import annotations
 
@@ -18,35 +15,31 @@ __all__ = ["Reference"]
 
 @dataclass(frozen=True)
 class Reference:
-    """Make reference draws of a problem by two long runs that must agree, or exactly.
+    """Make reference draws of a problem, exactly or by two long runs that must agree.
 
-    Writes NAME/draws.npz and NAME/certificate.json, both or neither; what has not mixed or does
-    not agree is not kept. A run that has ended is kept until both have, and pose-pairs before, so
-    that the same command goes on after an interrupt.
+    Writes NAME/draws.npz and NAME/certificate.json, or nothing if the runs have not converged or
+    disagree. Repeating an interrupted command continues after the last finished run.
     """
 
     problem: Positional[str]
-    """Name of a problem (see probmotion list), or one with other numbers in quotes, such as
-    "gait-noisy3d(noise=0.05)"."""
+    """Name of a problem (see probmotion list), with parameters as "gait-noisy3d(noise=0.05)"."""
 
     draws: int = 4000
-    """Draws in all, a multiple of 8."""
+    """Total number of draws, a multiple of 8."""
 
     seed: int = 0
-    """Seed of the runs."""
+    """Random seed."""
 
     out: Path | None = None
-    """Folder in which the problem's own is made; by default where comparisons look for it, in the
-    user's cache."""
+    """Parent of the output folder; by default the reference store in the user's cache."""
 
     def run(self) -> None:
-        """Draw, certify, write, and say what is known of the draws."""
         from probmotion.problems.catalogue import problem_without_reference
         from probmotion.problems.references.making import ReferenceRefused, make_reference
         from probmotion.problems.references.store import references_folder
         from probmotion.threads import one_thread
 
-        # Called as it calls itself, whatever order its numbers were given in.
+        # The canonical name does not depend on the order of the parameters.
         problem = problem_without_reference(self.problem)
         name = problem.name
         folder = (references_folder() if self.out is None else self.out) / name
@@ -58,34 +51,33 @@ class Reference:
                 )
             reference.save(folder)
         except ReferenceRefused:
-            # The same runs would be refused again.
+            # Repeating the runs would give the same result.
             shutil.rmtree(unfinished)
             raise
         except KeyboardInterrupt as stop:
             if unfinished.is_dir() and any(unfinished.iterdir()):
                 raise KeyboardInterrupt(
-                    "interrupted; what was made is kept, and the same command goes on"
+                    "interrupted; finished runs are stored, repeat the command to continue"
                 ) from stop
             raise
         else:
             shutil.rmtree(unfinished)
         finally:
-            # Where no run has ended nothing is left.
+            # Remove the folder if no run has finished.
             with suppress(OSError):
                 unfinished.rmdir()
-        told = reference.certificate
-        agreed = told["agreement"]
-        print(f"{name}: {reference.n} draws by {told['sampler']}, kept in {folder}")
-        if told["rhat"] is not None:
-            print(f"  R-hat {told['rhat']:.4f}, least ESS {told['ess_bulk']:.0f}")
-        print(f"  two runs apart: {_apart(agreed)}")
-        if told["agreement_wherever_they_stand"] is not None:
-            print(f"  wherever motions stand: {_apart(told['agreement_wherever_they_stand'])}")
+        certificate = reference.certificate
+        print(f"{name}: wrote {reference.n} draws by {certificate['sampler']} to {folder}")
+        if certificate["rhat"] is not None:
+            print(f"  R-hat {certificate['rhat']:.4f}, least ESS {certificate['ess_bulk']:.0f}")
+        print(f"  agreement of two runs: {_described(certificate['agreement'])}")
+        if (centred := certificate["agreement_wherever_they_stand"]) is not None:
+            print(f"  agreement up to translation: {_described(centred)}")
 
 
-def _apart(agreed: Mapping[str, float]) -> str:
+def _described(agreement: Mapping[str, float]) -> str:
     return (
-        f"sliced Wasserstein ratio {agreed['swd_ratio']:.2f} (at most "
-        f"{agreed['swd_ratio_at_most']:.2f}), means {agreed['mean_z']:.1f} standard errors (at "
-        f"most {agreed['mean_z_at_most']:.1f})"
+        f"sliced Wasserstein ratio {agreement['swd_ratio']:.2f} (at most "
+        f"{agreement['swd_ratio_at_most']:.2f}), mean difference {agreement['mean_z']:.1f} "
+        f"standard errors (at most {agreement['mean_z_at_most']:.1f})"
     )

@@ -1,7 +1,7 @@
-"""Samplers' settings as command-line options, made from their dataclasses.
+"""Command-line options for the settings of samplers, generated from their dataclasses.
 
-A setting that is a number or a word is an option of its own. One that is an object (a guidance, a
-proposal) is written as in Python: ``DPS`` or ``DPS(strength=0.5)``.
+Numbers and words are options of their own. Objects (a guidance, a proposal) are written as in
+Python: ``DPS`` or ``DPS(strength=0.5)``.
 """
 
 from __future__ import annotations
@@ -27,31 +27,17 @@ from probmotion.posteriors.sampling import (
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-__all__ = [
-    "object_from_text",
-    "objects_as_words",
-    "option_name",
-    "presets_of",
-    "sampler_called",
-    "settings_of_samplers",
-    "text_of_object",
-]
+__all__ = ["objects_as_words", "presets_of", "sampler_called", "settings_of_samplers"]
 
 
-def option_name(sampler: str) -> str:
-    """Return the field of a sampler's settings: its name as an identifier."""
+def _option_name(sampler: str) -> str:
+    """Return the name of a sampler as an identifier."""
     name = re.sub(r"\W", "_", sampler)
     return name if name.isidentifier() and not iskeyword(name) else f"sampler_{name}"
 
 
 def settings_of_samplers(quick: bool = False) -> type[Any]:
-    """Return a dataclass with one field per registered sampler: its settings.
-
-    Parameters
-    ----------
-    quick : bool
-        Whether they begin from :data:`probmotion.comparison.QUICK` rather than the defaults.
-    """
+    """Return a dataclass with a field per registered sampler, for quick runs if ``quick``."""
     begin = {}
     if quick:
         from probmotion.comparison.quick import quick_samplers
@@ -60,8 +46,8 @@ def settings_of_samplers(quick: bool = False) -> type[Any]:
     entries: dict[str, tuple[type, Any]] = {}
     for name, kind in importable_samplers().items():
         default = partial(_same, begin[name]) if quick else kind
-        # Of two that other packages call nearly alike, the first has options.
-        entries.setdefault(option_name(name), (kind, field(default_factory=default)))
+        # If two names give the same identifier, the first has options.
+        entries.setdefault(_option_name(name), (kind, field(default_factory=default)))
     settings = make_dataclass(
         "Settings", [(name, *entry) for name, entry in entries.items()], frozen=True
     )
@@ -74,7 +60,7 @@ def _same(value: Any) -> Any:
 
 
 def presets_of(kind: type) -> list[str]:
-    """Return the names of a sampler's presets: class methods that need no argument."""
+    """Return the names of a sampler's presets: public class methods without required arguments."""
     return [
         name
         for name, held in vars(kind).items()
@@ -90,27 +76,22 @@ def presets_of(kind: type) -> list[str]:
 def sampler_called(name: str, settings: Any) -> Any:
     """Return the sampler ``name`` with its settings, or the preset ``sampler.preset``.
 
-    Parameters
-    ----------
-    name : str
-        A registered sampler, or one and a preset of its, such as ``"mas.reference_code"``.
-    settings : object
-        An instance of :func:`settings_of_samplers`'s class.
+    ``settings`` is an instance of the class from :func:`settings_of_samplers`.
 
     Raises
     ------
     ValueError
-        If there is no such sampler or preset, with the known ones, or it has no defaults.
+        If there is no such sampler or preset, or it has no defaults.
     """
-    # Others may have a point in their names.
+    # Third-party samplers may have a dot in their names.
     base, _, preset = (name, "", "") if name in sampler_names() else name.partition(".")
     kind = load_sampler(base)
     if not preset:
-        given = getattr(settings, option_name(base), None)
+        given = getattr(settings, _option_name(base), None)
         return given if type(given) is kind else default_sampler(base)
     known = presets_of(kind)
     if preset not in known:
-        names = ", ".join(f"{base}.{one}" for one in known) or f"{base} alone, which has no presets"
+        names = ", ".join(f"{base}.{one}" for one in known) or f"{base}, which has no presets"
         raise ValueError(f"sampler must be {names}, got {name!r}")
     return getattr(kind, preset)()
 
@@ -140,7 +121,7 @@ def _rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
 
 def _kinds(annotation: Any) -> list[type]:
-    """Return the dataclasses that an annotation stands for: those of a union, or of a protocol."""
+    """Return the dataclasses that an annotation allows: those of a union or a protocol."""
     if isinstance(annotation, types.UnionType) or getattr(annotation, "__origin__", None) is Union:
         kinds = list(get_args(annotation))
         return kinds if all(is_dataclass(kind) for kind in kinds) else []
@@ -152,15 +133,10 @@ def _kinds(annotation: Any) -> list[type]:
 
 
 def object_from_text(text: str, kinds: Iterable[type]) -> Any:
-    """Return the object that ``text`` writes, such as ``"DPS"`` or ``"DPS(strength=0.5)"``.
+    """Return the object written as ``"DPS"`` or ``"DPS(strength=0.5)"``.
 
-    Only the names in ``kinds`` and literal values are understood; nothing is evaluated.
-
-    Raises
-    ------
-    ValueError
-        If the text is no such expression, or a name or setting is unknown; the message lists the
-        known ones.
+    Only names of ``kinds`` and literals are accepted; nothing is evaluated. Anything else is a
+    ``ValueError``.
     """
     known = {kind.__name__: kind for kind in kinds}
     try:
@@ -169,8 +145,8 @@ def object_from_text(text: str, kinds: Iterable[type]) -> Any:
         built = None
     if type(built) not in known.values():
         raise ValueError(
-            f"{text!r} is not an object, expected one of {', '.join(known)}, with settings in "
-            "parentheses such as Name(setting=1)"
+            f"setting must be one of {', '.join(known)}, with options such as Name(option=1), got "
+            f"{text!r}"
         )
     return built
 
@@ -180,7 +156,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     if not isinstance(name, ast.Name):
         return ast.literal_eval(tree)
     if name.id not in known:
-        raise ValueError(f"{name.id!r} must be one of {', '.join(known)}, got unknown")
+        raise ValueError(f"setting must be one of {', '.join(known)}, got {name.id!r}")
     kind: Any = known[name.id]
     if not isinstance(tree, ast.Call):
         return kind()
@@ -188,7 +164,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     for keyword in tree.keywords:
         if keyword.arg not in settings:
             raise ValueError(
-                f"{name.id} has no setting {keyword.arg!r}, expected one of {', '.join(settings)}"
+                f"options of {name.id} must be among {', '.join(settings)}, got {keyword.arg!r}"
             )
     return kind(
         *(_build(value, known) for value in tree.args),
@@ -197,7 +173,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
 
 
 def text_of_object(value: Any) -> str:
-    """Return the text that :func:`object_from_text` reads as ``value``; defaults are left out."""
+    """Return the text that :func:`object_from_text` reads as ``value``, without defaults."""
     changed = [
         f"{entry.name}={_text(getattr(value, entry.name))}"
         for entry in fields(value)

@@ -1,4 +1,4 @@
-"""What is in a file: a few lines of words, and a picture."""
+"""Summaries of files for ``probmotion show``."""
 
 from __future__ import annotations
 
@@ -23,19 +23,7 @@ _LOSSES = ("loss", "validation_loss")
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """A file's content in words, and motions of it to look at.
-
-    Parameters
-    ----------
-    text : str
-        A few lines.
-    skeleton : Skeleton
-        The J joints.
-    motions : ndarray, (n, L, J, 3)
-        What to draw, metres; n is 0 where there is no 3D motion.
-    label : str
-        What to call them.
-    """
+    """A file's summary in words, and n motions (n, L, J, 3) in metres to draw; n may be 0."""
 
     text: str
     skeleton: Skeleton
@@ -43,17 +31,11 @@ class Summary:
     label: str
 
     def draw(self, path: Path) -> None:
-        """Write a picture of the motions.
-
-        Raises
-        ------
-        ValueError
-            If there is no 3D motion to draw.
-        """
+        """Write a figure of the motions."""
         from probmotion.plots.skeletons import draw_skeletons
 
         if not len(self.motions):
-            raise ValueError("picture is given, but the file holds no 3D motion; expected one")
+            raise ValueError("figure requires a file with 3D motion")
         sided = bool(self.skeleton.mirrored_pairs)
         draw_skeletons(
             {self.label: self.motions},
@@ -67,15 +49,7 @@ class Summary:
 def summarise(path: Path, fps: float | None = None, skeleton: str | None = None) -> Summary:
     """Return a summary of a file of motion, keypoints or draws, or of a trained network.
 
-    Parameters
-    ----------
-    path : Path
-        The file; of a network also the folder of its training run.
-    fps : float, optional
-        Frames per second of keypoints in JSON or a table, which do not hold it.
-    skeleton : str, optional
-        Preset that keypoints in JSON are of, where their number does not tell, or whose joints
-        are taken from a table.
+    ``fps`` and ``skeleton`` are the frame rate and layout of keypoints in JSON or a table.
 
     Raises
     ------
@@ -94,26 +68,18 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
         from probmotion.io.files import read_keypoints
 
         return _of_tracks(path, read_keypoints(path, fps, skeleton))
-    from probmotion.io.files import read_motion
+    from probmotion.io.files import load
 
-    return _of_motion(path, read_motion(path))
+    return _of_motion(path, load(path))
 
 
 def kind_of_network(path: Path) -> str:
-    """Return the kind of the trained network in a file, or in the folder of its training run.
-
-    Raises
-    ------
-    MotionFileError
-        If the file is no checkpoint.
-    FileNotFoundError
-        If there is no such file.
-    """
+    """Return the kind of the trained network in a file or the folder of a training run."""
     file = path / _MODEL if path.is_dir() else path
     if not file.is_file():
         raise FileNotFoundError(
-            f"there is no network {file}, expected a file, the folder of a training run or the "
-            "name of one in the package"
+            f"there is no network {file}; pass a file, the folder of a training run or the name of "
+            "a shipped network"
         )
     return str(_header(file)["kind"])
 
@@ -132,15 +98,14 @@ def _holds_keypoints(path: Path) -> bool:
 
 
 def _of_motion(path: Path, motion: Motion) -> Summary:
-    size = motion.positions.reshape(-1, 3)
-    low, high = size.min(axis=0), size.max(axis=0)
+    heights = motion.positions[..., 1]
     root = motion.positions[:, motion.skeleton.roots[0]]
-    walked = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
+    travelled = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
     text = [
         f"{path}: a motion",
         _length(motion.frames, motion.fps),
         _joints(motion.skeleton),
-        f"  height {low[1]:.2f} to {high[1]:.2f} m; the root travels {walked:.2f} m over ground",
+        f"  height {heights.min():.2f} to {heights.max():.2f} m, root path {travelled:.2f} m",
         f"  local rotations: {'yes' if motion.rotations is not None else 'no'}",
     ]
     return Summary("\n".join(text), motion.skeleton, motion.positions[None], motion.name)
@@ -160,7 +125,7 @@ def _of_tracks(path: Path, tracks: list[KeypointTrack]) -> Summary:
 def _of_draws(path: Path, draws: MotionDraws) -> Summary:
     attributes, sizes = draws.dataset.attrs, draws.dataset.sizes
     sampler = str(attributes["sampler"])
-    evaluations = ", ".join(f"{n} {kind}" for kind, n in draws.counts.items()) or "none counted"
+    evaluations = ", ".join(f"{n} {kind}" for kind, n in draws.counts.items()) or "not counted"
     text = [
         f"{path}: draws of {sampler}",
         f"  {sizes['chain']} x {sizes['draw']} (chains x draws), seed {attributes['seed']}, "
@@ -179,15 +144,15 @@ def _of_checkpoint(path: Path) -> Summary:
     header = _header(path)
     try:
         kind, card = header["kind"], header["settings"]
-        # A denoiser has the joints and the size of the prior that it was trained beside.
+        # A denoiser has the joints and the size of its prior.
         network = card["network"].get("prior", card["network"])
         skeleton = Skeleton(network["joint_names"], network["parents"])
         shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
         text = [
-            f"{path}: a {kind} of {header['numbers']} numbers",
+            f"{path}: a {kind} of {header['numbers']} parameters",
             f"  {shape}",
             _joints(skeleton),
-            *_learnt_from(kind, card["network"]),
+            *_training_data(kind, card["network"]),
             _progress(card),
         ]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -196,7 +161,7 @@ def _of_checkpoint(path: Path) -> Summary:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """Return what a checkpoint's file says of itself, with the number of its ``numbers``."""
+    """Return the header of a checkpoint with its number of parameters as ``numbers``."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -211,27 +176,25 @@ def _header(path: Path) -> dict[str, Any]:
 def _no_checkpoint(path: Path) -> ValueError:
     from probmotion.io.errors import MotionFileError
 
-    return MotionFileError(
-        f"{path} is damaged or of another program, expected a checkpoint of this one"
-    )
+    return MotionFileError(f"{path} is damaged or not a checkpoint of probmotion")
 
 
-def _learnt_from(kind: str, network: dict[str, Any]) -> list[str]:
-    """Return what a network learnt from, in lines."""
+def _training_data(kind: str, network: dict[str, Any]) -> list[str]:
+    """Return lines about the training data of a network."""
     if kind == "motion-dvae":
         data = network["data"]
-        learnt_from = f"  learnt from {data['frames']} frames of {_clips(data['clips'])}"
-        return [_windows(network), learnt_from]
+        frames = f"  trained on {data['frames']} frames of {_clips(data['clips'])}"
+        return [_windows(network), frames]
     if kind == "motion-denoiser":
         noise = network["noise"]
         return [
             _windows(network["prior"]),
-            f"  learnt from noisy joints of {_clips(network['clips'])}",
+            f"  trained on noisy joints of {_clips(network['clips'])}",
             f"  noise of {noise['least']:g} to {noise['most']:g} m, outliers in "
-            f"{noise['outliers']:.0%} of windows, hidden joints in {noise['hidden']:.0%}",
+            f"{noise['outliers']:.0%} of windows, occlusion in {noise['hidden']:.0%}",
         ]
     data = network["data"]
-    return [f"  learnt from {data['tracks']} tracks of {', '.join(data['clips'])}"]
+    return [f"  trained on {data['tracks']} tracks of {', '.join(data['clips'])}"]
 
 
 def _windows(network: dict[str, Any]) -> str:
@@ -244,7 +207,7 @@ def _clips(names: list[str]) -> str:
 
 
 def _progress(card: dict[str, Any]) -> str:
-    """Return how long a network was trained, and its last losses."""
+    """Return the length of the training and the last losses."""
     last, training = card["history"][-1] if card["history"] else {}, card["training"]
     losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
     return (
@@ -260,6 +223,6 @@ def _length(frames: int, fps: float) -> str:
 def _joints(skeleton: Skeleton) -> str:
     roots = ", ".join(skeleton.joint_names[root] for root in skeleton.roots)
     return (
-        f"  {skeleton.n_joints} joints below {roots}, "
+        f"  {skeleton.n_joints} joints, rooted at {roots}, "
         f"{len(skeleton.mirrored_pairs)} left-right pairs"
     )

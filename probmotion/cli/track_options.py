@@ -1,4 +1,4 @@
-"""Which 2D tracks a command of training learns from: its options, and the tracks they name."""
+"""Options that select the 2D tracks to train on."""
 
 from __future__ import annotations
 
@@ -15,80 +15,71 @@ __all__ = ["TrackData", "learning_tracks"]
 
 @dataclass(frozen=True)
 class TrackData:
-    """What is learnt from: clips that are filmed, or tracks; people made to walk by default."""
+    """Training data: 2D tracks, or projected 3D clips; synthetic walks by default."""
 
     clips: tuple[str, ...] = ()
-    """3D motion files, .npz or .bvh, or quoted patterns. They are filmed by cameras around them,
-    and a detector with errors finds the joints: only these pictures are learnt from."""
+    """3D motion files (.npz, .bvh) or quoted patterns, projected to 2D with detection errors."""
 
     tracks: tuple[str, ...] = ()
-    """Files of 2D keypoints (.json, .npz, .csv), folders of a video's frames as OpenPose writes
-    them (--tracks op/video0 op/video1), or quoted patterns. Their names are those of clips. Of
-    other bodies than people, --skeleton must be named."""
+    """Files of 2D keypoints (.json, .npz, .csv), OpenPose folders, or quoted patterns.
+    Set --skeleton for bodies other than people."""
 
     tracks_fps: float | None = None
-    """Frames per second of keypoints in files that do not hold it."""
+    """Frames per second of keypoint files that do not contain it."""
 
     layout: str | None = None
-    """What keypoints in JSON are (see probmotion list), where their number does not tell."""
+    """Layout of keypoints in JSON (see probmotion list) if their number is ambiguous."""
 
     people: int | None = None
-    """How many people to follow in JSON that does not say who is who."""
+    """Number of people to track in JSON without identities."""
 
     skeleton: str = "person14"
-    """The joints to learn (see probmotion list), which clips or tracks must have; own: those that
-    the files of tracks hold."""
+    """Joints to learn (see probmotion list), or own for those of the track files."""
 
     fps: float = 20.0
-    """Frames per second to learn at."""
+    """Frame rate to train at, frames per second."""
 
     validation: tuple[str, ...] = ()
-    """Names of clips (files without ending) on which the loss is watched; a tenth by default."""
+    """Names of validation clips (files without extension); a random tenth by default."""
 
     test: tuple[str, ...] = ()
-    """Names of clips that are kept for measuring; a tenth by default."""
+    """Names of held-out test clips; a random tenth by default."""
 
     views: int | None = None
-    """Cameras around each 3D clip; 64 by default."""
+    """Number of cameras around each 3D clip; 64 by default."""
 
     centre: Literal["frame", "sequence"] = "frame"
-    """Whether the root is at the origin in every frame, or on average."""
+    """Whether the root is at the origin in every frame or on average."""
 
     data_seed: int = 0
-    """Seed of cameras, detection errors and, where no clips are named, of the split."""
+    """Seed of cameras, detection errors and the random split."""
 
 
 def learning_tracks(
     data: TrackData, threshold: float = 0.3, shortest: float = 1.0
 ) -> LearningTracks:
-    """Return the tracks that the options name, and print what preparing them dropped.
+    """Return the selected tracks, prepared and split, and print what was dropped.
 
-    Parameters
-    ----------
-    data : TrackData
-        The options.
-    threshold : float
-        Least confidence that counts.
-    shortest : float
-        Seconds of the shortest track that is kept.
+    ``threshold`` is the least confidence of a detection, ``shortest`` the least duration of a
+    track in seconds.
     """
     from probmotion.data.projections import Filming
     from probmotion.data.synthetic.walks import synthetic_walks
     from probmotion.data.tracks.learning import film_clips, read_tracks, split_tracks
-    from probmotion.io.files import files_named, load_motion
+    from probmotion.io.files import files_named, load
     from probmotion.motion.skeleton import Skeleton
     from probmotion.motion.splits import clip_of
 
     if data.clips and data.tracks:
-        raise ValueError("clips and tracks are both given, expected one of them")
+        raise ValueError("clips and tracks are mutually exclusive")
     for name in ("tracks_fps", "layout", "people"):
         if getattr(data, name) is not None and not data.tracks:
-            raise ValueError(f"{name} is given without tracks, expected --tracks FILE… beside it")
+            raise ValueError(f"{name} requires --tracks FILE…")
     if data.tracks and data.views is not None:
-        raise ValueError("views is given with tracks, expected it only where clips are filmed")
+        raise ValueError("views applies to 3D clips only, got tracks")
     own = data.skeleton == "own"
     if own and not data.tracks:
-        raise ValueError("skeleton is 'own' without tracks, expected --tracks FILE… that hold one")
+        raise ValueError("skeleton 'own' requires --tracks FILE…")
     skeleton = None if own else Skeleton.preset(data.skeleton)
     if skeleton is None or data.tracks:
         prepared = read_tracks(
@@ -103,8 +94,8 @@ def learning_tracks(
             shortest=shortest,
         )
     else:
-        # A file may hold another name; options name clips by their files.
-        clips = [replace(load_motion(path), name=path.stem) for path in files_named(data.clips)]
+        # Clips are named by their files, whatever name a file contains.
+        clips = [replace(load(path), name=path.stem) for path in files_named(data.clips)]
         prepared = film_clips(
             clips or synthetic_walks(skeleton=skeleton),
             skeleton,
@@ -117,11 +108,10 @@ def learning_tracks(
     print(prepared)
     if not (data.validation or data.test):
         check_enough_clips(clip_of(track.name) for track in prepared.tracks)
-    found = split_tracks(
+    split = split_tracks(
         prepared.tracks, validation=data.validation, test=data.test, seed=data.data_seed
     )
     for part in ("train", "validation", "test"):
-        names = getattr(found.split, part)
-        count = len(getattr(found, part))
-        print(f"{part}: {count} tracks of {len(names)} clips: {listed(names)}")
-    return found
+        names = getattr(split.split, part)
+        print(f"{part}: {len(getattr(split, part))} tracks of {len(names)} clips: {listed(names)}")
+    return split

@@ -1,7 +1,4 @@
-"""The commands ``probmotion train dvae | denoiser``: what bodies do, learnt from 3D clips.
-
-Each is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
-"""
+"""The commands ``probmotion train dvae`` and ``probmotion train denoiser``."""
 
 from __future__ import annotations
 
@@ -23,71 +20,70 @@ from probmotion.cli.training_options import (
 if TYPE_CHECKING:
     from probmotion.motion.motion import Motion
     from probmotion.motion.skeleton import Skeleton
-    from probmotion.motion.splits import Split
 
-__all__ = ["TrainDVAE", "TrainDenoiser", "learning_clips"]
+__all__ = ["TrainDVAE", "TrainDenoiser"]
 
 Size = Literal["tiny", "small", "paper"]
 
 
 @dataclass(frozen=True)
 class BodyClips:
-    """What is learnt from: 3D clips of bodies; people made to walk, run and march by default."""
+    """Training data: 3D clips of bodies; synthetic people who walk, run and march by default."""
 
     clips: tuple[str, ...] = ()
-    """3D motion files, .npz or .bvh, or quoted patterns."""
+    """3D motion files (.npz, .bvh) or quoted patterns."""
 
     validation: tuple[str, ...] = ()
-    """Names of clips (files without ending) on which the loss is watched; a tenth by default."""
+    """Names of validation clips (files without extension); a random tenth by default."""
 
     test: tuple[str, ...] = ()
-    """Names of clips that are kept for measuring; a tenth by default."""
+    """Names of held-out test clips; a random tenth by default."""
 
     data_seed: int = 0
-    """Seed of the split or, where no clips are named, of the people who are made."""
+    """Seed of the random split, or of the synthetic clips."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the recordings are like that the denoiser is to learn from."""
+    """Noise of the synthetic recordings."""
 
     least: float = 0.01
-    """Least standard deviation of a joint's coordinate, metres."""
+    """Least standard deviation of the noise, metres."""
 
     most: float = 0.08
-    """Greatest standard deviation of a joint's coordinate, metres."""
+    """Greatest standard deviation of the noise, metres."""
 
     outliers: float = 0.4
-    """Share of windows whose noise has outliers (Student-t)."""
+    """Fraction of windows with outliers (Student-t noise)."""
 
     hidden: float = 0.6
-    """Share of windows in which limbs hide for a while, and single joints here and there."""
+    """Fraction of windows with occluded limbs and joints."""
 
 
 @dataclass(frozen=True)
 class TrainDVAE:
-    """Learn a Motion-DVAE, a prior of what a body does next, from clean 3D motion.
+    """Train a Motion-DVAE, an autoregressive prior over 3D motion, from clean clips.
 
-    The same command goes on where it was stopped; a run that is finished goes on with more steps.
+    Writes model.safetensors and losses.csv. Repeating the command continues an interrupted run;
+    more --steps extend a finished one.
     """
 
     out: Path
-    """Folder for model.safetensors, losses.csv and what is needed to go on."""
+    """Output folder."""
 
     size: Size = "small"
-    """tiny: seconds, for trying out; small: minutes on two cores; paper: a GPU."""
+    """Network size; tiny trains in seconds, small in minutes on two cores, paper needs a GPU."""
 
     skeleton: str = "person14"
-    """The joints to learn (see probmotion list), which clips must have."""
+    """Joints to learn (see probmotion list)."""
 
     fps: float = 30.0
-    """Frames per second to learn at; clips at another rate are resampled."""
+    """Frame rate to train at, frames per second; other clips are resampled."""
 
     data: OmitArgPrefixes[BodyClips] = field(default_factory=BodyClips)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
     def run(self) -> None:
-        """Train."""
         from probmotion.models.bodies.body_states import BodyStates, rest_pose
         from probmotion.models.dvae.settings import DVAESettings
         from probmotion.models.dvae.training import DVAETrainee, usual_dvae_training
@@ -100,8 +96,8 @@ class TrainDVAE:
         check_positive("fps", self.fps)
         skeleton = Skeleton.preset(self.skeleton)
         size = getattr(DVAESettings, self.size)()
-        parts = learning_clips(self.data, skeleton, self.fps, size.frames)
-        _say_annealing(annealing, settings.steps)
+        parts = _learning_clips(self.data, skeleton, self.fps, size.frames)
+        _print_annealing(annealing, settings.steps)
         clips = parts["train"]
         states = BodyStates(skeleton, rest_pose(skeleton, [clip.positions for clip in clips]))
         trainee = DVAETrainee(
@@ -112,29 +108,28 @@ class TrainDVAE:
 
 @dataclass(frozen=True)
 class TrainDenoiser:
-    """Learn to denoise 3D joints with a Motion-DVAE, from noisy joints alone.
+    """Train a denoiser of 3D joints with a Motion-DVAE prior, from noisy joints alone.
 
-    Clips only make the noisy joints. They are brought to the joints and the frame rate of the
-    prior. The same command goes on where it was stopped.
+    Clips are only used to make noisy joints, on the prior's skeleton and frame rate. Writes
+    model.safetensors and losses.csv. Repeating the command continues an interrupted run; more
+    --steps extend a finished one.
     """
 
     out: Path
-    """Folder for model.safetensors, losses.csv and what is needed to go on."""
+    """Output folder."""
 
     prior: str
-    """What motion is like: the folder or file of a run of probmotion train dvae, or the name of
-    one in the package. It stays as it is."""
+    """Motion-DVAE: folder or file of a run of probmotion train dvae, or a shipped network.
+    Its weights are not changed."""
 
     size: Size = "small"
-    """How long to learn, by the prior's size. tiny: seconds, for trying out; small: minutes on two
-    cores; paper: a GPU."""
+    """Training length for the prior's size; tiny takes seconds, small minutes, paper a GPU."""
 
     noise: OmitArgPrefixes[Noise] = field(default_factory=Noise)
     data: OmitArgPrefixes[BodyClips] = field(default_factory=BodyClips)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
     def run(self) -> None:
-        """Train."""
         from probmotion.models.dvae.denoiser_training import (
             DenoiserTrainee,
             usual_denoiser_training,
@@ -151,8 +146,8 @@ class TrainDenoiser:
             f"prior: {prior.skeleton.n_joints} joints, windows of {prior.frames} frames at "
             f"{prior.fps:g} fps"
         )
-        parts = learning_clips(self.data, prior.skeleton, prior.fps, prior.frames)
-        _say_annealing(annealing, settings.steps)
+        parts = _learning_clips(self.data, prior.skeleton, prior.fps, prior.frames)
+        _print_annealing(annealing, settings.steps)
         trainee = DenoiserTrainee(
             parts["train"],
             parts["validation"],
@@ -164,118 +159,71 @@ class TrainDenoiser:
         run_training(trainee, settings, self.out, self.training.device)
 
 
-def learning_clips(
+def _learning_clips(
     data: BodyClips, skeleton: Skeleton, fps: float, frames: int
 ) -> dict[str, list[Motion]]:
-    """Return the clips of each part that the options name, and print what was done to them.
-
-    Parameters
-    ----------
-    data : BodyClips
-        The options.
-    skeleton : Skeleton
-        The joints to bring clips to.
-    fps : float
-        Frames per second to bring them to.
-    frames : int
-        Of a window: shorter clips are left out.
-    """
+    """Return the selected clips of each part with at least ``frames`` frames, and print them."""
     from probmotion.data.denoising_clips import synthetic_denoising_clips
+    from probmotion.data.tracks.learning import split_names, unique_files
+    from probmotion.io.files import load
     from probmotion.validation import check_count
 
     check_count("data_seed", data.data_seed, least=0)
     if data.clips:
-        found = _long_clips(_read_clips(data.clips), skeleton, fps, frames)
-        split = _split(data, [clip.name for clip in found])
+        clips = [replace(load(p), name=name) for name, p in unique_files(data.clips).items()]
+        clips = _long_clips(clips, skeleton, fps, frames)
+        names = [clip.name for clip in clips]
+        if not (data.validation or data.test):
+            check_enough_clips(names)
+        split = split_names(names, validation=data.validation, test=data.test, seed=data.data_seed)
         parts = {
-            part: [clip for clip in found if clip.name in getattr(split, part)]
+            part: [clip for clip in clips if clip.name in getattr(split, part)]
             for part in ("train", "validation", "test")
         }
     else:
         for name in ("validation", "test"):
             if getattr(data, name):
-                raise ValueError(f"{name} is given without clips, expected --clips FILE… beside it")
-        made = synthetic_denoising_clips(seed=data.data_seed)
-        every = [clip for clips in made.values() for clip in clips]
+                raise ValueError(f"{name} requires --clips FILE…")
+        synthetic = synthetic_denoising_clips(seed=data.data_seed)
+        every = [clip for clips in synthetic.values() for clip in clips]
         long = {clip.name: clip for clip in _long_clips(every, skeleton, fps, frames)}
-        parts = {part: [long[clip.name] for clip in clips] for part, clips in made.items()}
+        parts = {part: [long[clip.name] for clip in clips] for part, clips in synthetic.items()}
     for part, clips in parts.items():
         count = sum(clip.frames for clip in clips)
-        names = listed([clip.name for clip in clips])
-        print(f"{part}: {count} frames of {len(clips)} clips: {names}")
+        names = [clip.name for clip in clips]
+        print(f"{part}: {count} frames of {len(clips)} clips: {listed(names)}")
     return parts
 
 
-def _read_clips(paths: tuple[str, ...]) -> list[Motion]:
-    """Return the motions of files, each called as its file."""
-    from probmotion.io.files import files_named, load_motion
-
-    files: dict[str, Path] = {}
-    for path in files_named(paths):
-        if path.stem in files:
-            raise ValueError(
-                f"clips has {files[path.stem]} and {path}, expected files of other names: a clip "
-                "is called as its file"
-            )
-        files[path.stem] = path
-    return [replace(load_motion(path), name=name) for name, path in files.items()]
-
-
 def _long_clips(clips: list[Motion], skeleton: Skeleton, fps: float, frames: int) -> list[Motion]:
-    """Return clips on the skeleton at the frame rate, without those shorter than a window."""
+    """Return retargeted and resampled clips, without those shorter than a window."""
     from probmotion.models.bodies.body_states import check_bones
 
     rates = Counter(clip.fps for clip in clips if clip.fps != fps)
-    found = [_on(skeleton, clip).resample(fps) for clip in clips]
+    resampled = [_retargeted(clip, skeleton).resample(fps) for clip in clips]
     for rate, count in sorted(rates.items()):
         print(f"resampled to {fps:g} fps: {count} clips at {rate:g} fps")
-    for clip in found:
-        parents = [max(parent, 0) for parent in skeleton.parents]
+    parents = [max(parent, 0) for parent in skeleton.parents]
+    for clip in resampled:
         check_bones(clip.name, clip.positions[0] - clip.positions[0, parents], skeleton)
-    long = [clip for clip in found if clip.frames >= frames]
+    long = [clip for clip in resampled if clip.frames >= frames]
     if not long:
         raise ValueError(
-            f"clips has none of {frames} frames or more at {fps:g} frames per second, expected "
-            f"some; the longest has {max(clip.frames for clip in found)}"
+            f"clips must include one of at least {frames} frames at {fps:g} fps, got at most "
+            f"{max(clip.frames for clip in resampled)}"
         )
-    if short := [clip.name for clip in found if clip.frames < frames]:
-        print(f"left out, shorter than {frames} frames: {len(short)} clips: {listed(short)}")
+    if short := [clip.name for clip in resampled if clip.frames < frames]:
+        print(f"skipped, shorter than {frames} frames: {len(short)} clips: {listed(short)}")
     return long
 
 
-def _on(skeleton: Skeleton, clip: Motion) -> Motion:
+def _retargeted(clip: Motion, skeleton: Skeleton) -> Motion:
     try:
         return clip.retarget(skeleton)
     except ValueError as error:
-        raise ValueError(f"clips has {clip.name}, which cannot be learnt from: {error}") from error
+        raise ValueError(f"clip {clip.name} cannot be retargeted: {error}") from error
 
 
-def _split(data: BodyClips, names: list[str]) -> Split:
-    """Return the clips of each part: those that are named, or a tenth each at random."""
-    from probmotion.motion.splits import Split, split_clips
-
-    if not (data.validation or data.test):
-        check_enough_clips(names)
-        return split_clips(names, seed=data.data_seed)
-    for given, missing in (("validation", "test"), ("test", "validation")):
-        if not getattr(data, missing):
-            raise ValueError(
-                f"{given} is given without {missing}, expected clips for both or neither"
-            )
-        for name in getattr(data, given):
-            if name not in names:
-                raise ValueError(
-                    f"{given} has {name!r}, which names no clip, expected some of "
-                    f"{', '.join(sorted(names))}"
-                )
-    if twice := sorted(set(data.validation) & set(data.test)):
-        raise ValueError(f"test has {twice[0]!r}, which validation has too, expected other clips")
-    rest = sorted(set(names) - set(data.validation) - set(data.test))
-    if not rest:
-        raise ValueError("validation and test have every clip, expected some to learn from")
-    return Split(tuple(rest), tuple(sorted(data.validation)), tuple(sorted(data.test)))
-
-
-def _say_annealing(annealing: int, steps: int) -> None:
-    within = "" if annealing <= steps else f", more than the {steps} to take"
-    print(f"the weight of KL rises over {annealing} steps{within}")
+def _print_annealing(annealing: int, steps: int) -> None:
+    note = "" if annealing <= steps else f", more than the {steps} of this run"
+    print(f"KL weight: annealed over {annealing} steps{note}")

@@ -1,7 +1,4 @@
-"""What all commands of training share: how long to learn, where to, and the run itself.
-
-The kinds are in :mod:`probmotion.cli.train` and :mod:`probmotion.cli.train_bodies`.
-"""
+"""Options and functions shared by the training commands."""
 
 from __future__ import annotations
 
@@ -20,80 +17,73 @@ _LISTED = 6
 
 @dataclass(frozen=True)
 class Steps:
-    """How long and how fast to learn; by default as the size was tried."""
+    """Optimisation settings; defaults depend on the size."""
 
     steps: int | None = None
-    """Gradient steps."""
+    """Number of gradient steps."""
 
     batch: int | None = None
-    """Sequences per step."""
+    """Number of sequences per step."""
 
     learning_rate: float | None = None
-    """Of the optimiser, after a linear warm-up."""
+    """Learning rate after a linear warm-up."""
 
     checkpoint_every: int = 500
-    """Steps between two checkpoints, each with a validation loss."""
+    """Number of steps between checkpoints, each with a validation loss."""
 
     seed: int = 0
-    """Of the first weights, batches and noise."""
+    """Seed of initial weights, batches and noise."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute; mixed precision on cuda."""
+    """Device; cuda uses mixed precision."""
 
     def settings(self, usual: TrainingSettings) -> TrainingSettings:
-        """Return the usual settings of a size with what was asked for in their place."""
+        """Return the usual settings of a size, overridden by the given options."""
         from probmotion.models.training.trainer import check_device
 
-        check_device(self.device)  # here, because preparing data takes minutes
-        asked = {
-            name: value
-            for name, value in asdict(self).items()
-            if value is not None and name != "device"
-        }
-        return replace(usual, **asked)
+        check_device(self.device)  # before data are prepared, which takes minutes
+        given = {k: v for k, v in asdict(self).items() if v is not None and k != "device"}
+        return replace(usual, **given)
 
 
 def check_out(out: Path) -> None:
-    """Refuse at once a folder that could not be made after minutes of preparing data."""
-    standing = next((place for place in (out, *out.parents) if place.exists()), out)
-    if standing.is_file():
-        where = "" if standing == out else f" below {standing}"
-        raise ValueError(f"out is {out},{where} which is a file, expected a folder")
+    """Raise ``ValueError`` if the output folder is a file or below one."""
+    existing = next((place for place in (out, *out.parents) if place.exists()), out)
+    if existing.is_file():
+        raise ValueError(f"out must be a folder, got {out}; {existing} is a file")
 
 
 def check_enough_clips(names: Iterable[str]) -> None:
-    """Refuse clips that are too few to be split by shares."""
+    """Raise ``ValueError`` if there are too few clips for a random split."""
     clips = sorted(set(names))
-    # Fewer have no tenth: half a clip is rounded to none.
-    if len(clips) < 6:
+    if len(clips) < 6:  # half a clip rounds to none
         raise ValueError(
-            f"the number of clips is {len(clips)} ({', '.join(clips)}), too few to keep out a "
-            "tenth twice, expected at least 6, or --validation NAME and --test NAME to say which "
-            "are kept out"
+            f"clips must be at least 6 for a random split, got {len(clips)} ({', '.join(clips)}); "
+            "name held-out clips by --validation and --test"
         )
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first names in words."""
+    """Return the first names, separated by commas."""
     return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
 
 
 def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
-    """Train, or go on, and print how far it is."""
+    """Train or continue training, and print the progress."""
     from probmotion.models.training.checkpoints import MODEL, load_checkpoint
     from probmotion.models.training.runs import steps_taken
     from probmotion.models.training.trainer import train
 
     before = steps_taken(out, trainee.kind)
     if not before and (out / MODEL).exists():
-        load_checkpoint(out / MODEL, trainee.kind)  # another network's is not written over
+        load_checkpoint(out / MODEL, trainee.kind)  # never overwrite another kind of network
     result = train(trainee, settings, out, device=device)
     last, kept = result.history[-1], result.kept
     ended = ""
     if last["step"] < settings.steps:
-        ended = f"; it ended at step {last['step']:.0f}, as the validation loss fell no more"
+        ended = f"; stopped early at step {last['step']:.0f}, as the validation loss no longer fell"
     if not result.steps:
-        print(f"{result.model} is finished: it has taken {before} steps of {settings.steps}{ended}")
+        print(f"{result.model} is finished: {before} of {settings.steps} steps{ended}")
         return
     print(
         f"wrote {result.model}: step {kept['step']:.0f}, loss {kept['loss']:.4f}, validation loss "

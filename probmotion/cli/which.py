@@ -1,7 +1,4 @@
-"""The command ``probmotion which``: the sampler to take for a problem, by what was measured.
-
-It is a dataclass whose fields are its options, as in :mod:`probmotion.cli`.
-"""
+"""The command ``probmotion which``: advice on samplers from measurements."""
 
 from __future__ import annotations
 
@@ -14,17 +11,16 @@ __all__ = ["Which"]
 
 @dataclass(frozen=True)
 class Which:
-    """Say which sampler to take for a problem, how wrong it is, and what is wrong with the others.
+    """Recommend a sampler for a problem, with its errors and those of the alternatives.
 
-    The figures were measured once, with a small budget, and come with the package; of other
-    problems, numbers and budgets, probmotion compare finds out.
+    The measurements ship with the package and were taken once with a small budget. Use probmotion
+    compare for other problems and budgets.
     """
 
     problems: Positional[tuple[str, ...]] = ()
-    """Names of problems (see probmotion list); all that were measured by default."""
+    """Names of problems (see probmotion list); all measured ones by default."""
 
     def run(self) -> None:
-        """Print the advice."""
         from probmotion.comparison import advise, measured
 
         print("\n\n".join(str(advise(name)) for name in self.problems or measured().problems))

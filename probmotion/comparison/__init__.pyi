@@ -1,6 +1,5 @@
 from .advice import Advice as Advice, Standing as Standing, advise as advise
-from .comparison import Comparison as Comparison
-from .grid import compare as compare
+from .grid import Comparison as Comparison, compare as compare
 from .measurements import (
     Measured as Measured,
     measured as measured,

@@ -1,4 +1,4 @@
-"""The pictures of a comparison: quality against cost, and every sampler's draws as skeletons."""
+"""Figures of a comparison: quality against cost, and skeletons of every sampler's draws."""
 
 from __future__ import annotations
 
@@ -8,71 +8,67 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.comparison.results.qualities import first_quality
+from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.plots.pairs import draw_pairs
 from probmotion.plots.quality import plot_quality_against_cost
 from probmotion.plots.skeletons import draw_skeletons
 
 if TYPE_CHECKING:
-    from probmotion.comparison.comparison import Comparison
+    from probmotion.comparison.results.grid_results import GridResults
     from probmotion.motion.skeleton import Skeleton
     from probmotion.posteriors.problem import Problem
 
-__all__ = ["draw_comparison", "draw_problem"]
+__all__ = ["draw_comparison"]
 
-_SHOWN = 4
+_DRAWS = 4
 _POSES = 6
+_SIDE_VIEW = np.pi / 2 - 0.35
+"""Heading of bodies without observations, radians."""
 
 
 def draw_comparison(
-    comparison: Comparison, problems: Iterable[Problem], folder: str | Path
+    comparison: GridResults, problems: Iterable[Problem], folder: str | Path
 ) -> list[Path]:
-    """Write the plot and one picture of skeletons per problem; return their paths.
+    """Write ``quality_against_cost.png`` and ``skeletons_<problem>.png``; return their paths.
 
-    The plot is of the first of :data:`~probmotion.comparison.results.qualities.QUALITIES` that was
-    measured. Where none was, there is no plot.
+    The plot is left out if no headline metric was measured. Skeletons with observations are seen
+    from the side of the first camera, which leaves that view open, with the truth in grey.
 
     Parameters
     ----------
-    comparison : Comparison
-        What was drawn.
+    comparison : GridResults
+        Results of a grid.
     problems : iterable of Problem
-        Those of its problems to draw.
+        Problems to draw.
     folder : str or Path
-        Where ``quality_against_cost.png`` and ``skeletons_<problem>.png`` go.
-    """
-    folder = Path(folder)
-    written = []
-    table = comparison.table()
-    if quality := first_quality(table):
-        written.append(folder / "quality_against_cost.png")
-        plot_quality_against_cost(table, written[0], quality=quality)
-    for problem in problems:
-        path = folder / f"skeletons_{problem.name}.png"
-        draw_problem(comparison, problem, path)
-        written.append(path)
-    return written
-
-
-def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> None:
-    """Write each sampler's draws of a problem below exact draws, or those of a long run.
-
-    Where there is evidence, motions are seen from the side of the first camera, which is what it
-    does not show, and the truth stands behind them in grey. Where there is none, all motions are
-    turned to the same heading. Of single poses, some that were held out stand above the draws.
+        Existing folder.
 
     Raises
     ------
     ValueError
-        If there is neither a sampler's draw nor a reference draw.
+        If a problem has neither draws nor references.
     """
+    folder = Path(folder)
+    written = []
+    table = comparison.table()
+    if headline_metric(table):
+        written.append(folder / "quality_against_cost.png")
+        plot_quality_against_cost(table, written[0])
+    for problem in problems:
+        written.append(folder / f"skeletons_{problem.name}.png")
+        _draw_problem(comparison, problem, written[-1])
+    return written
+
+
+def _draw_problem(comparison: GridResults, problem: Problem, path: Path) -> None:
+    """Write each sampler's draws of a problem below exact or reference draws."""
     drawn = {}
-    shown = _SHOWN if problem.held_out is None else _POSES
+    shown = _DRAWS if problem.held_out is None else _POSES
     for result in comparison.results:
         if result.problem == problem.name and result.seed == 0 and result.failure is None:
             motions = comparison.draws(problem.name, result.sampler).flat()
-            # Neighbours in a chain look alike: show draws that are far apart.
+            # Consecutive draws of a chain are similar.
             drawn[result.sampler] = motions[:: max(1, len(motions) // shown)]
     rows = {}
     if "exact" in drawn:
@@ -82,35 +78,28 @@ def draw_problem(comparison: Comparison, problem: Problem, path: str | Path) -> 
         rows[label] = problem.reference(0, shown)
     rows |= drawn
     if not rows:
-        raise ValueError(f"problem is {problem.name!r}, which no sampler drew from")
-    posterior = problem.posterior
+        raise ValueError(f"problem must have draws or references, got none for {problem.name!r}")
+    skeleton, likelihood = problem.posterior.skeleton, problem.posterior.likelihood
     if problem.held_out is not None:
-        _draw_poses({"held out": problem.held_out} | rows, posterior.skeleton, path, problem.name)
+        _draw_poses({"held out": problem.held_out} | rows, skeleton, path, problem.name)
         return
-    cameras = getattr(posterior.likelihood, "cameras", None)
-    if posterior.likelihood is None:
-        sided = bool(posterior.skeleton.mirrored_pairs)
-        heading = np.pi / 2 - 0.35 if sided else None
-        draw_skeletons(rows, posterior.skeleton, path, heading=heading, title=problem.name)
+    if likelihood is None:
+        heading = _SIDE_VIEW if skeleton.mirrored_pairs else None
+        draw_skeletons(rows, skeleton, path, heading=heading, title=problem.name)
         return
-    azimuth = 0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2
+    cameras = getattr(likelihood, "cameras", None)
     draw_skeletons(
         rows,
-        posterior.skeleton,
+        skeleton,
         path,
-        azimuth=azimuth,
+        azimuth=0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2,
         truth=problem.truth,
         title=problem.name + ("" if cameras is None else ", seen from the camera's side"),
     )
 
 
-def _draw_poses(
-    rows: dict[str, np.ndarray], skeleton: Skeleton, path: str | Path, title: str
-) -> None:
-    """Write poses of several people, each row's evenly apart: (n, 1, J, 3).
-
-    All are turned to the first, as where a pair stands and which way is up may be left open.
-    """
+def _draw_poses(rows: dict[str, np.ndarray], skeleton: Skeleton, path: Path, title: str) -> None:
+    """Write evenly spaced poses of each row, (n, 1, J, 3), aligned with the first pose."""
     chosen = {
         label: motions[:: max(1, len(motions) // _POSES), 0][:_POSES]
         for label, motions in rows.items()

@@ -1,4 +1,4 @@
-"""`compare`: the grid problem × sampler × seed."""
+"""Experiment grids: every sampler on every problem with every seed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from probmotion import seeds as addressed
-from probmotion.comparison.comparison import Comparison
-from probmotion.comparison.results.budgets import Budget, check_budget
+from probmotion.calibration.result import Calibration
+from probmotion.comparison.results.budgets import Budget
+from probmotion.comparison.results.grid_results import GridResults
 from probmotion.comparison.results.naming import (
     AnyProblem,
     AnySampler,
@@ -19,14 +20,38 @@ from probmotion.comparison.results.naming import (
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.stored_problems import store_problem
 from probmotion.comparison.run.locks import locked
-from probmotion.comparison.run.tasks import Grid, refuse_taken, run_grid
+from probmotion.comparison.run.tasks import (
+    Grid,
+    check_grid_options,
+    refuse_other_settings,
+    run_grid,
+)
 from probmotion.files import writable_folder
+from probmotion.plots.quality import plot_quality_against_cost
 from probmotion.problems.catalogue import load_problem
-from probmotion.validation import check_count, check_positive
+from probmotion.report.page import write_report
+from probmotion.validation import check_count
 
-__all__ = ["compare"]
+__all__ = ["Comparison", "compare"]
 
-_FEWEST_DRAWS = 10
+_FIGURE = "quality_against_cost.png"
+
+
+class Comparison(GridResults):
+    """Draws and metrics of every sampler on every problem.
+
+    :class:`~probmotion.comparison.results.grid_results.GridResults` documents its table and draws.
+    """
+
+    def plot(self, path: str | Path | None = None) -> Path:
+        """Plot quality against cost and return the path, by default in the folder of the grid."""
+        target = self.folder / _FIGURE if path is None else Path(path)
+        plot_quality_against_cost(self.table(), target)
+        return target
+
+    def report(self, path: str | Path, calibration: Calibration | None = None) -> Path:
+        """Write a self-contained HTML page with tables, plots and animated draws."""
+        return write_report(self, path, calibration)
 
 
 def compare(
@@ -43,92 +68,81 @@ def compare(
     time_limit: float | None = None,
     progress: bool = True,
 ) -> Comparison:
-    """Run every sampler on every problem and measure what it drew.
+    """Run every sampler on every problem and measure its draws.
 
-    Each cell of the grid has its own random numbers, addressed by the names of its problem and
-    sampler and its seed, and is kept as soon as it is finished: the same call after a run that
-    was killed runs what is missing. The bits do not depend on workers or executor.
+    The random numbers of a run depend only on its problem, sampler and seed, so the results do not
+    depend on ``workers`` or ``executor``. Each run is stored as soon as it is finished; repeating
+    the call after an interruption runs only what is missing.
 
     Parameters
     ----------
     problems : str, Problem, MotionPosterior, or several
-        Names of registered problems, or objects; a mapping gives them other names.
+        Names of registered problems, or objects; a mapping assigns other names.
     samplers : str, Sampler, or several, optional
-        Names of registered samplers, which stand for their default settings, or objects; a
-        mapping gives them other names. All registered samplers by default.
+        Names of registered samplers with default settings, or objects; a mapping assigns other
+        names. All registered samplers by default.
     draws : int
-        Draws per cell in all; every sampler returns as many.
+        Number of draws per run, over all chains.
     chains : int
-        Chains that they are spread over.
+        Number of chains per run.
     seeds : int
         Number of replicates.
     out : str or Path, optional
-        Folder for cells, ``table.csv`` and ``failures.json``; a temporary one by default.
+        Folder for the runs, ``table.csv`` and ``failures.json``; temporary by default.
     workers : int
-        Processes that are spawned; what one of them dies of is a row. 0 runs in this one, as a
-        debugger wants: where memory ends, all ends.
+        Number of worker processes. With 0 everything runs in this process, which suits a debugger
+        but does not survive a crash of a sampler.
     executor : concurrent.futures.Executor, optional
-        Run the cells there instead; it must see the same ``out``.
+        Executor to use instead of worker processes; its workers must see the folder ``out``.
     budget : Budget, optional
-        What every sampler may spend on a cell, by the setting that it names as its ``effort``;
-        pilot runs, once per problem and sampler, find out how much of it that is, and cost about
-        as much as a cell. Their own settings by default.
+        Cost that every sampler may spend on a run. Pilot runs, which cost about as much as a run,
+        choose the settings once per problem and sampler. Given settings by default.
     time_limit : float, optional
-        Seconds that a cell may take, the making of its problem not counted; one that takes longer
-        is a failure. It is ended in time in processes of our own, and in the main thread of a
-        system with interval timers; elsewhere, as on an executor's threads, it runs to its end.
+        Time limit of a run in seconds, without loading its problem; a longer run is recorded as
+        failed. Threads of an executor are not interrupted.
     progress : bool
-        Show bars, of cells and (in this process) of draws.
+        Show progress bars.
 
     Raises
     ------
     ValueError
-        If a problem or sampler is unknown, two have one name, a number is out of range,
-        ``out`` holds finished cells of the same names that were made with other settings, was
-        written by another version, or another run is at work on one of the problems there.
+        If a problem or sampler is unknown, names are not unique, a number is out of range,
+        ``out`` holds runs made with other settings or by another version, or another process is
+        running one of the problems there.
     OSError
-        If ``out`` cannot be written to, said before anything is computed, or no longer, as when
-        the disk is full: finished cells are kept.
+        If ``out`` cannot be written to; finished runs are kept.
     KeyboardInterrupt
-        At Ctrl-C; the message says how many cells are finished and where.
+        At Ctrl-C; the message states how many runs are finished.
     """
-    check_count("draws", draws, least=_FEWEST_DRAWS)
-    check_count("chains", chains)
+    check_grid_options(draws, chains, workers, budget, time_limit)
     check_count("seeds", seeds)
-    check_count("workers", workers, least=0)
-    if draws % chains:
-        raise ValueError(f"draws must be a multiple of chains, {chains}, got {draws}")
-    if time_limit is not None:
-        check_positive("time_limit", time_limit)
-    check_budget(budget)
-    submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
-    if executor is not None and not submits:
-        raise ValueError(f"executor must be one that has submit(), or None, got {executor!r}")
+    can_submit = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
+    if executor is not None and not can_submit:
+        raise ValueError(f"executor must be an object with submit(), or None, got {executor!r}")
     chosen = named_problems(problems)
     used = named_samplers(samplers)
     given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out)
-    # Workers may stand in another folder.
+    # Workers may have another working directory.
     folder = writable_folder(given).absolute()
     Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, seeds, budget)
     with locked(folder, chosen):
         grid = Grid(folder, plan, chosen, used, budget, time_limit)
-        refuse_taken(folder, [*grid.pilots(), *grid.cells()])
+        refuse_other_settings(folder, [*grid.pilots(), *grid.runs()])
         for name, source in chosen.items():
             problem = load_problem(source) if isinstance(source, str) else source
-            # Pictures show reference draws that the first seed is measured against.
+            # The reference draws that metrics of the first seed use.
             seed = addressed.integer(0, "exact", name)
             try:
                 store_problem(problem, folder / "problems" / name, seed=seed)
             except OSError:
                 raise
             except Exception:
-                # A problem whose references cannot be drawn has no pictures; each of its cells
-                # meets the same error, and says so in its row.
+                # Reference draws failed; every run of the problem will record the same error.
                 continue
         plan.save(folder)
         run_grid(grid, workers, executor, progress)
-        # A run of other problems in this folder may have left its own plan.
+        # A grid of other problems in the same folder may have overwritten the plan.
         plan.save(folder)
         comparison = Comparison(folder, plan, temporary=out is None)
         comparison.write(folder)

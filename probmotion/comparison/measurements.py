@@ -1,7 +1,7 @@
-"""The measurements that come with the package: every sampler on every problem, once.
+"""Measurements of every sampler on every problem, shipped with the package.
 
-``measured.csv`` holds the rows of a comparison's table that advice is made of, ``measured.json``
-how they were measured, what each problem is and why some samplers have no numbers on it.
+``measured.csv`` holds the rows of a comparison's table that advice needs, ``measured.json`` the
+settings, problem descriptions and reasons for missing values.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probmotion.comparison.results.qualities import QUALITIES
+from probmotion.comparison.results.headline_metrics import HEADLINE_METRICS
 from probmotion.files import written_whole
 from probmotion.metrics.chains import rhat_of_independent
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probmotion.comparison.comparison import Comparison
+    from probmotion.comparison.grid import Comparison
 
 __all__ = ["Measured", "measured", "save_measurements"]
 
 _FOLDER = Path(__file__).parent
-_ROWS, _ABOUT = "measured.csv", "measured.json"
-_KEPT = (
-    *QUALITIES,
+_ROWS, _SETTINGS = "measured.csv", "measured.json"
+_STORED_METRICS = (
+    *HEADLINE_METRICS,
     "seconds",
     "variance_ratio",
     "off_manifold_ratio",
@@ -39,26 +39,26 @@ _DIGITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What was measured.
+    """Measurements of samplers on problems.
 
     Parameters
     ----------
     rows : DataFrame
         Columns problem, sampler, seed, metric, value.
     command : str
-        What measured it.
+        Command that produced them.
     draws, seeds : int
-        Draws of a cell, and independent repeats.
+        Draws per run, and number of replicates.
     rhat_at_most : float
-        What the R-hat of so many draws is for chains that have mixed, 95 times in 100.
+        95 % quantile of R-hat for independent draws of this number.
     notes : list of str
-        What every sampler could spend.
+        Notes on the budget.
     problems : dict of str
-        By name, what it is.
+        Descriptions by name.
     samplers : list of str
-        Their names.
+        Names.
     words : dict of str
-        By ``problem/sampler``: why one has no numbers, in a word.
+        Reason for missing draws by ``problem/sampler``, in a word.
     """
 
     rows: pd.DataFrame
@@ -73,43 +73,34 @@ class Measured:
 
 
 def save_measurements(comparison: Comparison, command: str, folder: str | Path = _FOLDER) -> None:
-    """Write what advice needs of a comparison; by default in the place of what is shipped.
+    """Write the measurements of a comparison that a command produced.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        Of every sampler on every problem.
-    command : str
-        What made it.
-    folder : str or Path
-        Where ``measured.csv`` and ``measured.json`` go.
+    By default they replace the shipped ones, ``measured.csv`` and ``measured.json``.
     """
     table = comparison.table()
-    rows = table[table["metric"].isin(_KEPT)].copy()
+    rows = table[table["metric"].isin(_STORED_METRICS)].copy()
     rows["value"] = [float(f"{value:.{_DIGITS}g}") for value in rows["value"]]
     plan, folder = comparison.plan, Path(folder)
-    about = Measured(
-        rows.iloc[:0],
-        command,
-        plan.draws,
-        plan.seeds,
-        rhat_of_independent(plan.chains, plan.draws // plan.chains),
-        list(plan.notes),
-        dict(plan.problems),
-        list(plan.samplers),
-        table.attrs["words"],
-    )
-    told = {name: value for name, value in vars(about).items() if name != "rows"}
+    settings = {
+        "command": command,
+        "draws": plan.draws,
+        "seeds": plan.seeds,
+        "rhat_at_most": rhat_of_independent(plan.chains, plan.draws // plan.chains),
+        "notes": list(plan.notes),
+        "problems": dict(plan.problems),
+        "samplers": list(plan.samplers),
+        "words": table.attrs["words"],
+    }
     with written_whole(folder / _ROWS) as unfinished:
         rows.to_csv(unfinished, index=False)
-    with written_whole(folder / _ABOUT) as unfinished:
-        unfinished.write_text(json.dumps(told, indent=1, ensure_ascii=False), encoding="utf-8")
+    with written_whole(folder / _SETTINGS) as unfinished:
+        unfinished.write_text(json.dumps(settings, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
 @cache
 def measured(folder: str | Path = _FOLDER) -> Measured:
-    """Return what was measured; by default what comes with the package."""
+    """Return the measurements in a folder, by default the shipped ones."""
     import pandas as pd
 
-    told = json.loads((Path(folder) / _ABOUT).read_text(encoding="utf-8"))
-    return Measured(pd.read_csv(Path(folder) / _ROWS), **told)
+    settings = json.loads((Path(folder) / _SETTINGS).read_text(encoding="utf-8"))
+    return Measured(pd.read_csv(Path(folder) / _ROWS), **settings)

@@ -1,8 +1,4 @@
-"""What makes a look at many problems quick: few draws, few seconds, and settings that cost less.
-
-Nothing of it is used unless asked for, and all of it is printed under the table and stored with the
-draws like any other.
-"""
+"""Settings of quick runs: few draws, a small budget and cheaper samplers."""
 
 from __future__ import annotations
 
@@ -18,25 +14,25 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "sds": {"iterations": 2000},
     "dvae": {"training_steps": 600, "training_pairs": 8000},
 }
-"""By sampler: the settings that differ from its own defaults."""
+"""Settings by sampler that differ from the defaults."""
 
 QUICK_DRAWS = 40
-"""Of a cell."""
+"""Draws per run."""
 
 QUICK_BUDGET = Budget(seconds=6.0)
-"""Of a cell."""
+"""Budget of a run."""
 
 QUICK_LIMIT = 60.0
-"""Seconds after which a cell, or the pilots of its budget, is given up (``time_limit``)."""
+"""Time limit in seconds of a run, or of the pilots of its budget."""
 
 
 def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:
-    """Return samplers with their quick settings, by name; all registered ones by default.
+    """Return samplers with quick settings by name; all registered ones by default.
 
     Raises
     ------
     ValueError
-        If a name is unknown; the message lists the known ones.
+        If a name is unknown.
     """
     chosen = importable_samplers() if names is None else names
     return {name: load_sampler(name)(**QUICK.get(name, {})) for name in chosen}

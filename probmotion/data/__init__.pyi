@@ -38,7 +38,6 @@ from .pairs import (
     read_salsa_bvh as read_salsa_bvh,
 )
 from .projections import (
-    Centre as Centre,
     DetectorNoise as DetectorNoise,
     Filming as Filming,
     centre_motion as centre_motion,

@@ -1,4 +1,4 @@
-"""Single clips of one person in the CMU database by name: from archives, or from its own files."""
+"""Clips of one person from the CMU database, by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from probmotion.data.downloads import data_places
 from probmotion.io.amc import read_amc
 from probmotion.io.errors import MotionFileError
-from probmotion.io.files import load_motion
+from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 
 __all__ = ["cmu_clip"]
@@ -26,20 +26,19 @@ _PLACE = "as folder= or in the environment variable PROBMOTION_DATA"
 
 
 def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
-    """Return a clip of one person from the CMU database, from where it is found first.
+    """Return a clip of one person from the CMU database.
 
-    Looked at are the folders of :func:`~probmotion.data.downloads.data_places`. One holds the clip
-    as an archive (``cmu_02_02.npz``, or below ``cmu_single``) or as the database's own files
-    (``02.asf`` and ``02_02.amc``, or below ``cmu-01-02-03``), of which every fourth frame is
-    taken. Both give the same numbers, which are rounded to single precision and end after 30
-    seconds.
+    Searches the folders of :func:`~probmotion.data.downloads.data_places` for an archive
+    (``cmu_02_02.npz``, or below ``cmu_single``) or the original files (``02.asf`` and
+    ``02_02.amc``, or below ``cmu-01-02-03``), of which every fourth frame is used. Both give
+    identical numbers: single precision, at most 30 seconds. Nothing is downloaded.
 
     Parameters
     ----------
     name : str
-        The subject and the trial: ``"cmu_02_02"``.
+        Subject and trial: ``"cmu_02_02"``.
     folder : str or Path, optional
-        Where it is.
+        Folder to search instead.
 
     Returns
     -------
@@ -49,11 +48,11 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     Raises
     ------
     ValueError
-        If ``name`` is no such name.
+        If ``name`` is malformed.
     FileNotFoundError
-        If it is nowhere; the message says how to get it. Nothing is fetched.
+        If the clip is not found; the message says how to obtain it.
     MotionFileError
-        If the file that is found is damaged, or an archive of another rate.
+        If the file is damaged, or an archive has another frame rate.
     """
     match = _NAME.fullmatch(name) if isinstance(name, str) else None
     if match is None:
@@ -63,45 +62,40 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     for place in places:
         for archive in (place / "cmu_single" / f"{name}.npz", place / f"{name}.npz"):
             if archive.is_file():
-                return _shortened(_archived(archive), name)
+                return _named_start(_archived(archive), name)
         for originals in (place / _DATASET, place):
             skeleton = originals / f"{subject}.asf"
             motion = originals / f"{subject}_{trial}.amc"
             if skeleton.is_file() and motion.is_file():
-                return _shortened(_thinned(read_amc(motion, skeleton, _SOURCE_FPS)), name)
+                return _named_start(_subsampled(read_amc(motion, skeleton, _SOURCE_FPS)), name)
     raise FileNotFoundError(
-        f"the clip {name} is not in {', '.join(map(str, places))}; {_way_to_get(subject, trial)}"
+        f"clip {name} is not in {', '.join(map(str, places))}; {_hint(subject, trial)}"
     )
 
 
 def _archived(path: Path) -> Motion:
-    """Return the motion of an archive."""
-    motion = load_motion(path)
+    motion = load(path)
     if motion.fps != _FPS:
-        raise MotionFileError(
-            f"{path} has {motion.fps:g} frames per second, expected {_FPS:g}: a clip of a known "
-            "name is the same everywhere"
-        )
+        raise MotionFileError(f"{path} must have {_FPS:g} frames per second, got {motion.fps:g}")
     return motion
 
 
-def _thinned(motion: Motion) -> Motion:
-    """Return the frames that an archive has of an original, rounded as there."""
+def _subsampled(motion: Motion) -> Motion:
+    """Return the frames of an original at 30 fps, rounded as in the archives."""
     step = round(motion.fps / _FPS)
     return replace(motion, positions=motion.positions[::step].astype(np.float32), fps=_FPS)
 
 
-def _shortened(motion: Motion, name: str) -> Motion:
-    """Return the clip's first 30 seconds under its name."""
+def _named_start(motion: Motion, name: str) -> Motion:
+    """Return the first 30 seconds of a clip under ``name``."""
     return replace(motion.window(0, min(motion.frames, _FRAMES)), name=name)
 
 
-def _way_to_get(subject: str, trial: str) -> str:
-    """Return what the error says of a clip that is nowhere."""
+def _hint(subject: str, trial: str) -> str:
     if subject not in _SUBJECTS:
-        return f"give the folder that holds its archive, {_PLACE}"
+        return f"pass the folder with its archive {_PLACE}"
     names = f'["{subject}.asf", "{subject}_{trial}.amc"]'
     return (
-        f'probmotion.data.downloads.download("{_DATASET}", names={names}) fetches it, or give the '
-        f"folder that holds it, {_PLACE}"
+        f'probmotion.data.downloads.download("{_DATASET}", names={names}) fetches it, or pass the '
+        f"folder with the files {_PLACE}"
     )

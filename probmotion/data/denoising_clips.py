@@ -1,4 +1,4 @@
-"""Clips of one person to learn denoising from: real ones, apart by clip, and made ones."""
+"""Clips of one person for training denoisers: recorded, split by clip, and synthetic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.data.synthetic.gaits import GAITS, make_gait
-from probmotion.io.files import load_motion
+from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
@@ -55,42 +55,37 @@ DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
         "deepmimic_human/humanoid3d_long_walk3",
     ),
 }
-"""Clips by part: 45 of the 48 of one person, the held-out ones held out whole.
+"""Clips by part: 45 of the 48 clips of one person.
 
-Tested are a climb (``cmu_01_13``; twelve others are learnt from), a walk (``cmu_02_02``), sword
-play (``cmu_02_07``; of two other trials one is learnt from, one validated on), a dance
-(``cmu_131_02``; ``cmu_131_01`` is learnt from), DeepMimic's walk (``humanoid3d_long_walk3``), and
-what nothing that is learnt is like: getting up from the back (``humanoid3d_getup_faceup``).
-Validated on are a climb, sword play, a jump and a sneaking walk.
-
-Left out are two excerpts, ``humanoid3d_walk`` of ``humanoid3d_long_walk1`` and
-``humanoid3d_zombie_walk`` of ``humanoid3d_long_zombie``, and ``humanoid3d_jog``, which is shorter
-than a window.
+The test clips are a climb, a walk, sword play, a dance and DeepMimic's walk, all of kinds present
+in training, and getting up from the back (``humanoid3d_getup_faceup``), which is unlike any
+training clip. Excluded are two excerpts, ``humanoid3d_walk`` and ``humanoid3d_zombie_walk``, and
+``humanoid3d_jog``, which is shorter than a window.
 """
 
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 
 
 def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
-    """Return the clips of each part on ``person14`` at 30 frames per second.
+    """Return the recorded clips of each part on ``person14`` at 30 frames per second.
 
-    A clip with frames that its file marks as ``suspect`` (its markers jump there) comes as the
-    pieces between them, called ``cmu_01_07-0`` and so on: no window holds such a frame.
+    A clip is split at frames marked as ``suspect`` in its file (marker jumps) into segments named
+    ``cmu_01_07-0``, ….
 
     Parameters
     ----------
     folder : str or Path
-        Holds the clips of :data:`DENOISING_CLIPS` as ``.npz``.
+        Folder with the clips of :data:`DENOISING_CLIPS` as ``.npz``.
 
     Raises
     ------
     FileNotFoundError
-        If one is missing.
+        If a clip is missing.
     ValueError
-        If a file's ``suspect`` is not one truth value per frame.
+        If ``suspect`` is not one bool per frame.
     """
     return {
-        part: [piece for name in names for piece in _pieces(Path(folder) / f"{name}.npz")]
+        part: [segment for name in names for segment in _segments(Path(folder) / f"{name}.npz")]
         for part, names in DENOISING_CLIPS.items()
     }
 
@@ -98,19 +93,10 @@ def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
 def synthetic_denoising_clips(
     n: int = 60, *, seconds: float = 4.0, seed: int = 0
 ) -> dict[str, list[Motion]]:
-    """Return people who walk, run and march, made by the project, for where there are no clips.
+    """Return synthetic people who walk, run and march, on ``person14`` at 30 frames per second.
 
-    They are on ``person14`` at 30 frames per second, in the parts of :func:`denoising_clips`.
-
-    Parameters
-    ----------
-    n : int
-        Number of clips to learn from; a fifth as many each, of every style one at least, are for
-        validation and for tests.
-    seconds : float
-        Length of a clip.
-    seed : int
-        Seed of what varies between clips.
+    There are ``n`` training clips of ``seconds`` s; validation and test have n / 5 each, at least
+    one per style.
     """
     check_count("n", n)
     check_positive("seconds", seconds)
@@ -121,32 +107,32 @@ def synthetic_denoising_clips(
     first = 0
     for part, size in (("train", n), ("validation", held_out), ("test", held_out)):
         parts[part] = [
-            _made(number, frames, seed).retarget(skeleton) for number in range(first, first + size)
+            _gait(number, frames, seed).retarget(skeleton) for number in range(first, first + size)
         ]
         first += size
     return parts
 
 
-def _made(number: int, frames: int, seed: int) -> Motion:
-    """Return the gait of a number: styles take turns."""
+def _gait(number: int, frames: int, seed: int) -> Motion:
+    """Return gait ``number``; the styles alternate."""
     style = _STYLES[number % len(_STYLES)]
     return make_gait(style, number // len(_STYLES), frames=frames, fps=_FPS, seed=seed)
 
 
-def _pieces(path: Path) -> list[Motion]:
-    """Return what lies between a clip's suspect frames, each piece at least a window long."""
-    motion = load_motion(path).retarget(Skeleton.preset("person14"))
+def _segments(path: Path) -> list[Motion]:
+    """Return the segments between suspect frames that are at least a window long."""
+    motion = load(path).retarget(Skeleton.preset("person14"))
     with np.load(path) as archive:
         suspect = archive["suspect"] if "suspect" in archive else np.zeros(motion.frames, bool)
     if suspect.dtype != bool or suspect.shape != (motion.frames,):
         raise ValueError(
-            f"folder has {path.name} with suspect of {suspect.dtype} and shape {suspect.shape}, "
-            f"expected {motion.frames} truth values, one per frame"
+            f"{path.name}: suspect must be bool of shape ({motion.frames},), got {suspect.dtype} "
+            f"of shape {suspect.shape}"
         )
     if not suspect.any():
         return [motion.resample(_FPS)]
     edges = np.flatnonzero(np.diff(suspect, prepend=True, append=True))
-    pieces = [motion.window(start, stop - start) for start, stop in edges.reshape(-1, 2).tolist()]
-    whole = [piece.resample(_FPS) for piece in pieces]
-    kept = [piece for piece in whole if piece.frames >= _FRAMES]
-    return [replace(piece, name=f"{motion.name}-{number}") for number, piece in enumerate(kept)]
+    segments = [motion.window(start, stop - start) for start, stop in edges.reshape(-1, 2).tolist()]
+    resampled = [segment.resample(_FPS) for segment in segments]
+    long = [segment for segment in resampled if segment.frames >= _FRAMES]
+    return [replace(segment, name=f"{motion.name}-{number}") for number, segment in enumerate(long)]

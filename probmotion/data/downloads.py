@@ -1,10 +1,7 @@
-"""Public motions by name: files of the CMU database, fetched when asked for, checked, kept.
+"""Public motion data by name: downloaded on request, verified and cached.
 
-The registry beside this module lists where each file is (repository, commit, path), its SHA-256
-and its size. Nothing is fetched unless :func:`download` is called.
-
-The data are Carnegie Mellon University's (:data:`CMU_TERMS`); who publishes results obtained with
-them is asked for the sentence :data:`CMU_ACKNOWLEDGEMENT`.
+``registry.csv`` beside this module lists repository, commit, path, SHA-256 and size of each file.
+The data are Carnegie Mellon University's (:data:`CMU_TERMS`); cite :data:`CMU_ACKNOWLEDGEMENT`.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ CMU_ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created "
     "with funding from NSF EIA-0196217."
 )
-"""What CMU asks to be added to the acknowledgements of a publication."""
+"""Acknowledgement that CMU requests in publications."""
 
 CMU_TERMS = (
     "This data is free for use in research and commercial projects worldwide. If you publish "
@@ -42,25 +39,23 @@ CMU_TERMS = (
     "your published paper to jkh+mocap@cs.cmu.edu, and also would add this text to your "
     f'acknowledgments section: "{CMU_ACKNOWLEDGEMENT}"'
 )
-"""CMU's terms, as its database states them. The data themselves may not be sold."""
+"""CMU's terms as stated by the database. The data themselves may not be sold."""
 
 SALSA_TRIALS = ("01", "02", "03", "04", "05", "06", "07", "09", "10", "11")
-"""The trials of :func:`salsa_pairs`; the registry has 12 to 15 too, and lacks 08."""
+"""Trials of :func:`salsa_pairs`. The registry also has 12 to 15; 08 does not exist."""
 
 _ADDRESS = "https://raw.githubusercontent.com"
 _FOLDER_VARIABLE = "PROBMOTION_DATA"
 _REGISTRY = Path(__file__).with_name("registry.csv")
-_PATIENCE = 30.0  # seconds without a byte
+_TIMEOUT = 30.0  # seconds without data
 
 
 class DownloadError(OSError):
-    """A file could not be fetched, or is not the one expected: one sentence with its address."""
+    """A file cannot be downloaded, or has another SHA-256; the message contains its address."""
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """A line of the registry."""
-
     dataset: str
     repository: str
     commit: str
@@ -75,24 +70,17 @@ class _Entry:
 
 
 def data_folder() -> Path:
-    """Return where downloads are kept.
-
-    The folder that the environment variable ``PROBMOTION_DATA`` names, or the user's cache.
-    """
+    """Return the download folder: ``PROBMOTION_DATA`` if set, else the user's cache."""
     import pooch
 
     return Path(os.environ.get(_FOLDER_VARIABLE) or pooch.os_cache("probmotion"))
 
 
 def data_places(folder: str | Path | None = None) -> list[Path]:
-    """Return where clips of known names are looked for, the first place first.
+    """Return the folders to search for clips, in order.
 
-    Parameters
-    ----------
-    folder : str or Path, optional
-        Looked at and nothing else, if given. By default: the folder that the environment variable
-        ``PROBMOTION_DATA`` names; ``../shared/data`` beside the current directory; the cache of
-        :func:`download`.
+    These are ``folder`` alone if given; by default ``PROBMOTION_DATA`` (environment variable),
+    ``../shared/data`` beside the current directory, and the cache of :func:`download`.
     """
     if folder is not None:
         return [Path(folder)]
@@ -108,24 +96,23 @@ def download(
     base_url: str | None = None,
     progress: bool = False,
 ) -> list[Path]:
-    """Fetch files of a data set, check their SHA-256 and return where they are.
+    """Download files of a data set, verify their SHA-256 and return their paths.
 
-    A file that is there and has the right SHA-256 is not fetched again. Each appears whole or not
-    at all; what was finished before an interruption stays. CMU's terms hold (:data:`CMU_TERMS`).
+    Files that are present and intact are not downloaded again. Each file appears completely or not
+    at all. CMU's terms apply (:data:`CMU_TERMS`).
 
     Parameters
     ----------
     dataset : str
         ``"cmu-salsa"`` (BVH, subjects 60 and 61) or ``"cmu-01-02-03"`` (ASF and AMC).
     names : sequence of str, optional
-        Files, such as ``"60_10_scaled.bvh"``; all by default (71 and 62 MB).
+        File names, such as ``"60_10_scaled.bvh"``; all by default (71 and 62 MB).
     folder : str or Path, optional
-        Where to keep them, below it in a folder called after the data set; by default
-        :func:`data_folder`.
+        Parent of the data set's folder; :func:`data_folder` by default.
     base_url : str, optional
         Address of a mirror, before ``/repository/commit/path``; GitHub's by default.
     progress : bool
-        Whether to show a bar for each file.
+        Whether to show a progress bar for each file.
 
     Returns
     -------
@@ -137,8 +124,7 @@ def download(
     ValueError
         If the data set or a name is unknown.
     DownloadError
-        If a file cannot be fetched or written, or has another SHA-256; the message names the file
-        and the address.
+        If a file cannot be downloaded or written, or has another SHA-256.
     """
     entries = _chosen(dataset, names)
     place = (data_folder() if folder is None else Path(folder)) / dataset
@@ -147,26 +133,26 @@ def download(
 
 
 def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
-    """Return CMU's ten salsa clips of two people, from where they are found first.
+    """Return CMU's ten salsa clips of two people.
 
-    Looked at are the folders of :func:`data_places`. One holds the clips if all ten are there, as
-    archives (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or as pairs of BVH files
-    (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``).
+    Searches the folders of :func:`data_places` for all ten as archives (``cmu_60_61_TT.npz``, or
+    below ``cmu_salsa_pairs``) or pairs of BVH files (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``,
+    or below ``cmu-salsa``). Nothing is downloaded.
 
     Parameters
     ----------
     folder : str or Path, optional
-        Where they are.
+        Folder to search instead.
 
     Returns
     -------
     list of Motion
-        The trials :data:`SALSA_TRIALS` on ``pair17``, 30 fps, ``cmu_60_61_01`` first.
+        The trials :data:`SALSA_TRIALS` on ``pair17`` at 30 fps, ``cmu_60_61_01`` first.
 
     Raises
     ------
     FileNotFoundError
-        If they are nowhere; the message says how to get them. Nothing is fetched.
+        If they are not found; the message says how to obtain them.
     """
     places = data_places(folder)
     for place in places:
@@ -183,8 +169,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
                 return [read_salsa_bvh(lead, follow) for lead, follow in couples]
     raise FileNotFoundError(
         f"the ten salsa clips are not in {', '.join(map(str, places))}; "
-        'probmotion.data.downloads.download("cmu-salsa") fetches them, or give the folder that '
-        "holds them"
+        'probmotion.data.downloads.download("cmu-salsa") fetches them, or pass their folder'
     )
 
 
@@ -195,7 +180,6 @@ def _registry() -> tuple[_Entry, ...]:
 
 
 def _chosen(dataset: str, names: Sequence[str] | None) -> list[_Entry]:
-    """Return the registry's entries of a data set, all or those named."""
     known = list(dict.fromkeys(entry.dataset for entry in _registry()))
     if dataset not in known:
         raise ValueError(f"dataset must be one of {', '.join(known)}, got {dataset!r}")
@@ -207,43 +191,42 @@ def _chosen(dataset: str, names: Sequence[str] | None) -> list[_Entry]:
     for name in names:
         if name not in entries:
             raise ValueError(
-                f"names has {name!r}, expected files of {dataset}: {', '.join(entries)}"
+                f"names must be files of {dataset} ({', '.join(entries)}), got {name!r}"
             )
     return [entries[name] for name in names]
 
 
 def _fetch(entry: _Entry, place: Path, base: str, progress: bool) -> Path:
-    """Return the path of an entry's file, fetched unless it is there."""
+    """Return the path of a file, downloaded if missing."""
     import pooch
     import requests
 
     url = f"{base}/{entry.repository}/{entry.commit}/{entry.path}"
     try:
-        # It is written under another name, and moved to its own once the hash is right.
         pooch.retrieve(
             url,
             known_hash=entry.sha256,
             fname=entry.name,
             path=place,
-            downloader=pooch.HTTPDownloader(progressbar=progress, timeout=_PATIENCE),
+            downloader=pooch.HTTPDownloader(progressbar=progress, timeout=_TIMEOUT),
         )
     except requests.RequestException as error:
-        answer: int | str = type(error).__name__
-        if error.response is not None:  # which pooch leaves open where a file is not there
-            answer = error.response.status_code
+        reason: int | str = type(error).__name__
+        if error.response is not None:  # pooch leaves it open
+            reason = error.response.status_code
             error.response.close()
         raise DownloadError(
-            f"{entry.name} cannot be fetched from {url} ({answer}), expected a network that "
-            f"reaches it, base_url= of a mirror, or the file in {place}"
+            f"{entry.name} cannot be downloaded from {url} ({reason}); check the network, pass "
+            f"base_url= of a mirror, or put the file into {place}"
         ) from error
-    except ValueError as error:  # pooch raises no other
+    except ValueError as error:  # pooch raises it for a wrong hash only
         raise DownloadError(
-            f"{entry.name} at {url} has not the SHA-256 {entry.sha256} of the registry, expected "
-            "the file unchanged; nothing of it was kept"
+            f"{entry.name} at {url} does not have the SHA-256 {entry.sha256} of the registry; the "
+            "file was discarded"
         ) from error
     except OSError as error:
         raise DownloadError(
-            f"{entry.name} from {url} cannot be kept in {place} "
-            f"({error.strerror or type(error).__name__}), expected a folder that is writable"
+            f"{entry.name} from {url} cannot be written to {place} "
+            f"({error.strerror or type(error).__name__}); choose a writable folder"
         ) from error
     return place / entry.name

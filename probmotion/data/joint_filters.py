@@ -1,4 +1,4 @@
-"""Filters of noisy 3D joints that know nothing of bodies: what a learnt prior has to beat."""
+"""Classical filters of noisy 3D joints: baselines without a body model."""
 
 from __future__ import annotations
 
@@ -19,12 +19,9 @@ __all__ = [
     "savitzky_golay",
 ]
 
-_FIRST_POSITION = 10.0
-"""Standard deviation of a joint's first position about the mean of its seen entries, metres."""
-_FIRST_SPEED = 10.0
-"""Standard deviation of its first velocity about 0, metres per second."""
-_LEAST, _MOST = 1e-3, 1e3
-"""Between which accelerations the fit looks, m/s^1.5."""
+_FIRST_POSITION = 10.0  # prior sd of the first position about the mean observation, m
+_FIRST_SPEED = 10.0  # prior sd of the first velocity, m/s
+_LEAST, _MOST = 1e-3, 1e3  # range of the fitted acceleration, m/s^1.5
 
 
 def savitzky_golay(
@@ -35,23 +32,22 @@ def savitzky_golay(
     window_seconds: float = 0.5,
     order: int = 3,
 ) -> np.ndarray:
-    """Return joints whose coordinates are each replaced by a polynomial's value in a window.
+    """Smooth joint coordinates with local polynomials (Savitzky and Golay 1964).
 
-    Hidden entries are first filled joint by joint: linear interpolation over time between seen
-    ones, and the first (last) seen entry before (after) it. The filter then weighs filled and
-    seen entries alike. Within half a window of either end the polynomial of the first (last)
-    whole window is read (Savitzky and Golay 1964; SciPy's ``mode="interp"``).
+    Missing entries are first interpolated linearly over time (:func:`filled_between`) and weigh as
+    much as observed ones. Within half a window of an end the polynomial of the outermost window is
+    used (SciPy's ``mode="interp"``).
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres. Entries that are not seen are not read and may be NaN.
+        Metres; unobserved entries are ignored and may be NaN.
     seen : ndarray of bool, (L, J)
-        Which entries are observed.
+        Whether an entry is observed.
     fps : float
         Frames per second.
     window_seconds : float
-        Length of the window, rounded to the nearest odd number of frames.
+        Window length, rounded to the nearest odd number of frames.
     order : int
         Degree of the polynomial, at least 0.
 
@@ -63,8 +59,8 @@ def savitzky_golay(
     Raises
     ------
     ValueError
-        If shapes disagree, a joint is hidden in all frames, a seen entry is not finite, the
-        window is longer than the motion, or ``order`` is not below the window's frames.
+        If shapes disagree, a joint is never observed, an observed entry is not finite, the window
+        is longer than the motion, or ``order`` is not less than the window's frames.
     """
     check_positive("fps", fps)
     check_positive("window_seconds", window_seconds)
@@ -74,14 +70,11 @@ def savitzky_golay(
     frames = 2 * round((window_seconds * fps - 1) / 2) + 1
     if frames > len(joints):
         raise ValueError(
-            f"window_seconds is {window_seconds:g}, {frames} frames at {fps:g} fps, expected at "
-            f"most the motion's {len(joints)} frames"
+            f"window_seconds must be at most the motion's {len(joints)} frames at {fps:g} fps, "
+            f"got {window_seconds:g} ({frames} frames)"
         )
     if order >= frames:
-        raise ValueError(
-            f"order is {order}, expected less than the {frames} frames of a window of "
-            f"{window_seconds:g} s"
-        )
+        raise ValueError(f"order must be less than the window's {frames} frames, got {order}")
     return savgol_filter(filled_between(joints, seen), frames, order, axis=0, mode="interp")
 
 
@@ -95,44 +88,39 @@ def kalman_smooth(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return each joint's posterior under a constant-velocity model with white acceleration.
 
-    Every coordinate of every joint is a process of its own: its acceleration is white noise of
-    spectral density q = ``acceleration``², so that over a time d the state (position, velocity)
-    moves by F and gathers noise of covariance Q,
+    Coordinates are independent. With white acceleration of spectral density q = acceleration²,
+    the state (position, velocity) evolves over a time d by F with process noise Q,
 
         F = [1 d; 0 1],  Q = q [d³/3 d²/2; d²/2 d].
 
-    An entry is seen with Gaussian noise of variance ``noise``² / confidence, and not at all where
-    the confidence is 0. A first position is normal about the mean of the joint's seen entries,
-    10 m wide, a first velocity about 0, 10 m/s wide. Kalman's filter and the backward pass of
-    Rauch, Tung and Striebel (1965, "Maximum likelihood estimates of linear dynamic systems") give
-    the posterior exactly, hidden spans included.
+    Observations have Gaussian noise of variance noise² / confidence. The first position is
+    normal about the mean of the joint's observations with sd 10 m, the first velocity about 0 with
+    sd 10 m/s. The Kalman filter and the Rauch–Tung–Striebel smoother (Rauch, Tung and Striebel
+    1965, "Maximum likelihood estimates of linear dynamic systems") give the exact posterior.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres. Entries of confidence 0 are not read and may be NaN.
+        Metres; entries of confidence 0 are ignored and may be NaN.
     confidence : ndarray, (L, J)
-        Multiplies the precision; 0 hides an entry.
+        Factor of the precision; 0 for a missing entry.
     noise : float
         Standard deviation of a coordinate of confidence 1, metres.
     fps : float
         Frames per second.
     acceleration : float or ndarray, (J,), optional
-        √q of all joints or of each, m/s^1.5: a velocity changes by about √(q · seconds). By
-        default those of :func:`fit_acceleration`.
+        √q of all joints or of each, m/s^1.5; :func:`fit_acceleration` by default.
 
     Returns
     -------
-    mean : ndarray, (L, J, 3)
-        Posterior means of the positions, metres.
-    deviation : ndarray, (L, J, 3)
-        Their posterior standard deviations, metres.
+    mean, deviation : ndarray, (L, J, 3)
+        Posterior means and standard deviations of the positions, metres.
 
     Raises
     ------
     ValueError
-        If shapes disagree, a joint is hidden in all frames, a seen entry is not finite, or a
-        number is out of range.
+        If shapes disagree, a joint is never observed, an observed entry is not finite, or a number
+        is out of range.
     """
     if acceleration is None:
         acceleration = fit_acceleration(joints, confidence, noise=noise, fps=fps)
@@ -163,44 +151,39 @@ def log_marginal_likelihood(
     fps: float,
     acceleration: float | np.ndarray,
 ) -> np.ndarray:
-    """Return log p(seen entries) of each joint, (J,), given what :func:`kalman_smooth` is."""
-    return _forward(
-        _Problem.of(joints, confidence, noise, fps, acceleration)
-    ).log_marginal_likelihood
+    """Return log p(observations) of each joint, (J,); arguments as :func:`kalman_smooth`."""
+    problem = _Problem.of(joints, confidence, noise, fps, acceleration)
+    return _forward(problem).log_marginal_likelihood
 
 
 def fit_acceleration(
     joints: np.ndarray, confidence: np.ndarray, *, noise: float, fps: float
 ) -> np.ndarray:
-    """Return the accelerations under which each joint's seen entries are most probable, (J,).
+    """Return the maximum-likelihood acceleration of each joint, (J,), m/s^1.5.
 
-    For each joint the maximum of :func:`log_marginal_likelihood` between 0.001 and 1000 m/s^1.5, found by
-    Brent's method on the logarithm. A joint that does not move is taken to the lower end.
+    Maximises :func:`log_marginal_likelihood` between 0.001 and 1000 m/s^1.5 by Brent's method on
+    the logarithm. A joint at rest gets the lower end.
     """
     joints, confidence = np.asarray(joints), np.asarray(confidence)
-    log_marginal_likelihood(
-        joints, confidence, noise=noise, fps=fps, acceleration=1.0
-    )  # refuses bad input
+    _Problem.of(joints, confidence, noise, fps, 1.0)  # validates the input
 
     def cost(exponent: float, one: slice) -> float:
         given = {"noise": noise, "fps": fps, "acceleration": 10.0**exponent}
         return -float(log_marginal_likelihood(joints[:, one], confidence[:, one], **given)[0])
 
     bounds = (math.log10(_LEAST), math.log10(_MOST))
-    found = []
+    fitted = []
     for joint in range(joints.shape[1]):
         one = (slice(joint, joint + 1),)
         best = minimize_scalar(cost, bounds=bounds, args=one, method="bounded")
-        found.append(10.0**best.x)
-    return np.array(found)
+        fitted.append(10.0**best.x)
+    return np.array(fitted)
 
 
 class _Problem(NamedTuple):
-    """What a pass over the frames reads."""
-
-    joints: np.ndarray  # (L, J, 3) less the centre, 0 where hidden
-    variance: np.ndarray  # (L, J) of the noise, infinite where hidden
-    centre: np.ndarray  # (J, 3) means of the seen entries
+    joints: np.ndarray  # (L, J, 3) minus the centre, 0 where missing
+    variance: np.ndarray  # (L, J) of the noise, infinite where missing
+    centre: np.ndarray  # (J, 3) means of the observed entries
     step: np.ndarray  # (2, 2) F
     process: np.ndarray  # (2, 2) or (J, 2, 2) Q
 
@@ -218,7 +201,7 @@ class _Problem(NamedTuple):
         confidence = np.asarray(confidence, dtype=np.float64)
         check_finite("confidence", confidence)
         if confidence.size and confidence.min() < 0:
-            raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
+            raise ValueError(f"confidence must be non-negative, got {confidence.min():g}")
         seen = confidence > 0
         joints = _seen_joints(joints, seen, "confidence")
         centre = joints.sum(axis=0) / seen.sum(axis=0)[:, None]
@@ -240,7 +223,7 @@ class _Problem(NamedTuple):
 
 
 class _Passes(NamedTuple):
-    """States after (and, ``predicted``, before) each frame's entries; axes share covariances."""
+    """States after and, ``predicted``, before each update; axes share covariances."""
 
     mean: np.ndarray  # (L, J, 2, 3)
     covariance: np.ndarray  # (L, J, 2, 2)
@@ -250,7 +233,7 @@ class _Passes(NamedTuple):
 
 
 def _forward(problem: _Problem) -> _Passes:
-    """Kalman's filter, all joints and axes at once."""
+    """Run the Kalman filter on all joints and axes at once."""
     L, J, _ = problem.joints.shape
     means, covariances = np.empty((2, L, J, 2, 3)), np.empty((2, L, J, 2, 2))
     mean = np.zeros((J, 2, 3))
@@ -265,10 +248,10 @@ def _forward(problem: _Problem) -> _Passes:
         seen = np.isfinite(variance)
         total = covariance[:, 0, 0] + variance
         innovation = problem.joints[frame] - mean[:, 0]
-        # Infinite variance has a gain of 0: a hidden entry changes nothing.
+        # An infinite variance has zero gain.
         gain = covariance[:, :, :1] / total[:, None, None]
         mean = mean + gain * innovation[:, None]
-        # Joseph's form: the covariance stays positive definite.
+        # Joseph form, which keeps the covariance positive definite.
         kept = np.eye(2) - gain * np.array([1.0, 0.0])
         added = np.where(seen, variance, 0.0)[:, None, None] * (gain @ np.swapaxes(gain, -1, -2))
         covariance = kept @ covariance @ np.swapaxes(kept, -1, -2) + added
@@ -279,26 +262,35 @@ def _forward(problem: _Problem) -> _Passes:
 
 
 def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
-    """Return the joints with 0 where hidden; refuse a joint that is never seen."""
+    """Return the joints with 0 where missing."""
     joints = np.asarray(joints, dtype=np.float64)
     check_shape("joints", joints, ("L", "J", 3))
     check_shape(name, seen, joints.shape[:2])
     if len(joints) == 0:
-        raise ValueError("joints has no frame, expected at least one")
+        raise ValueError("joints must have at least one frame, got none")
     never = np.flatnonzero(~seen.any(axis=0))
     if len(never):
         raise ValueError(
-            f"{name} hides joint {never[0]} in all {len(joints)} frames, expected every joint to "
-            "be seen in at least one"
+            f"{name} must observe every joint in at least one frame, got none of joint {never[0]}"
         )
     check_finite("joints", joints[seen])
     return np.where(seen[..., None], joints, 0.0)
 
 
 def filled_between(joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the joints with hidden entries interpolated over time, held at the ends.
+    """Return the joints with missing entries interpolated over time and held at the ends.
 
-    It is a ValueError if a joint is hidden in all frames, or a seen entry is not finite.
+    Parameters
+    ----------
+    joints : ndarray, (L, J, 3)
+        Metres; unobserved entries are ignored and may be NaN.
+    seen : ndarray of bool, (L, J)
+        Whether an entry is observed.
+
+    Raises
+    ------
+    ValueError
+        If a joint is never observed, or an observed entry is not finite.
     """
     seen = np.asarray(seen, dtype=bool)
     joints = _seen_joints(joints, seen, "seen")

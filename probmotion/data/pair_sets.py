@@ -1,4 +1,4 @@
-"""Sets of pose-pairs: the frames that are the dance, clips held out whole, heights, the seed."""
+"""Data sets of pose pairs: dance frames, held-out clips, body heights and the seed pose."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ __all__ = [
 ]
 
 SALSA_HELD_OUT = ("cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11")
-"""The salsa clips that no one learns from: 3 of 10, 2 658 of the 8 257 frames of dance."""
+"""Held-out salsa clips: 3 of 10, 2658 of the 8257 dance frames."""
 
-# Shares of the body's height below the ankles and above the joint where the skull begins, after
-# Drillis and Contini's proportions (ankle .039, eyes .936, chin .870 of the height).
+# Fractions of the body height below the ankles and above the base of the skull, after Drillis and
+# Contini (ankle .039, eyes .936, chin .870 of the height).
 _FOOT = 0.039
 _SKULL = 0.10
 _SEED_POSES = 400
-_HEIGHTS = (0.5, 3.0)
-_FARTHEST = 5.0
+_HEIGHTS = (0.5, 3.0)  # plausible heights, m
+_FARTHEST = 5.0  # greatest distance between roots, m
 _LEG = ("hip", "knee", "ankle")
 
 
 def dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> np.ndarray:
-    """Return which frames are the dance.
+    """Return which frames show the dance.
 
-    Left out are the opening, until the partners first come near; frames in which someone is far
-    from everybody else; and glitches, the frames on both sides of an impossible step.
+    Excluded are the opening, until the partners first come close; frames in which someone is far
+    from everybody else; and glitches, the frames on both sides of an implausibly fast step.
 
     Parameters
     ----------
     motion : Motion
         Two people or more.
     farthest : float
-        Greatest distance of a person's root from the nearest other's, metres.
+        Greatest distance of a person's root from the nearest other root, metres.
     fastest : float
         Greatest speed of a joint, metres per second.
 
@@ -59,38 +59,38 @@ def dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0)
     Raises
     ------
     ValueError
-        If the motion is of one person, or a limit is not above 0.
+        If the motion has one person, or a limit is not positive.
     """
-    return ~np.any(_not_the_dance(motion, farthest, fastest), axis=0)
+    return ~np.any(_excluded_frames(motion, farthest, fastest), axis=0)
 
 
 def describe_dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> str:
-    """Return one sentence: how many frames :func:`dance_frames` keeps, and why others go.
+    """Return a sentence with the numbers of frames that :func:`dance_frames` keeps and excludes.
 
-    A frame is counted once, under the first reason that holds.
+    An excluded frame is counted once, under the first reason that applies.
     """
-    opening, apart, glitch = _not_the_dance(motion, farthest, fastest)
+    opening, apart, glitch = _excluded_frames(motion, farthest, fastest)
     counts = opening.sum(), (apart & ~opening).sum(), (glitch & ~apart & ~opening).sum()
     return (
         f"{motion.name or 'the motion'}: {motion.frames - sum(counts)} of {motion.frames} frames "
-        f"are the dance; left out are {counts[0]} of the opening, {counts[1]} with the partners "
-        f"over {farthest:g} m apart and {counts[2]} beside a step faster than {fastest:g} m/s"
+        f"are dance; excluded are {counts[0]} of the opening, {counts[1]} with partners over "
+        f"{farthest:g} m apart and {counts[2]} next to a step faster than {fastest:g} m/s"
     )
 
 
 def ground_truth(
     motions: Sequence[Motion], n: int | None = None, *, farthest: float = 1.2, fastest: float = 7.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pose-pairs evenly apart among the dance frames of several clips.
+    """Return pose pairs evenly spaced over the dance frames of several clips.
 
-    Yin et al. (2018), section 6, take 6 000 frames in this way from the salsa of the CMU database.
+    Yin et al. (2018), section 6, take 6000 frames in this way from the salsa of the CMU database.
 
     Parameters
     ----------
     motions : sequence of Motion
         Clips of one skeleton, each with two people or more.
     n : int, optional
-        How many; all frames of the dance by default.
+        Number of pose pairs; all dance frames by default.
     farthest, fastest : float
         As in :func:`dance_frames`.
 
@@ -99,50 +99,50 @@ def ground_truth(
     positions : ndarray, (n, J, 3)
         Metres.
     clip, frame : ndarray of int, (n,)
-        Where each comes from: the index of the motion, and the frame in it.
+        Index of the motion and of its frame.
 
     Raises
     ------
     ValueError
-        If there is no motion, skeletons differ, or fewer than ``n`` frames are the dance.
+        If there is no motion, skeletons differ, or there are fewer than ``n`` dance frames.
     """
     if not motions:
         raise ValueError("motions must contain at least one, got none")
     for motion in motions:
         if motion.skeleton != motions[0].skeleton:
             raise ValueError(
-                f"motions has {motion} of another skeleton than {motions[0]}, expected one; "
-                "motion.retarget(skeleton) has it"
+                f"motions must share one skeleton, got {motions[0]} and {motion}; use "
+                "motion.retarget(skeleton)"
             )
     frames = [
         np.flatnonzero(dance_frames(motion, farthest=farthest, fastest=fastest))
         for motion in motions
     ]
-    clip = np.repeat(np.arange(len(motions)), [len(kept) for kept in frames])
+    clip = np.repeat(np.arange(len(motions)), list(map(len, frames)))
     frame = np.concatenate(frames)
     total = len(frame)
     if total == 0:
         first = describe_dance_frames(motions[0], farthest=farthest, fastest=fastest)
-        raise ValueError(f"motions has no frame of dance, expected some; of the first, {first}")
+        raise ValueError(f"motions must contain dance frames, got none; {first}")
     if n is None:
         n = total
     check_count("n", n)
     if n > total:
-        raise ValueError(f"n must be at most the {total} frames of the dance, got {n}")
-    chosen = (2 * np.arange(n) + 1) * total // (2 * n)  # the middles of n equal stretches
-    every = np.concatenate([m.positions[kept] for m, kept in zip(motions, frames, strict=True)])
+        raise ValueError(f"n must be at most the {total} dance frames, got {n}")
+    chosen = (2 * np.arange(n) + 1) * total // (2 * n)  # midpoints of n equal intervals
+    every = np.concatenate([m.positions[f] for m, f in zip(motions, frames, strict=True)])
     return every[chosen], clip[chosen], frame[chosen]
 
 
 def hold_out(
     motions: Sequence[Motion], names: Sequence[str] = SALSA_HELD_OUT
 ) -> tuple[list[Motion], list[Motion]]:
-    """Return the motions that are held in and those held out: whole clips, by name.
+    """Split motions by name into those kept and those held out.
 
     Raises
     ------
     ValueError
-        If a name is not that of exactly one motion, or no motion would be left in or out.
+        If a name does not match exactly one motion, or either part would be empty.
     """
     if isinstance(names, str):
         raise ValueError(f"names must be a list of names, got {names!r}")
@@ -150,32 +150,32 @@ def hold_out(
     for name in names:
         if known.count(name) != 1:
             raise ValueError(
-                f"names has {name!r}, which is the name of {known.count(name)} motions, expected "
-                f"one of {', '.join(dict.fromkeys(known))}"
+                f"names must be names of one motion each ({', '.join(dict.fromkeys(known))}), got "
+                f"{name!r}, the name of {known.count(name)}"
             )
     held_in = [motion for motion in motions if motion.name not in names]
     held_out = [motion for motion in motions if motion.name in names]
     if not held_in or not held_out:
         raise ValueError(
-            f"names has {len(held_out)} of the {len(motions)} motions, expected at least one to be "
-            "held out and one to be left"
+            f"names must hold out at least one of {len(motions)} motions and leave one, got "
+            f"{len(held_out)} names"
         )
     return held_in, held_out
 
 
 def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return how tall the people stand, from the lengths of their bones.
+    """Return the standing heights of the people, from the lengths of their bones.
 
     The height is the sum of shin, thigh (means of both sides), the midpoint of the hips to the
-    pelvis and the bones from there to ``head``, divided by 0.861: 3.9 % of the height
-    are below the ankles and 10 % above the joint at which the skull begins.
+    pelvis and the bones from there to ``head``, divided by 0.861: 3.9 % of the height are below the
+    ankles and 10 % above the base of the skull.
 
     Parameters
     ----------
     positions : ndarray, (…, J, 3)
-        Pose-pairs, metres; they need not stand.
+        Poses, metres.
     skeleton : Skeleton
-        K trees, each with the hips, knees and ankles, and with a ``head`` where the skull begins.
+        K people, each with hips, knees, ankles and a ``head``, the base of the skull.
 
     Returns
     -------
@@ -193,9 +193,9 @@ def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
-    """Raise ``ValueError`` unless a pose (J, 3) is of people in metres, within reach of each other.
+    """Raise ``ValueError`` unless a pose (J, 3) shows people in metres, close to each other.
 
-    People are 0.5 to 3 m tall (:func:`person_height`), their roots at most 5 m apart.
+    People must be 0.5 to 3 m tall (:func:`person_height`), with roots at most 5 m apart.
     """
     check_shape(name, pose, (skeleton.n_joints, 3))
     check_finite(name, pose)
@@ -203,30 +203,17 @@ def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
     odd = heights[(heights < _HEIGHTS[0]) | (heights > _HEIGHTS[1])]
     if odd.size:
         raise ValueError(
-            f"{name} has people {odd[0]:.3g} m tall, expected {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} "
-            "m: positions are metres"
+            f"people in {name} must be {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} m tall, got "
+            f"{odd[0]:.3g}; positions are in metres"
         )
     roots = pose[list(skeleton.roots)]
     apart = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
     if apart > _FARTHEST:
-        raise ValueError(
-            f"{name} has people {apart:.3g} m apart, expected at most {_FARTHEST:g} m: they "
-            "interact closely"
-        )
+        raise ValueError(f"people in {name} must be at most {_FARTHEST:g} m apart, got {apart:.3g}")
 
 
 def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
-    """Return the motion scaled about the world's origin so that its people's mean height is given.
-
-    ONE factor for all: who is taller stays taller, what touches still touches.
-
-    Parameters
-    ----------
-    motion : Motion
-        Any number of people.
-    height : float
-        Mean of :func:`person_height` over people and frames, metres.
-    """
+    """Return the motion scaled about the origin to a mean :func:`person_height`, metres."""
     check_positive("height", height)
     factor = height / person_height(motion.positions, motion.skeleton).mean()
     offsets = motion.rest_offsets
@@ -238,16 +225,15 @@ def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
 
 
 def choose_seed(positions: np.ndarray) -> int:
-    """Return the index of the one pose-pair to start from: the medoid of all.
+    """Return the index of the medoid pose pair, the seed from which the others are drawn.
 
-    It is the one whose mean distance to the others is the least. Distances are root mean square
-    over the joints, metres, after the best rotation and translation of the whole pair (Kabsch),
-    among at most 400 pose-pairs evenly apart, so that everybody finds the same one.
+    Distances are root mean square over the joints after the best rotation and translation of the
+    pair (Kabsch), among at most 400 evenly spaced pose pairs, so that the choice is deterministic.
 
     Parameters
     ----------
     positions : ndarray, (n, J, 3)
-        Pose-pairs of the clips that are held in, metres.
+        Pose pairs of the training clips, metres.
 
     Raises
     ------
@@ -257,7 +243,7 @@ def choose_seed(positions: np.ndarray) -> int:
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("n", "J", 3))
     if len(positions) == 0:
-        raise ValueError("positions has no pose-pair, expected at least one")
+        raise ValueError("positions must contain at least one pose pair, got none")
     check_finite("positions", positions)
     n = min(len(positions), _SEED_POSES)
     chosen = (2 * np.arange(n) + 1) * len(positions) // (2 * n)
@@ -269,9 +255,9 @@ def choose_seed(positions: np.ndarray) -> int:
 
 
 def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rms distances of a pose (J, 3) to others (n, J, 3), centred, when best turned.
+    """Return the aligned rms distances of a centred pose (J, 3) to others (n, J, 3).
 
-    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), whose last term is at best σ₁ + σ₂ ± σ₃.
+    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), with maximum σ₁ + σ₂ ± σ₃ of the last trace.
     """
     products = pose.T @ others
     sigma = np.linalg.svd(products, compute_uv=False)
@@ -280,13 +266,13 @@ def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(square, 0.0) / len(pose))
 
 
-def _not_the_dance(motion: Motion, farthest: float, fastest: float) -> np.ndarray:
-    """Return (3, L): frames of the opening, with someone apart, and beside impossible steps."""
+def _excluded_frames(motion: Motion, farthest: float, fastest: float) -> np.ndarray:
+    """Return masks (3, L) of opening, distant and glitch frames."""
     check_positive("farthest", farthest)
     check_positive("fastest", fastest)
     roots = motion.positions[:, motion.skeleton.roots]
     if roots.shape[1] < 2:
-        raise ValueError(f"motion is {motion} of 1 person, expected 2 or more")
+        raise ValueError(f"motion must have at least 2 people, got {motion}")
     distances = np.linalg.norm(roots[:, :, None] - roots[:, None], axis=-1)
     distances += np.where(np.eye(roots.shape[1]), np.inf, 0.0)
     apart = distances.min(axis=-1).max(axis=-1) > farthest
@@ -302,14 +288,14 @@ def _height(positions: np.ndarray, skeleton: Skeleton, root: int) -> np.ndarray:
     """Return the height (…) of the person below ``root``."""
     tree = [j for j in range(skeleton.n_joints) if j == root or root in skeleton.ancestors(j)]
     names = skeleton.subset(tree).canonical_names
-    wanted = ("head", *(f"{side}_{part}" for side in ("left", "right") for part in _LEG))
-    missing = [name for name in wanted if name not in names]
+    required = ("head", *(f"{side}_{part}" for side in ("left", "right") for part in _LEG))
+    missing = [name for name in required if name not in names]
     if missing:
         raise ValueError(
-            f"skeleton lacks {', '.join(missing)} below {skeleton.joint_names[root]!r}, expected "
-            "hips, knees, ankles and a head"
+            f"skeleton must have hips, knees, ankles and a head below "
+            f"{skeleton.joint_names[root]!r}, but lacks {', '.join(missing)}"
         )
-    at = {name: positions[..., tree[names.index(name)], :] for name in wanted}
+    at = {name: positions[..., tree[names.index(name)], :] for name in required}
     hips = (at["left_hip"] + at["right_hip"]) / 2
     head = tree[names.index("head")]
     chain = [head, *skeleton.ancestors(head)]

@@ -1,7 +1,6 @@
-"""Clips of two people as motions of one skeleton, ``pair17``: from archives and pairs of BVH files.
+"""Clips of two people on the skeleton ``pair17``, from archives and pairs of BVH files.
 
-What is done with them (which frames are the dance, whole clips held out, heights, the seed) is in
-:mod:`probmotion.data.pair_sets`.
+See :mod:`probmotion.data.pair_sets` for dance frames, held-out clips, heights and the seed pose.
 """
 
 from __future__ import annotations
@@ -12,43 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.data.pair_sets import (
-    SALSA_HELD_OUT,
-    choose_seed,
-    dance_frames,
-    describe_dance_frames,
-    ground_truth,
-    hold_out,
-    person_height,
-    scaled_to_height,
-)
 from probmotion.io.bvh import read_bvh
-from probmotion.io.files import load_motions
+from probmotion.io.files import load_all
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = [
-    "SALSA_HELD_OUT",
-    "choose_seed",
-    "dance_frames",
-    "describe_dance_frames",
-    "ground_truth",
-    "hold_out",
-    "load_pairs",
-    "pair_motion",
-    "pair_of",
-    "person_height",
-    "read_salsa_bvh",
-    "scaled_to_height",
-]
+__all__ = ["load_pairs", "pair_motion", "pair_of", "read_salsa_bvh"]
 
-# Metres per unit of the files of CMU's subjects 60 (lead) and 61 (follow). Their conversion put
-# both on one figure and scaled each root's path by the ratio of the legs; 0.0254/0.45 m is CMU's
-# unit, and the divisors were fitted to a metric conversion of trial 01 (rms residual 5 mm).
+# Metres per unit of the BVH files of CMU's subjects 60 (lead) and 61 (follow). The conversion used
+# one figure for both and scaled each root's path by the ratio of leg lengths; CMU's unit is
+# 0.0254/0.45 m, and the divisors were fitted to a metric conversion of trial 01 (rms 5 mm).
 _SALSA_SCALES = (0.0254 / 0.45 / 0.04389, 0.0254 / 0.45 / 0.04700)
-# The bodies come out of the figure's rest pose in the first frames, and the last ones jump.
+# The first frames leave the rest pose of the figure, and the last ones jump.
 _SALSA_START, _SALSA_END = 24, 6
-_SALSA_FPS = 60.0  # the files say 120, at which the dance is twice too fast
+_SALSA_FPS = 60.0  # the files say 120, which is wrong
 _SALSA_NAME = re.compile(r"(?P<subject>60|61)_(?P<trial>\d\d)(_scaled)?")
 
 
@@ -58,94 +34,87 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
     Parameters
     ----------
     paths : str, Path or iterable of them
-        A folder (all of its ``.npz`` files), files, or patterns such as ``"dances/*.npz"``.
+        A folder of ``.npz`` files, files, or patterns such as ``"dances/*.npz"``.
 
     Returns
     -------
     list of Motion
-        On ``pair17``, sorted by path, each at its own rate and called by its file's stem. The
-        people are ``person0`` and ``person1`` in the file's order.
+        On ``pair17`` (:func:`pair_of`), sorted by path, named by their files.
 
     Raises
     ------
     FileNotFoundError
-        If a folder or a pattern holds no file.
+        If nothing matches.
     ValueError
-        If a clip has not two people, or one of them lacks a joint; the message says who and which.
+        As :func:`pair_of`.
     """
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     patterns: list[str | Path] = []
     for path in map(Path, given):
         if path.is_dir() and not any(path.glob("*.npz")):
-            raise FileNotFoundError(f"paths has the folder {path}, which holds no .npz file")
+            raise FileNotFoundError(f"folder {path} contains no .npz file")
         patterns += sorted(path.glob("*.npz")) if path.is_dir() else [path]
-    return [pair_of(motion) for motion in load_motions(patterns)]
+    return [pair_of(motion) for motion in load_all(patterns)]
 
 
 def pair_of(motion: Motion) -> Motion:
-    """Return a motion of two people on ``pair17``, joints matched by their canonical names.
+    """Return a motion of two people on ``pair17``, with joints matched by canonical name.
 
     Parameters
     ----------
     motion : Motion
-        Of a skeleton with two trees, whatever their joints are called; the tree whose root comes
-        first becomes ``person0``.
+        Two people; the one whose root comes first becomes ``person0``.
 
     Raises
     ------
     ValueError
-        If there are not two trees, or one lacks a joint; the message names the joints.
+        If there are not two roots, or a joint is missing.
     """
     skeleton = Skeleton.preset("pair17")
     if motion.skeleton == skeleton:
         return motion
     roots = motion.skeleton.roots
     if len(roots) != 2:
-        raise ValueError(
-            f"motion is {motion} with {len(roots)} root{'s' * (len(roots) != 1)}, expected 2: one "
-            "for each person"
-        )
+        raise ValueError(f"motion must have 2 roots, one per person, got {len(roots)} in {motion}")
     people = [_person(motion, number, root) for number, root in enumerate(roots)]
     return Motion(np.concatenate(people, axis=1), skeleton, motion.fps, name=motion.name)
 
 
 def pair_motion(first: Motion, second: Motion, name: str = "") -> Motion:
-    """Return two people's motions as one of ``pair17``: two BVH files with a common frame.
+    """Combine the motions of two people into one on ``pair17``.
 
-    Nothing is moved: both must be in metres, in one world, and begin at one moment.
+    Both must be in metres, in one world frame, and start at the same time.
 
     Parameters
     ----------
     first, second : Motion
-        One person each, ``person0`` and ``person1``; of one frame rate and length.
+        One person each, with the same frame rate and number of frames.
     name : str
-        What to call the clip, both names by default.
+        Name of the result; both names by default.
 
     Raises
     ------
     ValueError
-        If rates or lengths differ, or a motion is not one person with all joints; the message
-        says how to make it fit.
+        If rates or lengths differ, or a motion is not one person with all joints.
     """
     if first.fps != second.fps:
         raise ValueError(
-            f"second has {second.fps:g} frames per second and first {first.fps:g}, expected one "
-            f"rate: second.resample({first.fps:g}) has it"
+            f"first and second must have one frame rate, got {first.fps:g} and {second.fps:g}; use "
+            f"second.resample({first.fps:g})"
         )
     if first.frames != second.frames:
         longer = "second" if second.frames > first.frames else "first"
         raise ValueError(
-            f"second has {second.frames} frames and first {first.frames}, expected clips of one "
-            f"moment: {longer}.window(start, {min(first.frames, second.frames)}) cuts the longer "
-            "one to the frames that they share"
+            f"first and second must have as many frames, got {first.frames} and {second.frames}; "
+            f"use {longer}.window(start, {min(first.frames, second.frames)})"
         )
     people = []
     for number, (argument, motion) in enumerate((("first", first), ("second", second))):
         roots = motion.skeleton.roots
         if len(roots) != 1:
             raise ValueError(
-                f"{argument} is {motion} with {len(roots)} roots, expected one person; pair_of "
-                "takes a motion of both"
+                f"{argument} must have one root, got {len(roots)} in {motion}; use pair_of for a "
+                "motion of two people"
             )
         people.append(_person(motion, number, roots[0]))
     return Motion(
@@ -157,24 +126,23 @@ def pair_motion(first: Motion, second: Motion, name: str = "") -> Motion:
 
 
 def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
-    """Read one trial of CMU's salsa from its two BVH files, in metres and at 30 fps.
+    """Read a trial of CMU's salsa from its two BVH files, in metres and at 30 fps.
 
-    The files are the DAZ-friendly conversion of the CMU database, subjects 60 and 61, scaled as
-    :mod:`probmotion.data.downloads` finds them. Each person gets a factor of his or her own
-    about the world's origin (1.286 and 1.201 m per unit); the first 24 and last 6 frames, where
-    the bodies leave the figure's rest pose and jump, are cut; every second frame of the 60 per
-    second is kept (the headers' 120 is wrong); and both are lowered together until the
-    lowest joints of each person and frame are above the floor, y = 0, in 98 of 100 cases.
+    The files are the DAZ-friendly conversion of the CMU database, subjects 60 and 61, in the scaled
+    version of :mod:`probmotion.data.downloads`. Each person is scaled about the origin (1.286 and
+    1.201 m per unit); the first 24 and last 6 frames are cut; every second frame of 60 per second
+    is kept; both people are lowered together until 98 % of the lowest joints are above the floor, y
+    = 0.
 
     Parameters
     ----------
     lead, follow : str or Path
-        ``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh`` of one trial TT.
+        ``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh`` of a trial TT.
 
     Returns
     -------
     Motion
-        On ``pair17``, called ``cmu_60_61_TT``.
+        On ``pair17``, named ``cmu_60_61_TT``.
 
     Raises
     ------
@@ -191,8 +159,8 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     both = pair_motion(end_sites[0], end_sites[1], f"cmu_60_61_{trial}")
     least = _SALSA_START + _SALSA_END + 1
     if both.frames < least:
-        raise ValueError(f"lead has {both.frames} frames, expected a trial of at least {least}")
-    # Toes are End Sites: the floor is found before they are left out.
+        raise ValueError(f"lead must have at least {least} frames, got {both.frames}")
+    # The floor is estimated with the toes, which are End Sites and dropped later.
     lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in end_sites])
     floor = np.percentile(lowest, 2)
     kept = both.positions[_SALSA_START : both.frames - _SALSA_END : 2]
@@ -200,18 +168,18 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
 
 
 def _salsa_trial(lead: Path, follow: Path) -> str:
-    """Return the two digits of the trial; scales depend on the subject, whom the name tells."""
+    """Return the two digits of the trial."""
     trials = []
     for argument, path, subject in (("lead", lead, "60"), ("follow", follow, "61")):
         match = _SALSA_NAME.fullmatch(path.stem)
         if match is None or match["subject"] != subject:
             raise ValueError(
-                f"{argument} is {path.name!r}, expected '{subject}_TT_scaled.bvh' with the two "
-                "digits TT of a trial"
+                f"{argument} must be named {subject}_TT_scaled.bvh, TT being the trial, got "
+                f"{path.name!r}"
             )
         trials.append(match["trial"])
     if trials[0] != trials[1]:
-        raise ValueError(f"follow is of trial {trials[1]} and lead of {trials[0]}, expected one")
+        raise ValueError(f"lead and follow must be one trial, got {' and '.join(trials)}")
     return trials[0]
 
 
@@ -219,13 +187,13 @@ def _person(motion: Motion, number: int, root: int) -> np.ndarray:
     """Return the positions (L, 17, 3) of the person below ``root``."""
     skeleton = motion.skeleton
     tree = [j for j in range(skeleton.n_joints) if j == root or root in skeleton.ancestors(j)]
-    # Named on their own, joints lose what stands before all of them alike: the person's name.
+    # Canonical names of a sub-skeleton drop the common prefix, the person's name.
     names = skeleton.subset(tree).canonical_names
-    wanted = Skeleton.preset("person17").joint_names
-    missing = [name for name in wanted if names.count(name) != 1]
+    required = Skeleton.preset("person17").joint_names
+    missing = [name for name in required if names.count(name) != 1]
     if missing:
         raise ValueError(
-            f"motion is {motion}, whose person {number} (root {skeleton.joint_names[root]!r}) "
-            f"lacks {', '.join(missing)}, expected the 17 joints of person17"
+            f"person {number} (root {skeleton.joint_names[root]!r}) of {motion} must have the "
+            f"joints of person17, but lacks {', '.join(missing)}"
         )
-    return motion.positions[:, [tree[names.index(name)] for name in wanted]]
+    return motion.positions[:, [tree[names.index(name)] for name in required]]

@@ -1,7 +1,4 @@
-"""2D tracks from 3D clips, as if the clips had been filmed and a detector had found the joints.
-
-What is learnt from such tracks has seen no third dimension; the clips stay behind as the truth.
-"""
+"""Synthetic 2D tracks: projections of 3D clips with detection errors."""
 
 from __future__ import annotations
 
@@ -24,23 +21,23 @@ Centre = Literal["frame", "sequence"]
 
 @dataclass(frozen=True)
 class DetectorNoise:
-    """How a detector errs.
+    """Error model of a keypoint detector.
 
-    A joint is either found, with small errors and a high confidence, or lost for a while, with
-    large errors and a low one, or not reported at all.
+    A joint is either found, with small errors and high confidence, or lost for some time, with
+    large errors and low confidence or not reported at all.
 
     Parameters
     ----------
     found : float
         Standard deviation of a found joint, metres at the subject's distance.
     lost : float
-        Standard deviation of a lost joint that is reported.
+        Standard deviation of a lost joint, likewise.
     share : float
-        Share of the time that a joint is lost, at least 0 and below 1.
+        Fraction of time that a joint is lost, in [0, 1).
     frames : float
-        Frames that a joint stays lost, on average.
+        Mean duration of a loss, frames, at least 1.
     silent : float
-        Share of lost joints that are not reported: NaN with confidence 0.
+        Fraction of lost joints that are not reported (NaN with confidence 0), in [0, 1].
 
     Raises
     ------
@@ -67,29 +64,23 @@ class DetectorNoise:
             raise ValueError(f"frames must be a finite number of at least 1, got {self.frames}")
         if self._begin > 1:
             raise ValueError(
-                f"share is {self.share} with frames {self.frames}, expected a joint to be found "
-                "for a frame between two losses"
+                f"share must be at most frames / (1 + frames), got {self.share} with frames "
+                f"{self.frames}"
             )
 
     @classmethod
     def none(cls) -> DetectorNoise:
-        """Return the detector that makes no error."""
+        """Return a detector without errors."""
         return cls(found=0.0, share=0.0)
 
     @property
     def _begin(self) -> float:
-        """Chance that a found joint is lost in the next frame."""
+        """Probability that a found joint is lost in the next frame."""
         return self.share / (1 - self.share) / self.frames
 
     def lost_spans(self, rng: np.random.Generator, frames: int, joints: int) -> np.ndarray:
-        """Return when joints are lost: a Markov chain in time for each, (frames, joints) bool."""
+        """Return which joints are lost, (frames, joints) bool: a Markov chain per joint."""
         stay = 1 - 1 / self.frames
-        begin = self.share / (1 - self.share) / self.frames
-        if begin > 1:
-            raise ValueError(
-                f"share is {self.share} with frames {self.frames}, expected a joint to be found "
-                "for a frame between two losses"
-            )
         lost = np.empty((frames, joints), bool)
         lost[0] = rng.random(joints) < self.share
         for frame in range(1, frames):
@@ -100,13 +91,13 @@ class DetectorNoise:
     def detect(
         self, rng: np.random.Generator, keypoints: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return what is reported of true keypoints: ``(L, J, 2) → (L, J, 2), (L, J)``."""
+        """Return detections of keypoints (L, J, 2) and their confidences (L, J)."""
         L, J, _ = keypoints.shape
         lost = self.lost_spans(rng, L, J)
         silent = lost & (rng.random((L, J)) < self.silent)
         size = np.where(lost, self.lost, self.found)
         reported = keypoints + size[..., None] * rng.standard_normal((L, J, 2))
-        # Found joints score .5 to 1, lost ones 0 to .3, as the thresholds in use expect.
+        # The usual thresholds, 0.3 and 0.5, separate detected from lost joints.
         confidence = np.where(lost, 0.3 * rng.random((L, J)), 0.5 + 0.5 * rng.random((L, J)))
         confidence = np.where(silent, 0.0, confidence)
         return np.where(confidence[..., None] > 0, reported, np.nan), confidence
@@ -114,26 +105,26 @@ class DetectorNoise:
 
 @dataclass(frozen=True)
 class Filming:
-    """Where the cameras stand, and on what pictures are centred.
+    """Camera placement and image centring.
 
     Parameters
     ----------
     elevation : float
-        Mean elevation of the cameras, radians: the published π/16.
+        Mean elevation of the cameras, radians; π/16 as in *MAS*.
     tilt : float
-        Elevations vary by up to this much about the mean, radians.
+        Greatest deviation from the mean elevation, radians.
     distance : float
-        Metres from the subject.
+        Distance of the cameras from the subject, metres.
     perspective : bool
-        Perspective cameras, whose pictures are in metres at the subject's distance.
+        Perspective rather than orthographic cameras; images are in metres at the subject's
+        distance.
     centre : {"frame", "sequence"}
-        The root is at the origin in every frame, as in pictures that follow the subject, or on
-        average over the track's frames.
+        Whether the root is at the origin in every frame or on average.
 
     Raises
     ------
     ValueError
-        If a number is out of range or the centre unknown.
+        If a number is out of range or ``centre`` unknown.
     """
 
     elevation: float = math.pi / 16
@@ -146,8 +137,8 @@ class Filming:
         check_positive("distance", self.distance)
         if not abs(self.elevation) + self.tilt < math.pi / 2 or self.tilt < 0:
             raise ValueError(
-                f"elevation is {self.elevation} with tilt {self.tilt}, expected cameras between "
-                "-pi/2 and pi/2"
+                f"elevation must be within tilt and pi/2 of 0, got {self.elevation} with tilt "
+                f"{self.tilt}"
             )
         if self.centre not in get_args(Centre):
             raise ValueError(f"centre must be frame or sequence, got {self.centre!r}")
@@ -170,46 +161,46 @@ def project_clips(
     filming: Filming | None = None,
     noise: DetectorNoise | None = None,
 ) -> list[KeypointTrack]:
-    """Return what cameras around each clip and a detector would have found.
+    """Return 2D tracks of 3D clips, seen by random cameras through a noisy detector.
 
     Parameters
     ----------
     motions : sequence of Motion
-        3D clips with a name each.
+        3D clips with unique names.
     views : int
         Cameras per clip, each at a random azimuth and elevation.
     seed : int
-        Of cameras and errors; a clip's tracks do not depend on the other clips.
+        Seed of cameras and errors; the tracks of a clip do not depend on other clips.
     filming : Filming, optional
-        Where the cameras stand; the defaults of :class:`Filming`.
+        Camera placement.
     noise : DetectorNoise, optional
-        How the detector errs; the defaults of :class:`DetectorNoise`.
+        Detector.
 
     Returns
     -------
     list of KeypointTrack
-        Called ``"<clip>/<view>"``; metres at the subject's distance, x right and y down, centred
-        on the root.
+        Named ``"<clip>/<view>"``; metres at the subject's distance, x right and y down, centred on
+        the root.
 
     Raises
     ------
     ValueError
-        If there is no clip, or two have one name or none.
+        If there is no clip, or names are missing or repeated.
     """
     check_count("views", views)
     if not motions:
         raise ValueError("motions must contain at least one clip, got none")
     names = [motion.name for motion in motions]
     if len(set(names)) < len(names) or "" in names:
-        raise ValueError(f"motions has the names {', '.join(names)}, expected one of its own each")
-    shot, erring = filming or Filming(), noise or DetectorNoise()
+        raise ValueError(f"motions must have unique names, got {', '.join(names)}")
+    filming, detector = filming or Filming(), noise or DetectorNoise()
     tracks = []
     for motion in motions:
         rng = seeds.generator(seed, "filming", motion.name)
-        cameras = shot.cameras(rng, views)
-        pictures = cameras.project(centre_motion(motion, shot.centre).positions)
-        for view, picture in enumerate(pictures):
-            keypoints, confidence = erring.detect(rng, picture)
+        cameras = filming.cameras(rng, views)
+        projected = cameras.project(centre_motion(motion, filming.centre).positions)
+        for view, image in enumerate(projected):
+            keypoints, confidence = detector.detect(rng, image)
             name = f"{motion.name}/{view}"
             tracks.append(KeypointTrack(keypoints, confidence, motion.skeleton, motion.fps, name))
     return tracks

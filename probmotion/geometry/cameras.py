@@ -1,6 +1,6 @@
-"""Cameras: batches of views, perspective or orthographic, and what they see.
+"""Perspective and orthographic cameras, in batches of V views.
 
-Axes are OpenCV's: x right, y down, z forward. A world point X is at R X + t in the camera.
+Axes follow OpenCV: x right, y down, z forward. A world point X has camera coordinates R X + t.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Cameras"]
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """V cameras that look at one scene.
+    """Batch of V cameras.
 
     Parameters
     ----------
@@ -26,17 +26,18 @@ class Cameras:
     translation : ndarray, (V, 3)
         World to camera, metres.
     focal : ndarray, (V,)
-        Perspective: image units per unit slope. Orthographic: image units per metre.
+        Focal length. Perspective: image units per unit slope. Orthographic: image units per metre.
     centre : ndarray, (V, 2), optional
         Principal point, image units; the origin by default.
     orthographic : bool
-        Whether the projection ignores depth.
+        Whether the projection is orthographic.
 
     Raises
     ------
     ValueError
-        If shapes disagree, a value is not finite, a focal length is not above zero, or a
-        rotation is not orthonormal with determinant 1 (to 1e-6).
+        If shapes disagree, a value is not finite, a focal length is not positive, or a rotation is
+        not
+        orthonormal with determinant 1 (to 1e-6).
     """
 
     rotation: np.ndarray
@@ -50,7 +51,7 @@ class Cameras:
         check_shape("rotation", rotation, ("V", 3, 3))
         n_views = len(rotation)
         if n_views == 0:
-            raise ValueError("rotation has no camera, expected at least one")
+            raise ValueError("rotation must contain at least one camera, got none")
         translation = np.asarray(self.translation, dtype=np.float64)
         focal = np.asarray(self.focal, dtype=np.float64)
         centre = np.zeros((n_views, 2)) if self.centre is None else self.centre
@@ -65,18 +66,13 @@ class Cameras:
             check_positive("focal", float(value))
         gap = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
         if gap > 1e-6:
-            raise ValueError(
-                f"rotation is off an orthonormal matrix by {gap:.2g}, expected at most 1e-6"
-            )
+            raise ValueError(f"rotation must be orthonormal to 1e-6, got a deviation of {gap:.2g}")
         if (np.linalg.det(rotation) < 0).any():
-            raise ValueError("rotation has a reflection (determinant -1), expected determinant 1")
-        for name, value in (
-            ("rotation", rotation),
-            ("translation", translation),
-            ("focal", focal),
-            ("centre", centre),
-        ):
-            object.__setattr__(self, name, value)
+            raise ValueError("rotation must have determinant 1, got a reflection")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+        object.__setattr__(self, "focal", focal)
+        object.__setattr__(self, "centre", centre)
 
     @classmethod
     def ring(
@@ -88,7 +84,7 @@ class Cameras:
         start: float = 0.0,
         perspective: bool = False,
     ) -> Cameras:
-        """Return cameras evenly around the vertical axis that look at the origin.
+        """Return cameras evenly spaced around the vertical axis, facing the origin.
 
         Parameters
         ----------
@@ -97,13 +93,13 @@ class Cameras:
         elevation : float
             Radians above the horizon.
         distance : float
-            Metres from the origin. A perspective camera's focal length is the same number, so
-            that both kinds of camera show the origin's plane at one image unit per metre
-            (MAS, appendix C).
+            Metres from the origin. Perspective cameras have the same number as focal length, so
+            that
+            both kinds project the origin's plane at one image unit per metre (MAS, appendix C).
         start : float
-            Azimuth of the first camera, radians; 0 stands on the +Z axis.
+            Azimuth of the first camera, radians; 0 is the +Z axis.
         perspective : bool
-            Perspective cameras rather than orthographic ones.
+            Whether the cameras are perspective instead of orthographic.
         """
         check_count("n_views", n_views)
         azimuth = start + 2 * np.pi * np.arange(n_views) / n_views
@@ -120,7 +116,7 @@ class Cameras:
         distance: float = 7.0,
         perspective: bool = False,
     ) -> Cameras:
-        """Return cameras at the given azimuths and elevations (V,), radians, facing the origin."""
+        """Return cameras at azimuths and elevations (V,), radians, facing the origin."""
         check_positive("distance", distance)
         azimuth = np.atleast_1d(np.asarray(azimuth, dtype=np.float64))
         check_finite("azimuth", azimuth)
@@ -146,7 +142,7 @@ class Cameras:
 
     @property
     def azimuth(self) -> np.ndarray:
-        """Azimuth of each camera's position as seen from what it looks at, radians, (V,)."""
+        """Azimuth of each camera's position relative to its viewing target, radians, (V,)."""
         forward = self.rotation[:, 2]
         return np.arctan2(-forward[:, 0], -forward[:, 2])
 
@@ -156,13 +152,8 @@ class Cameras:
         return np.arcsin(np.clip(-self.rotation[:, 2, 1], -1.0, 1.0))
 
     @property
-    def upright(self) -> bool:
-        """Whether every camera's image x axis is horizontal (no roll)."""
-        return bool(np.abs(self.rotation[:, 0, 1]).max() < 1e-12)
-
-    @property
     def image_axes(self) -> np.ndarray:
-        """P: the image axes in the world times the focal length, (V, 2, 3).
+        """P, the world directions of the image axes times the focal length, (V, 2, 3).
 
         For orthographic cameras ``project(X) = P X + offset``.
         """
@@ -170,11 +161,11 @@ class Cameras:
 
     @property
     def offset(self) -> np.ndarray:
-        """Image of the world's origin under orthographic projection, (V, 2)."""
+        """Image of the world origin under orthographic projection, (V, 2)."""
         return self.focal[:, None] * self.translation[:, :2] + self.centre
 
     def view(self, index: int) -> Cameras:
-        """Return one of the cameras as a batch of one."""
+        """Return one camera as a batch of one."""
         one = slice(index, index + 1) if index >= 0 else slice(index, index + 1 or None)
         assert self.centre is not None
         return Cameras(
@@ -186,14 +177,14 @@ class Cameras:
         )
 
     def as_orthographic(self) -> Cameras:
-        """Return orthographic cameras that agree with these at the world origin's depth."""
+        """Return orthographic cameras with the same scale at the depth of the world origin."""
         if self.orthographic:
             return self
         focal = self.focal / self.translation[:, 2]
         return Cameras(self.rotation, self.translation, focal, self.centre, orthographic=True)
 
     def depth(self, points: Array) -> Array:
-        """Return points' distances along the z axes: ``(…, L, J, 3) → (…, V, L, J)``."""
+        """Return depths along the cameras' z axes: ``(…, L, J, 3) → (…, V, L, J)``, metres."""
         forward = constant(self.rotation[:, 2], points)
         depth = constant(self.translation[:, 2], points)
         xp = array_namespace(points)
@@ -201,13 +192,12 @@ class Cameras:
         return moved + depth[:, None, None]
 
     def project(self, points: Array) -> Array:
-        """Return what the cameras see: ``(…, L, J, 3) → (…, V, L, J, 2)``, image units.
+        """Return image points: ``(…, L, J, 3) → (…, V, L, J, 2)``, image units.
 
         Raises
         ------
         ValueError
-            If a perspective camera has a point beside or behind it. (Not checked while JAX
-            traces the function, where values are not known yet.)
+            If a point is not in front of a perspective camera. Not checked under JAX tracing.
         """
         check_shape("points", points, ("…", "L", "J", 3))
         xp = array_namespace(points)
@@ -229,6 +219,6 @@ class Cameras:
         if nearest.size and nearest.min() <= 0:
             view = int(np.argwhere(nearest <= 0)[0][-3])
             raise ValueError(
-                f"points has a joint {nearest.min():.3g} m in front of camera {view}, expected "
-                "every joint in front of every camera; move the cameras away or centre the motion"
+                f"points must be in front of every camera, got depth {nearest.min():.3g} m in "
+                f"camera {view}; move the cameras away or centre the motion"
             )

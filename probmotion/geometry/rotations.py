@@ -1,8 +1,8 @@
-"""Rotations: vectors, matrices, quaternions, six numbers and Euler angles.
+"""Conversions between rotation vectors, matrices, quaternions, 6D vectors and Euler angles.
 
-Every function runs on NumPy, torch and JAX arrays of any batch shape, under ``jax.jit`` and with
-finite gradients at the identity and at half turns. Rotations are active: ``R @ x`` turns x. A
-quaternion is (w, x, y, z). Angles are radians.
+All functions accept NumPy, torch and JAX arrays of any batch shape, work under ``jax.jit`` and have
+finite gradients at the identity and at half turns. Rotations are active: ``R @ x`` rotates x.
+Quaternions are (w, x, y, z); angles are in radians.
 """
 
 from __future__ import annotations
@@ -17,19 +17,18 @@ __all__ = [
     "geodesic_angle",
     "matrix_to_euler",
     "matrix_to_quaternion",
-    "matrix_to_six_numbers",
+    "matrix_to_rotation_6d",
     "matrix_to_vector",
     "quaternion_product",
     "quaternion_to_matrix",
     "quaternion_to_vector",
-    "six_numbers_to_matrix",
+    "rotation_6d_to_matrix",
     "slerp",
-    "slerp_quaternions",
     "vector_to_matrix",
     "vector_to_quaternion",
 ]
 
-# Below this squared angle the series are as exact as float64: the first term left out is 1e-19.
+# Squared angle below which the series are exact in float64; the first omitted term is 1e-19.
 _SMALL = 1e-6
 
 
@@ -44,7 +43,7 @@ def vector_to_matrix(vector: Array) -> Array:
     small = square < _SMALL
     angle = _safe_sqrt(square, small)
     first = xp.where(small, 1 - square / 6 + square**2 / 120, xp.sin(angle) / angle)
-    # (1 − cos θ)/θ² as a sine of the half angle, which loses no digit for small angles.
+    # (1 − cos θ)/θ² from the sine of the half angle, without cancellation at small angles.
     half = xp.where(small, 1 - square / 24 + square**2 / 1920, 2 * xp.sin(angle / 2) / angle)
     cross = _cross_matrix(vector)
     return constant(np.eye(3), vector) + first * cross + half**2 / 2 * xp.matmul(cross, cross)
@@ -70,7 +69,7 @@ def vector_to_quaternion(vector: Array) -> Array:
 def quaternion_to_vector(quaternion: Array) -> Array:
     """Return the rotation vector of a quaternion: ``(…, 4) → (…, 3)``, of length at most π.
 
-    The quaternion may have any length above zero.
+    The quaternion need not be normalised.
     """
     quaternion = _short(_unit(quaternion))
     xp = array_namespace(quaternion)
@@ -78,7 +77,7 @@ def quaternion_to_vector(quaternion: Array) -> Array:
     square = xp.sum(imaginary**2, axis=-1, keepdims=True)
     small = square < _SMALL
     sine = _safe_sqrt(square, small)
-    # 2 atan(s/w)/s; the series in s/w is read only where w is near 1.
+    # 2 atan(s/w)/s; the series in s/w is used only for w close to 1.
     tangent = xp.where(small, square / xp.where(small, real, xp.ones_like(real)) ** 2, square)
     series = 2 * (1 - tangent / 3 + tangent**2 / 5) / xp.where(small, real, xp.ones_like(real))
     return xp.where(small, series, 2 * xp.atan2(sine, real) / sine) * imaginary
@@ -97,8 +96,8 @@ def quaternion_to_matrix(quaternion: Array) -> Array:
 def matrix_to_quaternion(matrix: Array) -> Array:
     """Return the unit quaternion of a matrix, w at least 0: ``(…, 3, 3) → (…, 4)``.
 
-    4 q qᵀ is linear in R; its row of the largest diagonal entry is q up to a factor of at least 2,
-    at every angle.
+    4 q qᵀ is linear in R. Its row with the largest diagonal entry is q times a factor of at least
+    2.
     """
     check_shape("matrix", matrix, ("…", 3, 3))
     xp = array_namespace(matrix)
@@ -120,7 +119,7 @@ def matrix_to_quaternion(matrix: Array) -> Array:
 
 
 def quaternion_product(first: Array, second: Array) -> Array:
-    """Return the quaternion of ``second``, then ``first``: ``(…, 4), (…, 4) → (…, 4)``."""
+    """Return the Hamilton product, ``second`` then ``first``: ``(…, 4), (…, 4) → (…, 4)``."""
     check_shape("first", first, ("…", 4))
     check_shape("second", second, ("…", 4))
     xp = array_namespace(first, second)
@@ -137,12 +136,12 @@ def quaternion_product(first: Array, second: Array) -> Array:
     )
 
 
-def six_numbers_to_matrix(numbers: Array) -> Array:
-    """Return the matrix whose first two columns are nearest to six numbers.
+def rotation_6d_to_matrix(numbers: Array) -> Array:
+    """Return the rotation matrix of a 6D vector by Gram-Schmidt: ``(…, 6) → (…, 3, 3)``.
 
-    Zhou et al. 2019, "On the continuity of rotation representations in neural networks", eq. 15:
-    Gram-Schmidt on the columns (0:3) and (3:6), ``(…, 6) → (…, 3, 3)``. The two must not be
-    parallel.
+    Entries 0:3 and 3:6 are the first two columns and must not be parallel (Zhou et al. 2019, "On
+    the
+    continuity of rotation representations in neural networks", eq. 15).
     """
     check_shape("numbers", numbers, ("…", 6))
     xp = array_namespace(numbers)
@@ -153,28 +152,29 @@ def six_numbers_to_matrix(numbers: Array) -> Array:
     return xp.stack([first, second, third], axis=-1)
 
 
-def matrix_to_six_numbers(matrix: Array) -> Array:
-    """Return the first two columns of a matrix one after the other: ``(…, 3, 3) → (…, 6)``."""
+def matrix_to_rotation_6d(matrix: Array) -> Array:
+    """Return the first two columns of a matrix, concatenated: ``(…, 3, 3) → (…, 6)``."""
     check_shape("matrix", matrix, ("…", 3, 3))
     xp = array_namespace(matrix)
     return xp.concat([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 
 def euler_to_matrix(angles: Array, order: str) -> Array:
-    """Return the matrix of three turns about moving axes: ``(…, 3) → (…, 3, 3)``.
+    """Return the matrix of intrinsic Euler angles: ``(…, 3) → (…, 3, 3)``.
 
     Parameters
     ----------
     angles : Array, (…, 3)
         Radians, in the order of ``order``.
     order : str
-        Three of ``X``, ``Y``, ``Z``, neighbours different: ``"ZXY"`` is ``R_z R_x R_y``, as a
-        BVH's channels ``Zrotation Xrotation Yrotation``.
+        Three of ``X``, ``Y``, ``Z`` with different neighbours: ``"ZXY"`` is ``R_z R_x R_y``, the
+        BVH
+        channels ``Zrotation Xrotation Yrotation``.
 
     Raises
     ------
     ValueError
-        If ``order`` is not such a word.
+        If ``order`` is invalid.
     """
     check_shape("angles", angles, ("…", 3))
     axes = _axes(order)
@@ -184,10 +184,10 @@ def euler_to_matrix(angles: Array, order: str) -> Array:
 
 
 def matrix_to_euler(matrix: Array, order: str) -> Array:
-    """Return the angles of three turns about moving axes: ``(…, 3, 3) → (…, 3)``.
+    """Return the intrinsic Euler angles of a matrix: ``(…, 3, 3) → (…, 3)``.
 
-    The middle angle is in [−π/2, π/2], or in [0, π] where the first and last axis are the same.
-    Where it is at the end of its range (gimbal lock), the first angle is 0.
+    The middle angle is in [−π/2, π/2], or in [0, π] if the first and last axes are equal. At gimbal
+    lock the first angle is 0.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def matrix_to_euler(matrix: Array, order: str) -> Array:
     radius = xp.where(locked, xp.zeros_like(square), _safe_sqrt(square, locked))
     zero, one = xp.zeros_like(sine), xp.ones_like(cosine)
     first = xp.atan2(xp.where(locked, zero, sine), xp.where(locked, one, cosine))
-    # What is left once the first turn is undone has a row that depends on the last angle alone,
-    # and is of length 1 even where the first angle is ill determined.
+    # After undoing the first turn, this row depends on the last angle only. It has length 1 even
+    # if the first angle is ill-conditioned.
     row = (
         xp.cos(first)[..., None] * matrix[..., j, :]
         + parity * xp.sin(first)[..., None] * matrix[..., k, :]
@@ -226,9 +226,9 @@ def matrix_to_euler(matrix: Array, order: str) -> Array:
 
 
 def geodesic_angle(first: Array, second: Array) -> Array:
-    """Return the angle of the rotation from ``first`` to ``second``, in [0, π].
+    """Return the angle between rotation matrices, in [0, π]: ``(…, 3, 3), (…, 3, 3) → (…)``.
 
-    Matrices, ``(…, 3, 3), (…, 3, 3) → (…)``. The gradient at equal rotations is 0.
+    The gradient at equal rotations is 0.
     """
     xp = array_namespace(first, second)
     quaternion = matrix_to_quaternion(xp.matmul(xp.matrix_transpose(first), second))
@@ -239,7 +239,7 @@ def geodesic_angle(first: Array, second: Array) -> Array:
 
 
 def slerp(first: Array, second: Array, fraction: Array) -> Array:
-    """Return the rotations on the way from ``first`` to ``second`` at constant speed.
+    """Return rotations between ``first`` and ``second`` at constant angular velocity.
 
     Parameters
     ----------
@@ -251,35 +251,25 @@ def slerp(first: Array, second: Array, fraction: Array) -> Array:
     Returns
     -------
     Array, (…, 3, 3)
-        The shorter way; at half a turn, where both are as long, one of them.
+        Rotations along the shorter arc.
     """
     xp = array_namespace(first, second)
     step = matrix_to_vector(xp.matmul(xp.matrix_transpose(first), second))
     return xp.matmul(first, vector_to_matrix(fraction[..., None] * step))
 
 
-def slerp_quaternions(first: Array, second: Array, fraction: Array) -> Array:
-    """Return :func:`slerp` of unit quaternions, ``(…, 4), (…, 4), (…) → (…, 4)``.
-
-    q and −q are the same rotation: the result starts at ``first`` and ends at ±``second``.
-    """
-    inverse = first * constant([1.0, -1.0, -1.0, -1.0], first)
-    step = quaternion_to_vector(quaternion_product(inverse, second))
-    return quaternion_product(first, vector_to_quaternion(fraction[..., None] * step))
-
-
 def _axes(order: str) -> tuple[int, int, int]:
     axes = tuple("XYZ".find(letter) for letter in order.upper())
     if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
         raise ValueError(
-            f"order is {order!r}, expected three of X, Y and Z with different neighbours, such as "
-            "'ZXY'"
+            "order must be three of X, Y and Z with different neighbours, such as 'ZXY', got "
+            f"{order!r}"
         )
     return axes[0], axes[1], axes[2]
 
 
 def _turn(angle: Array, axis: int) -> Array:
-    """Return the matrices of turns about one axis: ``(…) → (…, 3, 3)``."""
+    """Return the rotation matrices about one axis: ``(…) → (…, 3, 3)``."""
     xp = array_namespace(angle)
     fixed, cosine, sine = np.zeros((3, 3, 3))
     j, k = (axis + 1) % 3, (axis + 2) % 3
@@ -304,7 +294,7 @@ def _cross_matrix(vector: Array) -> Array:
 
 
 def _safe_sqrt(square: Array, excluded: Array) -> Array:
-    """Return √square, 1 where ``excluded``: a gradient there would be infinite, then NaN."""
+    """Return √square, 1 where ``excluded``, so that gradients stay finite at 0."""
     xp = array_namespace(square)
     return xp.sqrt(xp.where(excluded, xp.ones_like(square), square))
 
@@ -315,6 +305,6 @@ def _unit(vector: Array) -> Array:
 
 
 def _short(quaternion: Array) -> Array:
-    """Return q or −q, the one with w at least 0."""
+    """Return q or −q, whichever has w at least 0."""
     xp = array_namespace(quaternion)
     return xp.where(quaternion[..., :1] < 0, -quaternion, quaternion)

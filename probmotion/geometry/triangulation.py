@@ -1,14 +1,14 @@
-"""Triangulation: the motion that comes nearest to its pictures in V views, in closed form.
+"""Weighted least-squares triangulation of joints from V views.
 
-Every joint of every frame is a least-squares problem of its own, with 3 unknowns and 2 V
-equations. A camera shows the point X at (u, v) = (a/c, b/c), where a, b, c are the rows of its
-projection matrix times (X, 1). With a', b', c' the rows' first three entries,
+Each joint of each frame is an independent least-squares problem with 3 unknowns and 2 V equations.
+A camera projects the point X to (u, v) = (a/c, b/c), where a, b, c are the rows of its projection
+matrix times (X, 1). With a', b', c' the first three entries of the rows,
 
     J = [a' − u c', b' − v c'] / c,
     JᵀJ = (a'a'ᵀ + b'b'ᵀ − u (a'c'ᵀ + c'a'ᵀ) − v (b'c'ᵀ + c'b'ᵀ) + (u² + v²) c'c'ᵀ) / c²,
 
-so the normal equations of all points are a few fixed matrices, made of the cameras alone, times a
-few numbers per view and point. Orthographic cameras are the case c' = 0, c = 1.
+so the normal equations of all points are fixed matrices of the cameras times a few numbers per view
+and point. Orthographic cameras are the case c' = 0, c = 1.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["triangulate"]
 
 _POOR = 1e3
-"""Condition number of the normal equations from which a warning is due: two views 3.6° apart."""
+"""Condition number of the normal equations above which to warn: two views 3.6° apart."""
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Which entries of a symmetric 3×3 matrix are kept, in this order."""
+"""Stored entries of a symmetric 3×3 matrix."""
 
 
 def triangulate(
@@ -41,10 +41,9 @@ def triangulate(
 ) -> Array:
     """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for every frame and joint (MAS, section 4.2).
 
-    Orthographic cameras need one solve. Perspective ones are linearised ``iterations`` times,
-    each time with the exact residual and gradient, the derivative with respect to depth among
-    them; the normal matrix is the first linearisation's (simplified Gauss-Newton), which a move
-    of ‖δ‖ changes by about 2‖δ‖/depth only.
+    Orthographic cameras are solved in closed form. Perspective cameras use ``iterations`` steps of
+    simplified Gauss-Newton: residual and gradient are exact, the normal matrix is that of the first
+    linearisation.
 
     Parameters
     ----------
@@ -53,34 +52,34 @@ def triangulate(
     cameras : Cameras
         The V views.
     weights : Array, (V,), (…, V) or (…, V, L, J), optional
-        w, 1 by default; where it is 0 the keypoint is not read and may be NaN.
+        w, 1 by default. Keypoints of weight 0 are ignored and may be NaN.
     initial : Array, (…, L, J, 3), optional
-        Where perspective cameras are linearised first, metres; by default the solution of the
-        linear equations that say "X is on the ray". Orthographic cameras need none.
+        Initial points for perspective cameras, metres; the linear ray intersection by default.
     iterations : int
-        Linearisations of perspective cameras.
+        Gauss-Newton steps for perspective cameras.
 
     Returns
     -------
     Array, (…, L, J, 3)
-        Metres.
+        Points in metres.
 
     Warns
     -----
     UserWarning
-        If the views are so nearly parallel that the normal equations' condition number is above
-        1000; the message says how large it is.
+        If the views are nearly parallel (condition number of the normal equations above 1000).
 
     Raises
     ------
     ValueError
-        If there are fewer than two views, shapes disagree, a keypoint is not finite, the views
-        (or those that see some joint) determine no point, or a point is behind a perspective
-        camera. (What depends on values is not checked while JAX traces the function.)
+        If there are fewer than two views, shapes disagree, a keypoint is not finite, the views do
+        not
+        determine some point, or a point is behind a perspective camera. Conditions on values are
+        not
+        checked under JAX tracing.
     """
     V = cameras.n_views
     if V < 2:
-        raise ValueError(f"cameras has {V} view, expected at least two")
+        raise ValueError(f"cameras must contain at least two views, got {V}")
     check_shape("keypoints", keypoints, ("…", V, "L", "J", 2))
     check_count("iterations", iterations)
     xp = array_namespace(keypoints)
@@ -98,7 +97,7 @@ def triangulate(
         seen = xp.where(weight > 0, seen, xp.zeros_like(seen))
     equations = _equations(cameras, keypoints)
     ones = xp.ones_like(seen[0, :1, :])
-    # Singular equations divide by 0 here; they are reported below.
+    # Singular equations divide by 0 here and are reported below.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if cameras.orthographic or initial is None:
             normal, pull = _on_rays(xp, equations, seen, weight)
@@ -124,7 +123,7 @@ def triangulate(
 
 
 class _Equations(NamedTuple):
-    """The fixed matrices of V cameras."""
+    """Fixed matrices of V cameras."""
 
     projection: Array  # (3 V, 4): rows a, then b, then c
     square: Array  # (6, V): a'a'ᵀ + b'b'ᵀ
@@ -172,7 +171,7 @@ def _numpy_equations(cameras: Cameras) -> _Equations:
 def _normal(
     xp: Any, equations: _Equations, inverse_depth: Array, image: Array, weight: Array | None
 ) -> Array:
-    """Return Σ_v w JᵀJ at the given image points (2, V, N), (6, N)."""
+    """Return Σ_v w JᵀJ at the image points (2, V, N): (6, N)."""
     scale = inverse_depth * inverse_depth
     if weight is not None:
         scale = scale * weight
@@ -202,9 +201,9 @@ def _pull(
 def _on_rays(
     xp: Any, equations: _Equations, seen: Array, weight: Array | None
 ) -> tuple[Array, Array]:
-    """Return the normal equations of (a' − u c')·X = u c₄ − a₄ and its like, u, v as seen.
+    """Return the normal equations of the rays (a' − u c')·X = u c₄ − a₄ and its counterpart in v.
 
-    They are the least-squares problem itself where c' = 0.
+    For c' = 0 they are exact.
     """
     _, V, N = seen.shape
     origin = equations.projection[:, 3:]
@@ -218,7 +217,7 @@ def _on_rays(
 
 
 def _factor(normal: Array) -> tuple[Array, ...]:
-    """Return the L D Lᵀ factors of symmetric matrices (6, N): 1/D and L's entries, (N,) each."""
+    """Return the L D Lᵀ factors of symmetric matrices (6, N): 1/D, then L, (N,) each."""
     a, b, c, d, e, f = (normal[i, ...] for i in range(6))
     inverse_1 = 1 / a
     l21, l31 = b * inverse_1, c * inverse_1
@@ -239,7 +238,7 @@ def _solve(factors: tuple[Array, ...], right: Array) -> tuple[Array, Array, Arra
 
 
 def _views_first(values: Array, trailing: int) -> Array:
-    """Move the views to the front: ``(…, V, L, J[, 2]) → ([2,] V, N)``, N all the points."""
+    """Move the views to the front and flatten the points: ``(…, V, L, J[, 2]) → ([2,] V, N)``."""
     xp = array_namespace(values)
     V, L, J = values.shape[len(values.shape) - trailing - 3 :][:3]
     if trailing:
@@ -272,14 +271,12 @@ def _refuse_unfit(
     factors: tuple[Array, ...],
     inverse_depth: Array | None,
 ) -> None:
-    """Warn of poor conditions; raise where there is no solution."""
+    """Warn about ill-conditioned views; raise if there is no solution."""
     if weights is None and not np.isfinite(_number(xp.sum(found))):
         check_finite("keypoints", keypoints)
     if weights is not None and not _number(xp.min(weights)) >= 0:
-        raise ValueError(
-            f"weights is {_number(xp.min(weights)):g} at its least, expected 0 or more"
-        )
-    # trace³/determinant is never below the condition number, and cheap.
+        raise ValueError(f"weights must be 0 or more, got {_number(xp.min(weights)):g}")
+    # trace³/determinant is a cheap upper bound of the condition number.
     trace = normal[0, ...] + normal[3, ...] + normal[5, ...]
     bound = trace * trace * trace * (factors[0] * factors[1] * factors[2])
     if not (_number(xp.max(bound)) < _POOR and _number(xp.min(bound)) > 0):
@@ -288,8 +285,8 @@ def _refuse_unfit(
         view, point = np.argwhere(~(to_numpy(inverse_depth) > 0))[0]
         *_, frame, joint = np.unravel_index(point, points)
         raise ValueError(
-            f"keypoints put joint {joint} of frame {frame} behind camera {view}, expected every "
-            "joint in front of every camera; check the cameras, or give an initial motion"
+            f"keypoints must lie in front of every camera, got joint {joint} of frame {frame} "
+            f"behind camera {view}; check the cameras or pass initial"
         )
 
 
@@ -308,12 +305,12 @@ def _report_condition(normal: np.ndarray, points: tuple[int, ...]) -> None:
     *_, frame, joint = (int(i) for i in np.unravel_index(worst, points))
     if not condition[worst] < 0.01 / np.finfo(normal.dtype).eps:
         raise ValueError(
-            f"keypoints of joint {joint} in frame {frame} determine no point (condition number "
-            f"{condition[worst]:.2g}), expected two views of it that are not parallel"
+            f"keypoints of joint {joint} in frame {frame} do not determine a point (condition "
+            f"number {condition[worst]:.2g}); at least two non-parallel views are needed"
         )
     if condition[worst] > _POOR:
         warnings.warn(
-            f"the views are nearly parallel: the condition number is {condition[worst]:.3g} at "
-            f"joint {joint} of frame {frame}, so depths are that much less certain",
+            f"the views are nearly parallel (condition number {condition[worst]:.3g} at joint "
+            f"{joint} of frame {frame}), so depths are uncertain",
             stacklevel=3,
         )

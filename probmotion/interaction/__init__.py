@@ -1,4 +1,4 @@
-"""The likelihood of 2D annotations of people together, their retrieval and completion."""
+"""Likelihood of 2D annotations of interacting people, retrieval and completion."""
 
 import lazy_loader
 

@@ -1,15 +1,13 @@
 from .annotated_pairs import AnnotatedPairs as AnnotatedPairs
 from .completion import (
-    BANDWIDTH as BANDWIDTH,
-    Completed as Completed,
-    blend as blend,
+    CompletionResult as CompletionResult,
     complete as complete,
     complete_keypoints as complete_keypoints,
     nearest_annotation_completion as nearest_annotation_completion,
     occluded_joint_error as occluded_joint_error,
 )
 from .retrieval import (
-    Retrieved as Retrieved,
+    RetrievalResult as RetrievalResult,
     retrieve as retrieve,
     view_grid as view_grid,
     views_around as views_around,

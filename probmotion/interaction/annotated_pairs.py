@@ -1,10 +1,11 @@
-"""`AnnotatedPairs`: what 2D annotations of a kind of motion say of a 3D pose-pair."""
+"""Likelihood of 3D pose-pairs given 2D annotations of the same kind of motion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,36 +25,31 @@ __all__ = ["AnnotatedPairs"]
 class AnnotatedPairs:
     """L(Θ) ∝ (1/m) Σᵢ max_j exp(−d(M Θ_vᵢ, p_j)²/2σ_l²), vᵢ ~ f(v) (Yin et al. 2018, eqs. 5-9).
 
-    A pose-pair is as likely as its projections are like what was annotated in similar views. The m
-    views are drawn once, from the seed, so that the density is a function; :meth:`evaluate` with
-    generators draws fresh ones, an unbiased estimate of the integral over views.
+    Compares projections of the pose-pair with annotations in similar views. The m views are drawn
+    once from ``seed``, so that the density is deterministic; :meth:`evaluate` with generators draws
+    fresh views for an unbiased estimate of the integral over views.
 
     Parameters
     ----------
     annotations : Annotations
-        n annotated pairs with their views, metres.
+        n annotated pairs with views, metres.
     n_views : int
-        m.
+        Number of views m.
     n_near : int
-        Annotations that each view is compared with: the nearest in view angle.
+        Number of annotations compared per view, nearest in view angle.
     noise : float
-        σ_l, in the unit of the dissimilarity: metres, but for shape context, which has none.
+        σ_l, in the unit of the dissimilarity: metres; dimensionless for shape contexts.
     view_bandwidth : float
         σ_v, radians.
     measure : str
-        ``"interaction"``: interaction coordinates; ``"cartesian"`` or ``"shape-context"``.
+        Distance: ``"interaction"``, ``"cartesian"`` or ``"shape-context"``.
     graph : str
-        Whose edges interaction coordinates are taken along; see
+        Graph of the interaction coordinates; one of
         :data:`probmotion.interaction.geometry.graphs.GRAPHS`.
     shortest_edge : float
         ε of eq. 8, metres.
     seed : int
         Seed of the views.
-
-    Raises
-    ------
-    ValueError
-        If the annotations have no views, or a number is out of range.
     """
 
     annotations: Annotations
@@ -79,7 +75,7 @@ class AnnotatedPairs:
         check_positive("noise", self.noise)
         if self.annotations.views is None:
             raise ValueError(
-                "annotations has no views, expected them known or estimated: use "
+                "annotations must have views, got none: estimate them with "
                 "AnnotatedPairs.estimated(annotations, seed_pose)"
             )
         check_positive("view_bandwidth", self.view_bandwidth)
@@ -103,40 +99,40 @@ class AnnotatedPairs:
     def estimated(
         cls, annotations: Annotations, seed_pose: np.ndarray, **settings: object
     ) -> AnnotatedPairs:
-        """Return the likelihood of annotations whose views are estimated from their backbones.
+        """Return the likelihood with views estimated from the backbones.
 
         Parameters
         ----------
         annotations : Annotations
-            What was annotated; views that it has are not used. Those whose view cannot be estimated
-        are left out and counted in ``dropped``.
+            Annotations; existing views are ignored. Those without an estimate are left out and
+            counted in ``dropped``.
         seed_pose : ndarray, (J, 3)
-            A 3D pose-pair, whose torsos are fitted to the annotations, metres.
+            3D pose-pair with the torsos to fit, metres.
         **settings
             The other parameters of the class.
         """
         if np.shape(seed_pose) != (annotations.skeleton.n_joints, 3):
             raise ValueError(
-                f"seed_pose has shape {np.shape(seed_pose)}, expected "
-                f"({annotations.skeleton.n_joints}, 3): the annotations are of "
-                f"{len(annotations.skeleton.roots)} people"
+                f"seed_pose must have shape ({annotations.skeleton.n_joints}, 3), as the "
+                f"annotations of {len(annotations.skeleton.roots)} people, got "
+                f"{np.shape(seed_pose)}"
             )
         views = annotation_views(annotations, seed_pose)
         known = ~np.isnan(views).any(axis=-1)
         if not known.any():
             raise ValueError(
-                f"annotations shows too little of the torsos in all {len(views)} pictures to "
-                "estimate views, expected at least three torso joints of each person in one"
+                "annotations must show at least three torso joints of each person in one frame, "
+                f"got none in {len(views)} frames"
             )
         dropped = dict(annotations.dropped)
         if not known.all():
-            dropped["view not to be estimated"] = int((~known).sum())
+            dropped["view not estimated"] = int((~known).sum())
         kept = replace(annotations, views=views).subset(np.flatnonzero(known))
         return cls(replace(kept, dropped=dropped), **settings)  # type: ignore[arg-type]
 
     @property
     def skeleton(self) -> Skeleton:
-        """Of the annotated pairs."""
+        """Skeleton of the annotated pairs."""
         return self.annotations.skeleton
 
     @property
@@ -146,37 +142,30 @@ class AnnotatedPairs:
 
     @property
     def log_bound(self) -> float:
-        """The most that log L can be, 0: no pose need be compared that this cannot save."""
+        """Upper bound of log L, 0; lets truncated posteriors skip evaluations."""
         return 0.0
 
     def log_density(self, positions: Array) -> np.ndarray:
-        """Return log L up to a constant: ``(…, 1, J, 3) → (…)``; NumPy arrays only.
-
-        Raises
-        ------
-        ValueError
-            If the array is torch's or JAX's: graphs are not differentiable.
-        """
+        """Return log L up to a constant: ``(…, 1, J, 3) → (…)``; NumPy arrays only."""
         if not isinstance(positions, np.ndarray):
             raise ValueError(
-                f"positions is a {type(positions).__name__}, expected a NumPy array: the graphs "
-                "of interaction coordinates have no gradient"
+                f"positions must be a NumPy array, got {type(positions).__name__}: the likelihood "
+                "is not differentiable"
             )
         return self.evaluate(positions)[0]
 
     def evaluate(
         self, positions: np.ndarray, generators: Sequence[np.random.Generator] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return log L and the annotation that is closest in each view.
+        """Return log L and the closest annotation in each view.
 
         Parameters
         ----------
         positions : ndarray, (…, 1, J, 3)
             Pose-pairs, metres.
         generators : sequence of numpy.random.Generator, optional
-            One per pose-pair, each of which draws views of its own: exp(log L) is then an unbiased
-            estimate, as the pseudo-marginal method needs (Andrieu and Roberts 2009). By
-            default the fixed views.
+            One per pose-pair, to draw fresh views: exp(log L) is then an unbiased estimate, for
+            pseudo-marginal samplers (Andrieu and Roberts 2009). By default the fixed views.
 
         Returns
         -------
@@ -190,28 +179,26 @@ class AnnotatedPairs:
             projected = project_to_views(poses, self.views, self.skeleton)
             distances, closest = self.comparer.nearest(projected, self.near)
         else:
-            found = [
-                self._with_fresh_views(pose, rng)
-                for pose, rng in zip(poses, generators, strict=True)
-            ]
-            distances, closest = (np.concatenate(rows) for rows in zip(*found, strict=True))
+            pairs = zip(poses, generators, strict=True)
+            results = [self._with_fresh_views(pose, rng) for pose, rng in pairs]
+            distances, closest = (np.concatenate(rows) for rows in zip(*results, strict=True))
         log_terms = -0.5 * (distances / self.noise) ** 2
         log_density = logsumexp(log_terms, axis=-1) - math.log(self.n_views)
         return log_density.reshape(batch), closest.reshape(*batch, self.n_views)
 
     def degenerate_fraction(self, positions: np.ndarray) -> float:
-        """Return the share of pictures of poses (n, 1, J, 3) whose joints had to be joggled."""
+        """Return the fraction of projections of poses (n, 1, J, 3) with degenerate joints."""
         check_shape("positions", positions, ("n", 1, self.n_joints, 3))
-        pictures = project_to_views(positions[:, 0], self.views, self.skeleton)
-        return self.comparer.degenerate(pictures) / (pictures.shape[0] * pictures.shape[1])
+        projections = project_to_views(positions[:, 0], self.views, self.skeleton)
+        return self.comparer.degenerate(projections) / (len(projections) * self.n_views)
 
     def joint_speeds(self, closest: np.ndarray) -> np.ndarray:
-        """Return how fast joints move in the annotations that are closest (eq. 12's mean).
+        """Return the mean squared joint speeds of the closest annotations (eq. 12).
 
         Parameters
         ----------
         closest : ndarray of int, (…, m)
-            Annotations, one per view: D'. One that is closest in several views counts as often.
+            Annotations D', one per view, with repetitions.
 
         Returns
         -------
@@ -221,21 +208,20 @@ class AnnotatedPairs:
         return self._squared_differences[closest].mean(axis=-3)
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> AnnotatedPairs:
-        """Return the likelihood of as many annotations of one pose-pair (1, J, 3).
+        """Return the likelihood of simulated annotations of one pose-pair (1, J, 3).
 
-        Each is its projection in a view drawn from f(v), every keypoint moved by noise of
-        standard deviation σ_l: the density itself is not that of any such picture.
+        Each annotation is a projection to a view drawn from f(v), with Gaussian noise σ_l. This
+        is not the model of eq. 9, which has no generative form.
         """
         check_shape("positions", positions, (1, self.n_joints, 3))
         views = self.distribution.sample(rng, len(self.annotations))
-        seen = project_to_views(np.asarray(positions, dtype=np.float64), views, self.skeleton)[0]
-        seen = seen + self.noise * rng.standard_normal(seen.shape)
-        still = np.full((len(seen), 2, *seen.shape[1:]), np.nan)
+        exact = project_to_views(np.asarray(positions, dtype=np.float64), views, self.skeleton)[0]
+        keypoints = exact + self.noise * rng.standard_normal(exact.shape)
         drawn = replace(
             self.annotations,
-            keypoints=seen,
-            visible=np.ones(seen.shape[:-1], dtype=bool),
-            neighbours=still,
+            keypoints=keypoints,
+            visible=np.ones(keypoints.shape[:-1], dtype=bool),
+            neighbours=np.full((len(keypoints), 2, *keypoints.shape[1:]), np.nan),
             views=views,
         )
         return replace(self, annotations=drawn)
@@ -247,17 +233,15 @@ class AnnotatedPairs:
         projected = project_to_views(pose[None], views, self.skeleton)
         return self.comparer.nearest(projected, self.distribution.near(views, self.n_near))
 
-    @property
+    @cached_property
     def _squared_differences(self) -> np.ndarray:
         """Squared turn and stretch of every joint in every annotation, (n, J, 2)."""
-        if "squared" not in self.__dict__:
-            turn, stretch = self.annotations.local_differences()
-            object.__setattr__(self, "squared", np.stack([turn**2, stretch**2], axis=-1))
-        return self.__dict__["squared"]
+        turn, stretch = self.annotations.local_differences()
+        return np.stack([turn**2, stretch**2], axis=-1)
 
 
 def _check_metres(annotations: Annotations) -> None:
-    """Raise ``ValueError`` where the pictures' bones are of no one's length."""
+    """Raise ``ValueError`` if the bone lengths are not those of people in metres."""
     ends, starts = np.array(annotations.skeleton.bones).T
     bones = annotations.keypoints[:, ends] - annotations.keypoints[:, starts]
     seen = annotations.visible[:, ends] & annotations.visible[:, starts]
@@ -266,8 +250,8 @@ def _check_metres(annotations: Annotations) -> None:
     length = float(np.quantile(np.linalg.norm(bones[seen], axis=-1), 0.9))
     if not _BONES[0] < length < _BONES[1]:
         raise ValueError(
-            f"annotations has bones {length:.3g} long (0.9 quantile), expected {_BONES[0]:g} to "
-            f"{_BONES[1]:g} m: keypoints are metres"
+            f"annotations must have bones of {_BONES[0]:g} to {_BONES[1]:g} m (0.9 quantile), got "
+            f"{length:.3g}: keypoints must be in metres"
         )
 
 

@@ -1,7 +1,7 @@
-"""Completion of hidden joints from a posterior's draws (Yin et al. 2018, section 6, figure 12).
+"""Completion of occluded joints from posterior draws (Yin et al. 2018, section 6, figure 12).
 
-In space (as a depth sensor sees) or in the image plane, always in three steps: the nearest draws
-on the visible joints, their median, and its deformation onto the visible joints.
+In 3D or in the image: the nearest draws on the visible joints, their median, and its
+deformation onto the visible joints.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 
 __all__ = [
     "BANDWIDTH",
-    "Completed",
+    "CompletionResult",
     "blend",
     "complete",
     "complete_keypoints",
@@ -29,17 +29,17 @@ __all__ = [
 ]
 
 BANDWIDTH = 0.3
-"""How far a visible joint's displacement reaches, metres."""
+"""Default bandwidth of :func:`blend`, metres."""
 
 _FEWEST = 4
-"""Visible joints that are compared: fewer have no tetrahedron."""
+"""Minimum number of visible joints: a tetrahedron."""
 
 
-class Completed(NamedTuple):
+class CompletionResult(NamedTuple):
     """A completed pair.
 
-    ``positions`` (J, D), metres, the visible joints as they were given; ``median`` (J, D), what was
-    deformed onto them; ``indices`` (n,) of the draws whose median it is, the nearest first.
+    ``positions`` (J, D), metres, with the visible joints unchanged; ``median`` (J, D) before the
+    deformation; ``indices`` (n,) of the draws of the median, nearest first.
     """
 
     positions: np.ndarray
@@ -56,42 +56,39 @@ def complete(
     n_nearest: int = 100,
     bandwidth: float = BANDWIDTH,
     measure: str = "interaction",
-) -> Completed:
-    """Return a 3D pose-pair whose hidden joints are filled in from draws.
+) -> CompletionResult:
+    """Complete the occluded joints of a 3D pose-pair from draws.
 
-    1. The ``n_nearest`` draws: by the interaction coordinates of the visible joints alone, after
-       the best rigid alignment of these.
-    2. M: each joint's median, coordinate by coordinate, over these draws as aligned.
-    3. M is deformed onto the visible joints by :func:`blend`.
+    1. Select the ``n_nearest`` draws by the distance of the visible joints.
+    2. Align them rigidly to the visible joints and take the coordinate-wise median.
+    3. Deform the median onto the visible joints with :func:`blend`.
 
     Parameters
     ----------
     pose : ndarray, (J, 3)
-        Joints, metres; those that are hidden are never read.
+        Joints, metres; occluded joints are ignored.
     visible : ndarray of bool, (J,)
-        Which are seen; at least four.
+        Mask of visible joints; at least four.
     draws : ndarray, (S, J, 3)
-        The posterior's draws, metres; any place and heading.
+        Posterior draws, metres; any position and heading.
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     n_nearest : int
-        How many draws make the median.
+        Number of draws in the median.
     bandwidth : float
-        How far a visible joint's displacement reaches, metres.
+        Bandwidth of the deformation, metres.
     measure : str
         One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, a visible value is not finite, fewer than four joints are visible, or
-        there are fewer draws than ``n_nearest``.
     """
     pose, visible = _checked("pose", pose, visible, skeleton, 3)
     draws = np.asarray(draws, dtype=np.float64)
     check_shape("draws", draws, ("S", skeleton.n_joints, 3))
     check_finite("draws", draws)
-    _check_nearest(n_nearest, len(draws))
+    check_count("n_nearest", n_nearest)
+    if n_nearest > len(draws):
+        raise ValueError(
+            f"n_nearest must be at most {len(draws)}, the number of draws, got {n_nearest}"
+        )
     distances = pose_distances(pose[visible][None], draws[:, visible], measure)[0]
     indices = np.argsort(distances, kind="stable")[:n_nearest]
     return _deformed_median(draws[indices], indices, pose, visible, bandwidth)
@@ -106,43 +103,21 @@ def complete_keypoints(
     views: np.ndarray | None = None,
     n_nearest: int = 100,
     bandwidth: float = BANDWIDTH,
-) -> Completed:
-    """Return a 2D pair whose hidden joints are filled in from draws' projections.
+) -> CompletionResult:
+    """Complete the occluded joints of a 2D pair (J, 2) from projections of draws.
 
-    As :func:`complete`, in the image plane: the nearest draws are those of
-    :func:`probmotion.interaction.retrieval.retrieve`, each in the view in which it fits best.
-
-    Parameters
-    ----------
-    keypoints : ndarray, (J, 2)
-        2D pair, metres, x right, y up; hidden joints are never read.
-    visible : ndarray of bool, (J,)
-        Which are annotated; at least four.
-    draws : ndarray, (S, J, 3)
-        The posterior's draws, metres.
-    skeleton : Skeleton
-        The J joints.
-    views : ndarray, (V, 2), optional
-        Views to look from; see :func:`probmotion.interaction.retrieval.retrieve`.
-    n_nearest : int
-        How many different draws make the median.
-    bandwidth : float
-        How far a visible joint's displacement reaches, metres.
-
-    Raises
-    ------
-    ValueError
-        As :func:`complete` does.
+    As :func:`complete`, in the image (metres, x right, y up): the nearest draws are those of
+    :func:`probmotion.interaction.retrieval.retrieve`, each in its best one of ``views``.
     """
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
-    found = retrieve(keypoints, draws, skeleton, views=views, visible=visible, n=n_nearest)
-    pictures = np.stack(
+    nearest = retrieve(keypoints, draws, skeleton, views=views, visible=visible, n=n_nearest)
+    projections = np.stack(
         [
             project_to_views(draws[index][None], view[None], skeleton)[0, 0]
-            for index, view in zip(found.indices, found.views, strict=True)
+            for index, view in zip(nearest.indices, nearest.views, strict=True)
         ]
     )
-    return _deformed_median(pictures, found.indices, keypoints, visible, bandwidth)
+    return _deformed_median(projections, nearest.indices, keypoints, visible, bandwidth)
 
 
 def nearest_annotation_completion(
@@ -151,31 +126,20 @@ def nearest_annotation_completion(
     annotated: np.ndarray,
     skeleton: Skeleton,
     annotated_visible: np.ndarray | None = None,
-) -> Completed:
-    """Return a 2D pair whose hidden joints are one annotation's: what no model can do, too.
+) -> CompletionResult:
+    """Complete the occluded joints of a 2D pair (J, 2) from the nearest annotation, a baseline.
 
-    The annotation is the one that is nearest in the interaction coordinates of the visible joints,
-    of those that know every hidden joint. Its hidden joints are taken after the best rigid
-    alignment in the image.
+    The annotation is the nearest in interaction coordinates of the visible joints among those that
+    show every occluded joint, rigidly aligned in the image.
 
     Parameters
     ----------
-    keypoints : ndarray, (J, 2)
-        2D pair, metres; hidden joints are never read.
-    visible : ndarray of bool, (J,)
-        Which are annotated; at least four.
+    keypoints, visible, skeleton
+        As for :func:`complete_keypoints`.
     annotated : ndarray, (n, J, 2)
         Annotated 2D pairs, metres.
-    skeleton : Skeleton
-        The J joints.
     annotated_visible : ndarray of bool, (n, J), optional
-        Which joints they have; all by default.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, fewer than four joints are visible, or no annotation knows every
-        hidden joint.
+        Mask of their annotated joints; all by default.
     """
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
     annotated = np.asarray(annotated, dtype=np.float64)
@@ -186,29 +150,29 @@ def nearest_annotation_completion(
         check_shape("annotated_visible", known, annotated.shape[:2])
     candidates = np.flatnonzero(known[:, ~visible].all(axis=1))
     if len(candidates) == 0:
-        raise ValueError("annotated has no pair with every hidden joint, expected at least one")
+        raise ValueError("annotated must contain a pair with every occluded joint, got none")
     comparer = PairComparer(annotated[candidates][:, visible], known[candidates][:, visible])
     index = candidates[comparer.distances(keypoints[visible][None])[0].argmin()]
     median = np.asarray(align_rigidly(annotated[index], keypoints, visible & known[index]))
     positions = np.where(visible[:, None], keypoints, median)
-    return Completed(positions, median, np.array([index]))
+    return CompletionResult(positions, median, np.array([index]))
 
 
 def blend(
     median: np.ndarray, target: np.ndarray, visible: np.ndarray, bandwidth: float = BANDWIDTH
 ) -> np.ndarray:
-    """Return ``median`` deformed onto the visible joints of ``target``, which it then has exactly.
+    """Deform ``median`` onto the visible joints of ``target``, which are matched exactly.
 
-    A hidden joint h is displaced by a Gaussian-weighted mean of the visible joints' displacements,
+    The displacement of an occluded joint h is a Gaussian-weighted mean over the visible joints v,
 
         Δ_h = Σ_v w_hv (target_v − median_v) / Σ_v w_hv,   w_hv = exp(−‖median_h − median_v‖²/2b²).
 
     Parameters
     ----------
     median, target : ndarray, (J, D)
-        Metres; hidden joints of ``target`` are never read.
+        Metres; occluded joints of ``target`` are ignored.
     visible : ndarray of bool, (J,)
-        At least one.
+        Mask of visible joints; at least one.
     bandwidth : float
         b, metres.
     """
@@ -216,7 +180,7 @@ def blend(
     hidden = ~visible
     apart = median[hidden, None] - median[None, visible]
     exponents = -np.sum(apart**2, axis=-1) / (2 * bandwidth**2)
-    # Relative to the nearest, so that a joint far from every visible one still has weights.
+    # Subtract the maximum, so that the weights of distant joints do not underflow.
     weights = np.exp(exponents - exponents.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     blended = target.copy()
@@ -225,25 +189,20 @@ def blend(
 
 
 def occluded_joint_error(truth: np.ndarray, estimate: np.ndarray, hidden: np.ndarray) -> float:
-    """Return the mean distance of estimated from true hidden joints, metres.
+    """Return the mean error of the occluded joints, metres, without alignment.
 
     Parameters
     ----------
     truth, estimate : ndarray, (…, J, D)
-        Pairs in the same coordinates, D = 2 or 3, metres. Nothing is aligned.
+        Pairs, D = 2 or 3, metres.
     hidden : ndarray of bool, (…, J)
-        Which joints count.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ or no joint is hidden.
+        Mask of occluded joints; at least one.
     """
     check_shape("truth", truth, ("…", "J", "D"))
     check_shape("estimate", estimate, truth.shape)
     check_shape("hidden", hidden, truth.shape[:-1])
     if not np.any(hidden):
-        raise ValueError("hidden has no joint, expected at least one")
+        raise ValueError("hidden must mark at least one joint, got none")
     return float(np.linalg.norm(truth - estimate, axis=-1)[hidden].mean())
 
 
@@ -253,27 +212,21 @@ def _deformed_median(
     target: np.ndarray,
     visible: np.ndarray,
     bandwidth: float,
-) -> Completed:
+) -> CompletionResult:
     """Return the completion from the nearest draws, (n, J, D)."""
     aligned = align_rigidly(poses, np.broadcast_to(target, poses.shape), visible)
     median = np.median(aligned, axis=0)
-    return Completed(blend(median, target, visible, bandwidth), median, indices)
+    return CompletionResult(blend(median, target, visible, bandwidth), median, indices)
 
 
 def _checked(
     name: str, pose: np.ndarray, visible: np.ndarray, skeleton: Skeleton, axes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pose, hidden joints 0, and which joints are visible, or raise ``ValueError``."""
+    """Return the pose with occluded joints set to 0, and the mask of visible joints."""
     pose, visible = np.asarray(pose, dtype=np.float64), np.asarray(visible, dtype=bool)
     check_shape(name, pose, (skeleton.n_joints, axes))
     check_shape("visible", visible, (skeleton.n_joints,))
     if visible.sum() < _FEWEST:
-        raise ValueError(f"visible has {visible.sum()} joints, expected at least {_FEWEST}")
+        raise ValueError(f"visible must mark at least {_FEWEST} joints, got {visible.sum()}")
     check_finite(name, pose[visible])
     return np.where(visible[:, None], pose, 0.0), visible
-
-
-def _check_nearest(n_nearest: int, n_draws: int) -> None:
-    check_count("n_nearest", n_nearest)
-    if n_nearest > n_draws:
-        raise ValueError(f"n_nearest must be at most {n_draws}, the draws, got {n_nearest}")

@@ -1,7 +1,4 @@
-"""Indirect lifting: the drawn 3D pose-pair that a 2D pair looks like (Yin et al. 2018, section 6).
-
-No 2D pair is ever lifted by itself: it is looked up among the pictures of the posterior's draws.
-"""
+"""Indirect lifting: the posterior draw closest to a 2D pair (Yin et al. 2018, section 6)."""
 
 from __future__ import annotations
 
@@ -14,17 +11,17 @@ from probmotion.interaction.geometry.nearest import PairComparer
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["Retrieved", "retrieve", "view_grid", "views_around"]
+__all__ = ["RetrievalResult", "retrieve", "view_grid", "views_around"]
 
-_PICTURES = 4096
-"""Pictures compared at once; does not change what is found."""
+_BLOCK = 4096
+"""Projections compared at once; has no effect on the result."""
 
 
-class Retrieved(NamedTuple):
-    """The n draws that look most like each 2D pair, the nearest first.
+class RetrievalResult(NamedTuple):
+    """The n closest draws of each 2D pair, nearest first.
 
-    ``indices`` (…, n) into the draws, ``views`` (…, n, 2) in which each looks most like it,
-    radians, and ``distances`` (…, n) there, metres.
+    ``indices`` (…, n) of the draws; ``views`` (…, n, 2), the best view of each, radians;
+    ``distances`` (…, n), metres (dimensionless for shape contexts).
     """
 
     indices: np.ndarray
@@ -33,10 +30,10 @@ class Retrieved(NamedTuple):
 
 
 def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
-    """Return views (φ, θ) all around a pair, (V, 2), radians.
+    """Return a grid of views (φ, θ), (V, 2), radians.
 
-    φ is even over the circle, from −π on; θ is even between 50° and 100°, from well above to a
-    little below the pair's own horizon, where videos are taken from, or 90° alone.
+    φ is uniform on the circle; θ is uniform from 50° to 100°, the usual range of videos, or 90° if
+    ``n_heights`` is 1.
     """
     check_count("n_azimuths", n_azimuths)
     check_count("n_heights", n_heights)
@@ -47,7 +44,7 @@ def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
 
 
 def views_around(view: np.ndarray) -> np.ndarray:
-    """Return 15 views around an estimated one, (15, 2), radians: up to 30° in φ and 15° in θ."""
+    """Return 15 views within 30° in φ and 15° in θ of a view (2,), radians: (15, 2)."""
     check_shape("view", view, (2,))
     check_finite("view", np.asarray(view))
     turns, tilts = np.radians((-30.0, -15.0, 0.0, 15.0, 30.0)), np.radians((-15.0, 0.0, 15.0))
@@ -64,12 +61,10 @@ def retrieve(
     visible: np.ndarray | None = None,
     n: int = 1,
     measure: str = "interaction",
-) -> Retrieved:
-    """Return the draws whose projections are nearest to 2D pairs, each in its best view.
+) -> RetrievalResult:
+    """Return the n draws with the smallest distance to each 2D pair over all views.
 
-    A draw is as near as its nearest projection over ``views``, rigidly aligned in the image. A
-    pose that a chain repeats counts once, by its first index. All 2D pairs are looked up in one
-    pass over the draws' pictures.
+    Projections are rigidly aligned in the image. Repeated draws count once, by their first index.
 
     Parameters
     ----------
@@ -78,26 +73,16 @@ def retrieve(
     draws : ndarray, (S, J, 3)
         3D pose-pairs, metres.
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     views : ndarray, (V, 2), optional
-        Views (φ, θ) in the pairs' own frame (eqs. 3-5), radians: :func:`view_grid` by default.
-        Where the view of a 2D pair is estimated, hand in views around the estimate.
+        Views (φ, θ) in the local frame (eqs. 3-5), radians: :func:`view_grid` by default, or
+        :func:`views_around` an estimate.
     visible : ndarray of bool, (…, J), optional
-        Joints that are annotated; all by default.
+        Mask of annotated joints; all by default.
     n : int
-        How many draws.
+        Number of distinct draws.
     measure : str
         As in :class:`probmotion.interaction.geometry.nearest.PairComparer`.
-
-    Returns
-    -------
-    retrieved : Retrieved
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, a value is not finite, there is no view, or there are fewer than n
-        different draws.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     check_shape("keypoints", keypoints, ("…", skeleton.n_joints, 2))
@@ -108,13 +93,13 @@ def retrieve(
     check_shape("views", views, ("V", 2))
     check_count("n", n)
     if len(views) == 0:
-        raise ValueError("views must contain at least one, got none")
+        raise ValueError("views must contain at least one view, got none")
     batch = keypoints.shape[:-2]
     seen = np.ones(keypoints.shape[:-1], dtype=bool) if visible is None else np.asarray(visible)
     check_shape("visible", seen, keypoints.shape[:-1])
     first = np.sort(np.unique(draws, axis=0, return_index=True)[1])
     if n > len(first):
-        raise ValueError(f"n must be at most {len(first)}, the different draws, got {n}")
+        raise ValueError(f"n must be at most {len(first)}, the number of distinct draws, got {n}")
     comparer = PairComparer(
         keypoints.reshape(-1, *keypoints.shape[-2:]),
         seen.reshape(-1, skeleton.n_joints),
@@ -123,13 +108,11 @@ def retrieve(
     distances, best = _nearest_views(comparer, draws[first], views, skeleton)
     order = np.argsort(distances, axis=0, kind="stable")[:n].T
     pairs = np.arange(len(order))[:, None]
-    unlike = np.count_nonzero(~np.isfinite(distances[order, pairs]))
-    if unlike:
+    if not np.isfinite(distances[order, pairs]).all():
         raise ValueError(
-            f"visible shares no edge with {unlike} of the draws that were wanted, expected more "
-            "visible joints"
+            f"visible must share an edge with at least {n} draws, got too few visible joints"
         )
-    return Retrieved(
+    return RetrievalResult(
         first[order].reshape(*batch, n),
         views[best[order, pairs]].reshape(*batch, n, 2),
         distances[order, pairs].reshape(*batch, n),
@@ -139,13 +122,13 @@ def retrieve(
 def _nearest_views(
     comparer: PairComparer, draws: np.ndarray, views: np.ndarray, skeleton: Skeleton
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how near each draw comes to each 2D pair and in which view, (S, Q) each."""
+    """Return the distance and best view of each draw and 2D pair, (S, Q) each."""
     distances, best = [], []
-    step = max(1, _PICTURES // len(views))
+    step = max(1, _BLOCK // len(views))
     for start in range(0, len(draws), step):
-        pictures = project_to_views(draws[start : start + step], views, skeleton)
-        found = comparer.distances(pictures.reshape(-1, *pictures.shape[-2:]))
-        found = found.reshape(len(pictures), len(views), -1)
-        best.append(found.argmin(axis=1))
-        distances.append(found.min(axis=1))
+        projections = project_to_views(draws[start : start + step], views, skeleton)
+        block = comparer.distances(projections.reshape(-1, *projections.shape[-2:]))
+        block = block.reshape(len(projections), len(views), -1)
+        best.append(block.argmin(axis=1))
+        distances.append(block.min(axis=1))
     return np.concatenate(distances), np.concatenate(best)

@@ -1,8 +1,8 @@
-"""Reading motions from AMC files, each with the ASF file of its skeleton.
+"""Reader of AMC motion files, with the ASF files of their skeletons.
 
-A bone with the axes C (:mod:`probmotion.io.asf`) and the turns M of a frame is turned by
-C M C⁻¹ against its parent; of the turns that a file lists, the first is done first. The position
-of a bone's end is that of its parent's end plus the turned bone.
+A bone with axes C (:mod:`probmotion.io.asf`) and channel rotation M is rotated by C M C⁻¹ relative
+to its parent; the first channel listed is applied first. The end of a bone is the end of its
+parent plus the rotated bone.
 """
 
 from __future__ import annotations
@@ -34,24 +34,25 @@ def read_amc(
     path : str or Path
         The file.
     skeleton_path : str or Path, optional
-        The ASF file of its skeleton. By default the one beside it of the same name, or of the
-        subject's: ``02.asf`` for ``02_01.amc``.
+        ASF file of the skeleton. Default: the file beside it with the same name or that of the
+        subject (``02.asf`` for ``02_01.amc``).
     fps : float
-        Frames per second, which few files hold: 120 in most of the CMU database, 60 in some of it.
-        A file that declares another rate is refused.
+        Frames per second, rarely stored in the file: 120 in most of the CMU database, 60 in some of
+        it. A different rate declared in the file is an error.
 
     Returns
     -------
     motion : Motion
-        In metres. It has no rotations: each bone turns on its own, which rotations of the joints
-        could not express where several bones begin.
+        Motion in metres, without rotations: sibling bones rotate independently, which joint
+        rotations
+        cannot express.
 
     Raises
     ------
     MotionFileError
-        If a file is truncated, damaged or none of its format; the message names the line.
+        If a file is truncated, damaged or of another format.
     FileNotFoundError
-        If there is no such file, or none of its skeleton.
+        If the file or its skeleton does not exist.
     ValueError
         If ``fps`` is not above 0.
     """
@@ -65,36 +66,36 @@ def read_amc(
 
 
 def _beside(path: Path) -> Path:
-    """Return the ASF file that belongs to an AMC file by its name."""
+    """Return the ASF file that belongs to an AMC file by name."""
     stems = dict.fromkeys((path.stem, path.stem.rpartition("_")[0] or path.stem))
     candidates = [path.with_name(f"{stem}.asf") for stem in stems]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise FileNotFoundError(
-        f"there is no {' or '.join(map(str, candidates))} with the skeleton of {path}, expected "
-        "one of them, or skeleton_path="
+        f"there is no {' or '.join(map(str, candidates))} with the skeleton of {path}; pass "
+        "skeleton_path"
     )
 
 
 def _check_declarations(text: AcclaimText, fps: float) -> None:
-    """Refuse a file that is no AMC, or declares another unit or rate before its first frame."""
-    declared = {}
+    """Refuse files of other formats, units or rates, from the lines before the first frame."""
+    declared = set()
     for number, words in text.lines:
         if not words[0].startswith(":"):
             break
-        declared[words[0].upper()] = words[1:]
+        declared.add(words[0].upper())
         if words[0].upper() == _RATE and text.numbers(number, _RATE, words[1:], 1) != [fps]:
-            text.fail(number, f"{_RATE} is {words[1]}, expected {fps:g} as fps")
+            text.fail(number, f"{_RATE}: expected fps={fps:g}, got {words[1]}")
     else:
-        text.fail(text.length, "the file ends before its first frame, expected one at least")
+        text.fail(text.length, "expected at least one frame, got the end of the file")
     for wanted in _DECLARATIONS:
         if wanted not in declared:
-            text.fail(number, f"{shortened(words[0])} came, expected {wanted} before it")
+            text.fail(number, f"expected {wanted} first, got {shortened(words[0])}")
 
 
 def _values(text: AcclaimText, body: AcclaimSkeleton) -> np.ndarray:
-    """Return the values of all frames, (L, C): a column per channel, joints in order."""
+    """Return the channel values of all frames, (L, C), joints in order."""
     columns: dict[str, slice] = {}
     width = 0
     for name, channels in zip(body.skeleton.joint_names, body.channels, strict=True):
@@ -111,12 +112,12 @@ def _values(text: AcclaimText, body: AcclaimSkeleton) -> np.ndarray:
         if len(words) == 1 and name.isascii() and name.isdigit() and len(name) < 10:
             _check_whole(text, number, awaited, frame)
             if rows and int(name) != frame + 1:
-                text.fail(number, f"frame {name} came after {frame}, expected {frame + 1}")
+                text.fail(number, f"expected frame {frame + 1}, got {name}")
             frame, awaited = int(name), set(columns)
             rows.append([0.0] * width)
         elif not rows or name not in awaited:
-            wanted = "a bone that moves, once in a frame" if rows else "the number of a frame"
-            text.fail(number, f"{shortened(name)} came, expected {wanted}")
+            wanted = "each moving bone once in a frame" if rows else "the number of a frame"
+            text.fail(number, f"expected {wanted}, got {shortened(name)}")
         else:
             place = columns[name]
             count = place.stop - place.start
@@ -129,8 +130,7 @@ def _values(text: AcclaimText, body: AcclaimSkeleton) -> np.ndarray:
 def _check_whole(text: AcclaimText, number: int, awaited: set[str], frame: int) -> None:
     if awaited:
         text.fail(
-            number,
-            f"frame {frame} ends without {shortened(min(awaited))}, expected all bones that move",
+            number, f"expected all moving bones in frame {frame}, got no {shortened(min(awaited))}"
         )
 
 

@@ -1,8 +1,8 @@
-"""Reading skeletons from ASF files: bones, their own axes and what turns about them.
+"""Reader of ASF skeleton files.
 
-A bone reaches from its parent's end in a direction of the world, in the rest pose, and moves about
-axes of its own, which the rest pose turns by C against the world. A joint is the END of its bone
-and bears its name; ``root`` is the origin of all. Files are Y up, right-handed.
+A bone extends from its parent's end along a world direction in the rest pose and rotates about its
+own axes, which C rotates from the world's. A joint is the END of the bone of its name; ``root`` is
+the origin. Files are Y up, right-handed.
 
 Source: M. Meredith and S. Maddock, "Motion capture file formats explained" (2001).
 """
@@ -25,24 +25,24 @@ _INCH = 0.0254
 _ROOT = "root"
 _TURNS = ("RX", "RY", "RZ")
 _SHIFTS = ("TX", "TY", "TZ")
-_LENGTHS = (1e-3, 1e3)  # of the unit; outside, the file is damaged
+_LENGTHS = (1e-3, 1e3)  # plausible values of the unit
 _ENTRIES = ("id", "name", "direction", "length", "axis", "dof", "limits", "bodymass", "cofmass")
 
 
 @dataclass(frozen=True, eq=False)
 class AcclaimSkeleton:
-    """What an ASF file says of the J joints, ``root`` first.
+    """Content of an ASF file with J joints, ``root`` first.
 
     Attributes
     ----------
     skeleton : Skeleton
-        In the order in which the hierarchy names them.
+        Joints in the order of the hierarchy.
     offsets : ndarray, (J, 3)
-        From the parent's joint to this one in the rest pose, along the axes of the world, metres.
+        Offset from the parent in the rest pose, world axes, metres.
     axes : ndarray, (J, 3, 3)
-        C of each bone: what it turns about, against the axes of the world.
+        C, rotation of each bone's axes relative to the world.
     channels : tuple of tuple of str
-        What moves each joint in the file's order, such as ``("RX", "RZ")``; the root's may have
+        Channels of each joint in the file's order, such as ``("RX", "RZ")``; the root may have
         ``"TX"``, ``"TY"`` and ``"TZ"``.
     unit : float
         Metres per unit of length.
@@ -57,7 +57,7 @@ class AcclaimSkeleton:
 
 @dataclass(frozen=True)
 class _Bone:
-    """An entry of ``:bonedata``; lengths in the file's unit."""
+    """Entry of ``:bonedata``; lengths in the file's unit."""
 
     line: int
     offset: np.ndarray
@@ -71,17 +71,16 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
     Parameters
     ----------
     path : str or Path
-        The file. Its lengths are multiples of an inch divided by the ``length`` of its
-        ``:units``, and its angles degrees; keywords are read in any case.
+        The file. Its unit of length is an inch divided by the ``length`` of ``:units``; angles are
+        in
+        degrees; keywords are case-insensitive.
 
     Raises
     ------
     MotionFileError
-        If the file is truncated, damaged or none of this format, or has what is not read: angles
-        in radians, a root that rests elsewhere than in the origin, axes in another order than XYZ,
-        bones that grow. The message names the line.
-    FileNotFoundError
-        If there is no such file.
+        If the file is truncated, damaged or of another format, or uses unsupported features:
+        radians,
+        a root away from the origin, another axis order than XYZ, or translating bones.
     """
     text = AcclaimText.of(Path(path))
     sections = _sections(text)
@@ -94,7 +93,7 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
         skeleton = Skeleton(
             names, [names.index(parents[name]) if name != _ROOT else -1 for name in names]
         )
-    except ValueError as error:  # a cycle: every bone has a parent, and one only
+    except ValueError as error:  # a cycle
         raise MotionFileError(f"{path}: {error}") from error
     return AcclaimSkeleton(
         skeleton,
@@ -110,18 +109,18 @@ def _sections(text: AcclaimText) -> dict[str, list[Line]]:
     sections: dict[str, list[Line]] = {}
     number, words = text.lines[0]
     if not words[0].startswith(":"):
-        text.fail(number, f"{shortened(words[0])} came, expected :version, :name or :units")
+        text.fail(number, f"expected :version, :name or :units, got {shortened(words[0])}")
     for number, words in text.lines:
         if words[0].startswith(":"):
             keyword = words[0].lower()
             if keyword in sections:
-                text.fail(number, f"{shortened(words[0])} came again, expected it once")
+                text.fail(number, f"expected {shortened(words[0])} once, got it again")
             sections[keyword] = []
         else:
             sections[keyword].append((number, words))
     for keyword in (":units", ":root", ":bonedata", ":hierarchy"):
         if keyword not in sections:
-            text.fail(text.length, f"the file ends without {keyword}, expected all of a skeleton")
+            text.fail(text.length, f"expected {keyword}, got the end of the file")
     return sections
 
 
@@ -130,7 +129,7 @@ def _unit(text: AcclaimText, lines: list[Line]) -> float:
     entries = {words[0].lower(): (number, words[1:]) for number, words in lines}
     for name in ("length", "angle"):
         if name not in entries:
-            text.fail(lines[-1][0] if lines else text.length, f":units has no {name}, expected one")
+            text.fail(lines[-1][0] if lines else text.length, f"expected {name} in :units")
     number, words = entries["angle"]
     if [word.lower() for word in words] not in (["deg"], ["degrees"]):
         text.fail(number, f"angle must be deg, got {shortened(' '.join(words))}")
@@ -138,17 +137,17 @@ def _unit(text: AcclaimText, lines: list[Line]) -> float:
     (length,) = text.numbers(number, "length", words, 1)
     least, most = _LENGTHS
     if not least <= length <= most:
-        text.fail(number, f"length is {length:g}, expected between {least:g} and {most:g}")
+        text.fail(number, f"length must be between {least:g} and {most:g}, got {length:g}")
     return _INCH / length
 
 
 def _root(text: AcclaimText, lines: list[Line]) -> _Bone:
-    """Return the root, a bone without length at the origin."""
+    """Return the root, a bone of length 0 at the origin."""
     entries = {words[0].lower(): (number, words[1:]) for number, words in lines}
     if "order" not in entries:
-        text.fail(lines[-1][0] if lines else text.length, ":root has no order, expected one")
+        text.fail(lines[-1][0] if lines else text.length, "expected order in :root")
     for name in ("position", "orientation"):
-        # Readers differ in whether a motion counts from there.
+        # Readers disagree whether motions are relative to these.
         number, words = entries.get(name, (0, ["0"] * 3))
         if any(text.numbers(number, name, words, 3)):
             text.fail(number, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
@@ -158,7 +157,7 @@ def _root(text: AcclaimText, lines: list[Line]) -> _Bone:
 
 
 def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> None:
-    """Put the bones of ``:bonedata`` beside the root, by name."""
+    """Add the bones of ``:bonedata`` by name."""
     begun: int | None = None
     entries: dict[str, Line] = {}
     for number, words in lines:
@@ -168,75 +167,72 @@ def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) ->
         elif keyword == "end" and begun is not None:
             for needed in ("name", "direction", "length", "axis"):
                 if needed not in entries:
-                    text.fail(number, f"the bone of line {begun} has no {needed}, expected one")
+                    text.fail(number, f"expected {needed} in the bone of line {begun}")
             name = " ".join(entries["name"][1])
             if not name or name in bones:
-                text.fail(entries["name"][0], f"name must be a new one, got {shortened(name)}")
+                text.fail(entries["name"][0], f"name must be unique, got {shortened(name)}")
             bones[name] = _bone(text, begun, entries)
             begun = None
         elif begun is None or not (keyword in _ENTRIES or keyword.startswith("(")):
             wanted = "begin" if begun is None else f"{', '.join(_ENTRIES)} or end"
-            text.fail(number, f"{shortened(words[0])} came, expected {wanted}")
+            text.fail(number, f"expected {wanted}, got {shortened(words[0])}")
         elif keyword in entries:
-            text.fail(number, f"{keyword} came again in the bone of line {begun}, expected it once")
-        elif not keyword.startswith("("):  # those are further limits
+            text.fail(number, f"expected {keyword} once in the bone of line {begun}")
+        elif not keyword.startswith("("):  # further limits
             entries[keyword] = (number, words[1:])
     if begun is not None:
-        text.fail(lines[-1][0], f":bonedata ends inside the bone of line {begun}, expected its end")
+        text.fail(lines[-1][0], f"expected end of the bone of line {begun}")
 
 
 def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
-    """Return the bone that begins at a line."""
+    """Return the bone that begins at line ``begun``."""
     number, words = entries["direction"]
     direction = np.array(text.numbers(number, "direction", words, 3))
     (length,) = text.numbers(entries["length"][0], "length", entries["length"][1], 1)
     if length < 0:
         text.fail(entries["length"][0], f"length must be 0 or more, got {length:g}")
     if length > 0 and abs(np.linalg.norm(direction) - 1) > 1e-3:
-        text.fail(number, f"direction must be a vector of length 1, got {' '.join(words)[:60]}")
+        text.fail(number, f"direction must be a unit vector, got {' '.join(words)[:60]}")
     number, words = entries["axis"]
     if [word.upper() for word in words[3:]] != ["XYZ"]:
         text.fail(number, f"axis must be three angles and XYZ, got {shortened(' '.join(words))}")
     angles = np.deg2rad(text.numbers(number, "axis", words[:3], 3))
     number, words = entries.get("dof", (begun, []))
     channels = _channels(text, number, words, _TURNS)
-    # About X first, and about Z last.
+    # Rotation about X first, about Z last.
     return _Bone(begun, direction * length, euler_to_matrix(angles[::-1], "ZYX"), channels)
 
 
 def _channels(
     text: AcclaimText, number: int, words: list[str], known: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the channels that a line names."""
     channels = tuple(word.upper() for word in words)
     for place, channel in enumerate(channels):
         if channel not in known or channel in channels[:place]:
             text.fail(
                 number,
-                f"channel {shortened(words[place])} came, expected each of {', '.join(known)} once "
-                "at most",
+                f"expected channels {', '.join(known)}, each at most once, got "
+                f"{shortened(words[place])}",
             )
     return channels
 
 
 def _parents(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> dict[str, str]:
-    """Return the parent of each joint by name, the root first and its own."""
+    """Return the parent's name of each joint, the root first with itself as parent."""
     for place, wanted in ((0, "begin"), (-1, "end")):
         if not lines or [word.lower() for word in lines[place][1]] != [wanted]:
             number = lines[place][0] if lines else text.length
-            text.fail(number, f"{wanted} did not come, expected it around the hierarchy")
+            text.fail(number, f"expected {wanted} around the hierarchy")
     parents = {_ROOT: _ROOT}
     for number, words in lines[1:-1]:
         for name in words:
             if name not in bones:
-                text.fail(number, f"{shortened(name)} came, expected a bone of :bonedata")
+                text.fail(number, f"expected a bone of :bonedata, got {shortened(name)}")
         for name in words[1:]:
             if name in parents:
-                text.fail(number, f"{shortened(name)} has a second parent, expected one")
+                text.fail(number, f"expected one parent of {shortened(name)}, got a second")
             parents[name] = words[0]
     for name, bone in bones.items():
         if name not in parents:
-            text.fail(
-                bone.line, f"bone {shortened(name)} has no parent in the hierarchy, expected one"
-            )
+            text.fail(bone.line, f"expected a parent of {shortened(name)} in the hierarchy")
     return parents

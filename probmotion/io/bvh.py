@@ -1,9 +1,9 @@
-"""Reading motions from BVH files.
+"""Reader of BVH motion files.
 
-A joint's world transform is its parent's, times the translation, times the rotations of its
-channels in the order in which they are listed: the first is the outermost. A position channel
-replaces the offset along its axis, on roots and on other joints, as in Blender's importer.
-BVH has no unit and no axes; files are Y up, right-handed, and the unit is inferred.
+The world transform of a joint is its parent's, times the translation, times the rotations of its
+channels in the order listed (the first is the outermost). A position channel replaces the offset
+along its axis, on roots and on other joints, as in Blender's importer. BVH specifies no unit or
+axes; files are Y up, right-handed, and the unit is inferred.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _UNITS = {
     "centimetres": 0.01,
     "millimetres": 0.001,
 }
-# From a foot to the farther hand of an adult, along the bones.
+# Length in metres along the bones from a foot to the opposite hand of an adult.
 _REACH = 2.4
 
 
@@ -40,28 +40,27 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     path : str or Path
         The file.
     scale : float, optional
-        Metres per unit of the file. By default the unit among metres, centimetres, millimetres
-        and the CMU database's 1/0.45 inch by which the longest chain of bones comes nearest to
-        2.4 m, an adult's from foot to hand. A unit other than metres is announced by a
-        :class:`MotionFileWarning`.
+        Metres per unit of the file. Default: the unit among metres, centimetres, millimetres and
+        the
+        CMU database's 1/0.45 inch that brings the longest chain of bones closest to 2.4 m, foot to
+        hand
+        of an adult. Units other than metres issue a :class:`MotionFileWarning`.
     end_sites : bool
-        Whether End Sites become joints, called after their parent with ``_end``. They have no
-        channel and only give the last bones a length, so that they are left out by default: the
-        CMU database's 31 joints come back as 31.
+        Whether to include End Sites as joints, named after their parent with ``_end``.
 
     Returns
     -------
     motion : Motion
-        In metres, joints in the file's order, at the file's rate; a frame time that is printed
-        with a few digits stands for the integer rate that it rounds. Rotations are kept unless a
-        joint that is no root moves against its parent, which rotations could not express.
+        Motion in metres at the file's rate, joints in the file's order. A rounded frame time is
+        read
+        as the integer rate. Rotations are dropped if a joint other than a root translates relative
+        to
+        its parent.
 
     Raises
     ------
     MotionFileError
-        If the file is truncated, mis-ordered or damaged; the message names the line.
-    FileNotFoundError
-        If there is no such file.
+        If the file is truncated, out of order or damaged.
     ValueError
         If ``scale`` is not above 0.
     """
@@ -75,7 +74,7 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     positions = _world_positions(rotations, translations, skeleton)
     if scale is None:
         scale = _inferred_scale(positions, skeleton, path)
-    # Rotations and constant offsets describe the motion only if no bone has a channel that moves.
+    # Rotations and constant offsets describe the motion only if no bone translates.
     bones = [joint for joint, _ in skeleton.bones]
     rigid = not np.ptp(translations[:, bones], axis=0).any()
     rest_offsets = translations[0].copy()
@@ -92,7 +91,7 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
 
 
 def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:
-    """Return the skeleton of ``joints``, whose parents are indices into ``every``."""
+    """Return the skeleton of ``joints``, with parents as indices into ``every``."""
     place = {id(joint): index for index, joint in enumerate(joints)}
     parents = [-1 if joint.parent < 0 else place[id(every[joint.parent])] for joint in joints]
     taken = {joint.name for joint in joints if not joint.end_site}
@@ -108,7 +107,7 @@ def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:
 
 
 def _local_transforms(joints: list[BVHJoint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotations (L, J, 3, 3) and translations (L, J, 3) against the parents."""
+    """Return rotations (L, J, 3, 3) and translations (L, J, 3) relative to the parents."""
     rotations = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
     translations = np.tile(np.array([joint.offset for joint in joints]), (len(values), 1, 1))
     column = 0
@@ -122,7 +121,7 @@ def _local_transforms(joints: list[BVHJoint], values: np.ndarray) -> tuple[np.nd
                 angles[:, len(order)] = np.deg2rad(values[:, column])
                 order += axis
             column += 1
-        if order:  # axes without a channel turn by 0, wherever they stand
+        if order:  # axes without a channel have angle 0
             order += "".join(axis for axis in "XYZ" if axis not in order)
             rotations[:, index] = euler_to_matrix(angles, order)
     return rotations, translations
@@ -131,7 +130,7 @@ def _local_transforms(joints: list[BVHJoint], values: np.ndarray) -> tuple[np.nd
 def _world_positions(
     rotations: np.ndarray, translations: np.ndarray, skeleton: Skeleton
 ) -> np.ndarray:
-    """Return positions (L, J, 3); unlike ``forward_kinematics``, bones may change with time."""
+    """Return positions (L, J, 3); unlike ``forward_kinematics``, offsets vary over time."""
     world = np.array(rotations)
     positions = np.array(translations)
     for joint in skeleton.topological_order:
@@ -158,8 +157,8 @@ def _inferred_scale(positions: np.ndarray, skeleton: Skeleton, path: Path) -> fl
     unit = min(_UNITS, key=lambda name: abs(np.log(longest * _UNITS[name] / _REACH)))
     if _UNITS[unit] != 1:
         warnings.warn(
-            f"{path}: its longest chain of bones measures {longest:.3g}, so its unit was taken "
-            f"for {unit} ({_UNITS[unit]:.4g} m); read_bvh(path, scale=…) takes another",
+            f"{path}: assuming {unit} ({_UNITS[unit]:.4g} m per unit) from the longest chain of "
+            f"bones, {longest:.3g} units; set it with read_bvh(path, scale=…)",
             MotionFileWarning,
             stacklevel=4,
         )

@@ -1,4 +1,4 @@
-"""The grammar of BVH files: text → joints and channel values, every error with its line.
+"""Parser of the BVH grammar: joints and channel values.
 
 Source: M. Meredith and S. Maddock, "Motion capture file formats explained" (2001), section 4.
 """
@@ -13,36 +13,24 @@ from typing import NoReturn
 
 import numpy as np
 
-from probmotion.io.errors import MotionFileError, shortened
+from probmotion.io.errors import MotionFileError, decoded_lines, is_number, shortened
 
 __all__ = ["FRAME_TIMES", "BVHContent", "BVHJoint", "parse_bvh"]
 
 FRAME_TIMES = (1e-4, 1.0)
-"""Seconds; a frame time outside is an error, most often a rate or milliseconds instead."""
+"""Valid frame times in seconds; others are usually rates or milliseconds."""
 
-_LARGEST = 1e9
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _CHANNEL = re.compile(r"([XYZ])(POSITION|ROTATION)")
 
 
 @dataclass
 class BVHJoint:
-    """One ``ROOT``, ``JOINT`` or ``End Site`` block.
+    """``ROOT``, ``JOINT`` or ``End Site`` block.
 
-    Attributes
-    ----------
-    name : str
-        The joint's name; an End Site is called after its parent: ``Head_end``.
-    parent : int
-        Index of the parent, -1 for a root; a parent comes before its children.
-    line : int
-        Where the block begins.
-    end_site : bool
-        Whether it is an End Site, which has no channel.
-    offset : tuple of float
-        Offset from the parent at rest, file units.
-    channels : tuple of (str, str)
-        Axis and kind of each channel in the file's order, such as ``("X", "ROTATION")``.
+    The parent is an index, -1 for a root; parents precede their children. An End Site is named
+    after
+    its parent, such as ``Head_end``, and has no channels. Others have the axis and kind of each
+    channel in the file's order, such as ``("X", "ROTATION")``.
     """
 
     name: str
@@ -55,17 +43,7 @@ class BVHJoint:
 
 @dataclass
 class BVHContent:
-    """What a BVH file says.
-
-    Attributes
-    ----------
-    joints : list of BVHJoint
-        In the order of the file.
-    values : ndarray, (L, C)
-        One column per channel, joints in order.
-    fps : float
-        Frames per second; see :func:`_frame_rate`.
-    """
+    """Content of a BVH file: joints in file order, channel values (L, C) and frames per second."""
 
     joints: list[BVHJoint] = field(default_factory=list)
     values: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
@@ -73,23 +51,15 @@ class BVHContent:
 
 
 def parse_bvh(content: bytes, file: str) -> BVHContent:
-    """Parse a BVH file.
+    r"""Parse a BVH file in UTF-8 or else Latin-1; ``file`` is its name in errors.
 
-    Line ends may be ``\\n``, ``\\r\\n``, ``\\r`` or a mixture, words are separated by any blanks,
-    blank lines are skipped and keywords are read in any case. A name is all words up to the
-    line's end or brace.
-
-    Parameters
-    ----------
-    content : bytes
-        The file; UTF-8, or Latin-1 where it is not valid UTF-8.
-    file : str
-        What to call the file in errors.
+    Lines may end in ``\\n``, ``\\r\\n`` or ``\\r``, blank lines are skipped and keywords are
+    case-insensitive. A name extends to the end of the line or a brace.
 
     Raises
     ------
     MotionFileError
-        If the file is truncated, mis-ordered or damaged; the message names the line.
+        If the file is truncated, out of order or damaged.
     """
     return _Parser(content, file).parse()
 
@@ -97,56 +67,42 @@ def parse_bvh(content: bytes, file: str) -> BVHContent:
 class _Parser:
     def __init__(self, content: bytes, file: str) -> None:
         self.file = file
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("latin-1")
-        self.lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        self.lines = decoded_lines(content)
         self.content = BVHContent()
 
     def fail(self, line: int, problem: str) -> NoReturn:
         raise MotionFileError(f"{self.file}, line {line}: {problem}")
 
     def parse(self) -> BVHContent:
-        motion_line = next(
-            (
-                number
-                for number, line in enumerate(self.lines, start=1)
-                if line.strip().upper() == "MOTION"
-            ),
-            len(self.lines) + 1,
-        )
+        keywords = [line.strip().upper() for line in self.lines] + ["MOTION"]
+        motion_line = keywords.index("MOTION") + 1
         self.parse_hierarchy(motion_line)
         if motion_line > len(self.lines):
-            self.fail(len(self.lines), "the file ends, expected MOTION after the hierarchy")
+            self.fail(len(self.lines), "expected MOTION after the hierarchy")
         self.parse_motion(motion_line)
         return self.content
 
-    # --- HIERARCHY -------------------------------------------------------------------------
-
     def parse_hierarchy(self, motion_line: int) -> None:
-        """Parse what stands before the line of ``MOTION``."""
+        """Parse the lines before ``MOTION``."""
         statements = [
             (number, part.split())
             for number, line in enumerate(self.lines[: motion_line - 1], start=1)
             for part in re.split(r"([{}])", line)
             if part.strip()
         ]
-        if not statements:
-            came = "MOTION" if motion_line <= len(self.lines) else "nothing"
-            self.fail(min(motion_line, len(self.lines)), f"{came} came, expected HIERARCHY")
-        number, words = statements[0]
+        end = min(motion_line, len(self.lines))
+        number, words = statements[0] if statements else (end, [])
         if [word.upper() for word in words] != ["HIERARCHY"]:
-            self.fail(number, f"{shortened(' '.join(words))} came, expected HIERARCHY")
+            self.fail(number, f"expected HIERARCHY, got {shortened(' '.join(words))}")
 
-        declared: BVHJoint | None = None  # a joint whose opening brace is still to come
+        declared: BVHJoint | None = None  # a joint without its opening brace
         open_blocks: list[int] = []
         joints = self.content.joints
         for number, words in statements[1:]:
             keyword = words[0].upper()
             if (declared is not None) != (keyword == "{"):
                 wanted = "'{'" if declared else "ROOT, JOINT, End Site, OFFSET, CHANNELS or '}'"
-                self.fail(number, f"{shortened(words[0])} came, expected {wanted}")
+                self.fail(number, f"expected {wanted}, got {shortened(words[0])}")
             if keyword == "{":
                 open_blocks.append(len(joints) - 1)
                 declared = None
@@ -157,47 +113,36 @@ class _Parser:
                 joints.append(declared)
             elif keyword in ("OFFSET", "CHANNELS"):
                 if not open_blocks:
-                    self.fail(number, f"{keyword} came outside a joint, expected ROOT")
+                    self.fail(number, f"expected ROOT, got {keyword} outside a joint")
                 self.describe(number, words, joints[open_blocks[-1]])
             else:
-                self.fail(
-                    number,
-                    f"{shortened(words[0])} came, expected ROOT, JOINT, End Site, OFFSET, "
-                    "CHANNELS, a brace or MOTION",
-                )
+                wanted = "ROOT, JOINT, End Site, OFFSET, CHANNELS, a brace or MOTION"
+                self.fail(number, f"expected {wanted}, got {shortened(words[0])}")
         if declared is not None or open_blocks:
             unclosed = declared or joints[open_blocks[-1]]
-            end = min(motion_line, len(self.lines))
-            self.fail(
-                end,
-                f"the hierarchy ends inside {shortened(unclosed.name)} of line {unclosed.line}, "
-                "expected its closing brace",
-            )
+            name = shortened(unclosed.name)
+            self.fail(end, f"expected the closing brace of {name}, line {unclosed.line}")
         if not joints:
-            self.fail(
-                min(motion_line, len(self.lines)), "the hierarchy must contain ROOT, got none"
-            )
+            self.fail(end, "expected ROOT in the hierarchy")
 
     def declare(self, number: int, words: list[str], open_blocks: list[int]) -> BVHJoint:
-        """Return the joint that a line ``ROOT``, ``JOINT`` or ``End Site`` begins."""
+        """Return the joint of a ``ROOT``, ``JOINT`` or ``End Site`` line."""
         keyword = words[0].upper()
         joints = self.content.joints
         if keyword == "ROOT":
             if open_blocks:
-                open_name = joints[open_blocks[-1]].name
-                self.fail(
-                    number, f"ROOT came inside {shortened(open_name)}, expected it outside braces"
-                )
+                outer = shortened(joints[open_blocks[-1]].name)
+                self.fail(number, f"expected ROOT outside braces, got it inside {outer}")
             return BVHJoint(self.new_name(number, words), -1, number)
         if not open_blocks:
-            self.fail(number, f"{' '.join(words[:2])[:40]} came outside a joint, expected ROOT")
+            self.fail(number, f"expected ROOT, got {' '.join(words[:2])[:40]} outside a joint")
         parent = open_blocks[-1]
         if joints[parent].end_site:
-            self.fail(number, f"{keyword} came inside an End Site, expected OFFSET or '}}'")
+            self.fail(number, f"expected OFFSET or '}}' inside an End Site, got {keyword}")
         if keyword == "JOINT":
             return BVHJoint(self.new_name(number, words), parent, number)
         if len(words) < 2 or words[1].upper() != "SITE":
-            self.fail(number, f"{shortened(' '.join(words))} came, expected End Site")
+            self.fail(number, f"expected End Site, got {shortened(' '.join(words))}")
         end = f"{joints[parent].name}_end"
         return BVHJoint(end, parent, number, end_site=True, channels=())
 
@@ -205,40 +150,37 @@ class _Parser:
         """Return the name after ``ROOT`` or ``JOINT``."""
         name = " ".join(words[1:])
         if not name:
-            self.fail(number, f"{words[0]} has no name, expected one")
+            self.fail(number, f"expected a name after {words[0]}")
         for joint in self.content.joints:
             if joint.name == name and not joint.end_site:
                 self.fail(
-                    number,
-                    f"joint {shortened(name)} came before at line {joint.line}, expected every "
-                    "name once",
+                    number, f"expected unique names, got {shortened(name)} as in line {joint.line}"
                 )
         return name
 
     def describe(self, number: int, words: list[str], joint: BVHJoint) -> None:
-        """Parse a line ``OFFSET`` or ``CHANNELS`` of ``joint``."""
+        """Parse an ``OFFSET`` or ``CHANNELS`` line of ``joint``."""
         keyword = words[0].upper()
         if keyword == "OFFSET":
             if joint.offset is not None:
-                self.fail(number, f"{shortened(joint.name)} has a second OFFSET, expected one")
+                self.fail(number, f"expected one OFFSET of {shortened(joint.name)}, got a second")
             joint.offset = tuple(self.number(number, word) for word in words[1:])
             if len(joint.offset) != 3:
-                self.fail(number, f"OFFSET has {len(joint.offset)} values, expected 3")
+                self.fail(number, f"expected 3 values of OFFSET, got {len(joint.offset)}")
         elif joint.end_site:
-            self.fail(number, "CHANNELS came inside an End Site, expected OFFSET or '}'")
+            self.fail(number, "expected OFFSET or '}' inside an End Site, got CHANNELS")
         elif joint.channels is not None:
-            self.fail(number, f"{shortened(joint.name)} has a second CHANNELS, expected one")
+            self.fail(number, f"expected one CHANNELS of {shortened(joint.name)}, got a second")
         else:
             joint.channels = self.channels(number, words[1:])
 
     def channels(self, number: int, words: Sequence[str]) -> tuple[tuple[str, str], ...]:
-        """Return the axis and kind of each channel that ``words`` declare."""
+        """Return the axis and kind of each declared channel."""
         count = words[0] if words else ""
         if count != str(len(words) - 1):
             self.fail(
                 number,
-                f"CHANNELS announces {shortened(count)} channels and names "
-                f"{max(len(words) - 1, 0)}, expected as many as announced",
+                f"expected {shortened(count)} channels as declared, got {max(len(words) - 1, 0)}",
             )
         found = []
         for word in words[1:]:
@@ -246,24 +188,22 @@ class _Parser:
             if match is None or match.groups() in found:
                 self.fail(
                     number,
-                    f"channel {shortened(word)} came, expected each of Xposition, Yposition, "
-                    "Zposition, Xrotation, Yrotation and Zrotation once at most",
+                    "expected channels Xposition, Yposition, Zposition, Xrotation, Yrotation and "
+                    f"Zrotation, each at most once, got {shortened(word)}",
                 )
             found.append((match[1], match[2]))
         return tuple(found)
 
     def close_block(self, number: int, open_blocks: list[int]) -> None:
         if not open_blocks:
-            self.fail(number, "'}' came without an open brace, expected ROOT or MOTION")
+            self.fail(number, "expected ROOT or MOTION, got '}' without an open brace")
         joint = self.content.joints[open_blocks.pop()]
         for keyword, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
             if value is None:
-                self.fail(number, f"{shortened(joint.name)} closes without {keyword}, expected one")
-
-    # --- MOTION ----------------------------------------------------------------------------
+                self.fail(number, f"expected {keyword} in {shortened(joint.name)}, got '}}'")
 
     def parse_motion(self, motion_line: int) -> None:
-        """Parse what stands after the line of ``MOTION``."""
+        """Parse the lines after ``MOTION``."""
         rows = [
             (number, line)
             for number, line in enumerate(self.lines[motion_line:], start=motion_line + 1)
@@ -274,8 +214,8 @@ class _Parser:
             number, line = rows[position] if position < len(rows) else (len(self.lines), "")
             found, colon, value = line.partition(":")
             if " ".join(found.split()).upper() != key.upper() or not colon:
-                came = shortened(line.strip()) if line else "the end of the file"
-                self.fail(number, f"{came} came, expected '{key}: …'")
+                got = shortened(line.strip()) if line else "the end of the file"
+                self.fail(number, f"expected '{key}: …', got {got}")
             header[key] = (number, value.strip())
         number, frames = header["Frames"]
         if re.fullmatch(r"[0-9]{1,9}", frames) is None or int(frames) == 0:
@@ -286,17 +226,14 @@ class _Parser:
     def frame_rate(self, number: int, text: str) -> float:
         """Return frames per second.
 
-        A frame time is printed with a few digits: 0.033333 stands for 30 frames per second. The
-        integer rate whose frame time agrees to the last printed digit is taken, where one does
-        to 0.15 %; otherwise the reciprocal.
+        A frame time within its last printed digit (and 0.15 %) of an integer rate, such as 0.033333
+        s, is
+        taken as that rate.
         """
         frame_time = self.number(number, text)
         least, most = FRAME_TIMES
         if not least <= frame_time <= most:
-            self.fail(
-                number,
-                f"Frame Time is {text[:40]} s, expected between {least:g} and {most:g} seconds",
-            )
+            self.fail(number, f"Frame Time must be {least:g} to {most:g} seconds, got {text[:40]}")
         rate = round(1 / frame_time)
         exponent = Decimal(text).as_tuple().exponent
         last_digit = 10.0 ** float(exponent)
@@ -308,26 +245,25 @@ class _Parser:
         """Return the channel values, one row per frame."""
         columns = sum(len(joint.channels or ()) for joint in self.content.joints)
         if columns == 0:
-            self.fail(frames_line, "the hierarchy has no channel, expected at least one")
+            self.fail(frames_line, "expected at least one channel in the hierarchy, got none")
         if len(rows) != frames:
             self.fail(
                 rows[-1][0] if rows else len(self.lines),
-                f"the file ends after {len(rows)} lines of values, expected {frames}, the Frames "
-                f"of line {frames_line}",
+                f"expected {frames} lines of values as in line {frames_line}, got {len(rows)}",
             )
         values = np.empty((frames, columns))
         for row, (number, line) in zip(values, rows, strict=True):
             words = line.split()
             if len(words) != columns:
-                self.fail(number, f"{len(words)} values came, expected {columns}, one per channel")
+                self.fail(number, f"expected {columns} values, one per channel, got {len(words)}")
             try:
                 row[:] = list(map(float, words))
             except ValueError:
                 for word in words:
                     self.number(number, word)
                 raise
-        # Python's float takes more than BVH does (nan, 1_0): the slower check names the line.
-        suspect = ~(np.abs(values) <= _LARGEST).all(axis=1)
+        # float() also accepts nan and 1_0; the slower check rejects them and names the line.
+        suspect = ~(np.abs(values) <= 1e9).all(axis=1)
         suspect |= np.array(["_" in line or not line.isascii() for _, line in rows])
         for frame in np.flatnonzero(suspect):
             for word in rows[frame][1].split():
@@ -335,7 +271,6 @@ class _Parser:
         return values
 
     def number(self, number: int, word: str) -> float:
-        """Return a finite number of moderate size."""
-        if _NUMBER.fullmatch(word) is None or abs(float(word)) > _LARGEST:
-            self.fail(number, f"{shortened(word)} came, expected a number between -1e9 and 1e9")
+        if not is_number(word):
+            self.fail(number, f"expected a number between -1e9 and 1e9, got {shortened(word)}")
         return float(word)

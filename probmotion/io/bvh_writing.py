@@ -1,4 +1,4 @@
-"""Writing motions to BVH files that Blender and other programs read."""
+"""Writer of BVH motion files."""
 
 from __future__ import annotations
 
@@ -17,45 +17,47 @@ __all__ = ["write_bvh"]
 
 _ORDER = "ZYX"
 _DECIMALS = 8
-# Metres. Bones that are constant in float32 files, to 1e-7 m, count as constant.
+# Metres; larger than the rounding of constant bones in float32 files, 1e-7 m.
 _TOLERANCE = 1e-6
 
 
 def write_bvh(motion: Motion, path: str | Path) -> None:
     """Write a motion to a BVH file, in metres.
 
-    The rotations are the motion's own or, where it has none, fitted to its positions. Where they
-    and constant offsets reproduce every position to 1e-6 m, joints have rotation channels alone.
-    Otherwise (bones that change their length, siblings that move against each other) every joint
-    has position channels too, which give its place in its parent's frame and replace its offset,
-    as in Blender. Either way the positions come back to 1e-6 m, read with ``scale=1``. Joints are
-    written depth first, and come back in that order.
+    Rotations are the motion's own, or else fitted to its positions. If rotations and constant
+    offsets
+    reproduce all positions to 1e-6 m, joints have rotation channels only. Otherwise every joint
+    also
+    has position channels, which replace its offset, as in Blender. In both cases positions read
+    back
+    to 1e-6 m with ``scale=1``. Joints are written depth first.
 
     Parameters
     ----------
     motion : Motion
-        What to write. Several roots become several ``ROOT`` blocks.
+        Motion to write. Several roots become several ``ROOT`` blocks.
     path : str or Path
-        The file; replaced whole or not at all.
+        The file, written atomically.
 
     Raises
     ------
     ValueError
-        If a joint's name holds a blank or a brace, or the rate is below 1 or above 10 000 frames
-        per second.
+        If a joint's name contains a blank or a brace, or the rate is not 1 to 10 000 frames per
+        second.
     OSError
-        If the folder is missing or cannot be written to.
+        If the folder is missing or not writable.
     """
     skeleton = motion.skeleton
     for name in skeleton.joint_names:
         if not name or len(name.split()) != 1 or set(name) & set("{}"):
             raise ValueError(
-                f"joint_names holds {name!r}, expected names without blanks and braces, at which "
-                "a name ends in BVH"
+                f"joint_names must not contain blanks or braces in BVH files, got {name!r}"
             )
     least, most = FRAME_TIMES
     if not least <= 1 / motion.fps <= most:
-        raise ValueError(f"fps is {motion.fps:g}, expected {1 / most:g} to {1 / least:g} in BVH")
+        raise ValueError(
+            f"fps must be {1 / most:g} to {1 / least:g} in BVH files, got {motion.fps:g}"
+        )
     angles, offsets, translations = _channels(motion)
     columns = []
     for joint in skeleton.topological_order:
@@ -78,10 +80,10 @@ def _channels(motion: Motion) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndar
     if rotations is None or offsets is None:
         rotations, offsets = fit_rotations(skeleton, motion.positions)
     angles = np.rad2deg(matrix_to_euler(rotations, _ORDER)).round(_DECIMALS)
-    # A root's offset is 0: programs disagree whether its channels replace it or add to it.
+    # Root offsets are 0, since programs disagree whether channels replace or add to them.
     offsets = np.round(offsets, _DECIMALS)
     offsets[list(skeleton.roots)] = 0.0
-    # What a reader will make of the rounded angles decides, not what was meant.
+    # Compare with the positions that a reader reconstructs from the rounded angles.
     roots = motion.positions[:, list(skeleton.roots)]
     turns = euler_to_matrix(np.deg2rad(angles), _ORDER)
     reached, world = forward_kinematics(skeleton, turns, roots, offsets)

@@ -1,42 +1,45 @@
-"""What readers of motion files raise and warn with."""
+"""Errors, warnings and text helpers of the file readers."""
 
 from __future__ import annotations
 
+import re
 import reprlib
 from pathlib import Path
 
-__all__ = ["MotionFileError", "MotionFileWarning", "read_bytes", "shortened"]
+__all__ = [
+    "MotionFileError",
+    "MotionFileWarning",
+    "decoded_lines",
+    "is_number",
+    "read_bytes",
+    "shortened",
+]
+
+_LARGEST = 1e9
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class MotionFileError(ValueError):
-    """A file is no motion, or is damaged: one sentence with the file and the line or key."""
+    """A file is damaged or has the wrong format; the message names the file and the line or key."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_on_one_line(message))
 
 
 class MotionFileWarning(UserWarning):
-    """A file was read, but something had to be assumed: one sentence that says what."""
+    """A file was read with an assumption, which the message states."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_on_one_line(message))
 
 
 def _on_one_line(message: str) -> str:
-    """Escape what cannot be printed: names from a damaged file may hold line ends and worse."""
+    """Escape unprintable characters, such as line ends in names of damaged files."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a file.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    MotionFileError
-        If it is there and cannot be read.
-    """
+    """Return the content of a file; raise :class:`MotionFileError` if it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -47,6 +50,20 @@ def read_bytes(path: Path) -> bytes:
         ) from error
 
 
+def decoded_lines(content: bytes) -> list[str]:
+    """Return the lines of a text with any line ends, in UTF-8 or else Latin-1."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a plain decimal number between -1e9 and 1e9."""
+    return _NUMBER.fullmatch(word) is not None and abs(float(word)) <= _LARGEST
+
+
 _short = reprlib.Repr()
 _short.maxlevel = 2
 _short.maxstring = _short.maxother = 60
@@ -54,5 +71,5 @@ _short.maxlist = _short.maxtuple = _short.maxdict = 3
 
 
 def shortened(value: object) -> str:
-    """Return ``repr(value)`` cut to a length and depth that fit an error message."""
+    """Return ``repr(value)`` truncated for an error message."""
     return _short.repr(value)

@@ -1,4 +1,4 @@
-"""Reading and writing motion files: BVH, AMC, npz, keypoint JSON, DeepLabCut, predictions."""
+"""Loading and saving of motions and keypoint tracks, in a format chosen by the file's suffix."""
 
 from __future__ import annotations
 
@@ -17,37 +17,36 @@ from probmotion.io.npz import read_keypoint_npz, read_npz, write_npz
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = [
-    "files_named",
-    "load_motion",
-    "load_motions",
-    "read_keypoints",
-    "read_motion",
-    "save_motion",
-]
+__all__ = ["files_named", "load", "load_all", "read_keypoints", "save"]
 
 
-def read_motion(path: str | Path) -> Motion:
-    """Read a motion; the file's ending chooses the format: ``.bvh``, ``.npz`` or ``.amc``.
+def load(path: str | Path, fps: float | None = None) -> Motion:
+    """Read a motion from a ``.bvh``, ``.npz`` or ``.amc`` file.
 
     Parameters
     ----------
     path : str or Path
-        The file.
+        The file; an ``.amc`` needs its ``.asf`` skeleton beside it.
+    fps : float, optional
+        Frames per second to resample to; the file's own by default.
 
     Returns
     -------
     motion : Motion
-        In metres, Y up, at the file's own rate. Where a unit had to be inferred, a rate assumed
-        or joints left out, a :class:`MotionFileWarning` says so in one sentence; see
-        :func:`read_bvh`, :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
+        Motion in metres, Y up.
 
     Raises
     ------
     MotionFileError
-        If the file is no motion, or is damaged; the message names the line or key.
+        If the file contains no motion or is damaged.
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
+
+    Warns
+    -----
+    MotionFileWarning
+        If a unit or frame rate is assumed or joints are dropped; see :func:`read_bvh`,
+        :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
     """
     path = Path(path)
     readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": _read_amc_at_usual_rate}
@@ -55,38 +54,39 @@ def read_motion(path: str | Path) -> Motion:
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
         raise MotionFileError(
-            f"{path} ends in {path.suffix!r}, expected a motion in .bvh or .npz, or in .amc beside "
-            "its .asf (2D keypoints: read_keypoints)"
+            f"{path}: expected .bvh, .npz, or .amc beside its .asf, got {path.suffix!r}; use "
+            "read_keypoints for 2D keypoints"
         )
-    return readers[path.suffix.lower()](path)
+    motion = readers[path.suffix.lower()](path)
+    return motion if fps is None else motion.resample(fps)
 
 
 def _read_amc_at_usual_rate(path: Path) -> Motion:
-    """Return the motion of an AMC file, and warn of the rate."""
+    """Read an AMC file at the default rate, with a warning."""
     motion = read_amc(path)
     warnings.warn(
-        f"{path} is taken to have {motion.fps:g} frames per second, as most of the CMU database "
-        "has; read_amc(path, fps=…) takes another rate",
+        f"{path}: assuming {motion.fps:g} frames per second, as in most of the CMU database; set "
+        "it with read_amc(path, fps=…)",
         MotionFileWarning,
         stacklevel=4,
     )
     return motion
 
 
-def save_motion(motion: Motion, path: str | Path) -> None:
-    """Write a motion; the file's ending chooses the format: ``.bvh`` or ``.npz``.
+def save(motion: Motion, path: str | Path) -> None:
+    """Write a motion to a ``.bvh`` or ``.npz`` file.
 
     Raises
     ------
     ValueError
-        If the ending is another one, or the format cannot hold the motion.
+        If the suffix is another one, or the format cannot represent the motion.
     OSError
-        If the folder is missing or cannot be written to.
+        If the folder is missing or not writable.
     """
     path = Path(path)
     writers = {".bvh": write_bvh, ".npz": write_npz}
     if path.suffix.lower() not in writers:
-        raise ValueError(f"path ends in {path.suffix!r}, expected .bvh or .npz")
+        raise ValueError(f"path must end in .bvh or .npz, got {path.suffix!r}")
     writers[path.suffix.lower()](motion, path)
 
 
@@ -96,98 +96,74 @@ def read_keypoints(
     skeleton: Skeleton | str | None = None,
     people: int | None = None,
 ) -> list[KeypointTrack]:
-    """Read the 2D keypoint tracks of a file: one per person and camera.
+    """Read the 2D keypoint tracks of a file, one per person and camera.
 
     Parameters
     ----------
     path : str or Path
-        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, a ``.csv`` table of
-        DeepLabCut, or an ``.npz`` archive.
+        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, a DeepLabCut ``.csv`` table,
+        or
+        an ``.npz`` archive.
     fps : float, optional
-        Frames per second. JSON files and tables do not hold it: there it must be given.
+        Frames per second; required for JSON files and tables, which do not contain it.
     skeleton : Skeleton or str, optional
-        The keypoints of a JSON file in their order (see
-        :func:`~probmotion.io.keypoint_json.read_keypoint_json`), or the joints to take from a
+        Keypoints of a JSON file in their order (see
+        :func:`~probmotion.io.keypoint_json.read_keypoint_json`), or the joints to select from a
         table (see :func:`~probmotion.io.deeplabcut.read_deeplabcut`).
     people : int, optional
-        How many people to follow in a JSON file that does not say who is who.
+        Number of people to follow in a JSON file without track ids.
 
     Raises
     ------
     MotionFileError
-        If the file holds no keypoint track, or is damaged; the message says where.
+        If the file contains no keypoint track or is damaged.
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If ``fps`` is missing or not above 0, or ``skeleton`` is unknown or not to be given.
+        If ``fps`` is missing or not above 0, or ``skeleton`` or ``people`` does not apply.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
-    if path.suffix.lower() == ".npz":
-        if people is not None:
-            raise ValueError(
-                f"people was given with {path}, expected none: npz files say who is who"
-            )
-        if skeleton is not None:
-            raise ValueError(f"skeleton was given with {path}, expected none: npz files hold it")
-        return read_keypoint_npz(path, fps)
+    archive = path.suffix.lower() == ".npz"
     table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
+    for name, value, applies in (
+        ("people", people, not archive and not table),
+        ("skeleton", skeleton, not archive),
+    ):
+        if value is not None and not applies:
+            raise ValueError(f"{name} must be None for {path.suffix} files, got {value!r}")
+    if archive:
+        return read_keypoint_npz(path, fps)
     if fps is None:
-        kind = "a table" if table else "JSON"
-        raise ValueError(
-            f"fps is missing, expected frames per second: {path} is {kind}, which does not hold it"
-        )
+        raise ValueError(f"fps must be given for {path}, which does not contain a frame rate")
     if table:
-        if people is not None:
-            raise ValueError(f"people was given with {path}, expected none: tables say who is who")
         return read_deeplabcut(path, fps, skeleton)
     return read_keypoint_json(path, fps, skeleton, people)
 
 
-def load_motion(path: str | Path, fps: float | None = None) -> Motion:
-    """Read one motion from a ``.bvh``, ``.npz`` or ``.amc`` file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; an ``.amc`` has the ``.asf`` of its skeleton beside it.
-    fps : float, optional
-        Resample to this rate; the file's own rate is kept by default.
-
-    Raises
-    ------
-    MotionFileError
-        If the file is no motion, or is damaged; the message says where.
-    FileNotFoundError
-        If there is no such file.
-    """
-    motion = read_motion(Path(path))
-    return motion if fps is None else motion.resample(fps)
-
-
-def load_motions(
+def load_all(
     paths: str | Path | Iterable[str | Path], fps: float | None = None
 ) -> Sequence[Motion]:
-    """Read every motion that ``paths`` names, sorted by path.
+    """Read all motions of ``paths``, sorted by path.
 
     Parameters
     ----------
     paths : str, Path or iterable of them
         Files, or patterns such as ``"walks/*.bvh"``.
     fps : float, optional
-        Resample every clip to this rate.
+        Frames per second to resample to.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file.
     """
-    return [load_motion(path, fps) for path in files_named(paths)]
+    return [load(path, fps) for path in files_named(paths)]
 
 
 def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files that paths or patterns such as ``"walks/*.bvh"`` name, sorted.
+    """Return the files of paths or patterns such as ``"walks/*.bvh"``, sorted.
 
     Raises
     ------
@@ -199,6 +175,6 @@ def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     for pattern in map(str, given):
         matches = glob(pattern) if has_magic(pattern) else [pattern]
         if not matches:
-            raise FileNotFoundError(f"paths has {pattern!r}, which matches no file")
+            raise FileNotFoundError(f"paths must match a file, got {pattern!r}")
         found += matches
     return [Path(path) for path in sorted(found)]

@@ -1,4 +1,4 @@
-"""Keypoint tracks from the JSON of COCO, AlphaPose and OpenPose.
+"""Reader of keypoint tracks in the JSON formats of COCO, AlphaPose and OpenPose.
 
 =====================  ==========================================================================
 flavour                content
@@ -12,11 +12,10 @@ OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": [â€
                        frame; one such file; or a list of frames in one file
 =====================  ==========================================================================
 
-Frames are the images that a file lists (COCO annotations, OpenPose). Results name only images
-with a detection: there the frame is the last number in the image's name, and every frame between
-the first and the last belongs to the track. A keypoint with confidence 0 was not seen: it is NaN.
-The visibility v of COCO annotations becomes the confidence v/2: 0 not labelled, 0.5 labelled but
-hidden, 1 visible.
+Frames are the images listed in the file (COCO annotations, OpenPose). Results list only images with
+a detection: the frame is the last number in the image's name, and tracks include all frames between
+the first and the last. Keypoints of confidence 0 are NaN. The visibility v of COCO annotations
+becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from probmotion.io.errors import MotionFileError, read_bytes, shortened
-from probmotion.io.keypoint_layouts import keypoint_skeleton
 from probmotion.io.keypoint_linking import link_people
 from probmotion.io.keypoint_tracks import (
     Detection,
@@ -57,43 +55,39 @@ def read_keypoint_json(
     skeleton: Skeleton | str | None = None,
     people: int | None = None,
 ) -> list[KeypointTrack]:
-    """Read every person's keypoint track.
+    """Read the keypoint track of every person.
 
     Parameters
     ----------
     path : str or Path
         A JSON file, or a folder of OpenPose files, one per frame.
     fps : float
-        Frames per second, which these files do not hold.
+        Frames per second, which these files do not contain.
     skeleton : Skeleton or str, optional
-        The detector's keypoints in its order, or the name of a layout in
-        :data:`~probmotion.io.keypoint_layouts.LAYOUTS` or of a preset. By default what COCO
-        ``categories`` say, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25
-        are ambiguous.
+        The detector's keypoints in its order, or the name of a preset. Default: the COCO
+        ``categories``, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25 is
+        ambiguous.
     people : int, optional
-        How many people to follow from image to image where the file has no track ids; see
+        Number of people to follow between images in a file without track ids; see
         :func:`~probmotion.io.keypoint_linking.link_people`.
 
     Returns
     -------
     tracks : list of KeypointTrack
-        One per person, and video where the images belong to several. People are told apart by
-        ``track_id``, ``idx`` or ``person_id``; without them a frame may hold one person, unless
-        ``people`` says how many to follow.
+        One per person and video. People are identified by ``track_id``, ``idx`` or ``person_id``;
+        otherwise frames must contain one person, unless ``people`` is given.
 
     Raises
     ------
     MotionFileError
-        If the file holds no such tracks, or is damaged; the message says where.
-    FileNotFoundError
-        If there is no such file.
+        If the file contains no such tracks or is damaged.
     ValueError
-        If ``fps`` is not above 0, ``skeleton`` is no known name, or ``people`` are more than any
-        image shows.
+        If ``fps`` is not above 0, ``skeleton`` is an unknown name, or ``people`` exceeds the number
+        in any image.
     """
     path = Path(path)
     check_positive("fps", fps)
-    given = keypoint_skeleton(skeleton) if isinstance(skeleton, str) else skeleton
+    given = Skeleton.preset(skeleton) if isinstance(skeleton, str) else skeleton
     frames: Frames | None = None
     if path.is_dir():
         detections, frames = _folder(path)
@@ -125,12 +119,12 @@ def read_keypoint_json(
             ]
         else:
             raise MotionFileError(
-                f"{path} holds {_described(content)}, expected keypoints of COCO (annotations, or "
-                "a list with image_id and keypoints), AlphaPose or OpenPose (people)"
+                f"{path}: expected keypoints of COCO (annotations, or a list with image_id and "
+                f"keypoints), AlphaPose or OpenPose (people), got {_described(content)}"
             )
     counts = sorted({len(detection.values) for detection in detections})
     if len(counts) > 1:
-        raise MotionFileError(f"{path}: people have {counts} keypoints, expected one number")
+        raise MotionFileError(f"{path}: expected the same keypoints of all people, got {counts}")
     if people is not None:
         check_count("people", people)
         if all(detection.person is None for detection in detections):
@@ -138,11 +132,8 @@ def read_keypoint_json(
     return tracks_of(detections, frames, _checked_skeleton(given, counts, path), float(fps), path)
 
 
-# --- flavours --------------------------------------------------------------------------------
-
-
 def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], Frames]:
-    """Return the people of COCO annotations; frames are the images of each video, in order."""
+    """Return the detections of COCO annotations and the frames of each video."""
     where = f"{path}, images"
     images = _dicts(content.get("images"), where)
     order = next(
@@ -156,10 +147,7 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
         video = _identity(image, ("video_id", "vid_id"), where) or ""
         image_id = _identity(image, ("id",), where)
         if image_id is None or image_id in places:
-            raise MotionFileError(
-                f"{where}: id {shortened(image_id)} came, expected an id for each image, "
-                "all different"
-            )
+            raise MotionFileError(f"{where}: expected unique ids, got {shortened(image_id)}")
         length[video] = length.get(video, 0) + 1
         places[image_id] = video, length[video] - 1
 
@@ -169,13 +157,11 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
         image_id = _identity(person, ("image_id",), where)
         if image_id not in places:
             raise MotionFileError(
-                f"{where} has image_id {shortened(image_id)}, expected the id of an image"
+                f"{where}: image_id must be the id of an image, got {shortened(image_id)}"
             )
         values = keypoint_values(person.get("keypoints"), where)
         if not np.isin(values[:, 2], (0, 1, 2)).all():
-            raise MotionFileError(
-                f"{where} holds a visibility that is not 0, 1 or 2, expected COCO's x, y, v"
-            )
+            raise MotionFileError(f"{where}: expected visibilities 0, 1 or 2, got others")
         values[:, 2] /= 2
         track_id = _identity(person, ("track_id", "instance_id"), where)
         detections.append(Detection(*places[image_id], track_id, values, where))
@@ -183,7 +169,7 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
 
 
 def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
-    """Return the people of COCO results and of AlphaPose's own list."""
+    """Return the detections of COCO results and of AlphaPose's own list."""
     detections = []
     for number, person in enumerate(content):
         where = f"{path}, [{number}]"
@@ -195,7 +181,7 @@ def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
 
 
 def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[Detection]:
-    """Return the people of one frame of OpenPose, or of AlphaPose in its forms."""
+    """Return the detections of one frame of OpenPose, or of AlphaPose in the same form."""
     key = "people" if "people" in frame else "bodies"
     detections = []
     for index, person in enumerate(_dicts(frame[key], f"{where}, {key}")):
@@ -211,17 +197,17 @@ def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[
 
 
 def _folder(path: Path) -> tuple[list[Detection], Frames]:
-    """Return the people of an OpenPose folder; its files are the frames, evenly numbered."""
+    """Return the detections and frames of an OpenPose folder, with evenly numbered files."""
     files = sorted(path.glob("*.json"), key=lambda file: natural(file.name))
     if not files:
-        raise MotionFileError(f"{path} holds no .json file, expected OpenPose's, one per frame")
+        raise MotionFileError(f"{path}: expected OpenPose .json files, one per frame, got none")
     detections: list[Detection] = []
     numbers: dict[str, list[int]] = {}
     for file in files:
         content = _load(file)
         if not isinstance(content, dict) or "people" not in content:
             raise MotionFileError(
-                f"{file} holds {_described(content)}, expected one OpenPose frame: people"
+                f"{file}: expected an OpenPose frame with people, got {_described(content)}"
             )
         video, number = frame_number(file.name, str(file))
         numbers.setdefault(video, []).append(number)
@@ -233,24 +219,19 @@ def _folder(path: Path) -> tuple[list[Detection], Frames]:
         for before, after in pairwise(found):
             if after - before != step or step == 0:
                 raise MotionFileError(
-                    f"{path}: frame {after} follows frame {before}, expected frames numbered "
-                    f"evenly, in steps of {max(step, 1)}"
+                    f"{path}: expected frames in steps of {max(step, 1)}, got {before} and {after}"
                 )
         frames[video] = range(found[0], found[-1] + 1, step)
     return detections, frames
 
 
-# --- pieces ----------------------------------------------------------------------------------
-
-
 def _load(path: Path) -> Any:
-    content = read_bytes(path)
     try:
-        return json.loads(content)
+        return json.loads(read_bytes(path))
+    except MotionFileError:
+        raise
     except (ValueError, RecursionError) as error:
-        raise MotionFileError(
-            f"{path} is no JSON ({str(error)[:80]}), expected keypoints"
-        ) from error
+        raise MotionFileError(f"{path}: expected JSON ({str(error)[:80]})") from error
 
 
 def _dicts(value: Any, where: str) -> list[dict[str, Any]]:
@@ -260,13 +241,13 @@ def _dicts(value: Any, where: str) -> list[dict[str, Any]]:
 
 
 def _all_hold(items: Iterable[Any], key: str) -> bool:
-    """Whether there is an item, and each is an object with ``key``."""
+    """Return whether ``items`` is nonempty and consists of objects with ``key``."""
     listed = list(items)
     return bool(listed) and all(isinstance(item, dict) and key in item for item in listed)
 
 
 def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """Return the first of ``keys`` as text, None where there is none; OpenPose's -1 is none."""
+    """Return the first of ``keys`` as text, None if it is missing or OpenPose's -1."""
     value = next((item[key] for key in keys if item.get(key) is not None), None)
     while isinstance(value, list) and len(value) == 1:
         value = value[0]
@@ -280,10 +261,10 @@ def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | 
 
 
 def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
-    """Return the skeleton of the COCO categories that were annotated, None where they have none.
+    """Return the skeleton of the annotated COCO categories, None if they have none.
 
-    The file's edges form no tree in general: a category whose joints are those of a preset has
-    its parents; another has those of the spanning tree that is found first from its first joint.
+    Categories with the joints of a preset use its parents. Others use a spanning tree of the file's
+    edges, since these generally form no tree.
     """
     where = f"{path}, categories"
     key = ("category_id",)
@@ -300,9 +281,7 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
         except (ValueError, TypeError) as error:
             raise MotionFileError(f"{where}: {str(error)[:200]}") from error
         if found is not None and skeleton != found:
-            raise MotionFileError(
-                f"{where} has other keypoints than the category before, expected the same"
-            )
+            raise MotionFileError(f"{where}: expected the keypoints of the previous category")
         found = skeleton
     return found
 
@@ -319,8 +298,8 @@ def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
     for first, second in edges:
         if not {first, second} <= set(range(1, len(names) + 1)):
             raise ValueError(
-                f"skeleton has the edge {shortened([first, second])}, expected keypoint numbers "
-                f"from 1 to {len(names)}"
+                f"skeleton must have edges between keypoints 1 to {len(names)}, got "
+                f"{shortened([first, second])}"
             )
         neighbours.setdefault(first - 1, []).append(second - 1)
         neighbours.setdefault(second - 1, []).append(first - 1)
@@ -339,21 +318,20 @@ def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
 
 
 def _checked_skeleton(skeleton: Skeleton | None, counts: list[int], path: Path) -> Skeleton:
-    """Return the skeleton of ``counts[0]`` keypoints: the given one, or the usual one."""
+    """Return the given or the default skeleton of ``counts[0]`` keypoints."""
     if not counts:
-        raise MotionFileError(f"{path}: no person in any frame, expected at least one")
+        raise MotionFileError(f"{path}: expected at least one person, got none")
     (count,) = counts
     if skeleton is None:
         if count not in _BY_COUNT:
             raise MotionFileError(
-                f"{path}: people have {count} keypoints of unknown names, expected the argument "
-                f"skeleton to name them{_TWO_LAYOUTS.get(count, '')}"
+                f"{path}: expected the argument skeleton to name the {count} keypoints"
+                f"{_TWO_LAYOUTS.get(count, '')}"
             )
-        return keypoint_skeleton(_BY_COUNT[count])
+        return Skeleton.preset(_BY_COUNT[count])
     if skeleton.n_joints != count:
         raise MotionFileError(
-            f"{path}: people have {count} keypoints, expected {skeleton.n_joints}, the joints of "
-            "the skeleton"
+            f"{path}: expected {skeleton.n_joints} keypoints as in skeleton, got {count}"
         )
     return skeleton
 

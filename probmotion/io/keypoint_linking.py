@@ -1,4 +1,4 @@
-"""Following people from image to image, where a detector says who is where but not who is who."""
+"""Tracking of people across images by their keypoints."""
 
 from __future__ import annotations
 
@@ -15,28 +15,12 @@ __all__ = ["link_people"]
 def link_people(detections: Sequence[Detection], people: int) -> list[Detection]:
     """Return the detections of ``people`` people, with track ids ``"0"``, ``"1"``, …
 
-    A video begins at its first image with that many people or more, where the most confident are
-    named from left to right; earlier images are linked backwards. In every other image detections
-    go to the people so that the keypoints' distances to where each person is expected are least in
-    all (Hungarian method): where they were last seen, moved on as they moved then. Who is left over
-    is left out. People who change places while hidden can be confused.
-
-    Parameters
-    ----------
-    detections : sequence of Detection
-        Without ids, in any order.
-    people : int
-        How many to follow, at most as many as there ever are in one image.
-
-    Returns
-    -------
-    list of Detection
-        Those that were linked, in the order of videos and frames.
-
-    Raises
-    ------
-    ValueError
-        If no image of a video shows that many people.
+    Tracking starts at a video's first image with at least that many people, where the most
+    confident
+    ones are numbered from left to right, and proceeds forwards and backwards. In every other image,
+    detections are assigned to people by the minimum total keypoint distance from their expected
+    positions (Hungarian method), extrapolated with constant velocity. Other detections are dropped.
+    People who swap places during occlusion may be confused.
     """
     videos: dict[str, dict[int, list[Detection]]] = {}
     for detection in detections:
@@ -47,9 +31,9 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
         full = [number for number in order if len(frames[number]) >= people]
         if not full:
             most = max(len(found) for found in frames.values())
-            raise ValueError(f"people must be at most the {most} of one image, got {people}")
-        sure = sorted(frames[full[0]], key=lambda found: -found.values[:, 2].mean())[:people]
-        first = sorted(sure, key=lambda found: float(_middle(found.values)[0]))
+            raise ValueError(f"people must be at most {most}, as in one image, got {people}")
+        confident = sorted(frames[full[0]], key=lambda found: -found.values[:, 2].mean())[:people]
+        first = sorted(confident, key=lambda found: float(_middle(found.values)[0]))
         named = {full[0]: dict(enumerate(first))}
         at = order.index(full[0])
         for way in (order[at + 1 :], order[:at][::-1]):
@@ -64,7 +48,7 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
 
 
 class _Person:
-    """Where someone was last seen, and how fast the middle of their keypoints moved then."""
+    """Last detection of a person and the velocity of its mean keypoint."""
 
     def __init__(self, last: Detection, before: Detection | None = None) -> None:
         self.last = last
@@ -88,7 +72,7 @@ def _assigned(found: list[Detection], followed: list[_Person], frame: int) -> di
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Mean distance of the keypoints that both have; of the middles where they share none."""
+    """Return the mean distance of common keypoints, or of the mean keypoints if there are none."""
     both = (first[:, 2] > 0) & (second[:, 2] > 0)
     if not both.any():
         return float(np.linalg.norm(_middle(first) - _middle(second)))
@@ -96,6 +80,6 @@ def _distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _middle(values: np.ndarray) -> np.ndarray:
-    """Return the middle of the keypoints that were seen, (2,); 0 where there is none."""
+    """Return the mean of the detected keypoints, (2,); 0 if there is none."""
     seen = values[:, 2] > 0
     return values[seen, :2].mean(axis=0) if seen.any() else np.zeros(2)

@@ -1,4 +1,4 @@
-"""Detections of people in single images → one keypoint track per person."""
+"""Assembly of keypoint tracks from detections in single images."""
 
 from __future__ import annotations
 
@@ -22,20 +22,9 @@ _LONGEST_TRACK = 500_000
 
 @dataclass(frozen=True)
 class Detection:
-    """One person in one image.
+    """One person in one image: x, y and confidence of each keypoint, (J, 3), as ``values``.
 
-    Attributes
-    ----------
-    video : str
-        Which sequence of images the image belongs to.
-    frame : int
-        Its place in that sequence.
-    person : str or None
-        The track's identity, None where the file has none.
-    values : ndarray, (J, 3)
-        x, y and confidence of each keypoint.
-    where : str
-        Where in the file it stands, for errors.
+    ``person`` is the track id, None if the file has none; ``where`` is the location for errors.
     """
 
     video: str
@@ -46,49 +35,39 @@ class Detection:
 
 
 Frames = dict[str, range]
-"""Frames of each video: the first, the end and the step between two."""
+"""Range of the frame numbers of each video."""
 
 
 def keypoint_values(value: Any, where: str) -> np.ndarray:
-    """Return a flat list ``[x, y, confidence, x, y, …]`` as an array (J, 3).
-
-    Raises
-    ------
-    MotionFileError
-        If it is no such list.
-    """
+    """Return a flat list ``[x, y, confidence, x, y, …]`` as an array (J, 3)."""
     if not isinstance(value, list) or not value or len(value) % 3:
         raise MotionFileError(
-            f"{where} holds {shortened(value)}, expected a list of x, y, confidence per keypoint"
+            f"{where}: expected a list of x, y, confidence per keypoint, got {shortened(value)}"
         )
     for number in value:
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            raise MotionFileError(f"{where} holds {shortened(number)}, expected numbers")
-        if abs(number) > _LARGEST:
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, int | float)
+            or abs(number) > _LARGEST
+        ):
             raise MotionFileError(
-                f"{where} holds {shortened(number)}, expected numbers between -1e9 and 1e9"
+                f"{where}: expected numbers between -1e9 and 1e9, got {shortened(number)}"
             )
     values = np.array(value, dtype=np.float64).reshape(-1, 3)
     confidence = values[:, 2]
     if not (confidence >= 0).all():
         raise MotionFileError(
-            f"{where} holds the confidence {confidence[~(confidence >= 0)][0]:g}, expected 0 or "
-            "more"
+            f"{where}: expected confidence 0 or more, got {confidence[~(confidence >= 0)][0]:g}"
         )
     if np.isnan(values[confidence > 0]).any():
-        raise MotionFileError(f"{where} holds NaN where confidence is above 0, expected numbers")
+        raise MotionFileError(f"{where}: expected numbers where confidence is above 0, got NaN")
     return values
 
 
 def frame_number(image: Any, where: str) -> tuple[str, int]:
     """Return the video and the frame of an image: ``"walk_012.png"`` → ``("walk_", 12)``.
 
-    The frame is the last number in the image's name; what stands around it names the video.
-
-    Raises
-    ------
-    MotionFileError
-        If the name holds no number.
+    The frame is the last number in the image's name; the rest of it names the video.
     """
     if isinstance(image, int) and not isinstance(image, bool):
         return "", _frame(str(image), where)
@@ -96,7 +75,7 @@ def frame_number(image: Any, where: str) -> tuple[str, int]:
     numbers = list(re.finditer(r"[0-9]+", stem))
     if not numbers:
         raise MotionFileError(
-            f"{where} is called {shortened(image)}, expected a name with the frame's number"
+            f"{where}: expected a name with a frame number, got {shortened(image)}"
         )
     last = numbers[-1]
     return stem[: last.start()] + stem[last.end() :], _frame(last[0], where)
@@ -105,13 +84,13 @@ def frame_number(image: Any, where: str) -> tuple[str, int]:
 def _frame(number: str, where: str) -> int:
     if not number.isdecimal() or len(number) > 18:
         raise MotionFileError(
-            f"{where} is frame {shortened(number)}, expected a number of at most 18 digits"
+            f"{where}: expected a frame number of at most 18 digits, got {shortened(number)}"
         )
     return int(number)
 
 
 def natural(text: str) -> tuple[tuple[str, int], ...]:
-    """Return a sort key by which ``"frame10"`` comes after ``"frame9"``."""
+    """Return a sort key with ``"frame10"`` after ``"frame9"``."""
     parts = re.findall(r"([^0-9]*)([0-9]{0,19})", text)
     return tuple((word, int(number or -1)) for word, number in parts)
 
@@ -125,30 +104,15 @@ def tracks_of(
 ) -> list[KeypointTrack]:
     """Return one track per video and person, sorted by both.
 
-    Every track of a video spans all of its frames; where a person was not detected, keypoints
-    are NaN and confidence is 0.
-
-    Parameters
-    ----------
-    detections : sequence of Detection
-        In any order.
-    frames : dict of str to range, or None
-        The frames of each video; None: all from the first with a detection to the last.
-    skeleton, fps
-        Of every track.
-    file : Path
-        For names and errors.
-
-    Raises
-    ------
-    MotionFileError
-        If people cannot be told apart, or there are more than 500 000 frames.
+    Tracks span all frames of their video, by default from the first to the last detection;
+    keypoints of
+    missing detections are NaN with confidence 0.
     """
     unnamed = sum(detection.person is None for detection in detections)
     if 0 < unnamed < len(detections):
         raise MotionFileError(
-            f"{file}: {unnamed} of {len(detections)} detections have no track id, expected an id "
-            "for all or none"
+            f"{file}: expected a track id for all detections or none, got {unnamed} of "
+            f"{len(detections)} without"
         )
     grouped: dict[tuple[str, str], dict[int, Detection]] = {}
     seen: dict[str, list[int]] = {}
@@ -156,12 +120,12 @@ def tracks_of(
         seen.setdefault(detection.video, []).append(detection.frame)
         track = grouped.setdefault((detection.video, detection.person or ""), {})
         if detection.frame in track:
-            who = "two people without a track id"
+            who = "two people without track ids"
             if detection.person is not None:
                 who = f"person {shortened(detection.person)} twice"
             raise MotionFileError(
-                f"{detection.where}: frame {detection.frame} holds {who}, expected track ids "
-                "(track_id, idx or person_id) that tell people apart, or how many people to follow"
+                f"{detection.where}: expected unique track ids (track_id, idx or person_id), got "
+                f"{who} in frame {detection.frame}; set people to follow people without ids"
             )
         track[detection.frame] = detection
     if frames is None:
@@ -172,8 +136,7 @@ def tracks_of(
         span = frames[video]
         if len(span) > _LONGEST_TRACK:
             raise MotionFileError(
-                f"{file}: frames run from {span[0]} to {span[-1]}, expected {_LONGEST_TRACK} at "
-                "most"
+                f"{file}: expected at most {_LONGEST_TRACK} frames, got {span[0]} to {span[-1]}"
             )
         values = np.zeros((len(span), skeleton.n_joints, 3))
         for frame, detection in grouped[video, person].items():

@@ -1,25 +1,24 @@
 """Motions and keypoint tracks as ``.npz`` archives, without pickles.
 
-A motion's archive holds
+Keys of a motion:
 
 ======================  ==========================  ================================================
 key                     shape                       meaning
 ======================  ==========================  ================================================
-``positions``           (L, J, 3) or (L, P, J, 3)   metres; P people who share one skeleton
+``positions``           (L, J, 3) or (L, P, J, 3)   metres; P people with the same skeleton
 ``fps``                 ()                          frames per second
 ``joint_names``         (J,)                        strings
 ``parents``             (J,)                        integers, -1 for a root
-``up_axis``             (), optional                ``"y"`` (where absent) or ``"z"``
-``persons``             (P,), optional              what to call the people
+``up_axis``             (), optional                ``"y"`` (default) or ``"z"``
+``persons``             (P,), optional              names of the people
 ``rotations``           (L, J, 3, 3), optional      local rotation matrices
 ``rest_offsets``        (J, 3), optional            metres, with ``rotations``
 ``radii``               (J,), optional              metres, bone radii
-``name``                (), optional                what to call the clip
+``name``                (), optional                name of the clip
 ======================  ==========================  ================================================
 
-A track's archive holds ``keypoints`` (L, J, 2) and ``confidence`` (L, J), or (V, L, J, 2) and
-(V, L, J) with V ``camera_names``, beside ``fps``, ``joint_names`` and ``parents``. Other keys
-are left alone.
+Keys of a track: ``keypoints`` (L, J, 2) and ``confidence`` (L, J), or (V, L, J, 2) and (V, L, J)
+with V ``camera_names``; ``fps``, ``joint_names`` and ``parents``. Other keys are ignored.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ from probmotion.io.errors import MotionFileError, MotionFileWarning, read_bytes,
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["read_keypoint_npz", "read_npz", "write_npz"]
+__all__ = ["Archive", "read_keypoint_npz", "read_npz", "write_npz"]
 
 _LARGEST = 1e9
-# World up to Y up, right-handed: (x, y, z) of a Z-up world is (x, z, -y) here.
+# Rotation from Z up to Y up: (x, y, z) becomes (x, z, -y).
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_npz(path: str | Path) -> Motion:
     """Read a motion from an ``.npz`` archive.
 
-    People in one archive become one skeleton with one root per person; their joints are called
-    ``person:joint``. A world with Z up is turned to Y up about the x axis. Joints that have no
-    position in any frame are left out, with a :class:`MotionFileWarning` that names them.
+    Several people become one skeleton with one root each and joints named ``person:joint``. Z-up
+    worlds are rotated to Y up about the x axis. Joints without a position in any frame are dropped
+    with a :class:`MotionFileWarning`.
 
     Parameters
     ----------
@@ -59,19 +58,12 @@ def read_npz(path: str | Path) -> Motion:
     Raises
     ------
     MotionFileError
-        If the file is no such archive, or is damaged; the message names the key.
-    FileNotFoundError
-        If there is no such file.
+        If the file has another format or is damaged.
     """
     archive = Archive(Path(path))
     if "positions" not in archive.keys and "keypoints" in archive.keys:
-        archive.fail("keypoints came without positions, expected 3D: use read_keypoints for 2D")
-    positions = archive.numbers("positions")
-    if positions.ndim not in (3, 4) or positions.shape[-1] != 3 or 0 in positions.shape:
-        archive.fail(
-            f"positions has shape {positions.shape}, expected (L, J, 3) or (L, P, J, 3) with at "
-            "least one of each"
-        )
+        archive.fail("expected positions, got keypoints; use read_keypoints for 2D")
+    positions = archive.points("positions", "(L, J, 3) or (L, P, J, 3)")
     skeleton = archive.skeleton(positions.shape[-2])
     fps = archive.frame_rate()
     turn = archive.turn_to_y_up()
@@ -96,19 +88,19 @@ def read_npz(path: str | Path) -> Motion:
 
 
 def write_npz(motion: Motion, path: str | Path) -> None:
-    """Write a motion to an ``.npz`` archive, from which it reads back exactly.
+    """Write a motion to an ``.npz`` archive, without loss.
 
     Parameters
     ----------
     motion : Motion
-        What to write.
+        Motion to write.
     path : str or Path
-        The file; replaced whole or not at all.
+        The file, written atomically.
 
     Raises
     ------
     OSError
-        If the folder is missing or cannot be written to.
+        If the folder is missing or not writable.
     """
     skeleton = motion.skeleton
     arrays: dict[str, Any] = {
@@ -136,23 +128,16 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
     path : str or Path
         The file.
     fps : float, optional
-        Frames per second, in place of the file's own.
+        Frames per second; the file's own by default.
 
     Raises
     ------
     MotionFileError
-        If the file is no such archive, or is damaged; the message names the key.
-    FileNotFoundError
-        If there is no such file.
+        If the file has another format or is damaged.
     """
     archive = Archive(Path(path))
-    keypoints = archive.numbers("keypoints")
+    keypoints = archive.points("keypoints", "(L, J, 2) or (V, L, J, 2)")
     confidence = archive.numbers("confidence")
-    if keypoints.ndim not in (3, 4) or keypoints.shape[-1] != 2 or 0 in keypoints.shape:
-        archive.fail(
-            f"keypoints has shape {keypoints.shape}, expected (L, J, 2) or (V, L, J, 2) with at "
-            "least one of each"
-        )
     if confidence.shape != keypoints.shape[:-1]:
         archive.fail(f"confidence must have shape {keypoints.shape[:-1]}, got {confidence.shape}")
     skeleton = archive.skeleton(keypoints.shape[-2])
@@ -173,7 +158,7 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
 
 
 class Archive:
-    """The arrays of one ``.npz`` file, each read and checked when it is asked for."""
+    """Arrays of an ``.npz`` file, read and checked on access."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -181,64 +166,62 @@ class Archive:
         try:
             self.zip = zipfile.ZipFile(io.BytesIO(content))
             self.keys = [name.removesuffix(".npy") for name in self.zip.namelist()]
-        except Exception as error:  # a damaged zip fails in a dozen ways, MemoryError among them
-            raise MotionFileError(
-                f"{path} is no npz archive ({str(error)[:80]}), expected one with the keys "
-                "positions, fps, joint_names and parents"
-            ) from error
+        except Exception as error:  # damaged zip files raise many types, including MemoryError
+            raise MotionFileError(f"{path}: expected an npz archive ({str(error)[:80]})") from error
 
     def fail(self, problem: str) -> NoReturn:
         raise MotionFileError(f"{self.path}: {problem}")
 
     def array(self, key: str) -> np.ndarray:
-        """Return the array of ``key``."""
         if key not in self.keys:
             found = ", ".join(name[:40] for name in self.keys[:12]) or "none"
-            self.fail(
-                f"key {key} is missing, expected positions (or keypoints and confidence), fps, "
-                f"joint_names and parents; the keys found are {found}"
-            )
+            self.fail(f"expected the key {key}, got {found}")
         try:
             member = io.BytesIO(self.zip.read(f"{key}.npy"))
             return np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # see __init__; a pickled object array is a ValueError
+        except Exception as error:  # see __init__; pickled object arrays raise ValueError
             raise MotionFileError(
-                f"{self.path}: key {key} cannot be read ({str(error)[:80]}), expected an array of "
-                "numbers or strings"
+                f"{self.path}: expected numbers or strings in {key} ({str(error)[:80]})"
             ) from error
 
     def numbers(self, key: str) -> np.ndarray:
-        """Return an array of numbers as float64; NaN passes, infinite and absurd ones do not."""
+        """Return an array as float64; NaN is accepted, infinite and huge numbers are not."""
         array = self.array(key)
         if array.dtype.kind not in "fiu":
-            self.fail(f"{key} is of {shortened(array.dtype)}, expected real numbers")
+            self.fail(f"{key} must contain real numbers, got {shortened(array.dtype)}")
         array = array.astype(np.float64)
         absurd = np.abs(array) > _LARGEST
         if absurd.any():
-            self.fail(f"{key} holds {array[absurd][0]:g}, expected numbers between -1e9 and 1e9")
+            self.fail(f"{key} must be between -1e9 and 1e9, got {array[absurd][0]:g}")
+        return array
+
+    def points(self, key: str, shapes: str) -> np.ndarray:
+        """Return a nonempty array of three or four axes with the last size in ``shapes``."""
+        array = self.numbers(key)
+        if array.ndim not in (3, 4) or array.shape[-1] != int(shapes[-2]) or 0 in array.shape:
+            self.fail(f"{key} must have shape {shapes}, none of it 0, got {array.shape}")
         return array
 
     def names(self, key: str, kind: str, count: int) -> list[str]:
-        """Return ``count`` names; ``person0``, ``person1``, … where ``key`` is absent."""
+        """Return ``count`` names; ``person0``, ``person1``, … if ``key`` is missing."""
         if key not in self.keys:
             return [f"{kind}{index}" for index in range(count)]
         array = self.array(key)
         if array.dtype.kind != "U" or array.shape != (count,):
-            self.fail(
-                f"{key} is of {shortened(array.dtype)} and shape {array.shape}, expected {count} "
-                "strings"
-            )
+            self.fail(f"{key} must be {count} strings, got {array.dtype} of shape {array.shape}")
         return array.tolist()
 
+    def joint_names(self, count: int) -> list[str]:
+        self.array("joint_names")  # required, unlike other names
+        return self.names("joint_names", "joint", count)
+
     def word(self, key: str, default: str) -> str:
-        """Return the one string of ``key``, ``default`` where it is absent."""
+        """Return the string of ``key``, ``default`` if it is missing."""
         if key not in self.keys:
             return default
         array = self.array(key)
         if array.dtype.kind != "U" or array.shape != ():
-            self.fail(
-                f"{key} is of {shortened(array.dtype)} and shape {array.shape}, expected a string"
-            )
+            self.fail(f"{key} must be a string, got {array.dtype} of shape {array.shape}")
         return str(array)
 
     def frame_rate(self) -> float:
@@ -248,33 +231,27 @@ class Archive:
         return fps.item()
 
     def skeleton(self, n_joints: int) -> Skeleton:
-        self.array("joint_names")  # unlike persons, joints must be named
-        names = self.names("joint_names", "joint", n_joints)
+        names = self.joint_names(n_joints)
         parents = self.numbers("parents")
         if parents.shape != (n_joints,) or (parents != np.round(parents)).any():
-            self.fail(f"parents must have shape {n_joints} integers, got {parents.shape}")
-        sizes = None
-        if "radii" in self.keys:
-            radii = self.numbers("radii")
-            if radii.shape != (n_joints,) or not (radii >= 0).all():
-                self.fail(f"radii must have shape {n_joints} numbers, 0 or more, got {radii.shape}")
-            sizes = radii.tolist()
+            self.fail(f"parents must be {n_joints} integers, got shape {parents.shape}")
+        sizes = self.numbers("radii").ravel().tolist() if "radii" in self.keys else None
         try:
             return Skeleton(names, [int(parent) for parent in parents], sizes)
         except ValueError as error:
             raise MotionFileError(f"{self.path}: {error}") from error
 
     def turn_to_y_up(self) -> np.ndarray | None:
-        """Return the rotation from the file's world to Y up, None where that is the same."""
+        """Return the rotation from the file's world to Y up, None for the identity."""
         up = self.word("up_axis", "y").lower()
         if up not in ("y", "z"):
             self.fail(f"up_axis must be 'y' or 'z', got {shortened(up)}")
         if up == "z" and "rotations" in self.keys:
-            self.fail("up_axis is 'z' and rotations came, expected 'y' where there are rotations")
+            self.fail("up_axis must be 'y' in a file with rotations, got 'z'")
         return _Z_UP_TO_Y_UP if up == "z" else None
 
     def kinematics(self, frames: int, n_joints: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return rotations and rest offsets, None where there are none."""
+        """Return rotations and rest offsets, None if the file has none."""
         if "rotations" not in self.keys:
             return None, None
         rotations, rest_offsets = self.numbers("rotations"), self.numbers("rest_offsets")
@@ -288,7 +265,7 @@ class Archive:
 
 
 def _crowd(skeleton: Skeleton, persons: list[str]) -> Skeleton:
-    """Return the skeleton of several people, joints called ``person:joint``."""
+    """Return the skeleton of several people, with joints named ``person:joint``."""
     names = [f"{person}:{joint}" for person in persons for joint in skeleton.joint_names]
     parents = [
         parent if parent < 0 else parent + number * skeleton.n_joints
@@ -302,13 +279,13 @@ def _crowd(skeleton: Skeleton, persons: list[str]) -> Skeleton:
 def _without_unseen(
     positions: np.ndarray, skeleton: Skeleton, path: Path
 ) -> tuple[np.ndarray, Skeleton]:
-    """Return positions and skeleton without the joints that are NaN in every frame."""
+    """Drop the joints that are NaN in every frame."""
     unseen = np.isnan(positions).all(axis=(0, 2))
     if not unseen.any() or unseen.all():
         return positions, skeleton
     left_out = ", ".join(np.array(skeleton.joint_names)[unseen])
     warnings.warn(
-        f"{path}: the joints {left_out} have no position in any frame and were left out",
+        f"{path}: dropping the joints {left_out}, which have no position in any frame",
         MotionFileWarning,
         stacklevel=4,
     )

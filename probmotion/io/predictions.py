@@ -1,4 +1,4 @@
-"""3D poses that another program has predicted from 2D ones, as an ``.npz`` archive.
+"""Reader of 3D motions predicted by another program, as an ``.npz`` archive.
 
 =================  =========================  =====================================================
 key                shape                      meaning
@@ -6,7 +6,7 @@ key                shape                      meaning
 ``positions``      (N, L, J, 3), (L, J, 3)    metres; N motions of L frames
 ``joint_names``    (J,)                       strings
 ``fps``            ()                         frames per second
-``up_axis``        (), optional               ``"y"`` (where absent) or ``"z"``
+``up_axis``        (), optional               ``"y"`` (default) or ``"z"``
 =================  =========================  =====================================================
 """
 
@@ -20,7 +20,7 @@ from probmotion.io.errors import MotionFileError
 from probmotion.io.npz import Archive
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_count, check_positive
+from probmotion.validation import check_count, check_finite, check_positive
 
 __all__ = ["read_predictions"]
 
@@ -28,20 +28,19 @@ __all__ = ["read_predictions"]
 def read_predictions(
     path: str | Path, skeleton: Skeleton, frames: int | None = None, fps: float | None = None
 ) -> np.ndarray:
-    """Read the 3D motions that another program, a lifter for example, has predicted.
+    """Read 3D motions predicted by another program, such as a lifter.
 
     Parameters
     ----------
     path : str or Path
-        The archive; its keys are in this module's description.
+        The archive; see the module for its keys.
     skeleton : Skeleton
-        The J joints to have, found among the file's by their (canonical) names; others are left
-        out.
+        The J joints to return, matched by their (canonical) names.
     frames : int, optional
-        Cut every motion into as many windows of this length as fit, one after the other; what is
-        left at its end is dropped. Whole motions by default.
+        Split every motion into windows of this length and drop the remainder; whole motions by
+        default.
     fps : float, optional
-        Resample to this rate, before windows are cut; the file's own rate by default.
+        Frames per second to resample to before splitting; the file's own by default.
 
     Returns
     -------
@@ -51,10 +50,7 @@ def read_predictions(
     Raises
     ------
     MotionFileError
-        If the file is no such archive, is damaged, lacks a joint or has too few frames; the
-        message names the key.
-    FileNotFoundError
-        If there is no such file.
+        If the file has another format, is damaged, lacks a joint or has too few frames.
     ValueError
         If ``frames`` or ``fps`` is out of range.
     """
@@ -71,42 +67,24 @@ def read_predictions(
         return positions
     windows = positions.shape[1] // frames
     if windows == 0:
+        at_rate = "" if fps is None else f" at {fps:g} frames per second"
         archive.fail(
-            f"positions has {positions.shape[1]} frames"
-            f"{'' if fps is None else f' at {fps:g} frames per second'}, expected at least {frames}"
+            f"positions must have at least {frames} frames, got {positions.shape[1]}{at_rate}"
         )
     return positions[:, : windows * frames].reshape(-1, frames, *positions.shape[2:])
 
 
 def _motions(archive: Archive) -> list[Motion]:
-    """Return the file's motions, Y up, on a skeleton that has its names and no bones."""
-    for key in ("positions", "joint_names", "fps"):
-        if key not in archive.keys:
-            found = ", ".join(name[:40] for name in archive.keys[:12]) or "none"
-            archive.fail(
-                f"key {key} is missing, expected positions, joint_names and fps; the keys found "
-                f"are {found}"
-            )
-    positions = archive.numbers("positions")
-    if positions.ndim not in (3, 4) or positions.shape[-1] != 3 or 0 in positions.shape:
-        archive.fail(
-            f"positions has shape {positions.shape}, expected (N, L, J, 3) or (L, J, 3) with at "
-            "least one of each"
-        )
-    missing = ~np.isfinite(positions)
-    if missing.any():
-        where = tuple(int(index) for index in np.argwhere(missing)[0])
-        archive.fail(
-            f"positions must be finite, got {missing.sum()} values that are NaN, the first at index {where}, "
-            "expected a position for every joint and frame"
-        )
+    """Return the file's motions, Y up, on a skeleton without bones."""
+    positions = archive.points("positions", "(L, J, 3) or (N, L, J, 3)")
     n_joints = positions.shape[-2]
-    names = archive.names("joint_names", "joint", n_joints)
+    names = archive.joint_names(n_joints)
     rate = archive.frame_rate()
     turn = archive.turn_to_y_up()
-    if turn is not None:
-        positions = positions @ turn.T
     try:
+        check_finite("positions", positions)
+        if turn is not None:
+            positions = positions @ turn.T
         boneless = Skeleton(names, [-1] * n_joints)
         return [
             Motion(clip, boneless, rate) for clip in positions.reshape(-1, *positions.shape[-3:])
@@ -116,7 +94,7 @@ def _motions(archive: Archive) -> list[Motion]:
 
 
 def _on(motion: Motion, skeleton: Skeleton, fps: float | None, archive: Archive) -> np.ndarray:
-    """Return a motion's positions on the skeleton asked for, at the rate asked for."""
+    """Return the positions of a motion on ``skeleton`` at ``fps``."""
     try:
         found = motion.retarget(skeleton)
     except ValueError as error:

@@ -1,8 +1,7 @@
-"""A real recording to denoise: one person before several calibrated cameras, triangulated.
+"""Reader of multi-camera recordings of one person, triangulated for denoising.
 
-The detections are real and so are their errors, which differ between joints and frames; beside
-them is the 3D that the recording's authors made of the same detections and filtered. It is a
-comparison and no truth: none is known.
+Detections and their errors are real. The recording's own filtered 3D, computed from the same
+detections, serves for comparison; the ground truth is unknown.
 """
 
 from __future__ import annotations
@@ -20,27 +19,27 @@ from probmotion.motion.occlusion import joints_at_rate, joints_on_skeleton
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["Recording", "read_recording", "triangulate_seen", "undistorted"]
+__all__ = ["Recording", "read_recording"]
 
 _FIXED_POINT_STEPS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Noisy joints of a recording, and filtered ones.
+    """Noisy and filtered joints of a recording.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Triangulated frame by frame, metres, world Y up; NaN where hidden.
+        Joints triangulated frame by frame, metres, world Y up; NaN where occluded.
     filtered : ndarray, (L, J, 3)
-        The authors' 3D; NaN where they have none.
+        The recording's own 3D; NaN where missing.
     skeleton : Skeleton
         The J joints.
     fps : float
         Frames per second.
     name : str
-        What to call the recording.
+        Name of the recording.
     """
 
     joints: np.ndarray
@@ -51,8 +50,12 @@ class Recording:
 
     @property
     def seen(self) -> np.ndarray:
-        """Where a joint is triangulated, (L, J). Detectors' confidence says no more: in the real
-        recording it has no correlation (-.02) with how far a joint is from the filtered one."""
+        """Where joints are triangulated, (L, J).
+
+        Detection confidence is no further indicator of quality: its correlation with the distance
+        between
+        triangulated and filtered joints is -0.02.
+        """
         return np.isfinite(self.joints).all(axis=-1)
 
 
@@ -63,7 +66,7 @@ def read_recording(
     *,
     threshold: float = 0.3,
 ) -> Recording:
-    """Return the triangulated and the filtered joints of a recording of several cameras.
+    """Return the triangulated and the filtered joints of a multi-camera recording.
 
     Parameters
     ----------
@@ -71,25 +74,22 @@ def read_recording(
         An ``.npz`` with ``keypoints`` (V, L, J, 2), ``confidence`` (V, L, J), ``positions`` and the
         cameras' ``K``, ``R``, ``t`` and ``distortion``.
     skeleton : Skeleton, optional
-        The joints to return, ``person14`` by default; a pelvis or neck that the recording lacks is
-        midway between its hips or shoulders.
+        The joints to return, ``person14`` by default; a missing pelvis or neck is the midpoint of
+        hips or shoulders.
     fps : float, optional
-        Frames per second to return, those of the file where it is None.
+        Frames per second to return; None for the file's own.
     threshold : float
-        Least confidence of a detection that counts.
+        Minimum confidence of a detection.
 
     Raises
     ------
     MotionFileError
-        If the file is damaged, a key is missing, or an array is not of the shape above or NaN
-        where it is read.
-    FileNotFoundError
-        If there is no such file.
+        If the file is damaged, or a key is missing or has an invalid shape or NaN.
     ValueError
-        If a joint of ``skeleton`` cannot be had, the threshold is no share, or shapes do not fit.
+        If a joint of ``skeleton`` is missing, the threshold is not 0 to 1, or shapes do not fit.
     """
     if not (isinstance(threshold, Real) and 0 <= threshold <= 1):
-        raise ValueError(f"threshold must be a confidence, 0 to 1, got {threshold!r}")
+        raise ValueError(f"threshold must be 0 to 1, got {threshold!r}")
     archive = Archive(Path(path))
     keypoints, confidence = archive.numbers("keypoints"), archive.numbers("confidence")
     check_shape("keypoints", keypoints, ("V", "L", "J", 2))
@@ -108,8 +108,8 @@ def read_recording(
     rate = archive.frame_rate()
     wanted = rate if fps is None else float(fps)
     return Recording(
-        _brought(joints, source, target, rate, wanted),
-        _brought(filtered, source, target, rate, wanted),
+        _converted(joints, source, target, rate, wanted),
+        _converted(filtered, source, target, rate, wanted),
         target,
         wanted,
         archive.word("name", archive.path.stem),
@@ -119,16 +119,16 @@ def read_recording(
 def _weights(
     archive: Archive, keypoints: np.ndarray, confidence: np.ndarray, threshold: float
 ) -> np.ndarray:
-    """Return the confidences that count, (V, L, J), 0 elsewhere; a NaN one does not."""
+    """Return the confidences of at least ``threshold``, (V, L, J), 0 elsewhere."""
     if not np.isfinite(confidence).any():
-        archive.fail("confidence has no number that is not NaN, expected some to be numbers")
+        archive.fail("confidence must contain numbers, got only NaN")
     weights = np.where(confidence >= threshold, confidence, 0.0)
     lost = np.isnan(keypoints).any(axis=-1) & (weights > 0)
     if lost.any():
         view, frame, joint = np.argwhere(lost)[0]
         archive.fail(
-            f"keypoints is NaN at view {view}, frame {frame}, joint {joint}, where confidence is "
-            f"{weights[view, frame, joint]:g}, expected confidence 0 where nothing is detected"
+            f"keypoints must be finite unless their confidence is 0, got NaN at view {view}, frame "
+            f"{frame}, joint {joint} with confidence {weights[view, frame, joint]:g}"
         )
     return weights
 
@@ -145,38 +145,19 @@ def _calibration(archive: Archive, n_views: int) -> tuple[Cameras, np.ndarray, n
         focal, centre = matrix[:, [0, 1], [0, 1]].mean(axis=1), matrix[:, :2, 2]
         cameras = Cameras(found["R"], found["t"], focal, centre, orthographic=False)
     except ValueError as error:
-        archive.fail(f"K, R, t and distortion are no cameras': {error}")
+        archive.fail(f"K, R, t and distortion must describe cameras: {error}")
     return cameras, matrix, found["distortion"]
 
 
 def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarray) -> np.ndarray:
-    """Return the points that at least two cameras see, NaN elsewhere.
+    """Return the points (L, J, 3) of keypoints (V, L, J, 2) in at least two cameras, NaN elsewhere.
 
-    Parameters
-    ----------
-    keypoints : ndarray, (V, L, J, 2)
-        Image units; not read where the weight is 0.
-    cameras : Cameras
-        The V cameras.
-    weights : ndarray, (V, L, J)
-        Of squared errors in the image (:func:`~probmotion.geometry.triangulation.triangulate`).
-
-    Returns
-    -------
-    ndarray, (L, J, 3)
-        Metres.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, or cameras that see a joint are parallel.
+    Keypoints of weight 0, (V, L, J), are ignored.
     """
-    check_shape("keypoints", keypoints, (cameras.n_views, "L", "J", 2))
-    check_shape("weights", weights, keypoints.shape[:-1])
     seen = (weights > 0).sum(axis=0) >= 2
     found = np.full((*seen.shape, 3), np.nan)
     if seen.any():
-        # Joints of all frames side by side, as one frame of as many joints.
+        # All joints of all frames, as one frame.
         points = triangulate(keypoints[:, None, seen], cameras, weights[:, None, seen])
         found[seen] = points[0]
     return found
@@ -185,39 +166,18 @@ def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarra
 def undistorted(
     keypoints: np.ndarray, matrix: np.ndarray, distortion: np.ndarray, cameras: Cameras
 ) -> np.ndarray:
-    """Return keypoints as pinhole cameras of one focal length would show them.
+    """Return pixels (V, L, J, 2) as projected by pinhole cameras with the intrinsics of
+    ``cameras``.
 
-    A lens moves the slopes (x, y), with r² = x² + y², to
+    A lens with intrinsics K (V, 3, 3) and coefficients k₁, k₂, p₁, p₂ (V, 4) maps slopes (x, y),
+    with
+    r² = x² + y², to
 
         x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²), and with y and x, p₁ and p₂ exchanged,
 
-    which is undone by fixed-point steps. (Source: the OpenCV documentation of its pinhole model.)
-
-    Parameters
-    ----------
-    keypoints : ndarray, (V, L, J, 2)
-        Pixels.
-    matrix : ndarray, (V, 3, 3)
-        K: focal lengths and principal points of the lenses, without skew.
-    distortion : ndarray, (V, 4)
-        k₁, k₂, p₁, p₂.
-    cameras : Cameras
-        Their focal lengths and centres are those of the result.
-
-    Returns
-    -------
-    ndarray, (V, L, J, 2)
-        Pixels; NaN where a keypoint is.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit.
+    which is inverted by fixed-point iteration. (Source: OpenCV's documentation of the pinhole
+    model.)
     """
-    V = cameras.n_views
-    check_shape("keypoints", keypoints, (V, "L", "J", 2))
-    check_shape("matrix", matrix, (V, 3, 3))
-    check_shape("distortion", distortion, (V, 4))
     assert cameras.centre is not None
     focal, centre = matrix[:, None, None, [0, 1], [0, 1]], matrix[:, None, None, :2, 2]
     bent = (keypoints - centre) / focal
@@ -237,10 +197,10 @@ def undistorted(
     return straight * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
 
 
-def _brought(
+def _converted(
     joints: np.ndarray, source: Skeleton, target: Skeleton, rate: float, wanted: float
 ) -> np.ndarray:
-    """Return joints (L, J, 3), NaN where hidden, on another skeleton and at another rate."""
-    shown = np.isfinite(joints).all(axis=-1).astype(np.float64)
-    joints, shown = joints_on_skeleton(joints, shown, source, target)
-    return joints if wanted == rate else joints_at_rate(joints, shown, rate, wanted)[0]
+    """Return joints (L, J, 3), NaN where occluded, on another skeleton and at another rate."""
+    weights = np.isfinite(joints).all(axis=-1).astype(np.float64)
+    joints, weights = joints_on_skeleton(joints, weights, source, target)
+    return joints if wanted == rate else joints_at_rate(joints, weights, rate, wanted)[0]

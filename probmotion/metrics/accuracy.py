@@ -1,7 +1,4 @@
-"""How far is a motion from the true one?
-
-Errors are distances per joint and frame, metres, averaged over those that ``mask`` keeps.
-"""
+"""Errors of motions against a true motion, in metres per joint and frame."""
 
 from __future__ import annotations
 
@@ -32,17 +29,7 @@ def joint_errors(motions: Array, truth: Array) -> Array:
 def mean_over(errors: Array, mask: Array | None = None) -> Array:
     """Return the mean error of each motion, ``(…, L, J) → (…)``.
 
-    Parameters
-    ----------
-    errors : Array, (…, L, J)
-        Distances.
-    mask : Array of bool, (L, J), optional
-        Frames and joints that count; all by default.
-
-    Raises
-    ------
-    ValueError
-        If the mask keeps nothing.
+    Entries outside ``mask``, (L, J) bool, are ignored; an empty mask is a ``ValueError``.
     """
     xp = array_namespace(errors)
     if mask is None:
@@ -51,7 +38,7 @@ def mean_over(errors: Array, mask: Array | None = None) -> Array:
     weights = constant(mask, errors)
     total = float(xp.sum(weights))
     if total == 0:
-        raise ValueError("mask keeps no joint in any frame, expected at least one")
+        raise ValueError("mask must select at least one joint in a frame")
     return xp.sum(errors * weights, axis=(-2, -1)) / total
 
 
@@ -61,10 +48,9 @@ def aligned_by_root(motions: Array, root: int = 0) -> Array:
 
 
 def aligned_by_similarity(motions: Array, truth: Array) -> Array:
-    """Return each frame moved, turned and scaled to be nearest the truth's (Umeyama 1991).
+    """Return each frame aligned to the truth by a similarity, no reflection (Umeyama 1991).
 
-    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. Never a reflection. A frame whose joints all
-    coincide is moved alone.
+    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. A frame with all joints at one point is translated.
     """
     xp = array_namespace(motions, truth)
     check_shape("motions", motions, ("…", *truth.shape))
@@ -85,37 +71,30 @@ def aligned_by_similarity(motions: Array, truth: Array) -> Array:
 def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
     """Return the mean distance of accelerations, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
-    Second differences; the motions need at least three frames.
+    Accelerations are second differences and need at least three frames.
     """
     check_positive("fps", fps)
-    _refuse_few_frames(motions, truth)
+    _check_frames(motions, truth)
     return _mean_bend(motions - truth) * fps**2
 
 
 def acceleration_ratio(motions: Array, truth: Array) -> Array:
-    """Return the mean size of accelerations over the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
+    """Return the mean acceleration relative to the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
-    Second differences of joints' positions, at any frame rate. A motion is plausible between a
-    half and two (paper 001, appendix H.1): below it is smoothed, above it trembles.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than three frames, or the truth moves without any acceleration.
+    Plausible values are 0.5 to 2 (paper 001, appendix H.1): lower means oversmoothed, higher
+    jittery. Raises ``ValueError`` below three frames or if the truth has no acceleration.
     """
-    _refuse_few_frames(motions, truth)
+    _check_frames(motions, truth)
     size = float(_mean_bend(truth))
     if size == 0:
-        raise ValueError(
-            "truth has no acceleration in any frame, expected a motion to compare with"
-        )
+        raise ValueError("truth must have a nonzero acceleration in some frame")
     return _mean_bend(motions) / size
 
 
-def _refuse_few_frames(motions: Array, truth: Array) -> None:
+def _check_frames(motions: Array, truth: Array) -> None:
     check_shape("motions", motions, ("…", *truth.shape))
     if truth.shape[-3] < 3:
-        raise ValueError(f"truth has {truth.shape[-3]} frames, expected at least 3")
+        raise ValueError(f"truth must have at least 3 frames, got {truth.shape[-3]}")
 
 
 def _mean_bend(paths: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Have the chains mixed, and how many independent draws are theirs worth?"""
+"""Convergence diagnostics of Markov chains."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from probmotion.posteriors.draws import MotionDraws
 
 __all__ = [
     "chain_diagnostics",
+    "monitored_coordinates",
     "principal_coordinates",
     "rhat_of_independent",
-    "watched_coordinates",
 ]
 
+# Above this dimension, only the principal coordinates are monitored.
 _FEW = 32
-_TO_CORRELATE = 10
 _PRINCIPAL = 10
+# Relative standard deviation below which a coordinate is constant.
 _NOTHING = 1e-9
+# Shorter chains have no ESS: it could not reveal autocorrelation.
+_TO_CORRELATE = 10
+# Simulated runs behind a quantile of R-hat.
+_RUNS = 100
 
 
 def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> dict[str, float]:
-    """Return diagnostics of a chain sampler's run; nothing for draws that are independent.
+    """Return convergence diagnostics of a run; empty for independent draws.
 
-    ``ess_bulk``, ``ess_tail``: the smallest over ``values``, (chain, draw, n), by default
-    :func:`watched_coordinates`; ``rhat``: the largest (Vehtari et al. 2021, by ArviZ), NaN of fewer
-    than 4 draws a chain. Chains of fewer than 10 have no ESS: they are too short to show that draws
-    depend on each other, and stuck chains would have that of independent draws.
-    ``acceptance``: the mean; ``divergent``: the number of divergent transitions.
+    ``rhat`` is the largest and ``ess_bulk`` and ``ess_tail`` are the smallest over ``values``
+    (chain, draw, n), by default :func:`monitored_coordinates` (Vehtari et al. 2021, ArviZ); R-hat
+    is NaN below 4 draws per chain and ESS missing below 10. ``acceptance`` is the mean and
+    ``divergent`` the number of divergent transitions.
 
-    Walkers of an ensemble move by each other, so that a chain of them has no ESS of its own: a
-    run that stores its ``autocorrelation_time`` gets ``ess_bulk`` from that, and none where that
-    is NaN, not known. It cannot see that ensembles sit in different modes; their R-hat, each
-    ensemble being one chain, can.
+    Walkers of an ensemble are coupled, so ``ess_bulk`` then comes from the stored
+    ``autocorrelation_time`` (missing if NaN); ensembles in different modes only show in R-hat, with
+    each ensemble as one chain.
     """
     if draws.independent:
         return {}
@@ -40,7 +43,7 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
 
     data = draws.dataset
     n_chains, n_draws = data.sizes["chain"], data.sizes["draw"]
-    values = watched_coordinates(draws) if values is None else values
+    values = monitored_coordinates(draws) if values is None else values
     axes = {"chain_axis": 0, "draw_axis": 1}
     found: dict[str, float] = {}
     if "autocorrelation_time" in data:
@@ -61,9 +64,10 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
 
 
 def principal_coordinates(values: np.ndarray) -> np.ndarray:
-    """Return the leading 10 principal coordinates over all chains, fewer where fewer vary.
+    """Return the leading principal coordinates over all chains, at most 10.
 
-    ``(chain, draw, n) → (chain, draw, 1 to 10)``, widest first; the first is always there.
+    ``(chain, draw, n) → (chain, draw, k)``, by decreasing variance; constant ones are dropped, but
+    never the first.
     """
     flat = values.reshape(-1, values.shape[-1])
     left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
@@ -73,37 +77,36 @@ def principal_coordinates(values: np.ndarray) -> np.ndarray:
 
 
 def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
-    """Return what the R-hat of a run exceeds with probability ``1 − level`` though it has mixed.
+    """Return the upper ``level`` quantile of R-hat over converged runs.
 
-    The quantile of the greatest R-hat of as many coordinates as diagnostics ever look at, of
-    independent draws: of short chains it is far from 1. Found from 100 such runs.
+    It is that of the largest R-hat over as many coordinates as are monitored, estimated from 100
+    runs of independent draws; short chains exceed 1 by far.
 
     Parameters
     ----------
     chains, draws : int
-        Chains, and draws of each: 4 or more.
+        Chains, and draws of each, at least 4.
     level : float
         Between 0 and 1.
     seed : int
-        Of the runs.
+        Seed of the simulated runs.
     """
     from arviz_stats.base import array_stats
 
     greatest = []
-    for run in range(100):
-        # One at a time, each with its own stream: all at once would take gigabytes.
+    for run in range(_RUNS):
+        # One at a time: all at once would take gigabytes.
         rng = seeds.generator(seed, "rhat", run)
         values = rng.standard_normal((chains, draws, _FEW + 1))
         greatest.append(array_stats.rhat(values, chain_axis=0, draw_axis=1).max())
     return float(np.quantile(greatest, level))
 
 
-def watched_coordinates(draws: MotionDraws) -> np.ndarray:
-    """Return what diagnostics look at, (chain, draw, n).
+def monitored_coordinates(draws: MotionDraws) -> np.ndarray:
+    """Return the coordinates that diagnostics monitor, (chain, draw, n).
 
-    θ (the positions where a run stores none), or its 10 leading principal coordinates over all
-    chains where there are more than 32: the worst of a thousand is bad for perfect chains too.
-    The log density, where stored, is one more.
+    θ (else the positions), or its 10 leading principal coordinates above 32 dimensions, because the
+    worst of a thousand looks bad even for perfect chains; plus the log density if stored.
     """
     data = draws.dataset
     shape = (data.sizes["chain"], data.sizes["draw"])

@@ -1,4 +1,4 @@
-"""How well do draws cover real poses? (Yin et al. 2018, eq. 13)."""
+"""Coverage of real poses by draws (Yin et al. 2018, eq. 13)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probmotion.interaction.geometry.pose_distances import MEASURES, check_measure, pose_distances
+from probmotion.interaction.geometry.pose_distances import MEASURES, check_measure
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["coverage", "nearest_draw_distances", "pose_distances"]
+__all__ = ["coverage", "nearest_draw_distances"]
 
+# Draws per block, so that their graphs stay in a core's cache.
 _BLOCK = 256
-"""Draws looked at together: their graphs stay in a core's cache while every truth meets them."""
 
 
 def coverage(
@@ -29,24 +29,17 @@ def coverage(
     ground_truth : ndarray, (G, J, 3)
         Real poses, metres.
     draws : ndarray, (S, J, 3)
-        Draws, metres; a memory map will do, as a few hundred are looked at together. A pose that
-        a chain repeats is measured once.
+        Draws, metres; may be a memory map. Repeated poses are measured once.
     measure : str
-        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`; every one is taken
-        after the best rigid alignment of the two poses.
+        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`, after the best rigid
+        alignment of the two poses.
     counts : sequence of int, optional
-        Numbers of draws, in any order: coverage by the first so many draws, from one pass.
+        Numbers of leading draws, in any order, to compute coverage for in one pass.
 
     Returns
     -------
     coverage : float, or ndarray (len(counts),)
-        Metres, or without unit for shape contexts.
-
-    Raises
-    ------
-    ValueError
-        If a set is empty, shapes differ, a value is not finite, the measure is unknown, or a
-        count is not between 1 and S.
+        Metres; dimensionless for shape contexts.
     """
     wanted = [len(draws)] if counts is None else list(counts)
     least = nearest_draw_distances(ground_truth, draws, measure, wanted)
@@ -57,10 +50,7 @@ def coverage(
 def nearest_draw_distances(
     ground_truth: np.ndarray, draws: np.ndarray, measure: str, counts: Sequence[int]
 ) -> np.ndarray:
-    """Return min_{s ≤ count} D(g, s) for every count and real pose, (len(counts), G).
-
-    Arguments and errors are those of :func:`coverage`.
-    """
+    """Return min_{s ≤ count} D(g, s), (len(counts), G); arguments as in :func:`coverage`."""
     check_measure(measure)
     ground_truth = np.asarray(ground_truth, dtype=np.float64)
     check_shape("ground_truth", ground_truth, ("G", "J", 3))
@@ -68,14 +58,14 @@ def nearest_draw_distances(
     check_shape("draws", draws, ("S", ground_truth.shape[1], 3))
     for name, poses in (("ground_truth", ground_truth), ("draws", draws)):
         if len(poses) == 0:
-            raise ValueError(f"{name} must contain at least one pose, got none")
+            raise ValueError(f"{name} must contain at least one pose, got 0")
     if len(counts) == 0:
-        raise ValueError("counts must contain at least one number of draws, got none")
+        raise ValueError("counts must contain at least one number, got 0")
     for count in counts:
         check_count("counts", count)
         if count > len(draws):
-            raise ValueError(f"counts has {count}, expected at most {len(draws)}, the draws")
-    prepare, _, lower_minima = MEASURES[measure]
+            raise ValueError(f"counts must be at most the {len(draws)} draws, got {count}")
+    prepare, lower_minima = MEASURES[measure]
     truths = prepare(ground_truth)
     least = np.full(len(ground_truth), np.inf)
     seen: set[bytes] = set()
@@ -93,10 +83,7 @@ def nearest_draw_distances(
 
 
 def _first_seen(poses: np.ndarray, seen: set[bytes]) -> list[int]:
-    """Return the indices of poses that were not seen before, and remember them.
-
-    By a digest of 128 bits: two poses that differ share one with odds of 1e-28 in 100 000.
-    """
+    """Return the indices of new poses and add their 128-bit digests to ``seen``."""
     new = []
     for index, pose in enumerate(poses):
         digest = hashlib.blake2b(pose.tobytes(), digest_size=16).digest()

@@ -1,4 +1,4 @@
-"""Credible sets: the level of the smallest one that holds a truth, by its rank."""
+"""Credible sets: the smallest level that contains a truth, from its rank."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import numpy as np
 
 __all__ = ["DENSITY", "DISTANCE", "credible_level"]
 
+# Quantities whose credible sets are not central intervals.
 DENSITY, DISTANCE = "log density", "distance"
-"""Quantities whose credible sets are not central intervals."""
 
 
 def credible_level(quantity: str, ranks: np.ndarray) -> np.ndarray:
-    """Return the level of the smallest credible set that holds the truth, by its rank in [0, 1].
+    """Return the level of the smallest credible set that contains the truth of rank in [0, 1].
 
-    Of :data:`DENSITY` the set of highest density (Hermans et al. 2022, "A crisis in
-    simulation-based inference?"); of :data:`DISTANCE` the ball about a random point (Lemos et al.
-    2023, "Sampling-based accuracy testing of posterior estimators"); of any other quantity the
-    central interval.
+    The set is the highest-density region for :data:`DENSITY` (Hermans et al. 2022, "A crisis in
+    simulation-based inference?"), the ball around a random point for :data:`DISTANCE` (Lemos et al.
+    2023, "Sampling-based accuracy testing of posterior estimators"), else the central interval.
     """
     if quantity == DENSITY:
         return 1 - ranks

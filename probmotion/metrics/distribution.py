@@ -1,7 +1,4 @@
-"""How far is a set of draws from the distribution they claim to be of?
-
-Sets of draws are arrays (n, D): motions flattened, metres.
-"""
+"""Distances of sets of draws (n, D), flattened motions in metres, from reference draws."""
 
 from __future__ import annotations
 
@@ -31,22 +28,10 @@ def random_directions(rng: np.random.Generator, n: int, dim: int) -> np.ndarray:
 
 
 def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
-    """Return the sliced 2-Wasserstein distance of two sets of as many draws.
+    """Return the sliced 2-Wasserstein distance of two sets of equal size (Bonneel et al. 2015).
 
-    The root of the mean, over directions, of the squared 2-Wasserstein distance of the
-    projections (Bonneel et al. 2015).
-
-    Parameters
-    ----------
-    x, y : Array, (n, D)
-        The sets, in any array library.
-    directions : ndarray, (P, D)
-        Unit vectors to project on.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree.
+    It is the root mean square, over ``directions`` (P, D), of the 2-Wasserstein distances of the
+    projections: ``(n, D), (n, D) → ()``, in any array library.
     """
     xp = array_namespace(x, y)
     check_shape("x", x, ("n", directions.shape[-1]))
@@ -59,26 +44,21 @@ def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
 def sliced_wasserstein_ratio(
     draws: Array, references: Sequence[Array], directions: np.ndarray
 ) -> float:
-    """Return the sliced Wasserstein distance to exact draws over that of two exact sets.
+    """Return the sliced Wasserstein distance to exact draws relative to that of two exact sets.
 
-    1: indistinguishable from exact draws by this measure.
+    1 means indistinguishable from exact draws.
 
     Parameters
     ----------
     draws : Array, (n, D)
-        What is judged.
+        Draws to evaluate.
     references : sequence of Array, each (n, D)
-        Independent sets of as many exact draws; numerator and floor are means over them.
+        At least two independent sets of exact draws; both distances are averaged over them.
     directions : ndarray, (P, D)
         Unit vectors to project on.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two reference sets.
     """
     if len(references) < 2:
-        raise ValueError(f"references has {len(references)} sets, expected at least 2")
+        raise ValueError(f"references must have at least 2 sets, got {len(references)}")
     pairs = zip(references, [*references[1:], references[0]], strict=True)
     floor = np.mean([float(sliced_wasserstein(a, b, directions)) for a, b in pairs])
     found = np.mean([float(sliced_wasserstein(draws, r, directions)) for r in references])
@@ -86,7 +66,7 @@ def sliced_wasserstein_ratio(
 
 
 def trace_ratio(draws: Array, reference: Array) -> Array:
-    """Return tr Cov[draws] / tr Cov[reference], ``(n, D), (m, D) → ()``; < 1 is over-confident."""
+    """Return tr Cov[draws] / tr Cov[reference], ``(n, D), (m, D) → ()``; < 1: overconfident."""
     return _total_variance(draws) / _total_variance(reference)
 
 
@@ -105,25 +85,14 @@ def precision_recall(
 ) -> tuple[float, float]:
     """Return precision and recall of k-nearest-neighbour manifolds (Kynkäänniemi et al. 2019).
 
-    Precision: the share of draws that lie within the k-th neighbour's distance of some reference
-    draw; recall: the same with the roles swapped.
-
-    Parameters
-    ----------
-    draws, reference : ndarray, (n, D) and (m, D)
-        The sets.
-    neighbours : int
-        k.
-
-    Raises
-    ------
-    ValueError
-        If a set has k points or fewer.
+    Precision is the fraction of draws within the distance to the k-th neighbour of some reference
+    draw; recall swaps the roles. Both sets, (n, D) and (m, D), need more than ``neighbours`` = k
+    points.
     """
     for name, points in (("draws", draws), ("reference", reference)):
         if len(points) <= neighbours:
             raise ValueError(
-                f"{name} has {len(points)} points, expected more than neighbours={neighbours}"
+                f"{name} must have more than neighbours={neighbours} points, got {len(points)}"
             )
     apart = _distances(draws, reference)
     precision = (apart <= _radii(reference, neighbours)[None, :]).any(axis=1).mean()
@@ -138,7 +107,7 @@ def _total_variance(points: Array) -> Array:
 
 
 def _radii(points: np.ndarray, neighbours: int) -> np.ndarray:
-    """Distance of each point to its k-th nearest other point, (n,)."""
+    """Return the distance of each point to its k-th nearest neighbour, (n,)."""
     apart = _distances(points, points)
     np.fill_diagonal(apart, math.inf)
     return np.partition(apart, neighbours - 1, axis=1)[:, neighbours - 1]

@@ -1,4 +1,4 @@
-"""2D views of generated 3D motions, from random sides, to be judged beside real 2D motions."""
+"""Random 2D views of generated 3D motions, for comparison with real 2D motions."""
 
 from __future__ import annotations
 
@@ -18,14 +18,8 @@ Angles = Literal["all", "side", "reference-code-side"]
 def random_azimuths(rng: np.random.Generator, n: int, angles: Angles = "all") -> np.ndarray:
     """Return the azimuths of n cameras, radians, (n,).
 
-    ``all`` is uniform on the circle, ``side`` uniform on (π/4, 3π/4) from the reference view,
-    azimuth 0 (MAS, section 6.3); ``reference-code-side`` is π/2 for each, as what the authors'
-    code calls the side.
-
-    Raises
-    ------
-    ValueError
-        If ``angles`` is another.
+    ``all``: uniform on the circle; ``side``: uniform on (π/4, 3π/4) (MAS, section 6.3);
+    ``reference-code-side``: π/2, as in the authors' code.
     """
     check_count("n", n)
     if angles == "all":
@@ -48,34 +42,28 @@ def film_motions(
 ) -> np.ndarray:
     """Return one perspective view of each motion: ``(N, L, J, 3) → (N, L, J, 2)``.
 
-    The root is at the origin in every frame; views are in metres at its depth, x right, y down.
+    Views are centred on the root in every frame, in metres at its depth, x right and y down.
 
     Parameters
     ----------
     positions : ndarray, (N, L, J, 3)
         Motions, metres.
     rng : Generator
-        Of one azimuth per motion.
+        Draws one azimuth per motion.
     elevation : float
-        Of all cameras, radians.
+        Elevation of the cameras, radians.
     distance : float
         From camera to root, metres.
     angles : {"all", "side", "reference-code-side"}
-        Where the cameras stand; see :func:`random_azimuths`.
+        Distribution of azimuths; see :func:`random_azimuths`.
     root : int
-        The joint that the cameras follow.
-
-    Raises
-    ------
-    ValueError
-        If the shape is another, a number is not finite, ``angles`` is unknown, or a joint is
-        behind its camera.
+        Joint that the cameras follow.
     """
     check_shape("positions", positions, ("N", "L", "J", 3))
     check_finite("positions", positions)
     azimuths = random_azimuths(rng, len(positions), angles)
     centred = positions - positions[:, :, root : root + 1]
-    # To go around a motion by an azimuth is to turn it by as much the other way.
+    # Rotate the motion instead of the camera, by the negative azimuth.
     c, s = np.cos(azimuths)[:, None, None], np.sin(azimuths)[:, None, None]
     x, y, z = centred[..., 0], centred[..., 1], centred[..., 2]
     turned = np.stack([c * x - s * z, y, s * x + c * z], axis=-1)

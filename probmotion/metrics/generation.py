@@ -1,7 +1,4 @@
-"""How like real 2D motion is generated motion? The published evaluation (MAS, section 6.3).
-
-Sets of motions are compared by their features, (N, D), which an evaluator makes of 2D views.
-"""
+"""Similarity of generated to real 2D motion, by an evaluator's features (MAS, section 6.3)."""
 
 from __future__ import annotations
 
@@ -30,18 +27,16 @@ __all__ = [
     "score_generation",
 ]
 
+# Recall below which a generator has collapsed (MAS, table 2).
 COLLAPSED_BELOW = 0.1
-"""Recall below which a generator has collapsed (MAS, table 2)."""
-
 _CHAMFER_FRAMES = 10  # as published
-
+# Mean and standard deviation over repeats, by the names of GenerationScores.
 Scores = dict[str, tuple[float, float]]
-"""Mean and standard deviation over repeats, by the names of :class:`GenerationScores`."""
 
 
 @runtime_checkable
 class EncodesViews(Protocol):
-    """What makes features of 2D motions."""
+    """A feature extractor of 2D motions."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -49,7 +44,7 @@ class EncodesViews(Protocol):
 
     @property
     def frames(self) -> int:
-        """Most frames of a motion."""
+        """Largest number of frames of a motion."""
 
     def features(self, views: np.ndarray, lengths: np.ndarray | None = None) -> np.ndarray:
         """Return features: ``(N, L, J, 2) → (N, D)``; views in metres, centred on the root."""
@@ -57,18 +52,18 @@ class EncodesViews(Protocol):
 
 @dataclass(frozen=True)
 class GenerationScores:
-    """How one set of motions compares with real ones.
+    """Scores of a set of motions against real ones.
 
     Parameters
     ----------
     fid : float
-        Fréchet distance of features; 0 is right.
+        Fréchet distance of features; 0 is ideal.
     diversity : float
-        Mean distance of two motions; the real motions' own is right.
+        Mean distance of two motions; ideally that of real motions.
     precision : float
-        Share of motions among real ones; 1 is best.
+        Fraction of motions on the manifold of real ones; 1 is best.
     recall : float
-        Share of real motions among these; 1 is best.
+        Fraction of real motions on the manifold of these; 1 is best.
     """
 
     fid: float
@@ -78,22 +73,17 @@ class GenerationScores:
 
     @property
     def collapsed(self) -> bool:
-        """Whether the generator has lost most of what there is: recall < .1."""
+        """Whether the generator has collapsed: recall < 0.1."""
         return self.recall < COLLAPSED_BELOW
 
 
 def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
     """Return the squared Fréchet distance of two sets' Gaussians (Heusel et al. 2017, eq. 6).
 
-    ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½). With C = RᵀR, R triangular, the last trace is
-    the sum of the singular values of R_a R_bᵀ: no root of a matrix, and no trouble with fewer
-    motions than features. Small sets raise it, by about tr C (D + 5) / (4 N) each if features
-    vary alike: compare generators at equal sizes.
-
-    Parameters
-    ----------
-    a, b : ndarray, (N, D) and (M, D)
-        Features.
+    ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½) of features (N, D) and (M, D). With C = RᵀR, the
+    last trace is the sum of the singular values of R_a R_bᵀ, stable even for fewer motions than
+    features. The bias of small sets is about tr C (D + 5) / (4 N) each, so compare generators at
+    equal sizes.
 
     Raises
     ------
@@ -105,43 +95,29 @@ def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
     for name, features in (("a", a), ("b", b)):
         check_finite(name, features)
         if len(features) < 2:
-            raise ValueError(f"{name} has {len(features)} motions, expected at least 2")
+            raise ValueError(f"{name} must have at least 2 motions, got {len(features)}")
     root_a, root_b = _covariance_root(a), _covariance_root(b)
     shared = np.linalg.svd(root_a @ root_b.T, compute_uv=False).sum()
     apart = ((a.mean(axis=0) - b.mean(axis=0)) ** 2).sum()
     distance = apart + (root_a**2).sum() + (root_b**2).sum() - 2 * shared
-    # Of equal sets, rounding leaves some 1e-15 tr C of either sign.
+    # Equal sets give about ±1e-15 tr C by rounding.
     return max(0.0, float(distance))
 
 
 def _covariance_root(features: np.ndarray) -> np.ndarray:
-    """R with RᵀR the covariance."""
+    """Return R with RᵀR the covariance."""
     apart = (features - features.mean(axis=0)) / math.sqrt(len(features) - 1)
     return np.linalg.qr(apart).R
 
 
 def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) -> float:
-    """Return the mean distance of random pairs of different motions.
+    """Return the mean distance of ``pairs`` random pairs of motions, from features (N, D), N ≥ 2.
 
-    As in the MAS authors' code (200 pairs); their paper calls it the variance.
-
-    Parameters
-    ----------
-    features : ndarray, (N, D)
-        Of the motions.
-    rng : Generator
-        Of the pairs.
-    pairs : int
-        How many.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two motions.
+    As in the MAS authors' code (200 pairs); the paper calls it the variance.
     """
     check_count("pairs", pairs)
     if len(features) < 2:
-        raise ValueError(f"features has {len(features)} motions, expected at least 2")
+        raise ValueError(f"features must have at least 2 motions, got {len(features)}")
     first = rng.integers(0, len(features), pairs)
     second = (first + rng.integers(1, len(features), pairs)) % len(features)
     return float(np.linalg.norm(features[first] - features[second], axis=1).mean())
@@ -150,9 +126,9 @@ def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) 
 def score_features(
     features: np.ndarray, held_out: np.ndarray, rng: np.random.Generator
 ) -> GenerationScores:
-    """Return how motions compare with held-out real ones, by their features (N, D), (M, D).
+    """Return the scores of motions against held-out real ones, from features (N, D), (M, D).
 
-    Precision and recall have k = 3. ``rng`` draws the pairs of the diversity.
+    ``rng`` draws the pairs for the diversity.
     """
     precision, recall = precision_recall(features, held_out)
     fid = frechet_distance(features, held_out)
@@ -170,20 +146,19 @@ def score_generation(
 ) -> Scores:
     """Return mean and standard deviation of every score over repeats.
 
-    The ± is the standard deviation of one repeat's score (with repeats − 1 in the denominator),
-    over whatever ``draw_views`` draws anew. (The MAS authors' code prints the 95 % interval of the
-    mean, 1.96 standard deviations / √repeats.)
+    The standard deviation (ddof 1) is that of one repeat. (The MAS authors' code prints the 95 %
+    interval of the mean, 1.96 standard deviations / √repeats.)
 
     Parameters
     ----------
     features_of : callable
-        Makes features of views: ``(N, L, J, 2) → (N, D)``.
+        Computes features of views: ``(N, L, J, 2) → (N, D)``.
     draw_views : callable
-        Returns views, given a generator and how many are wanted at most.
+        Returns views, given a generator and their largest number.
     held_out_features : ndarray, (M, D)
-        Of real motions: the same in every repeat.
+        Features of real motions.
     seed : int
-        Repeat r is the same however many there are.
+        Seed; repeat r does not depend on ``repeats``.
     samples : int
         Motions per repeat.
     repeats : int
@@ -206,29 +181,23 @@ def score_generation(
 
 @dataclass(frozen=True, eq=False)
 class GenerationReference:
-    """Real 2D motion that generated motion is compared with, and how that is filmed.
+    """Real 2D motion to compare generated motion with.
 
     Parameters
     ----------
     evaluator : EncodesViews
-        Makes the features.
+        Feature extractor.
     held_out_features : ndarray, (M, D)
-        Of real motions that neither the generator nor the evaluator learnt from.
+        Features of real motions in neither training set.
     learnt_features : ndarray, (M, D), optional
-        Of the clips that were learnt from, filmed anew. Where clips are few, those that were held
-        out are another matter, and no model of the first can come near them; see :meth:`of_learnt`.
+        Features of the training clips. With few clips, held-out ones differ so much that no
+        generator comes close; see :meth:`of_learnt`.
     elevation : float
-        Of the cameras that film generated 3D motions, radians.
+        Elevation of the cameras that view generated motions, radians.
     distance : float
-        From them to the root, metres.
+        From the cameras to the root, metres.
     held_out_views : ndarray, (M', L', J, 2), optional
-        Some of the held-out motions themselves, metres, centred on the root: their distance from
-        generated ones needs no features.
-
-    Raises
-    ------
-    ValueError
-        If the features are not (M, D), the views not (M', L', J, 2), or one is not finite.
+        Held-out motions, metres, centred on the root, for the Chamfer distance.
     """
 
     evaluator: EncodesViews
@@ -251,15 +220,9 @@ class GenerationReference:
             check_finite("learnt_features", self.learnt_features)
 
     def of_learnt(self) -> GenerationReference:
-        """Return the reference whose real motions are those that were learnt from.
-
-        Raises
-        ------
-        ValueError
-            If their features are not known.
-        """
+        """Return the reference with the training clips as real motions."""
         if self.learnt_features is None:
-            raise ValueError("learnt_features must be features of learnt motions, got missing")
+            raise ValueError("learnt_features must be given, got None")
         return replace(self, held_out_features=self.learnt_features)
 
     def score_motions(
@@ -273,13 +236,11 @@ class GenerationReference:
     ) -> Scores:
         """Return the scores of 3D motions, (N, L, J, 3) metres.
 
-        Every repeat films ``samples`` of them, or all if there are no more, each from a fresh
-        side. The ± so holds the chance of sides and, if there are more, of subsets: of halves it is
-        that of the draws over √2. It does not hold that of training, or of the held-out motions.
+        Every repeat views up to ``samples`` of them from new azimuths. The standard deviation
+        covers azimuths and subsets, not training or the choice of held-out motions.
 
-        Views from the ``side`` compare with held-out views from all around only if azimuth 0 is
-        no side of the body's own: motions lifted from views at random azimuths, or that face any
-        way. Motions that all face +Z have another distribution there, however real they are.
+        Scores from the ``side`` require motions whose azimuth 0 is not a fixed body direction, such
+        as motions lifted from random views; if all motions face +Z, even real ones score badly.
         """
 
         def film(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -288,17 +249,12 @@ class GenerationReference:
         return self._score(film, seed, samples, repeats)
 
     def chamfer(self, positions: np.ndarray, *, seed: int) -> MotionChamfer:
-        """Return the Motion Chamfer Distance of 3D motions, (N, L, J, 3) metres, each seen once.
+        """Return the Motion Chamfer Distance of one view of each motion, (N, L, J, 3) metres.
 
-        Whole windows of 10 frames are compared, or of as many as there are if there are fewer.
-
-        Raises
-        ------
-        ValueError
-            If no motions were held out, but features alone.
+        Windows have 10 frames, or all if there are fewer. Requires ``held_out_views``.
         """
         if self.held_out_views is None:
-            raise ValueError("held_out_views must be 2D motions to compare with, got missing")
+            raise ValueError("held_out_views must be given, got None")
         views = self._film(positions, seeds.generator(seed, "chamfer"), "all")
         frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
         shown, real = (
@@ -319,10 +275,7 @@ class GenerationReference:
     def score_views(
         self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10
     ) -> Scores:
-        """Return the scores of 2D motions, (N, L, J, 2) metres, such as real ones.
-
-        Every repeat takes ``samples`` of them; if there are no more, only the diversity has a ±.
-        """
+        """Return the scores of 2D motions, (N, L, J, 2) metres, from subsets of ``samples``."""
 
         def take(rng: np.random.Generator, n: int) -> np.ndarray:
             return views[_subset(rng, len(views), n)]
@@ -347,5 +300,5 @@ class GenerationReference:
 
 
 def _subset(rng: np.random.Generator, n: int, most: int) -> np.ndarray:
-    """Which of n are taken: ``most`` at random, or all."""
+    """Return a random subset of n indices, at most ``most``."""
     return rng.permutation(n)[:most]

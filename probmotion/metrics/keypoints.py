@@ -1,7 +1,6 @@
-"""How near are predicted keypoints to annotated ones, and generated sequences to filmed ones?
+"""Errors of predicted 2D keypoints (Sun et al. 2024, "Ponymation", sections 4.2.2 and 4.3).
 
-The measures of Sun et al. 2024 ("Ponymation", sections 4.2.2 and 4.3, appendix C), which need no
-3D truth. Keypoints are in any unit of the picture, x right and y down.
+Keypoints are in any unit of the image, x right and y down.
 """
 
 from __future__ import annotations
@@ -24,60 +23,48 @@ def percentage_of_correct_keypoints(
     size: float | np.ndarray,
     *,
     visible: np.ndarray | None = None,
-    share: float = 0.1,
+    threshold: float = 0.1,
 ) -> float:
-    """Return PCK: the percentage of visible keypoints that are nearer than ``share · size``.
+    """Return PCK: the percentage of visible keypoints with error below ``threshold · size``.
 
     Parameters
     ----------
     predicted, truth : ndarray, (…, L, J, 2)
-        Keypoints; what is not visible may be NaN in the truth.
+        Keypoints; invisible ones may be NaN in the truth.
     size : float or ndarray
-        max(h, w) of the picture in the keypoints' unit: one number, or one for each sequence (…)
-        or frame (…, L). See :func:`image_extent` for tracks without a picture.
+        max(h, w) of the image in the keypoints' unit: one number, or one per sequence (…) or frame
+        (…, L); :func:`image_extent` for tracks without an image.
     visible : ndarray of bool, (…, L, J), optional
-        Keypoints that count; all by default.
-    share : float
-        Of the size, what an error must be below; .1 is the paper's PCK@0.1.
+        Mask of visible keypoints; all by default.
+    threshold : float
+        Relative to the size; 0.1 for PCK@0.1.
 
     Returns
     -------
     float
-        0 to 100, over all visible keypoints of all sequences alike.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a visible number is not finite, a size is not above 0, or nothing is
-        visible.
+        0 to 100, over the visible keypoints of all sequences.
     """
     seen = _check_keypoints(predicted, truth, visible)
-    check_positive("share", share)
+    check_positive("threshold", threshold)
     sizes = np.asarray(size, np.float64)
     if sizes.ndim > truth.ndim - 2 or sizes.shape != truth.shape[: sizes.ndim]:
         raise ValueError(
-            f"size has shape {sizes.shape}, expected one number, or one for each sequence or frame "
-            f"of {truth.shape[:-2]}"
+            f"size must be a number, or one per sequence or frame {truth.shape[:-2]}, got shape "
+            f"{sizes.shape}"
         )
     if not (np.isfinite(sizes) & (sizes > 0)).all():
-        raise ValueError("size has entries that are not finite numbers above 0")
+        raise ValueError("size must be finite and above 0")
     if not seen.any():
-        raise ValueError("visible has no keypoint in any frame, expected at least one")
+        raise ValueError("visible must contain at least one keypoint")
     sizes = sizes.reshape(*sizes.shape, *[1] * (truth.ndim - 1 - sizes.ndim))
-    errors = np.linalg.norm(_hidden_as_zero(predicted - truth, seen), axis=-1)
-    return 100 * float((errors < share * sizes)[seen].mean())
+    errors = np.linalg.norm(_masked(predicted - truth, seen), axis=-1)
+    return 100 * float((errors < threshold * sizes)[seen].mean())
 
 
 def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
-    """Return the larger side of the box around each sequence, for tracks without a picture.
+    """Return the longer side of the bounding box of each sequence: ``(…, L, J, 2) → (…)``.
 
-    ``(…, L, J, 2) → (…)``: one box around all visible keypoints of all its frames, as a camera
-    that does not zoom would cut it out.
-
-    Raises
-    ------
-    ValueError
-        If a visible keypoint is not finite, or a sequence has no extent.
+    The box contains the visible keypoints of all frames; its sides must not both be 0.
     """
     seen = _check_keypoints(keypoints, keypoints, visible, names=("keypoints", "keypoints"))
     axes = (-3, -2)
@@ -86,8 +73,8 @@ def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np
     sides: np.ndarray = (high - low).max(axis=-1)
     if not (sides > 0).all():
         raise ValueError(
-            "keypoints has a sequence whose visible ones are all in one place, expected a box "
-            "with sides above 0"
+            "keypoints must have an extent above 0 in every sequence, got one with all visible "
+            "keypoints at one point"
         )
     return sides
 
@@ -95,40 +82,30 @@ def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np
 def velocity_error(
     predicted: np.ndarray, truth: np.ndarray, visible: np.ndarray | None = None
 ) -> float:
-    """Return the relative error of the keypoints' displacements from frame to frame.
+    """Return the relative error of the keypoints' displacements between frames.
 
-    (1/T) Σ_t ‖δ̂_t − δ_t‖ / ‖δ_t‖ (section 4.2.2), averaged over sequences. δ_t is the vector of
-    the displacements of ALL keypoints that are visible in both frames: a joint that stands still
-    has no relative error of its own. T counts the displacements of a sequence; a frame in which
-    none of the truth's keypoints moves, or none is visible, has no relative error and does not
-    count.
+    (1/T) Σ_t ‖δ̂_t − δ_t‖ / ‖δ_t‖ (section 4.2.2), averaged over sequences, where δ_t stacks the
+    displacements of all keypoints visible in both frames. Frames with δ_t = 0 are skipped. A static
+    prediction has error 1.
 
     Parameters
     ----------
     predicted, truth : ndarray, (…, L, J, 2)
-        Keypoints; what is not visible may be NaN in the truth. A prediction that stands still has
-        an error of 1, twice the displacement too.
+        Keypoints; invisible ones may be NaN in the truth.
     visible : ndarray of bool, (…, L, J), optional
-        Keypoints that count; all by default.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a visible number is not finite, or a sequence of the truth does not
-        move.
+        Mask of visible keypoints; all by default.
     """
     seen = _check_keypoints(predicted, truth, visible)
     both = seen[..., 1:, :] & seen[..., :-1, :]
-    steps = _hidden_as_zero(np.diff(truth, axis=-3), both)
-    errors = _hidden_as_zero(np.diff(predicted, axis=-3) - np.diff(truth, axis=-3), both)
+    steps = _masked(np.diff(truth, axis=-3), both)
+    errors = _masked(np.diff(predicted, axis=-3) - np.diff(truth, axis=-3), both)
     length = np.sqrt((steps**2).sum(axis=(-2, -1)))
     off = np.sqrt((errors**2).sum(axis=(-2, -1)))
     moves = length > 0
     counted = moves.sum(axis=-1)
     if not (counted > 0).all():
         raise ValueError(
-            "truth has a sequence without any visible keypoint that moves, expected a motion to "
-            "compare with"
+            "truth must have a moving visible keypoint in every sequence, got a static sequence"
         )
     ratios = np.divide(off, length, out=np.zeros_like(off), where=moves)
     return float((ratios.sum(axis=-1) / counted).mean())
@@ -137,32 +114,29 @@ def velocity_error(
 def fit_linear_map(
     predicted: np.ndarray, annotated: np.ndarray, visible: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the weights that make annotated keypoints of predicted joints, where skeletons differ.
+    """Return weights W that map predicted joints to the keypoints of another skeleton.
 
-    Each keypoint is a weighted sum of the joints, the same in x and y and in all frames: the
-    weights W minimise Σ ‖W u − k‖² over the set's visible keypoints (section 4.2.2: "a linear
-    transformation"). Apply them to any pictures that are centred alike with ``W @ u``.
+    W minimises Σ ‖W u − k‖² over visible keypoints, the same for x and y and all frames (section
+    4.2.2: "a linear transformation"). Apply it to views with the same centring: ``W @ u``.
 
     Parameters
     ----------
     predicted : ndarray, (…, J, 2)
         Joints.
     annotated : ndarray, (…, K, 2)
-        Keypoints of the same frames; what is not visible may be NaN.
+        Keypoints of the same frames; invisible ones may be NaN.
     visible : ndarray of bool, (…, K), optional
-        Keypoints that count; all by default.
+        Mask of visible keypoints; all by default.
 
     Returns
     -------
     ndarray, (K, J)
-        W. A joint that is at the origin in every frame, as the root that pictures are centred
-        on, has weight 0.
+        W; 0 for a joint that is at the origin in every frame.
 
     Raises
     ------
     ValueError
-        If shapes disagree, a visible number is not finite, or the frames of a keypoint do not
-        determine its weights.
+        If an argument is invalid or the weights of a keypoint are underdetermined.
     """
     check_shape("predicted", predicted, ("…", "J", 2))
     check_finite("predicted", predicted)
@@ -176,13 +150,12 @@ def fit_linear_map(
     weights = np.zeros((n_keypoints, n_joints))
     for keypoint in range(n_keypoints):
         frames = seen[:, keypoint]
-        # Two equations a frame, one in x and one in y.
         system = joints[frames][:, used].transpose(0, 2, 1).reshape(-1, int(used.sum()))
         solution, _, rank, _ = np.linalg.lstsq(system, targets[frames, keypoint].ravel())
         if rank < system.shape[1]:
             raise ValueError(
-                f"predicted has {int(frames.sum())} frames for keypoint {keypoint} that determine "
-                f"{int(rank)} of the weights of {system.shape[1]} joints, expected all of them"
+                f"predicted must determine the weights of all {system.shape[1]} joints, got rank "
+                f"{int(rank)} from the {int(frames.sum())} frames of keypoint {keypoint}"
             )
         weights[keypoint, used] = solution
     return weights
@@ -194,7 +167,7 @@ def _check_keypoints(
     visible: np.ndarray | None,
     names: tuple[str, str] = ("predicted", "truth"),
 ) -> np.ndarray:
-    """Return what is visible, (…, L, J) bool, of keypoints that fit each other."""
+    """Check shapes and values; return the visibility mask (…, L, J)."""
     check_shape(names[1], truth, ("…", "L", "J", 2))
     check_shape(names[0], predicted, truth.shape)
     if visible is None:
@@ -202,12 +175,12 @@ def _check_keypoints(
     else:
         check_shape("visible", visible, truth.shape[:-1])
         if visible.dtype != bool:
-            raise ValueError(f"visible has entries of {visible.dtype}, expected truth values")
+            raise ValueError(f"visible must be boolean, got {visible.dtype}")
         seen = visible
     for name, values in zip(names, (predicted, truth), strict=True):
-        check_finite(name, _hidden_as_zero(values, seen))
+        check_finite(name, _masked(values, seen))
     return seen
 
 
-def _hidden_as_zero(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _masked(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return np.where(seen[..., None], values, 0.0)

@@ -1,4 +1,4 @@
-"""All measures that apply to one run on one problem, by name: the numbers of the table."""
+"""All metrics of one run on one problem, by name."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from probmotion import seeds
 from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
-from probmotion.metrics.cost import costs
-from probmotion.metrics.generation import diversity
+from probmotion.metrics.generation import GenerationReference, diversity
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
-from probmotion.metrics.structure import HasManifold, HasStyles
 from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.likelihoods import Keypoints2D
+from probmotion.posteriors.protocols import HasManifold, HasStyles
 
 if TYPE_CHECKING:
     from probmotion.posteriors.posterior import MotionPosterior
-    from probmotion.posteriors.problem import Problem, ScoresGeneration
+    from probmotion.posteriors.problem import Problem
 
 __all__ = ["accuracy_of", "load_libraries", "measure"]
 
-_LATE = (
+_LIBRARIES = (
     "arviz_stats.base",
     "scipy.spatial.distance",
     "sklearn.decomposition",
@@ -37,63 +36,60 @@ _LATE = (
 )
 
 _DIRECTIONS = 256
-# Exact draws to compare with: sets as large as the run's, as many as make about 4000.
+# Sets of exact draws, each as large as the run, about 4000 in all.
 _ENOUGH, _MOST_SETS = 4000, 8
 _MILLIMETRES = 1000.0
 _SQUARE_CENTIMETRES = 1e4
-_LOOKED_AT = 100
-_OF_DENSITY = 500
+_MOST_DEGENERATE = 100
+_MOST_STEIN = 500
 _REAL_PAIRS = 5000
 
 
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
-    """Return every measure that applies, by name.
+    """Return every applicable metric, by name.
 
-    Against reference draws, exact ones or those that a long run left, where the problem has them
-    (aligned to one motion where the problem says so, but for densities, styles and the manifold):
+    Against reference draws (exact or stored; aligned first if the problem requires it, except for
+    densities, styles and the manifold):
 
-    - ``swd_ratio``: sliced Wasserstein distance over that of two exact sets; 1 is right
-    - ``variance_ratio``: trace of covariance over the exact one; < 1 is over-confident
-    - ``mean_error_sd``: distance of means over √tr of the exact covariance; 0 is right
-    - ``off_manifold_ratio``: variance off the prior's manifold over exact draws'; 1 is right
-    - ``log_density_gap``: mean log density less exact draws', nats; 0 is right
+    - ``swd_ratio``: sliced Wasserstein distance relative to that of two exact sets; 1 is ideal
+    - ``variance_ratio``: trace of the covariance relative to the exact one; < 1: overconfident
+    - ``mean_error_sd``: error of the mean in posterior standard deviations; 0 is ideal
+    - ``off_manifold_ratio``: variance off the prior's manifold relative to exact draws; 1 is ideal
+    - ``log_density_gap``: mean log density minus that of exact draws, nats; 0 is ideal
     - ``mode_proportion_<style>`` and ``mode_proportions_tv``: proportion of each style, and total
-      variation distance of the proportions from those of exact draws
+      variation distance from those of exact draws
     - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
-    - ``mmd``: squared maximum mean discrepancy; 0 is right, and may be missed to either side
-    - ``c2st``: how often a classifier tells draws from reference draws; .5 is right
+    - ``mmd``: squared maximum mean discrepancy, unbiased; 0 is ideal
+    - ``c2st``: accuracy of a classifier between draws and reference draws; 0.5 is ideal
 
-    Against the density, where it has a gradient and the run keeps θ, ``ksd``: squared kernel Stein
-    discrepancy; 0 is right, and no number where most draws are one or the slope is not finite.
+    Against a differentiable density in θ, ``ksd``: squared kernel Stein discrepancy; 0 is ideal,
+    NaN if most draws are equal or the gradient is not finite.
 
-    Filmed, against held-out real 2D motion (MAS, section 6.3), mean over random views: ``fid``,
-    ``diversity_ratio`` (over the real motion's), ``view_precision``, ``view_recall``, and from the
-    side ``fid_side`` and ``view_recall_side``; ``fid_learnt`` and ``view_recall_learnt`` are
-    against the clips that were learnt from: few clips are far from few others, even real ones.
-    ``mcd_cm2``: Motion Chamfer Distance, square centimetres, of windows of 10 frames, where the
-    reference holds views and not their features alone; it falls with the number of draws.
+    Projected, against held-out real 2D motion (MAS, section 6.3), mean over random views: ``fid``,
+    ``diversity_ratio`` (relative to real motion), ``view_precision``, ``view_recall``; from the
+    side ``fid_side``, ``view_recall_side``; against the training clips ``fid_learnt``,
+    ``view_recall_learnt``; ``mcd_cm2``: Motion Chamfer Distance of 10-frame windows, cm², which
+    decreases with the number of draws.
 
-    Against poses that were held out: ``coverage_interaction``, ``coverage_cartesian`` and
-    ``coverage_shape-context``, the mean distance of each to its nearest draw; see
-    :func:`~probmotion.metrics.coverage.coverage`. Of a truncated density: ``at_cap`` and
-    ``near_floor``, shares of draws; of annotated evidence ``degenerate``, the share of a draw's
-    pictures (of 100 draws) that have no triangulation of their own.
+    Against held-out poses ``coverage_interaction``, ``coverage_cartesian`` and
+    ``coverage_shape-context``: mean distance to the nearest draw
+    (:func:`~probmotion.metrics.coverage.coverage`). ``at_cap`` and ``near_floor``: fractions of
+    draws at the bounds of a truncated density; ``degenerate``: fraction of views of annotated draws
+    without a unique triangulation.
 
-    Against the truth, where it is known, millimetres: see :func:`accuracy_of`. In the pictures of
-    2D evidence, against the truth's, all joints: ``pck``, percent nearer than a tenth of the
-    picture, and ``velocity_error``, relative, each as in :mod:`probmotion.metrics.keypoints`; no
-    numbers where a draw is behind a camera. Of chains: see
-    :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost: ``seconds`` and evaluations.
+    Against the truth: :func:`accuracy_of`; in the images of 2D observations ``pck`` (at a tenth of
+    the image extent, %) and ``velocity_error`` of :mod:`probmotion.metrics.keypoints`, NaN if a
+    draw is behind a camera. Chains: :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost:
+    ``seconds`` and evaluations.
 
     Parameters
     ----------
     problem : Problem
-        What was drawn from.
+        Problem that was sampled.
     draws : MotionDraws
         The run.
     seed : int
-        Seed of the exact draws and directions: the same for every sampler, so that samplers are
-        compared on common random numbers.
+        Seed of reference draws and directions, shared by all samplers.
     """
     found: dict[str, float] = {}
     positions = draws.flat()
@@ -102,7 +98,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     found |= _against_density(problem, draws)
     if problem.truth is not None:
         found |= accuracy_of(positions, problem.truth, problem.posterior)
-        found |= _in_pictures(positions, problem.truth, problem.posterior)
+        found |= _image_errors(positions, problem.truth, problem.posterior)
     if problem.held_out is not None:
         found |= _coverage_of(positions, problem.held_out)
     if problem.generation is not None:
@@ -114,21 +110,27 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     return found | chain_diagnostics(draws) | costs(draws)
 
 
+def costs(draws: MotionDraws) -> dict[str, float]:
+    """Return wall-clock ``seconds`` and ``<kind>_evaluations`` of a run."""
+    counts = {f"{kind}_evaluations": float(count) for kind, count in draws.counts.items()}
+    return {"seconds": draws.seconds} | counts
+
+
 @dataclass(frozen=True, eq=False)
 class _Exact:
-    """Reference draws of one problem, and what is measured of them for every sampler alike."""
+    """Reference draws of one problem and their metrics, shared by all samplers."""
 
     sets: list[np.ndarray]
     flat: np.ndarray
     directions: np.ndarray
     off: float | None
     log_density: float | None
-    shares: dict[str, float]
+    mode_proportions: dict[str, float]
 
 
 @lru_cache(maxsize=2)
 def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
-    most = problem.most_reference
+    most = problem.max_references
     n_sets = min(_MOST_SETS, max(2, _ENOUGH // n), *([] if most is None else [most // n]))
     reference = problem.reference(seed, n_sets * n)
     flat = _compared(problem, reference)
@@ -140,14 +142,14 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
         directions=distribution.random_directions(rng, _DIRECTIONS, flat.shape[1]),
         off=_off_manifold(prior, reference),
         log_density=_log_density(problem, reference),
-        shares=_shares(prior, reference),
+        mode_proportions=_mode_proportions(prior, reference),
     )
 
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
     flat = _compared(problem, positions)
-    # Of many draws as many are judged, evenly apart, as two sets of reference draws can have.
-    most = problem.most_reference
+    # Thin draws so that two reference sets are as large.
+    most = problem.max_references
     n = len(flat) if most is None else min(len(flat), most // 2)
     some = flat[np.arange(n) * len(flat) // n]
     exact = _exact_draws(problem, seed, n)
@@ -163,10 +165,10 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
     log_density = _log_density(problem, positions)
     if log_density is not None and exact.log_density is not None:
         found["log_density_gap"] = log_density - exact.log_density
-    shares = _shares(prior, positions)
-    if shares:
-        found |= {f"mode_proportion_{style}": share for style, share in shares.items()}
-        apart = [abs(share - exact.shares[style]) for style, share in shares.items()]
+    proportions = _mode_proportions(prior, positions)
+    if proportions:
+        found |= {f"mode_proportion_{style}": p for style, p in proportions.items()}
+        apart = [abs(p - exact.mode_proportions[style]) for style, p in proportions.items()]
         found["mode_proportions_tv"] = 0.5 * sum(apart)
     found["precision"], found["recall"] = distribution.precision_recall(some, exact.sets[0])
     found["mmd"] = maximum_mean_discrepancy(some, exact.sets[0])
@@ -175,7 +177,7 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
 
 
 def _compared(problem: Problem, motions: np.ndarray) -> np.ndarray:
-    """Return what of motions is compared with that of reference draws: (n, L J 3)."""
+    """Return motions flattened, (n, L J 3), and aligned if the problem requires it."""
     if problem.aligned_to is not None:
         motions = align_motions(motions, problem.aligned_to)
     return motions.reshape(len(motions), -1)
@@ -186,7 +188,7 @@ def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:
         return {}
     theta = draws.dataset["theta"].values
     theta = theta.reshape(-1, theta.shape[-1])
-    n = min(len(theta), _OF_DENSITY)
+    n = min(len(theta), _MOST_STEIN)
     chosen = theta[np.arange(n) * len(theta) // n]
     try:
         score = score_of(problem.posterior, chosen)
@@ -195,12 +197,12 @@ def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:
     try:
         return {"ksd": kernel_stein_discrepancy(chosen, score)}
     except ValueError:
-        # More than half of the draws are one, or the density has no slope where they are.
+        # Most draws are equal, or the gradient is not finite.
         return {"ksd": math.nan}
 
 
 def _against_real_views(
-    reference: ScoresGeneration, positions: np.ndarray, seed: int
+    reference: GenerationReference, positions: np.ndarray, seed: int
 ) -> dict[str, float]:
     samples = len(positions)
     around = reference.score_motions(positions, seed=seed, samples=samples)
@@ -235,18 +237,18 @@ def _log_density(problem: Problem, positions: np.ndarray) -> float | None:
     return None if value is None else float(np.mean(value))
 
 
-def _shares(prior: object, positions: np.ndarray) -> dict[str, float]:
+def _mode_proportions(prior: object, positions: np.ndarray) -> dict[str, float]:
     if not isinstance(prior, HasStyles):
         return {}
-    shares = prior.style_responsibilities(positions).mean(axis=0)
-    return {style: float(share) for style, share in zip(prior.styles, shares, strict=True)}
+    proportions = prior.style_responsibilities(positions).mean(axis=0)
+    return {style: float(p) for style, p in zip(prior.styles, proportions, strict=True)}
 
 
 def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float]:
     from probmotion.interaction.geometry.pose_distances import MEASURES
     from probmotion.metrics.coverage import coverage
 
-    # Poses are compared one by one, whatever motion they are a frame of.
+    # Frames are compared individually.
     poses, draws = (motions.reshape(-1, *motions.shape[-2:]) for motions in (held_out, positions))
     return {f"coverage_{kind}": float(coverage(poses, draws, kind)) for kind in MEASURES}
 
@@ -256,7 +258,7 @@ def _degenerate(problem: Problem, positions: np.ndarray) -> dict[str, float]:
     counted = getattr(likelihood, "degenerate_fraction", None)
     if counted is None:
         return {}
-    return {"degenerate": float(counted(positions[:: max(1, len(positions) // _LOOKED_AT)]))}
+    return {"degenerate": float(counted(positions[:: max(1, len(positions) // _MOST_DEGENERATE)]))}
 
 
 def accuracy_of(
@@ -264,13 +266,12 @@ def accuracy_of(
 ) -> dict[str, float]:
     """Return errors against the truth, millimetres (accelerations: m/s²).
 
-    - ``mpjpe``: after aligning the root in every frame, mean over draws: what to expect of one
-    - ``mpjpe_mean``: of the mean of all draws; ``mpjpe_best``: of the best draw
-    - ``mpjpe_visible``, ``mpjpe_occluded``: like ``mpjpe``, where the evidence saw the joint or not
-    - ``g_mpjpe``, ``g_mpjpe_mean`` and each with ``_visible``, ``_hidden``: without alignment
-    - ``pa_mpjpe``: after the best similarity per frame
-    - ``acceleration_error``: mean over draws; ``acceleration_ratio``: mean size of a draw's over
-      the truth's, where that has any; plausible between a half and two
+    - ``mpjpe_mm``: mean over draws, after root alignment in every frame
+    - ``mpjpe_mean_mm``: of the mean draw; ``mpjpe_best_mm``: of the best draw
+    - ``mpjpe_visible_mm``, ``mpjpe_occluded_mm``: over observed or occluded joints
+    - ``g_mpjpe_mm``, ``g_mpjpe_mean_mm``, each also ``_visible``, ``_occluded``: without alignment
+    - ``pa_mpjpe_mm``: after similarity alignment per frame
+    - ``acceleration_error``; ``acceleration_ratio``: relative to the truth's, plausible 0.5 to 2
     """
     root = posterior.skeleton.roots[0]
     target = accuracy.aligned_by_root(truth, root)
@@ -304,9 +305,10 @@ def accuracy_of(
     return found
 
 
-def _in_pictures(
+def _image_errors(
     positions: np.ndarray, truth: np.ndarray, posterior: MotionPosterior
 ) -> dict[str, float]:
+    """Return 2D errors against the projected truth."""
     if not isinstance(posterior.likelihood, Keypoints2D):
         return {}
     cameras = posterior.likelihood.cameras
@@ -317,7 +319,7 @@ def _in_pictures(
         return {"pck": math.nan, "velocity_error": math.nan}
     true = np.broadcast_to(true, shown.shape)
     found = {}
-    # One joint in one frame has no size to compare errors with.
+    # A single joint in a single frame has no extent.
     if np.ptp(true, axis=(-3, -2)).any(axis=-1).all():
         size = keypoints.image_extent(true)
         found["pck"] = keypoints.percentage_of_correct_keypoints(shown, true, size)
@@ -327,7 +329,7 @@ def _in_pictures(
 
 
 def _visible(posterior: MotionPosterior) -> np.ndarray | None:
-    """Where any view saw the joint, (L, J); None where the likelihood does not say."""
+    """Return the mask (L, J) of joints observed in any view; ``None`` if unknown."""
     entries = getattr(posterior.likelihood, "entries", None)
     if entries is None:
         return None
@@ -336,6 +338,6 @@ def _visible(posterior: MotionPosterior) -> np.ndarray | None:
 
 
 def load_libraries() -> None:
-    """Import what measures import when they are first asked, so that no cell's clock counts it."""
-    for name in _LATE:
+    """Import the libraries of the metrics in advance, to exclude that from measured times."""
+    for name in _LIBRARIES:
         import_module(name)

@@ -1,7 +1,7 @@
-"""How far are generated 2D sequences from filmed ones, as sets? The Motion Chamfer Distance.
+"""Motion Chamfer Distance between sets of 2D sequences.
 
-Of Sun et al. 2024 ("Ponymation", section 4.3 and appendix C): 1 400 generated sequences of 10
-frames, projected to 2D, against annotated ones.
+Sun et al. 2024 ("Ponymation", section 4.3 and appendix C): 1400 generated sequences of 10 frames,
+projected to 2D, against annotated ones.
 """
 
 from __future__ import annotations
@@ -15,21 +15,23 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["MotionChamfer", "motion_chamfer_distance"]
 
-# All products have this shape, padded, so that a distance never depends on the other sequences.
+# Products are padded to this size, so that a distance does not depend on other sequences.
 _BLOCK = 256
 
 
 class MotionChamfer(NamedTuple):
-    """The two directions of a Motion Chamfer Distance, squares of the keypoints' unit."""
+    """Both directions of a Motion Chamfer Distance, in squared keypoint units.
+
+    ``of_generated`` is the mean error of generated sequences to the nearest real one (fidelity),
+    ``of_real`` the reverse (coverage).
+    """
 
     of_generated: float
-    """Mean over generated sequences of the error of the nearest real one: fidelity."""
     of_real: float
-    """Mean over real sequences of the error of the nearest generated one: coverage."""
 
     @property
     def mean(self) -> float:
-        """The Motion Chamfer Distance: the mean of the two directions (half of their sum)."""
+        """The Motion Chamfer Distance, the mean of the two directions."""
         return (self.of_generated + self.of_real) / 2
 
 
@@ -40,35 +42,29 @@ def motion_chamfer_distance(
     visible: np.ndarray | None = None,
     frames: int = 10,
 ) -> MotionChamfer:
-    """Return how near generated sequences are to real ones, and real ones to generated ones.
+    """Return the mean nearest-neighbour errors between generated and real sequences.
 
-    The error of a pair of sequences is the keypoint MSE averaged over frames,
+    The error of a pair is the keypoint MSE averaged over frames::
 
         d(g, r) = 1/|T_r| Σ_{t ∈ T_r} 1/|V_rt| Σ_{j ∈ V_rt} ‖g_tj − r_tj‖²
 
-    with V_rt the keypoints of the real one that are visible in frame t, and T_r the frames that
-    have any. Sequences are compared where they are: centre both alike, at one scale.
+    with V_rt the keypoints of r visible in frame t, and T_r the frames with any. Sequences are not
+    aligned: centre and scale both sets alike.
 
-    Longer sequences are cut into windows of ``frames`` frames, one after the other. All windows of
-    the real ones are one set; the distance is averaged over the places of the generated ones'
-    windows (appendix C), so that longer sequences are no larger a set to choose from.
+    Sequences are split into windows of ``frames`` frames. All real windows form one set; the
+    distance is averaged over the window positions of the generated ones (appendix C), so that
+    longer sequences do not enlarge their set.
 
     Parameters
     ----------
     generated : ndarray, (N, L, J, 2)
         Generated keypoints.
     real : ndarray, (M, L', J, 2)
-        Annotated or filmed keypoints; what is not visible may be NaN.
+        Annotated keypoints; invisible ones may be NaN.
     visible : ndarray of bool, (M, L', J), optional
-        Keypoints of the real sequences that count; all by default.
+        Mask of visible real keypoints; all by default.
     frames : int
-        Frames of a window; L and L' are multiples of it.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a set is empty, a visible number is not finite, or a real window has
-        nothing visible.
+        Frames per window; must divide L and L'.
     """
     check_count("frames", frames)
     check_shape("generated", generated, ("N", "L", "J", 2))
@@ -76,7 +72,7 @@ def motion_chamfer_distance(
     seen = np.ones(real.shape[:3], bool) if visible is None else visible
     check_shape("visible", seen, real.shape[:3])
     if seen.dtype != bool:
-        raise ValueError(f"visible has entries of {seen.dtype}, expected truth values")
+        raise ValueError(f"visible must be boolean, got {seen.dtype}")
     check_finite("generated", generated)
     filled = np.where(seen[..., None], real, 0.0)
     check_finite("real", filled)
@@ -94,28 +90,27 @@ def motion_chamfer_distance(
 
 def _check_length(name: str, sequences: np.ndarray, frames: int) -> None:
     if sequences.size == 0:
-        raise ValueError(f"{name} must have shape at least one sequence, got {sequences.shape}")
+        raise ValueError(f"{name} must contain at least one sequence, got shape {sequences.shape}")
     if sequences.shape[1] % frames:
         raise ValueError(
-            f"{name} has sequences of {sequences.shape[1]} frames, expected a multiple of "
-            f"frames={frames}"
+            f"{name} must have a multiple of frames={frames} frames, got {sequences.shape[1]}"
         )
 
 
 def _weights(seen: np.ndarray) -> np.ndarray:
-    """Return what each keypoint counts in its sequence, (M, L, J), a sum of 1 per sequence."""
+    """Return keypoint weights (M, L, J) that sum to 1 in every sequence."""
     in_frame = seen.sum(axis=2, keepdims=True)
     in_sequence = (in_frame > 0).sum(axis=1, keepdims=True)
     if not in_sequence.all():
         raise ValueError(
-            f"visible has nothing in window {int(np.flatnonzero(in_sequence == 0)[0])} of the "
-            "real sequences, expected a keypoint at least"
+            "visible must contain a keypoint in every real window, got none in window "
+            f"{int(np.flatnonzero(in_sequence == 0)[0])}"
         )
     return seen / np.maximum(in_frame, 1) / in_sequence
 
 
 def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """Return the means over nearest neighbours of both directions, all windows of one length."""
+    """Return the mean nearest-neighbour errors in both directions."""
     of_generated, of_real = np.full(len(generated), np.inf), np.full(len(real), np.inf)
     for rows, columns, block in _blocks(generated, real, weights):
         of_generated[rows] = np.minimum(of_generated[rows], block.min(axis=1))
@@ -126,7 +121,7 @@ def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tu
 def _blocks(
     generated: np.ndarray, real: np.ndarray, weights: np.ndarray
 ) -> Iterator[tuple[slice, slice, np.ndarray]]:
-    """Yield rows, columns and the errors between them: Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖²."""
+    """Yield rows, columns and their errors Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖²."""
     constant = (weights * (real**2).sum(axis=-1)).sum(axis=(1, 2))
     factor = np.concatenate([weights[..., None], -2 * weights[..., None] * real], axis=-1)
     right = factor.reshape(len(real), -1)
@@ -139,7 +134,7 @@ def _blocks(
             columns = slice(column, min(column + _BLOCK, len(real)))
             block = left @ _padded(right[columns]).T
             block = block[: rows.stop - row, : columns.stop - column] + constant[columns]
-            # Rounding makes the error of copies a little less than 0.
+            # Rounding may make the error of copies negative.
             yield rows, columns, np.maximum(block, 0.0)
 
 

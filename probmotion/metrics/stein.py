@@ -1,7 +1,7 @@
-"""Do draws fit a density? The kernel Stein discrepancy, which needs its gradient and no others.
+"""Kernel Stein discrepancy: goodness of fit of draws to an unnormalised density.
 
-It compares draws with log p(θ | y), which may lack its constant, and so serves where nothing is
-known exactly. It is local: how mass is shared among modes that are far apart it does not see.
+It needs only the gradient of the log density. It is local: wrong weights of well-separated modes go
+undetected.
 """
 
 from __future__ import annotations
@@ -22,41 +22,33 @@ _BATCH = 256
 
 
 class NoGradient(ValueError):  # noqa: N818 (a condition, not a fault)
-    """The posterior has no log density in θ with a gradient; the message says why."""
+    """The posterior has no differentiable log density in θ; the message names the reason."""
 
 
 def kernel_stein_discrepancy(
     theta: np.ndarray, score: np.ndarray, *, length_scale: float | None = None
 ) -> float:
-    """Return the squared kernel Stein discrepancy of draws from a density, unbiased: 0 is right.
+    """Return the squared kernel Stein discrepancy of draws from a density, unbiased; 0 is ideal.
 
     The mean over pairs of different draws of (Liu et al. 2016, eqs. 9 and 14)
 
         s·s' k + s·∇'k + s'·∇k + tr ∇∇'k,    s = ∇ log p(θ), s' = ∇ log p(θ'),
 
-    with the inverse multiquadric kernel k = (1 + ‖θ − θ'‖²/ℓ²)^(−1/2): with a Gaussian kernel it
-    would not see draws that run away in three dimensions or more (Gorham and Mackey 2017, theorems
-    6 and 8). It is of θ/ℓ, with score ℓs, so that it does not depend on the unit of θ: draws of a
-    Gaussian whose variance is r times the right one have (1 − r)² times a constant of the shape.
+    with the inverse multiquadric kernel k = (1 + ‖θ − θ'‖²/ℓ²)^(−1/2); a Gaussian kernel would not
+    detect divergent draws in three dimensions or more (Gorham and Mackey 2017, theorems 6 and 8).
+    It is computed on θ/ℓ, so it is invariant to the unit of θ.
 
-    It is the U-statistic: the mean of the V-statistic (with each draw also paired with itself) is
-    E h(θ, θ)/n for exact draws, which grows with the dimension and would hide an error behind the
-    number of draws. The U-statistic of exact draws has mean 0 however many there are, and may be
-    below 0.
+    This is the U-statistic, with mean 0 for exact draws; it may be negative. The V-statistic has
+    mean E h(θ, θ)/n, which grows with the dimension.
 
     Parameters
     ----------
     theta : ndarray, (n, d)
-        The draws.
+        Draws, n ≥ 2.
     score : ndarray, (n, d)
-        ∇ log p there, with or without the constant (:func:`score_of`).
+        ∇ log p at the draws (:func:`score_of`).
     length_scale : float, optional
-        ℓ, in units of θ; the median distance of two of the draws by default.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two draws, a number is not finite, or the shapes disagree.
+        ℓ, in units of θ; by default the median distance between draws.
     """
     check_shape("score", score, np.shape(theta))
     check_finite("score", score)
@@ -78,26 +70,26 @@ def kernel_stein_discrepancy(
 
 
 def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    """Return ∇ log p(θ | y) by torch or, where the density lets torch not in, by JAX.
+    """Return ∇ log p(θ | y) by automatic differentiation with torch, else JAX.
 
     Parameters
     ----------
     posterior : MotionPosterior
-        Whose log density is differentiated.
+        Target.
     theta : ndarray, (n, dim)
-        Where.
+        Evaluation points.
 
     Returns
     -------
     score : ndarray, (n, dim)
-        In float64.
+        float64.
 
     Raises
     ------
     NoGradient
-        If there is no log density in these coordinates, or neither library passes through it.
+        If there is no log density in θ, or neither library can differentiate it.
     ValueError
-        If the gradient is not finite somewhere: a draw where the density is 0, or has a corner.
+        If the gradient is not finite.
     """
     check_shape("theta", theta, ("n", posterior.dim))
     check_finite("theta", theta)
@@ -112,7 +104,7 @@ def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
 
 
 def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    """Return the gradient by the first library that passes through the density."""
+    """Return the gradient by the first library that can differentiate the density."""
     reasons = []
     for name, gradient in (("torch", _torch_gradient), ("JAX", _jax_gradient)):
         try:
@@ -122,11 +114,11 @@ def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
         except NotConjugate as error:
             raise NoGradient(f"posterior has no score: {error}") from error
         except Exception as refused:
-            # A density that lets a library not in may raise anything; the next one decides.
+            # Densities may raise anything for arrays they do not support.
             reasons.append(f"{name} met {type(refused).__name__}")
     raise NoGradient(
         f"posterior has no score: {_kind(posterior.prior)} with "
-        f"{_kind(posterior.likelihood)} lets no gradient through, {' and '.join(reasons)}"
+        f"{_kind(posterior.likelihood)} is not differentiable, {' and '.join(reasons)}"
     )
 
 
@@ -134,7 +126,7 @@ def _torch_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray
     import torch
 
     point = torch.tensor(theta, requires_grad=True)
-    # Rows know nothing of each other: the gradient of their sum is each row's own.
+    # Rows are independent: the gradient of their sum holds each row's gradient.
     (gradient,) = torch.autograd.grad(posterior.log_density(point).sum(), point)
     return to_numpy(gradient)
 

@@ -1,4 +1,4 @@
-"""Skeletons, motions and 2D keypoint tracks, and what turns one into another."""
+"""Skeletons, motions, 2D keypoint tracks and operations on them."""
 
 import lazy_loader
 

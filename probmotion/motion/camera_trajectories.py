@@ -1,8 +1,8 @@
-"""A motion in the world from a person's poses in one camera and their 2D detections (SPIN-t).
+"""World motion from camera-space poses and 2D detections (SPIN-t).
 
-A single-image estimator gives each frame's pose in the camera's axes but not where it is, and its
-orientation roughly. Both are found from the detections and from the motion's smoothness (source:
-paper 001, appendix F, equation 12; the robust function: Geman and McClure 1987).
+A single-image estimator provides the pose of each frame in the camera's axes, without translation
+and with an approximate orientation. Both are optimised given the detections and the smoothness of
+the motion (source: paper 001, appendix F, equation 12; robust function: Geman and McClure 1987).
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 __all__ = ["CameraTrajectory", "fit_trajectory", "geman_mcclure"]
 
 _NEAR = 0.1
-"""Metres before the camera: nearer, 1/z goes on as its tangent, so that no step divides by 0."""
-_WIDER = (8.0, 4.0, 2.0, 1.0)
-"""Scales of the robust function one after the other, over the one that is asked for: with the last
-alone, outliers that lie to one side hold the motion where the linear equations put it."""
+"""Depth in metres below which 1/z is replaced by its tangent."""
+_SCHEDULE = (8.0, 4.0, 2.0, 1.0)
+"""Successive multiples of the robust scale. Starting at 1, one-sided outliers trap the optimiser
+in the minimum next to the linear solution."""
 _SMALL = 1e-3
-"""Squared angle below which series replace quotients: the terms left out are below 3e-14."""
+"""Squared angle below which series are used; the omitted terms are below 3e-14."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTrajectory:
-    """What :func:`fit_trajectory` found.
+    """Result of :func:`fit_trajectory`.
 
     Attributes
     ----------
     positions : ndarray, (L, J, 3)
         Joints in the world, metres.
     translations : ndarray, (L, 3)
-        r: where the local origin is in the camera's axes, metres.
+        r, position of the local origin in the camera's axes, metres.
     orientations : ndarray, (L, 3)
-        φ: rotation vectors that turn the local poses, in the camera's axes, radians.
+        φ, rotation vectors applied to the local poses, in the camera's axes, radians.
     cost : float
-        Equation 12 at the end.
+        Final value of equation 12.
     iterations : int
-        Of L-BFGS, all scales together.
+        L-BFGS iterations over all scales.
     converged : bool
-        Whether it stopped because nothing changed any more, not because it ran out of iterations.
+        Whether the last optimisation converged.
     """
 
     positions: np.ndarray
@@ -57,12 +57,9 @@ class CameraTrajectory:
 
 
 def geman_mcclure(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ρ = c² e²/(c² + e²) and its derivative by e², given e²; c is ``scale``.
-
-    Near e² for small errors, never above c².
-    """
-    share = scale**2 / (scale**2 + square)
-    return share * square, share**2
+    """Return ρ = c² e²/(c² + e²) and its derivative by e², given e² and c = ``scale``."""
+    ratio = scale**2 / (scale**2 + square)
+    return ratio * square, ratio**2
 
 
 def fit_trajectory(
@@ -71,54 +68,47 @@ def fit_trajectory(
     camera: Cameras,
     *,
     scale: float | None = None,
-    data_weight: float = 1.0,
     smoothness_weight: float | None = None,
     max_iterations: int = 1000,
 ) -> CameraTrajectory:
-    """Return the translations r and orientations φ that explain the detections smoothly.
+    """Return the smooth translations r and orientations φ that best explain the detections.
 
-    With v_tj = R(φ_t) local_tj + r_t, Π the camera and σ the confidences, L-BFGS minimises
+    With v_tj = R(φ_t) local_tj + r_t, camera projection Π and confidences σ, L-BFGS minimises
 
-        λ_data Σ_tj σ_tj ρ(‖Π(v_tj) − y_tj‖) + λ_smooth Σ_t ‖v_t − v_{t−1}‖².
+        Σ_tj σ_tj ρ(‖Π(v_tj) − y_tj‖) + λ Σ_t ‖v_t − v_{t−1}‖².
 
-    It starts from φ = 0 and the translations that solve the detections' linear equations frame by
-    frame (similar triangles); where a frame does not determine them, from those of its neighbours.
-    ρ is first as much as 8 times wider than asked for, so that far outliers do not decide which
-    minimum is found.
+    It starts from φ = 0 and the per-frame linear solution for the translations, interpolated where
+    the detections do not determine it. The scale of ρ decreases from 8 times ``scale``, so that
+    distant outliers do not determine the minimum.
 
     Parameters
     ----------
     local : ndarray, (L, J, 3)
         Poses relative to the root, metres, in the camera's axes: x right, y down, z forward.
     track : KeypointTrack
-        y and σ: the detections of these joints in the camera's image units. Entries of confidence
-        0 are not read.
+        y and σ, detections of these joints in the camera's image units. Entries of confidence 0 are
+        ignored.
     camera : Cameras
-        One perspective camera, still.
+        One static perspective camera.
     scale : float, optional
-        c of Geman and McClure's ρ, image units: errors well above it count as outliers. A
-        fortieth of the focal length by default: 12.5 cm at 5 m.
-    data_weight : float
-        λ_data, per image unit².
+        c of the Geman-McClure ρ, image units; much larger errors are treated as outliers. Default:
+        focal/40, or 12.5 cm at 5 m.
     smoothness_weight : float, optional
-        λ_smooth, per m². Only λ_smooth/λ_data matters to the result, image units² per m²: about
-        (error of a detection / movement of a joint from one frame to the next)². By default
-        λ_data (focal/30 m)²: a movement of 15 cm costs what a detection does that is 0.5 % of
-        the focal length off. More smooths the depth, which one camera shows poorly, and holds
-        back the motion's ends.
+        λ, image unit²/m²: about (detection error / movement of a joint between frames)². Default:
+        (focal/30 m)².
     max_iterations : int
-        Of L-BFGS, at each scale.
+        Maximum L-BFGS iterations at each scale.
 
     Returns
     -------
     CameraTrajectory
-        World positions and how they were found.
+        World positions and the fitted parameters.
 
     Raises
     ------
     ValueError
-        If shapes disagree, the camera is orthographic or not one, the detections determine no
-        place in front of it in any frame, a joint ends behind it, or a number is out of range.
+        If shapes disagree, the camera is not a single perspective one, no frame determines a
+        translation in front of the camera, a joint ends behind it, or a number is out of range.
     """
     local = np.asarray(local, dtype=np.float64)
     check_shape("local", local, (track.frames, track.skeleton.n_joints, 3))
@@ -127,22 +117,20 @@ def fit_trajectory(
     focal = float(camera.focal[0])
     scale = focal / 40 if scale is None else scale
     check_positive("scale", scale)
-    check_positive("data_weight", data_weight)
     if smoothness_weight is None:
-        smoothness_weight = data_weight * (focal / 30) ** 2
+        smoothness_weight = (focal / 30) ** 2
     check_positive("smoothness_weight", smoothness_weight)
     check_count("max_iterations", max_iterations)
-    objective = _Objective(
-        local, *_detections(track, camera), focal, float(data_weight), float(smoothness_weight)
-    )
+    objective = _Objective(local, *_detections(track, camera), focal, float(smoothness_weight))
     found, cost, iterations, converged = _minimum(objective, scale, max_iterations)
     translations, orientations = np.split(found.reshape(-1, 6), 2, axis=1)
     points = objective.points(translations, orientations)
     if points[..., 2].min() <= _NEAR:
         frame, joint = np.argwhere(points[..., 2] <= _NEAR)[0]
         raise ValueError(
-            f"track puts joint {joint} of frame {frame} {points[frame, joint, 2]:.3g} m in front "
-            f"of the camera, expected more than {_NEAR:g} m; look at its focal length and axes"
+            f"track must place joints more than {_NEAR:g} m in front of the camera, got "
+            f"{points[frame, joint, 2]:.3g} m for joint {joint} of frame {frame}; check the "
+            "camera's focal length and axes"
         )
     return CameraTrajectory(
         positions=(points - camera.translation[0]) @ camera.rotation[0],
@@ -156,13 +144,12 @@ def fit_trajectory(
 
 @dataclass(frozen=True, eq=False)
 class _Objective:
-    """Equation 12 as a function of (r_t, φ_t), all frames one after the other."""
+    """Equation 12 as a function of (r_t, φ_t), concatenated over frames."""
 
     local: np.ndarray  # (L, J, 3)
-    detections: np.ndarray  # (L, J, 2) less the principal point, 0 where not seen
+    detections: np.ndarray  # (L, J, 2) relative to the principal point, 0 where missing
     confidence: np.ndarray  # (L, J)
     focal: float
-    data_weight: float
     smoothness_weight: float
 
     def points(self, translations: np.ndarray, orientations: np.ndarray) -> np.ndarray:
@@ -177,8 +164,8 @@ class _Objective:
         inverse, slope = _inverse_depth(points[..., 2])
         apart = self.focal * points[..., :2] * inverse[..., None] - self.detections
         robust, weight = geman_mcclure((apart**2).sum(axis=-1), scale)
-        cost = self.data_weight * float((self.confidence * robust).sum())
-        pull = (2 * self.data_weight * self.focal) * (self.confidence * weight)[..., None] * apart
+        cost = float((self.confidence * robust).sum())
+        pull = (2 * self.focal) * (self.confidence * weight)[..., None] * apart
         by_point = np.empty_like(points)
         by_point[..., :2] = pull * inverse[..., None]
         by_point[..., 2] = (pull * points[..., :2]).sum(axis=-1) * slope
@@ -186,14 +173,14 @@ class _Objective:
         cost += self.smoothness_weight * float((steps**2).sum())
         by_point[1:] += 2 * self.smoothness_weight * steps
         by_point[:-1] -= 2 * self.smoothness_weight * steps
-        # A turn by dφ moves R x by (J dφ) × R x, J the left Jacobian of the rotation vector.
+        # A change dφ moves R x by (J dφ) × R x, with the left Jacobian J of the rotation vector.
         torque = np.cross(points - translations[:, None], by_point).sum(axis=1)
         by_orientation = (torque[:, None] @ _left_jacobian(orientations))[:, 0]
         return cost, np.concatenate([by_point.sum(axis=1), by_orientation], axis=1).ravel()
 
 
 def _inverse_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1/z and its derivative; nearer than ``_NEAR`` its tangent there."""
+    """Return 1/z, continued linearly below ``_NEAR``, and its derivative."""
     safe = np.maximum(depth, _NEAR)
     slope = -1 / safe**2
     return 1 / safe + slope * (depth - safe), slope
@@ -217,22 +204,22 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
 def _minimum(
     objective: _Objective, scale: float, max_iterations: int
 ) -> tuple[np.ndarray, float, int, bool]:
-    """Return (r_t, φ_t), their cost, iterations at all scales, and whether the last converged."""
+    """Return (r_t, φ_t), the cost, the number of iterations and whether the last fit converged."""
     start = _initial_translations(objective)
     found = np.concatenate([start, np.zeros_like(start)], axis=1).ravel()
     iterations = 0
-    # L-BFGS's tolerances are absolute below 1: the same stop whatever the image unit and weights.
-    unit = objective.data_weight * (objective.focal / 1000) ** 2
+    # L-BFGS tolerances are absolute below 1; dividing by this unit makes them scale-free.
+    unit = (objective.focal / 1000) ** 2
 
     def scaled(parameters: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
         cost, gradient = objective.cost_and_gradient(parameters, scale)
         return cost / unit, gradient / unit
 
-    for wider in _WIDER:
+    for multiple in _SCHEDULE:
         result = minimize(
             scaled,
             found,
-            args=(wider * scale,),
+            args=(multiple * scale,),
             jac=True,
             method="L-BFGS-B",
             options={
@@ -249,32 +236,24 @@ def _minimum(
 
 def _refuse_camera(camera: Cameras) -> None:
     if camera.n_views != 1:
-        raise ValueError(f"camera has {camera.n_views} views, expected one")
+        raise ValueError(f"camera must be one view, got {camera.n_views}")
     if camera.orthographic:
-        raise ValueError(
-            "camera is orthographic, which shows the same picture at every depth; expected a "
-            "perspective camera"
-        )
+        raise ValueError("camera must be perspective to determine depth, got an orthographic one")
 
 
 def _detections(track: KeypointTrack, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Return the detections less the principal point, 0 where not seen, and the confidences."""
+    """Return the detections relative to the principal point, 0 where missing, and confidences."""
     assert camera.centre is not None
     centred = track.keypoints - camera.centre[0]
     return np.where(track.confidence[..., None] > 0, centred, 0.0), track.confidence
 
 
 def _initial_translations(objective: _Objective) -> np.ndarray:
-    """Return r of each frame with φ = 0 by linear least squares, weighed by confidence, (L, 3).
+    """Return r of each frame for φ = 0 by confidence-weighted linear least squares, (L, 3).
 
-    f (X + r_x) = u (Z + r_z), and so with y: two equations in r for each detection. A frame with
-    fewer than two seen joints, or whose solution is not in front of the camera, gets a translation
-    between its neighbours'.
-
-    Raises
-    ------
-    ValueError
-        If no frame determines its translation.
+    Each detection gives f (X + r_x) = u (Z + r_z) and its counterpart in y. Frames with fewer than
+    two
+    detections, or a solution behind the camera, are interpolated.
     """
     local, image, focal = objective.local, objective.detections, objective.focal
     L, J, _ = local.shape
@@ -282,9 +261,9 @@ def _initial_translations(objective: _Objective) -> np.ndarray:
     rows[..., 0, 0] = rows[..., 1, 1] = focal
     rows[..., 2] = -image
     right = image * local[..., 2:] - focal * local[..., :2]
-    weighed = objective.confidence[..., None, None] * rows
-    normal = np.einsum("ljka,ljkb->lab", weighed, rows)
-    pull = np.einsum("ljka,ljk->la", weighed, right)
+    weighted = objective.confidence[..., None, None] * rows
+    normal = np.einsum("ljka,ljkb->lab", weighted, rows)
+    pull = np.einsum("ljka,ljk->la", weighted, right)
     found = np.zeros((L, 3))
     enough = (objective.confidence > 0).sum(axis=1) >= 2
     enough[enough] = np.linalg.cond(normal[enough]) < 1e12
@@ -292,8 +271,8 @@ def _initial_translations(objective: _Objective) -> np.ndarray:
     good = enough & ((found[:, None] + local)[..., 2].min(axis=1) > _NEAR)
     if not good.any():
         raise ValueError(
-            f"track determines a place in front of the camera in none of its {L} frames, expected "
-            "one with at least two joints of confidence above 0, in the camera's image units"
+            f"track must determine a position in front of the camera in at least one of its {L} "
+            "frames, from at least two joints of confidence above 0 in the camera's image units"
         )
     known = np.flatnonzero(good)
     return np.stack([np.interp(np.arange(L), known, found[known, axis]) for axis in range(3)], -1)

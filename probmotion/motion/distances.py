@@ -1,7 +1,8 @@
-"""How far is generated 3D motion from real 3D motion, whichever way a person faces?
+"""Distances between sets of 3D motions, invariant to heading.
 
-Motions are compared about their root, after the turn about the vertical that brings them nearest.
-A mirrored motion is another motion: exchanging depths is the error that 2D data invite.
+Motions are compared with the root at the origin, at the rotation about the vertical that minimises
+their distance. Mirror images are different motions, since depth inversion is the typical error of
+lifting from 2D.
 """
 
 from __future__ import annotations
@@ -14,20 +15,14 @@ import numpy as np
 
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = [
-    "NearestDistances",
-    "mirrored_fraction",
-    "nearest_distances",
-    "windows",
-    "yaw_aligned_distances",
-]
+__all__ = ["mirrored_fraction", "nearest_distances", "windows", "yaw_aligned_distances"]
 
-# All products have this shape, padded, so that a distance never depends on the other motions.
+# Products are padded to this shape, so that rounding does not depend on the number of motions.
 _BLOCK = 256
 
 
 class NearestDistances(NamedTuple):
-    """The two halves of a Chamfer distance between sets of motions, metres."""
+    """Both directions of a Chamfer distance between sets of motions, metres."""
 
     of_draws: float
     """Mean over draws of the distance to the nearest real motion: fidelity."""
@@ -38,33 +33,28 @@ class NearestDistances(NamedTuple):
 def yaw_aligned_distances(
     a: np.ndarray, b: np.ndarray, *, root: int = 0, mirrored: bool = False
 ) -> np.ndarray:
-    """Return every distance between two sets of motions: ``(N, L, J, 3), (M, …) → (N, M)``.
+    """Return the distances between two sets of motions: ``(N, L, J, 3), (M, …) → (N, M)``, metres.
 
-    The root mean square, over joints and frames, of the distance between joints, with roots at the
-    origin in every frame, at its minimum over one turn about the vertical per pair. With
-    h = x + iz and the heights y, that is, in closed form,
+    The distance is the root mean square over joints and frames, with roots at the origin in every
+    frame, minimised over one rotation about the vertical per pair. With h = x + iz and heights y::
 
         d² = (‖a‖² + ‖b‖² − 2 y_a·y_b − 2 |Σ h̄_a h_b|) / (L J)
-
-    so copies of a motion are at 0 up to about 1e-8 of its size. (The mean distance of joints has
-    no such form.)
 
     Parameters
     ----------
     a, b : ndarray, (N, L, J, 3) and (M, L, J, 3)
         Motions, metres.
     root : int
-        The joint at the origin.
+        Index of the root joint.
     mirrored : bool
-        Measure from the mirror images of ``a`` in depth, left joints still called left.
+        Use the depth-mirrored images of ``a``, without exchanging left and right joints.
 
     Raises
     ------
     ValueError
         If shapes disagree or a number is not finite.
     """
-    first, second = _Flat.of("a", a, root), _Flat.of("b", b, root)
-    _check_alike(first, second)
+    first, second = _pair({"a": a, "b": b}, root)
     distances = np.empty((len(a), len(b)))
     for rows, columns, block in _blocks(first, second, mirrored):
         distances[rows, columns] = block
@@ -72,17 +62,18 @@ def yaw_aligned_distances(
 
 
 def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> NearestDistances:
-    """Return how near draws are to real motion, and real motion to draws.
+    """Return the mean distance from draws to the nearest real motion, and the reverse.
 
-    Both matter: copies of one real motion are near, and cover nothing. Both fall with the size of
-    the other set; compare samplers at equal sizes, beside real motion's own distances.
+    Draws can copy one real motion, so both directions are needed. Both decrease with the size of
+    the
+    other set: compare samplers at equal sizes.
 
     Parameters
     ----------
     draws, real : ndarray, (N, L, J, 3) and (M, L, J, 3)
         Motions, metres; see :func:`windows` for long clips.
     root : int
-        The joint at the origin.
+        Index of the root joint.
 
     Raises
     ------
@@ -94,10 +85,11 @@ def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
 
 
 def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> float:
-    """Return the share of draws whose mirror image in depth is nearer to real motion than they are.
+    """Return the fraction of draws that are farther from real motion than their depth mirror image.
 
-    The image exchanges near and far, and no names: knees bend backwards. Orthographic cameras at
-    elevation 0 cannot tell the two apart, so a sampler that sees no more has .5 here.
+    Mirroring exchanges near and far but not joint names: knees bend backwards. Orthographic cameras
+    at
+    elevation 0 cannot distinguish the two, which gives 0.5.
 
     Parameters
     ----------
@@ -110,7 +102,7 @@ def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
 
 
 def windows(positions: np.ndarray, frames: int, stride: int = 1) -> np.ndarray:
-    """Return a clip's windows, starting every ``stride`` frames: ``(L, J, 3) → (n, frames, J, 3)``.
+    """Return windows of a clip every ``stride`` frames: ``(L, J, 3) → (n, frames, J, 3)``.
 
     Raises
     ------
@@ -122,7 +114,7 @@ def windows(positions: np.ndarray, frames: int, stride: int = 1) -> np.ndarray:
     check_count("stride", stride)
     if len(positions) < frames:
         raise ValueError(
-            f"positions has {len(positions)} frames, expected at least frames={frames}"
+            f"positions must have at least frames={frames} frames, got {len(positions)}"
         )
     starts = np.arange(0, len(positions) - frames + 1, stride)
     return positions[starts[:, None] + np.arange(frames)]
@@ -130,7 +122,7 @@ def windows(positions: np.ndarray, frames: int, stride: int = 1) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Flat:
-    """N motions about their root: horizontal positions x + iz and heights, (N, L J) each."""
+    """N motions relative to their root: horizontal positions x + iz and heights, (N, L J) each."""
 
     horizontal: np.ndarray
     heights: np.ndarray
@@ -142,7 +134,7 @@ class _Flat:
         check_shape(name, motions, ("N", "L", "J", 3))
         check_finite(name, motions)
         if motions.size == 0:
-            raise ValueError(f"{name} must have shape at least one motion, got {motions.shape}")
+            raise ValueError(f"{name} must contain at least one motion, got shape {motions.shape}")
         centred = np.asarray(motions, np.float64)
         centred = centred - centred[:, :, root : root + 1]
         flat = centred.reshape(len(motions), -1, 3)
@@ -154,13 +146,19 @@ class _Flat:
         )
 
 
-def _check_alike(a: _Flat, b: _Flat) -> None:
-    if a.shape != b.shape:
-        raise ValueError(f"b has motions of shape {b.shape}, expected {a.shape} like those of a")
+def _pair(motions: dict[str, np.ndarray], root: int) -> tuple[_Flat, _Flat]:
+    """Return two named sets of motions after checking that their shapes agree."""
+    first, second = (_Flat.of(name, values, root) for name, values in motions.items())
+    if first.shape != second.shape:
+        one, other = motions
+        raise ValueError(
+            f"{other} must have motions of shape {first.shape} like {one}, got {second.shape}"
+        )
+    return first, second
 
 
 def _blocks(a: _Flat, b: _Flat, mirrored: bool) -> Iterator[tuple[slice, slice, np.ndarray]]:
-    """Yield rows, columns and the distances between them."""
+    """Yield blocks of the distance matrix with their rows and columns."""
     turn = a.horizontal if mirrored else a.horizontal.conj()
     for row in range(0, len(turn), _BLOCK):
         rows = slice(row, min(row + _BLOCK, len(turn)))
@@ -171,7 +169,7 @@ def _blocks(a: _Flat, b: _Flat, mirrored: bool) -> Iterator[tuple[slice, slice, 
             inner += upright @ _padded(b.heights[columns]).T
             inner = inner[: rows.stop - row, : columns.stop - column]
             squares = a.squares[rows, None] + b.squares[columns] - 2 * inner
-            # Rounding makes the squared distance of copies a little less than 0.
+            # Rounding can make the squared distance of copies negative.
             yield rows, columns, np.sqrt(np.maximum(squares, 0.0) / turn.shape[1])
 
 
@@ -186,12 +184,8 @@ def _padded(rows: np.ndarray) -> np.ndarray:
 def _nearest(
     draws: np.ndarray, real: np.ndarray, root: int, mirrored: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each draw to the nearest real motion, and of each real one to a draw."""
-    first, second = _Flat.of("draws", draws, root), _Flat.of("real", real, root)
-    if first.shape != second.shape:
-        raise ValueError(
-            f"real has motions of shape {second.shape}, expected {first.shape} like the draws"
-        )
+    """Return the distance of each draw to the nearest real motion, and the reverse."""
+    first, second = _pair({"draws": draws, "real": real}, root)
     of_draws, of_real = np.full(len(draws), np.inf), np.full(len(real), np.inf)
     for rows, columns, block in _blocks(first, second, mirrored):
         of_draws[rows] = np.minimum(of_draws[rows], block.min(axis=1))

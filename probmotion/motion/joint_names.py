@@ -1,14 +1,14 @@
-"""One vocabulary for joints, and the names that data sets and programs give them.
+"""Canonical joint names across the naming schemes of data sets and programs.
 
-The canonical names are ``pelvis lower_spine spine chest neck upper_neck head head_top nose tail``
-and, with ``left_`` or ``right_`` before them, ``eye ear collar shoulder elbow wrist palm hand
-fingers thumb hip_joint hip knee ankle heel foot big_toe small_toe toe front_paw back_paw``.
-``foot`` is the ball of the foot, as in SMPL, ``toe`` its tip.
+Canonical names are ``pelvis lower_spine spine chest neck upper_neck head head_top nose tail`` and,
+with the prefix ``left_`` or ``right_``, ``eye ear collar shoulder elbow wrist palm hand fingers
+thumb hip_joint hip knee ankle heel foot big_toe small_toe toe front_paw back_paw``. ``foot`` is
+the ball of the foot, as in SMPL, and ``toe`` its tip.
 
-Schemes disagree about words. A BVH joint is named for the bone that begins there, so that
-``LeftLeg`` is a knee and ``LeftFoot`` an ankle; an ASF joint is where the bone of its name ends, so
-that ``ltibia`` is an ankle. ``left_foot`` is an ankle where no joint is called one, and the ball of
-the foot beside a ``left_ankle``. The joints of one skeleton are therefore named together.
+Words differ between schemes. A BVH joint is named after the bone that starts there (``LeftLeg`` is
+a knee), an ASF joint after the bone that ends there (``ltibia`` is an ankle). ``left_foot`` is the
+ankle of a skeleton without ``left_ankle``, and the ball of the foot otherwise. All joints of a
+skeleton are therefore named together.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["canonical_name", "canonical_names", "mirrored_name"]
+__all__ = ["canonical_names", "mirrored_name"]
 
-# Each word, in lower case without separators, with what it may mean, likeliest first.
+# Possible meanings of each word (lower case, without separators), most likely first.
 _CENTRAL: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("pelvis", "hip", "hips", "midhip", "hipcentre", "hipcenter"), ("pelvis",)),
     "root": ("pelvis", "root"),
@@ -56,7 +56,7 @@ _SIDED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("frontpaw", "fpaw"), ("front_paw",)),
     **dict.fromkeys(("backpaw", "hindpaw", "bpaw"), ("back_paw",)),
 }
-# What CMU's ASF files call the ends of their bones.
+# Names in CMU's ASF files, where a joint is the end of the bone.
 _ASF_CENTRAL = {
     "root": "pelvis",
     "lowerback": "lower_spine",
@@ -81,7 +81,7 @@ _ASF_SIDED = {
     "thumb": "thumb",
 }
 _ASF_MARKS = frozenset(side + bone for side in "lr" for bone in ("femur", "tibia", "humerus"))
-# Where the bone that begins at a joint ends, for joints called ``…_end``.
+# Names of joints called ``…_end``, by the joint before them.
 _END_OF = {
     "ankle": "foot",
     "foot": "toe",
@@ -105,35 +105,19 @@ _SHORT_SIDE = re.compile(r"^(?P<side>[lLrR])(?P<part>[a-z].*)$")
 _MIRRORED = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
 
 
-def canonical_name(name: str) -> str:
-    """Return the field's common name of a joint, or the name itself where none is known.
-
-    Parameters
-    ----------
-    name : str
-        A joint's name in any of the usual schemes: ``LeftUpLeg``, ``lThigh``, ``l_hip``,
-        ``mixamorig:LeftUpLeg`` and ``left_hip`` are all ``left_hip``.
-
-    See Also
-    --------
-    canonical_names : decides words of two meanings by the other joints of the skeleton.
-    """
-    return canonical_names([name])[0]
-
-
 def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the common names of the joints of one skeleton.
+    """Return the canonical names of the joints of one skeleton.
 
     Parameters
     ----------
     names : sequence of str
-        All joints of the skeleton. Those of several people are called ``person:joint`` and keep
-        the person; what stands before every joint alike is a rig's name and is dropped.
+        All joint names of the skeleton. A person prefix ``person:`` is kept if there are several
+        people; a prefix common to all joints is a rig name and is dropped.
 
     Returns
     -------
     tuple of str
-        The canonical names; a joint of unknown meaning keeps its own.
+        Canonical names; unknown joints keep their own.
     """
     people = [_person_of(name) for name in names]
     several = len(set(people)) > 1
@@ -147,13 +131,13 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _person_of(name: str) -> str:
-    """Return ``person`` of a joint called ``person:joint``, and ``""`` of any other."""
+    """Return the ``person`` prefix of a joint name, ``""`` if there is none."""
     match = _PERSON.match(_MIXAMO.sub("", name))
     return match["person"] if match else ""
 
 
 def mirrored_name(name: str) -> str | None:
-    """Return the right counterpart of a left joint's name in its own scheme, or None.
+    """Return the right counterpart of a left joint's name in the same scheme, or None.
 
     ``left_knee`` gives ``right_knee``, ``lShin`` gives ``rShin``; ``lowerback`` gives None.
     """
@@ -174,8 +158,7 @@ def _names_of_one(names: list[str]) -> list[str]:
         meanings[index] = (meaning,)
     result = list(names)
     taken: set[str] = set()
-    # Words of one meaning first, and canonical ones before others; then by name, so that the order
-    # of the joints does not matter.
+    # Unambiguous words first, then canonical ones, then by name: independent of the joint order.
     for index in sorted(
         range(len(names)),
         key=lambda i: (len(meanings[i]), meanings[i][:1] != (names[i],), _word(names[i])),
@@ -198,7 +181,7 @@ def _names_of_one(names: list[str]) -> list[str]:
 
 
 def _meanings(name: str) -> tuple[str, ...]:
-    """Return what a name may mean on its own, likeliest first; nothing where it is unknown."""
+    """Return the possible meanings of a name, most likely first; empty if it is unknown."""
     if _word(name) in _CENTRAL:
         return _CENTRAL[_word(name)]
     match = _side(name)
@@ -212,7 +195,7 @@ def _meanings(name: str) -> tuple[str, ...]:
 
 
 def _trunk(names: list[str]) -> dict[int, str]:
-    """Return the meanings of the joints between pelvis and neck, which schemes only number."""
+    """Return the meanings of the numbered joints between pelvis and neck."""
     order = ("abdomen", "spine", "chest", "upperchest")
     found = []
     for index, name in enumerate(names):
@@ -236,7 +219,7 @@ def _asf_name(name: str) -> str:
 
 
 def _in_side(name: str, table: dict[str, str]) -> str | None:
-    """Look a canonical name up in ``table``, the side kept."""
+    """Look up a canonical name in ``table``, preserving its side."""
     for side in ("left_", "right_", ""):
         if name.startswith(side):
             meaning = table.get(name.removeprefix(side))
@@ -245,7 +228,7 @@ def _in_side(name: str, table: dict[str, str]) -> str | None:
 
 
 def _side(name: str) -> re.Match[str] | None:
-    """Match a name with its side and part; ``lowerback`` and ``root`` have none."""
+    """Match the side and part of a name; None if it has no side, such as ``lowerback``."""
     if _word(name) in _CENTRAL or _TRUNK.match(_word(name)):
         return None
     for pattern in _SIDES:

@@ -1,4 +1,4 @@
-"""From joint rotations to positions, and back."""
+"""Forward kinematics, and fitting of joint rotations to positions."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["fit_rotations", "forward_kinematics"]
 
-# Rest offsets and rotations are fitted in turn; the first rest pose is already near.
+# Alternating fits of rest offsets and rotations; the initial rest pose is already close.
 _PASSES = 3
-# Weight of "turn with the parent", relative to the bones: decides only what they leave open.
+# Relative weight of the parent's rotation, which resolves only the undetermined twist.
 _TIE = 1e-12
 
 
 def forward_kinematics(
     skeleton: Skeleton, rotations: Array, root_translations: Array, rest_offsets: Array
 ) -> tuple[Array, Array]:
-    """Return where the joints are, and how they are turned in the world.
+    """Return joint positions and global rotations from local rotations.
 
-    ``G_j = G_parent R_j`` and ``p_j = p_parent + G_parent o_j``; at a root ``G_j = R_j`` and p_j
-    is its translation. NumPy, torch and JAX arrays alike.
+    ``G_j = G_parent R_j`` and ``p_j = p_parent + G_parent o_j``; for a root, ``G_j = R_j`` and p_j
+    is
+    its translation. Accepts NumPy, torch and JAX arrays.
 
     Parameters
     ----------
     skeleton : Skeleton
-        J joints, R of them roots. Parents may come after their children.
+        J joints with R roots. Parents may come after their children.
     rotations : Array, (…, L, J, 3, 3)
-        Each joint's rotation in its parent's frame.
+        Rotation of each joint in its parent's frame.
     root_translations : Array, (…, L, R, 3)
-        Positions of the roots in the order of ``skeleton.roots``, metres.
+        Root positions in the order of ``skeleton.roots``, metres.
     rest_offsets : Array, (…, J, 3)
-        Each joint's offset from its parent in the rest pose, metres. A root's is not used. Batch
-        axes broadcast: one body for all motions, or one for each.
+        Offset of each joint from its parent in the rest pose, metres; ignored for roots. Batch axes
+        broadcast.
 
     Returns
     -------
@@ -58,7 +59,7 @@ def forward_kinematics(
     check_shape("rest_offsets", rest_offsets, ("…", skeleton.n_joints, 3))
     xp = array_namespace(rotations, root_translations, rest_offsets)
     levels = _levels(skeleton)
-    # Joints equally far from a root are one step: a body has many joints and few such steps.
+    # All joints at the same depth are computed in one step.
     turns = [_at(xp, rotations, levels[0], -3)]
     positions = [root_translations]
     for above, level in pairwise(levels):
@@ -76,7 +77,7 @@ def forward_kinematics(
 
 
 def _levels(skeleton: Skeleton) -> list[list[int]]:
-    """Return the joints by how many bones they are from a root; roots in their own order."""
+    """Return the joints grouped by their number of bones from a root."""
     depths = [len(skeleton.ancestors(joint)) for joint in range(skeleton.n_joints)]
     return [
         [joint for joint, depth in enumerate(depths) if depth == level]
@@ -86,7 +87,7 @@ def _levels(skeleton: Skeleton) -> list[list[int]]:
 
 def _product(xp: Any, first: Array, second: Array) -> Array:
     if is_jax_array(first):
-        # XLA cannot compile a batch of matrix products behind a choice of joints.
+        # XLA fails to compile a batched matrix product of gathered joints.
         return xp.sum(first[..., None] * second[..., None, :, :], axis=-2)
     return xp.matmul(first, second)
 
@@ -100,17 +101,15 @@ def _at(xp: Any, values: Array, joints: list[int], axis: int) -> Array:
 def fit_rotations(
     skeleton: Skeleton, positions: np.ndarray, rest_offsets: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return joint rotations and a rest pose that reproduce positions as well as they can.
+    """Return joint rotations and a rest pose that reproduce positions in the least-squares sense.
 
-    With the roots' positions as translations, :func:`forward_kinematics` of the result gives the
-    positions back exactly where every bone keeps its length and the children of each joint keep
-    their angles to each other. Elsewhere something is lost: a bone's change of length over time
-    (the rest pose has its mean), and the movement of siblings against each other (their joint
-    has one rotation, the best in least squares: Kabsch 1976). The error of a joint is not passed
-    on: the next bone aims at its own end from where the last one really ended.
+    With the root positions as translations, :func:`forward_kinematics` of the result reproduces the
+    positions exactly if bone lengths and the angles between siblings are constant. Otherwise bones
+    have their mean length, and a joint with several children its least-squares rotation (Kabsch
+    1976). Errors do not accumulate: each bone starts at the fitted end of the previous one.
 
-    Positions do not say how a bone turns about itself. A joint with one child, or with none, or
-    with children in line, gets the least rotation against its parent, without that twist.
+    Positions do not determine the twist about a bone. A joint with at most one child, or with
+    collinear children, is rotated minimally relative to its parent.
 
     Parameters
     ----------
@@ -119,14 +118,14 @@ def fit_rotations(
     positions : ndarray, (L, J, 3)
         Metres.
     rest_offsets : ndarray, (J, 3), optional
-        The rest pose that rotations are from; by default one is fitted, near the first frame.
+        Rest pose. By default it is fitted, close to the first frame.
 
     Returns
     -------
     rotations : ndarray, (L, J, 3, 3)
-        Each joint's rotation in its parent's frame.
+        Rotation of each joint in its parent's frame.
     rest_offsets : ndarray, (J, 3)
-        Each joint's offset from its parent in the rest pose, metres; of a fitted one 0 for roots.
+        Offset of each joint from its parent in the rest pose, metres; 0 for roots if fitted.
 
     Raises
     ------
@@ -136,7 +135,7 @@ def fit_rotations(
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("L", skeleton.n_joints, 3))
     if len(positions) == 0:
-        raise ValueError("positions has no frame, expected at least one")
+        raise ValueError("positions must contain at least one frame, got none")
     check_finite("positions", positions)
     children: dict[int, list[int]] = {}
     for joint, parent in skeleton.bones:
@@ -166,7 +165,7 @@ def fit_rotations(
 
 
 def _rest_offsets(bones: np.ndarray) -> np.ndarray:
-    """Return the rigid set of bones (C, 3) that best fits those of all frames, (L, C, 3)."""
+    """Return the rigid set of bones (C, 3) that best fits those of all frames (L, C, 3)."""
     lengths = np.linalg.norm(bones, axis=-1).mean(axis=0)
     rest = _of_lengths(bones[0], lengths)
     upright = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
@@ -177,7 +176,7 @@ def _rest_offsets(bones: np.ndarray) -> np.ndarray:
 
 
 def _of_lengths(vectors: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return vectors (C, 3) scaled to lengths (C,); one of length 0 points upwards."""
+    """Return vectors (C, 3) scaled to lengths (C,); zero vectors point upwards."""
     norms = np.linalg.norm(vectors, axis=-1)
     directions = np.where(
         norms[:, None] > 0, vectors / np.where(norms > 0, norms, 1.0)[:, None], [0.0, 1.0, 0.0]
@@ -186,9 +185,9 @@ def _of_lengths(vectors: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 
 def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.ndarray:
-    """Return the rotations (L, 3, 3) that take ``rest`` (C, 3) nearest to ``bones`` (L, C, 3).
+    """Return the rotations (L, 3, 3) that best align ``rest`` (C, 3) with ``bones`` (L, C, 3).
 
-    What the bones leave open is as in ``above``, (L, 3, 3), the parent's rotation.
+    Undetermined rotations follow the parent's rotations ``above``, (L, 3, 3).
     """
     if len(rest) == 0:
         return above.copy()
@@ -204,13 +203,13 @@ def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.nd
 
 
 def _least_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the least rotations that turn each ``start`` (L, 3) to point along ``end``."""
+    """Return the smallest rotations that align each ``start`` (L, 3) with ``end``."""
     lengths = np.linalg.norm(start, axis=-1), np.linalg.norm(end, axis=-1)
     known = (lengths[0] > 0) & (lengths[1] > 0)
     start = start / np.where(known, lengths[0], 1.0)[:, None]
     end = end / np.where(known, lengths[1], 1.0)[:, None]
     axis = np.cross(start, end)
-    # Opposite directions leave the axis open: any that is square to ``start`` will do.
+    # Any axis orthogonal to ``start`` serves for opposite directions.
     parallel = np.linalg.norm(axis, axis=-1) < 1e-12
     other = np.cross(start, np.eye(3)[np.abs(start).argmin(axis=-1)])
     axis = np.where(parallel[:, None], other, axis)

@@ -1,4 +1,4 @@
-"""`Motion`: a skeleton's joints through time; `KeypointTrack`: their pictures in one camera."""
+"""3D motions and 2D keypoint tracks of a skeleton."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 __all__ = ["KeypointTrack", "Motion"]
 
 
-_MOST_CONFIDENT = 2
+_MAX_CONFIDENCE = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,17 +30,18 @@ class Motion:
     fps : float
         Frames per second.
     rotations : ndarray, (L, J, 3, 3), optional
-        Local rotation matrices of the joints in their parents' frames, where the source had them.
+        Local rotation matrices of the joints in their parents' frames, if the source provides them.
     rest_offsets : ndarray, (J, 3), optional
-        Offset of each joint from its parent in the rest pose, metres; given with ``rotations``.
+        Offset of each joint from its parent in the rest pose, metres; required with ``rotations``.
     name : str
-        What to call the clip in tables, the file's stem by default.
+        Name of the clip in tables; readers use the file's stem.
 
     Raises
     ------
     ValueError
-        If shapes do not fit the skeleton, a value is NaN or infinite, there is no frame, a
-        rotation is not orthonormal, or ``fps`` is not above zero.
+        If shapes do not fit the skeleton, a value is not finite, there is no frame, a rotation is
+        not
+        orthonormal, or ``fps`` is not positive.
     """
 
     positions: np.ndarray
@@ -54,13 +55,13 @@ class Motion:
         positions = np.asarray(self.positions, dtype=np.float64)
         check_shape("positions", positions, ("L", self.skeleton.n_joints, 3))
         if len(positions) == 0:
-            raise ValueError("positions has no frame, expected at least one")
+            raise ValueError("positions must contain at least one frame, got none")
         check_finite("positions", positions)
         check_positive("fps", self.fps)
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "fps", float(self.fps))
         if (self.rotations is None) != (self.rest_offsets is None):
-            raise ValueError("rotations and rest_offsets are given one without the other")
+            raise ValueError("rotations and rest_offsets must be given together, got only one")
         if self.rotations is not None and self.rest_offsets is not None:
             check_shape("rotations", self.rotations, (*positions.shape[:2], 3, 3))
             check_finite("rotations", self.rotations)
@@ -68,7 +69,7 @@ class Motion:
             gap = float(np.abs(product - np.eye(3)).max())
             if gap > 1e-3:
                 raise ValueError(
-                    f"rotations is off orthonormal matrices by {gap:.2g}, expected at most 0.001"
+                    f"rotations must be orthonormal to 0.001, got a deviation of {gap:.2g}"
                 )
             check_shape("rest_offsets", self.rest_offsets, (self.skeleton.n_joints, 3))
             check_finite("rest_offsets", self.rest_offsets)
@@ -88,25 +89,22 @@ class Motion:
         check_count("frames", frames)
         if not 0 <= start <= self.frames - frames:
             raise ValueError(
-                f"start is {start} with frames {frames}, expected a window inside the "
-                f"{self.frames} frames of {self.name or 'the motion'}"
+                f"start must be 0 to {self.frames - frames} for frames={frames}, got {start}"
             )
         stop = start + frames
         rotations = None if self.rotations is None else self.rotations[start:stop]
         return replace(self, positions=self.positions[start:stop], rotations=rotations)
 
     def resample(self, fps: float) -> Motion:
-        """Return the clip at another frame rate.
+        """Return the clip at another frame rate, with linear interpolation in time.
 
-        Positions are interpolated linearly in time and local rotations along the geodesic, so
-        that a motion sampled below ``fps`` gains no overshoot. Where both are given, the positions
-        of a frame between two old ones are those of the joints' straight paths. See
+        Local rotations are interpolated along the geodesic; see
         :func:`~probmotion.motion.resampling.resample`.
 
         Raises
         ------
         ValueError
-            If ``fps`` is not a number above 0 and at most 10 000.
+            If ``fps`` is not above 0 and at most 10 000.
         """
         if fps == self.fps:
             return self
@@ -114,27 +112,26 @@ class Motion:
         return replace(self, positions=positions, rotations=rotations, fps=float(fps))
 
     def centred(self) -> Motion:
-        """Return the motion with the first root's mean position over its frames at the origin."""
+        """Return the motion with the first root's mean position at the origin."""
         root = self.skeleton.roots[0]
         positions = self.positions - self.positions[:, root].mean(axis=0)
         return replace(self, positions=positions, rotations=None, rest_offsets=None)
 
     def turned(self, yaw: float) -> Motion:
-        """Return the motion turned by ``yaw`` radians about the vertical axis."""
+        """Return the motion rotated by ``yaw`` radians about the vertical axis."""
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return replace(self, positions=self.positions @ turn.T, rotations=None, rest_offsets=None)
 
     def retarget(self, skeleton: Skeleton) -> Motion:
-        """Return the motion on another skeleton, joints matched by their (canonical) names.
+        """Return the motion on another skeleton, with joints matched by their (canonical) names.
 
-        Positions stay where they are: proportions are the motion's, and no joint is made up.
-        Rotations are dropped unless the skeletons are equal.
+        Positions are unchanged. Rotations are dropped unless the skeletons are equal.
 
         Raises
         ------
         ValueError
-            If a joint of ``skeleton`` has no counterpart here; the message names it.
+            If a joint of ``skeleton`` has no counterpart.
         """
         if self.skeleton == skeleton:
             return self
@@ -161,23 +158,23 @@ class KeypointTrack:
     Parameters
     ----------
     keypoints : ndarray, (L, J, 2)
-        Image coordinates, x right and y down, pixels or the camera's unit. Entries that were not
-        seen are NaN and have confidence 0.
+        Image coordinates, x right and y down, pixels or the camera's unit. Missing entries are NaN
+        with confidence 0.
     confidence : ndarray, (L, J)
-        Between 0 (not seen) and 1; heatmaps peak a little above 1, and COCO's annotations count
-        to 2.
+        From 0 (missing) to 1; heatmap peaks slightly above 1 and COCO annotations up to 2 are
+        accepted.
     skeleton : Skeleton
         Names and parents of the J joints.
     fps : float
         Frames per second.
     name : str
-        What to call the track.
+        Name of the track.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, a confidence is negative, beyond 2 or not finite, or a keypoint that
-        has a confidence above 0 is not finite.
+        If shapes do not fit, a confidence is outside 0 to 2 or not finite, or a keypoint with
+        confidence above 0 is not finite.
     """
 
     keypoints: np.ndarray
@@ -192,21 +189,17 @@ class KeypointTrack:
         check_shape("keypoints", keypoints, ("L", self.skeleton.n_joints, 2))
         check_shape("confidence", confidence, keypoints.shape[:2])
         if len(keypoints) == 0:
-            raise ValueError("keypoints has no frame, expected at least one")
+            raise ValueError("keypoints must contain at least one frame, got none")
         check_finite("confidence", confidence)
-        if confidence.min() < 0:
-            raise ValueError(f"confidence is {confidence.min():g} at its least, expected 0 or more")
-        if confidence.max() > _MOST_CONFIDENT:
-            raise ValueError(
-                f"confidence is {confidence.max():g} at its most, expected 0 (not seen) to 1, or "
-                f"{_MOST_CONFIDENT} where annotations count so far: they are weights of losses"
-            )
+        for value in (confidence.min(), confidence.max()):
+            if not 0 <= value <= _MAX_CONFIDENCE:
+                raise ValueError(f"confidence must be 0 to {_MAX_CONFIDENCE}, got {value:g}")
         unseen = ~np.isfinite(keypoints).all(axis=-1)
         if (unseen & (confidence > 0)).any():
             frame, joint = np.argwhere(unseen & (confidence > 0))[0]
             raise ValueError(
-                f"keypoints is not finite at frame {frame}, joint {joint}, where confidence is "
-                f"{confidence[frame, joint]:g}; expected confidence 0 there"
+                f"keypoints must be finite unless their confidence is 0, got NaN or infinity at "
+                f"frame {frame}, joint {joint} with confidence {confidence[frame, joint]:g}"
             )
         check_positive("fps", self.fps)
         object.__setattr__(self, "keypoints", keypoints)

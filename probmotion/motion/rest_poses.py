@@ -1,13 +1,13 @@
-"""The mean pose of a kind of body from 2D tracks alone, filmed from all around.
+"""Estimation of a body's mean pose from 2D tracks filmed from all azimuths.
 
-A picture of a body that is turned by the azimuth φ about the vertical shows of a bone (X, Y, Z)
+A camera at azimuth φ projects a bone (X, Y, Z) to
 
     x = X cos φ + Z sin φ,    y = Y.
 
-Where azimuths are uniform, E[y] is the mean bone's Y and 2 E[x_a x_b] = X_a X_b + Z_a Z_b for two
-bones of a rigid body. How two bones of a moving one move together adds to it, most where a is b.
-Symmetry tells the mean pose from that: its X are odd (the left has the opposite of the right) and
-in line with how wide hips and shoulders are, its Z are even.
+For uniform azimuths, E[y] is the mean of Y, and 2 E[x_a x_b] = X_a X_b + Z_a Z_b for two bones of a
+rigid body. Joint movement of the bones adds to it, mostly for a = b. Bilateral symmetry separates
+the mean pose from this: X is odd under mirroring and proportional to the width of hips and
+shoulders, Z is even.
 """
 
 from __future__ import annotations
@@ -22,62 +22,63 @@ from probmotion.motion.skeleton import Skeleton
 __all__ = ["estimate_rest_pose", "is_four_legged"]
 
 _PASSES = 5000
-"""Of filling a Gram matrix's diagonal in, at most; where one bone moves most it takes 1000."""
+"""Maximum number of principal-factor iterations; 1000 occur if one bone moves most."""
 _SETTLED = 1e-8
-"""Change of the diagonal, of its greatest, at which it is filled in."""
-_TOLD = 0.01
-"""Metres: what is less far ahead does not say where the front is."""
+"""Relative change of the diagonal at convergence."""
+_AMBIGUOUS = 0.01
+"""Forward offset in metres below which the front is undetermined."""
 _SHORT = 1e-6
-"""Metres: below, a bone has no length, or no direction."""
+"""Length in metres below which a bone has no direction."""
 _HEADS = ("nose", "head_top", "head", "neck")
 _AHEAD = (("foot", "ankle"), ("toe", "ankle"), ("big_toe", "ankle"), ("nose", "neck"))
-"""Joints of people that are in front of others, besides knees."""
+"""Pairs of human joints of which the first is in front of the second."""
 
 
 def estimate_rest_pose(
     tracks: Sequence[KeypointTrack], threshold: float = 0.3, front: str | None = None
 ) -> np.ndarray:
-    """Return the rest pose of the body that tracks show: bones as they point on average.
+    """Return the rest pose with mean bone directions, estimated from 2D tracks.
 
-    It is what :func:`~probmotion.models.bodies.body_states.rest_pose` finds from 3D motions,
-    without them. Bones' heights are means over frames; their X and Z are factors of 2 E[x_a x_b],
-    see this module, the Z from pairs of different bones alone. The square of a length is
-    2 E[x²] + E[y²].
+    2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. The heights of bones
+    are
+    means over frames; X and Z are factors of 2 E[x_a x_b] (see the module), Z from pairs of
+    different
+    bones only. The squared length is 2 E[x²] + E[y²].
 
-    What is ignored: the cameras' elevation, of which heights are the cosine too short (2 % at the
-    usual π/16); that pictures are in perspective; a detector's errors, by six times the variance
-    of a coordinate in the square of a length; that N tracks, one azimuth each, are not all
-    azimuths, about 1/√(2N) of a length.
+    Not modelled: camera elevation, which shortens heights by its cosine (2 % at π/16); perspective;
+    detection errors, which add six times the coordinate variance to the squared length; and the
+    finite
+    number N of azimuths, about 1/√(2N) of a length.
 
-    Depth has two solutions, which are each other's mirror image, front and back exchanged. People
-    have their knees, toes and noses in front, four-legged animals their heads; for others
-    ``front`` must say. A body without left-right pairs may come out as its mirror image: pictures
-    are the same. Its joint that is farthest from the middle is then at +X.
+    Depth is determined up to a reflection that exchanges front and back. Knees, toes and noses of
+    people and heads of quadrupeds are in front; other bodies need ``front``. A body without
+    left-right pairs may be returned as its mirror image, with the joint farthest from the middle at
+    +X.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Of one skeleton with one root, from random azimuths at low elevation; metres.
+        Tracks of one skeleton with one root, from random azimuths at low elevation; metres.
     threshold : float
-        Joints of less confidence are left out, frame by frame.
+        Minimum confidence of a joint in a frame.
     front : str, optional
-        A joint that is ahead of the root in the mean pose.
+        A joint in front of the root in the mean pose.
 
     Returns
     -------
     ndarray, (J, 3)
-        Each joint's offset from its parent, metres, the root's 0; +Y is up, the body looks along
-        +Z and its left is at +X. Left and right are mirror images.
+        Offset of each joint from its parent, metres, 0 for the root; +Y is up, the body faces +Z
+        and
+        its left is at +X. Left and right are symmetric.
 
     Raises
     ------
     ValueError
-        If there is no track, skeletons differ, have several roots or are not their own mirror
-        image, bones are not seen or have no length or direction, or nothing tells where the front
-        is.
+        If there is no track, skeletons differ, have several roots or are not bilaterally symmetric,
+        bones are never detected or have no length or direction, or the front is undetermined.
     """
     skeleton = _shared_skeleton(tracks)
-    across, up, seen = _pictured_bones(tracks, skeleton, threshold)
+    across, up, seen = _projected_bones(tracks, skeleton, threshold)
     together = seen.T.astype(np.float64) @ seen
     _check_seen(together, skeleton)
     gram = 2 * (across.T @ across) / together
@@ -87,7 +88,7 @@ def estimate_rest_pose(
     if skeleton.mirrored_pairs:
         even, odd = _sides(skeleton)
         x, z = _halves(gram, even, odd, _trunk_pairs(skeleton))
-        # In the mean of a pair a healthy side hides its degenerate mirror image.
+        # Checked before averaging, which would hide a degenerate bone behind its mirror image.
         _check_long(length, skeleton)
         height, length = (
             even.T @ ((even @ values) / even.sum(axis=1)) for values in (height, length)
@@ -104,7 +105,7 @@ def estimate_rest_pose(
 
 
 def is_four_legged(skeleton: Skeleton) -> bool:
-    """Tell from the joints' names whether they are those of a four-legged animal."""
+    """Return whether the joint names are those of a quadruped."""
     return any(name == "tail" or name.endswith("_paw") for name in skeleton.canonical_names)
 
 
@@ -114,29 +115,27 @@ def _shared_skeleton(tracks: Sequence[KeypointTrack]) -> Skeleton:
     skeleton = tracks[0].skeleton
     for track in tracks:
         if track.skeleton != skeleton:
+            raise ValueError(f"tracks must have one skeleton, got other joints in {track.name!r}")
+    if len(skeleton.roots) != 1 or not skeleton.bones:
+        raise ValueError(
+            f"tracks must have a skeleton of one root with bones, got {len(skeleton.roots)} roots "
+            f"and {len(skeleton.bones)} bones"
+        )
+    order = skeleton.mirrored_order
+    for joint, parent in skeleton.bones:
+        if skeleton.parents[order[joint]] != order[parent]:
             raise ValueError(
-                f"tracks has {track.name!r} of other joints than the first, expected one skeleton"
-            )
-    if len(skeleton.roots) != 1:
-        raise ValueError(f"tracks has {len(skeleton.roots)} roots, expected one: it is one body")
-    if not skeleton.bones:
-        raise ValueError(f"tracks has the one joint {skeleton.joint_names[0]}, expected bones")
-    order, parents = skeleton.mirrored_order, skeleton.parents
-    for joint, parent in enumerate(parents):
-        mirrored = order[parent] if parent >= 0 else -1
-        if parents[order[joint]] != mirrored:
-            raise ValueError(
-                f"tracks has {skeleton.joint_names[joint]} on another joint than its mirror image "
-                "is, expected a skeleton that is its own mirror image, or a rest pose that is given"
+                "tracks must have a bilaterally symmetric skeleton, got different parents for "
+                f"{skeleton.joint_names[joint]} and its counterpart; pass a rest pose instead"
             )
     return skeleton
 
 
-def _pictured_bones(
+def _projected_bones(
     tracks: Sequence[KeypointTrack], skeleton: Skeleton, threshold: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y (up) and whether they are seen of all frames' bones, (frames, bones) each."""
-    joints, parents = (list(ends) for ends in zip(*skeleton.bones, strict=True))
+    """Return x, y (up) and visibility of the bones of all frames, (frames, bones) each."""
+    joints, parents = map(list, zip(*skeleton.bones, strict=True))
     keypoints = np.concatenate([track.keypoints for track in tracks])
     confidence = np.concatenate([track.confidence for track in tracks])
     visible = (confidence >= threshold) & np.isfinite(keypoints).all(axis=-1)
@@ -146,37 +145,31 @@ def _pictured_bones(
 
 
 def _check_seen(together: np.ndarray, skeleton: Skeleton) -> None:
-    """Refuse bones, or pairs of bones, that no frame has; frames' numbers (bones, bones)."""
-    names = [skeleton.joint_names[joint] for joint, _ in skeleton.bones]
-    for at, name in enumerate(names):
-        if together[at, at] == 0:
-            parent = skeleton.joint_names[skeleton.bones[at][1]]
-            raise ValueError(
-                f"tracks show {name} and {parent} together in no frame with confidence, expected "
-                "every bone in some"
-            )
+    """Refuse pairs of bones without a common frame, given counts (bones, bones)."""
     if (together == 0).any():
-        first, second = (names[at] for at in np.argwhere(together == 0)[0])
+        bones = skeleton.bones
+        first, second = (skeleton.joint_names[bones[at][0]] for at in np.argwhere(together == 0)[0])
         raise ValueError(
-            f"tracks show the bones to {first} and to {second} together in no frame with "
-            "confidence, expected every two bones in some"
+            "tracks must show every two bones together, got no confident frame with those to "
+            f"{first} and {second}"
         )
 
 
 def _check_long(sizes: np.ndarray, skeleton: Skeleton) -> None:
-    """Refuse bones, (bones,), of no length or direction, metres."""
+    """Refuse bones of no length or direction; lengths (bones,), metres."""
     for (joint, _), size in zip(skeleton.bones, sizes, strict=True):
         if not size > _SHORT:
             raise ValueError(
-                f"tracks show no length or direction of the bone to {skeleton.joint_names[joint]}, "
-                "expected all bones to point somewhere on average"
+                "tracks must have a mean direction for every bone, got none for the bone to "
+                f"{skeleton.joint_names[joint]}"
             )
 
 
 def _sides(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Return bones' memberships: (E, bones) in what is even, ±1 (O, bones) in what is odd.
+    """Return the bones' coefficients in even (E, bones) and odd (O, bones) combinations.
 
-    A central bone is an even one of its own; a pair is one even and one odd, the left its plus.
+    A central bone is even; a left-right pair has an even sum and an odd difference, left minus
+    right.
     """
     joints = [joint for joint, _ in skeleton.bones]
     one = {joint: np.eye(len(joints))[at] for at, joint in enumerate(joints)}
@@ -188,7 +181,7 @@ def _sides(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _trunk_pairs(skeleton: Skeleton) -> np.ndarray:
-    """Return which pairs leave one joint, as hips and shoulders do: they say what is left."""
+    """Return which pairs have a common parent, such as hips and shoulders."""
     parents = skeleton.parents
     return np.array([float(parents[a] == parents[b]) for a, b in skeleton.mirrored_pairs])
 
@@ -196,17 +189,17 @@ def _trunk_pairs(skeleton: Skeleton) -> np.ndarray:
 def _halves(
     gram: np.ndarray, even: np.ndarray, odd: np.ndarray, trunk: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return X and Z of a symmetric body's bones; Z or −Z.
+    """Return X and ±Z of the bones of a symmetric body.
 
-    X is what goes with the width of the trunk; legs that swing in turn are odd too, but not
-    sideways, so that a factor would take them for X.
+    X is proportional to the covariance with the trunk's width; a factor analysis of the odd parts
+    would also include legs in antiphase.
     """
     half = odd / 2
     odds = half @ gram @ half.T
     width = trunk @ odds @ trunk
     if not width > _SHORT**2:
         raise ValueError(
-            "tracks show left and right in one place, expected hips or shoulders of some width"
+            "tracks must have hips or shoulders of nonzero width, got left and right in one place"
         )
     lateral = odds @ trunk / np.sqrt(width)
     mean = even / even.sum(axis=1, keepdims=True)
@@ -215,9 +208,9 @@ def _halves(
 
 
 def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
-    """Return F (n, rank) with F Fᵀ nearest to the matrix off its diagonal (principal factors).
+    """Return F (n, rank) with F Fᵀ closest to the matrix off its diagonal (principal factors).
 
-    The diagonal has what bones move by themselves: it is only a bound.
+    The diagonal, which includes movement of single bones, is an upper bound.
     """
     filled, bound = gram.copy(), np.diag(gram)
     for _ in range(_PASSES):
@@ -228,12 +221,12 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
         np.fill_diagonal(filled, diagonal)
         if change <= _SETTLED * bound.max():
             break
-    # Of fewer bones than axes there is nothing along the others.
+    # With fewer bones than axes, the remaining axes are 0.
     return np.pad(factor, ((0, 0), (0, rank - factor.shape[1])))
 
 
 def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
-    """Return the solution that looks along +Z, of a body that may look along −Z or anywhere."""
+    """Return the rest pose rotated or reflected to face +Z."""
     place = np.zeros_like(rest)
     for joint in skeleton.topological_order:
         if skeleton.parents[joint] >= 0:
@@ -242,10 +235,10 @@ def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
     if skeleton.mirrored_pairs:
         ahead = np.array([0.0, ahead[1]])
     size = float(np.linalg.norm(ahead))
-    if size < _TOLD:
+    if size < _AMBIGUOUS:
         raise ValueError(
-            f"front is {front!r}, and no joint of the mean pose tells front from back, expected a "
-            "joint that is ahead of the root"
+            f"front must be a joint in front of the root, got {front!r}; the mean pose alone does "
+            "not determine front and back"
         )
     if skeleton.mirrored_pairs:
         return rest * [1.0, 1.0, np.sign(ahead[1])]
@@ -256,7 +249,7 @@ def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
 
 
 def _ahead(place: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
-    """Return X and Z of a way that points ahead, (2,), metres; 0 where nothing tells it."""
+    """Return X and Z of a forward direction, (2,), metres; 0 if undetermined."""
     names, flat = list(skeleton.canonical_names), place[:, [0, 2]]
     if front is not None:
         if front not in {*skeleton.joint_names, *names}:

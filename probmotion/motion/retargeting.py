@@ -6,39 +6,39 @@ from collections.abc import Sequence
 
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["common_skeleton", "matching_joints"]
+__all__ = ["common_skeleton", "counterpart", "matching_joints"]
 
 
 def matching_joints(source: Skeleton, target: Skeleton) -> list[int]:
     """Return the index in ``source`` of each joint of ``target``.
 
-    Where the source has every joint of the target by its own name, those are taken; elsewhere
-    joints are matched by their canonical names (:mod:`probmotion.motion.joint_names`).
-
-    Raises
-    ------
-    ValueError
-        If a joint of ``target`` has no counterpart, or several; the message names it.
+    Joints are matched by their own names if the source has all of them, and by canonical names
+    (:mod:`probmotion.motion.joint_names`) otherwise.
     """
     if set(target.joint_names) <= set(source.joint_names):
         return [source.joint_names.index(name) for name in target.joint_names]
-    return [
-        _counterpart(source, name, canonical)
-        for name, canonical in zip(target.joint_names, target.canonical_names, strict=True)
-    ]
+    chosen = []
+    for name, canonical in zip(target.joint_names, target.canonical_names, strict=True):
+        joint = counterpart(source, name, canonical)
+        if joint is None:
+            raise ValueError(
+                f"skeleton has the joint {name!r}, which has no counterpart among "
+                f"{', '.join(source.joint_names)}"
+            )
+        chosen.append(joint)
+    return chosen
 
 
 def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
-    """Return the skeleton of the joints that all skeletons have.
+    """Return the skeleton of the joints common to all skeletons.
 
-    Equal skeletons have that skeleton in common. Otherwise the joints are those of the first one
-    that every other one has too, by their canonical names and in the first one's order; a parent
-    that is left out is bridged.
+    Joints are matched by canonical names, in the order of the first skeleton; missing parents are
+    bridged.
 
     Raises
     ------
     ValueError
-        If there is no skeleton, or no joint that all of them have.
+        If there is no skeleton or no common joint.
     """
     skeletons = list(dict.fromkeys(skeletons))
     if not skeletons:
@@ -53,16 +53,16 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
     ]
     if not shared:
         raise ValueError(
-            f"skeletons have no joint in common: {', '.join(first.joint_names[:5])}, … and "
-            f"{', '.join(others[-1].joint_names[:5])}, …; expected joints of the same names"
+            f"skeletons must have a joint in common, got {', '.join(first.joint_names[:5])}, … "
+            f"and {', '.join(others[-1].joint_names[:5])}, …"
         )
     subset = first.subset(shared)
     names = [first.canonical_names[joint] for joint in shared]
     return Skeleton(names, subset.parents, subset.radii)
 
 
-def _counterpart(source: Skeleton, name: str, canonical: str) -> int:
-    """Return the index in ``source`` of the joint that another skeleton calls ``name``."""
+def counterpart(source: Skeleton, name: str, canonical: str) -> int | None:
+    """Return the index in ``source`` of another skeleton's joint, None if there is none."""
     for wanted, known in (
         (canonical, source.canonical_names),
         (name, source.canonical_names),
@@ -70,12 +70,6 @@ def _counterpart(source: Skeleton, name: str, canonical: str) -> int:
     ):
         if wanted in known:
             if known.count(wanted) > 1:
-                raise ValueError(
-                    f"skeleton has the joint {name!r}, which is several joints of the motion, "
-                    "expected one"
-                )
+                raise ValueError(f"skeleton must have one counterpart of {name!r}, got several")
             return known.index(wanted)
-    raise ValueError(
-        f"skeleton has the joint {name!r}, which has no counterpart in the motion, expected one "
-        f"of {', '.join(source.joint_names)}"
-    )
+    return None

@@ -1,6 +1,7 @@
-"""A skeleton: named joints, their parents, left-right pairs and bone radii.
+"""Skeletons: named joints with parents, left-right pairs and bone radii.
 
-A pair of people, or a gymnast and a ball, is ONE skeleton with several roots.
+Several bodies, such as a pair of people or a gymnast and a ball, form one skeleton with several
+roots.
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import numpy as np
-
 from probmotion.motion.joint_names import canonical_names, mirrored_name
 from probmotion.motion.presets import PRESETS
-from probmotion.validation import check_positive
+from probmotion.validation import check_count, check_positive
 
 __all__ = ["Skeleton"]
 
@@ -25,9 +24,9 @@ class Skeleton:
     Parameters
     ----------
     joint_names : sequence of str
-        One name per joint, all different.
+        One unique name per joint.
     parents : sequence of int
-        The index of each joint's parent, -1 for a root. A parent need not come before its child.
+        Index of each joint's parent, -1 for a root. Parents may come after their children.
     radii : sequence of float, optional
         Radius of each joint's bone to its parent, metres; for contact and penetration.
 
@@ -48,32 +47,25 @@ class Skeleton:
         radii: Sequence[float] | None = None,
     ) -> None:
         names = tuple(str(name) for name in joint_names)
-        for joint, parent in enumerate(parents):
-            if isinstance(parent, bool) or not isinstance(parent, int | np.integer):
-                raise ValueError(
-                    f"parents[{joint}] must be an integer, -1 for a root, got {parent!r}"
-                )
-        links = tuple(int(parent) for parent in parents)
         if not names:
             raise ValueError("joint_names must contain at least one joint, got none")
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise ValueError(f"joint_names repeats {repeated}, expected every name once")
-        if len(links) != len(names):
-            raise ValueError(
-                f"parents has {len(links)} entries, expected {len(names)}, one per joint"
-            )
-        for joint, parent in enumerate(links):
-            if not -1 <= parent < len(names):
+            raise ValueError(f"joint_names must be unique, got {repeated} several times")
+        for name, values in (("parents", parents), ("radii", radii)):
+            if values is not None and len(values) != len(names):
                 raise ValueError(
-                    f"parents[{joint}] ({names[joint]}) is {parent}, expected -1 (a root) or a "
-                    f"joint's index below {len(names)}"
+                    f"{name} must have one entry per joint, {len(names)}, got {len(values)}"
                 )
+        for joint, parent in enumerate(parents):
+            check_count(f"parents[{joint}]", parent, least=-1)
+            if parent >= len(names):
+                raise ValueError(
+                    f"parents[{joint}] must be -1 or a joint's index below {len(names)}, got "
+                    f"{parent}"
+                )
+        links = tuple(int(parent) for parent in parents)
         _refuse_cycles(names, links)
-        if radii is not None and len(radii) != len(names):
-            raise ValueError(
-                f"radii has {len(radii)} entries, expected {len(names)}, one per joint"
-            )
         for joint, radius in enumerate(radii or ()):
             check_positive(f"radii[{joint}]", radius)
         object.__setattr__(self, "joint_names", names)
@@ -82,16 +74,16 @@ class Skeleton:
 
     @classmethod
     def preset(cls, name: str) -> Skeleton:
-        """Return a skeleton by name; see :data:`probmotion.motion.presets.PRESETS`.
+        """Return a skeleton of :data:`probmotion.motion.presets.PRESETS` by name.
 
         Raises
         ------
         ValueError
-            If the name is unknown; the message lists the known ones.
+            If the name is unknown.
         """
         if name not in PRESETS:
             raise ValueError(f"name must be one of {', '.join(sorted(PRESETS))}, got {name!r}")
-        return cls(*PRESETS[name]())
+        return cls(*PRESETS[name])
 
     @property
     def n_joints(self) -> int:
@@ -105,12 +97,12 @@ class Skeleton:
 
     @cached_property
     def bones(self) -> tuple[tuple[int, int], ...]:
-        """Pairs (joint, parent), one per joint that has a parent."""
+        """Pairs (joint, parent) of all joints with a parent."""
         return tuple((j, parent) for j, parent in enumerate(self.parents) if parent >= 0)
 
     @cached_property
     def topological_order(self) -> tuple[int, ...]:
-        """Joint indices ordered so that every parent comes before its children."""
+        """Joint indices in an order with parents before their children."""
         order: list[int] = []
         children: dict[int, list[int]] = {}
         for joint, parent in enumerate(self.parents):
@@ -124,7 +116,7 @@ class Skeleton:
 
     @cached_property
     def mirrored_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Pairs (left, right) of joints whose names differ in the side alone."""
+        """Pairs (left, right) of joints with names that differ only in the side."""
         pairs = []
         for left, name in enumerate(self.joint_names):
             other = mirrored_name(name)
@@ -134,7 +126,7 @@ class Skeleton:
 
     @cached_property
     def mirrored_order(self) -> tuple[int, ...]:
-        """For every joint, the one on the other side; itself where there is none."""
+        """Index of each joint's left-right counterpart; its own if it has none."""
         order = list(range(self.n_joints))
         for left, right in self.mirrored_pairs:
             order[left], order[right] = right, left
@@ -142,7 +134,7 @@ class Skeleton:
 
     @cached_property
     def canonical_names(self) -> tuple[str, ...]:
-        """The field's common name of each joint (``left_knee``), or its own where unknown."""
+        """Canonical name of each joint (``left_knee``), or its own name if unknown."""
         return canonical_names(self.joint_names)
 
     def index(self, joint_name: str) -> int:
@@ -151,7 +143,7 @@ class Skeleton:
         Raises
         ------
         ValueError
-            If no joint has that name, or several do.
+            If no joint or several joints have that name.
         """
         if joint_name in self.joint_names:
             return self.joint_names.index(joint_name)
@@ -160,29 +152,23 @@ class Skeleton:
             return found[0]
         problem = "no joint" if not found else "several joints"
         raise ValueError(
-            f"joint_name is {joint_name!r}, which names {problem} of this skeleton, expected one "
-            f"of {', '.join(self.joint_names)}"
+            f"joint_name must be one of {', '.join(self.joint_names)}, got {joint_name!r}, which "
+            f"names {problem}"
         )
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
-        """Return the joints on the way from ``joint``'s parent to its root, nearest first."""
+        """Return the ancestors of ``joint``, from its parent to its root."""
         chain = []
         while (joint := self.parents[joint]) >= 0:
             chain.append(joint)
         return tuple(chain)
 
     def subset(self, joints: Sequence[int]) -> Skeleton:
-        """Return the skeleton of ``joints``; a parent that is left out is bridged.
-
-        A joint's new parent is its nearest ancestor among ``joints``; where none is left, it
-        becomes a root.
-        """
+        """Return the skeleton of ``joints``, each below its nearest ancestor among them."""
         kept = list(joints)
         for joint in kept:
             if not 0 <= joint < self.n_joints:
-                raise ValueError(
-                    f"joints has {joint}, expected indices from 0 to {self.n_joints - 1}"
-                )
+                raise ValueError(f"joints must be 0 to {self.n_joints - 1}, got {joint}")
         parents = []
         for joint in kept:
             above = [kept.index(a) for a in self.ancestors(joint) if a in kept]
@@ -199,7 +185,7 @@ def _refuse_cycles(names: tuple[str, ...], parents: tuple[int, ...]) -> None:
         while at >= 0 and at not in rooted:
             if at in path:
                 loop = " → ".join(names[i] for i in path[path.index(at) :])
-                raise ValueError(f"parents form a cycle ({loop}), expected a tree under each root")
+                raise ValueError(f"parents must form trees, got a cycle ({loop})")
             path.append(at)
             at = parents[at]
         rooted.update(path)

@@ -1,7 +1,7 @@
-"""Clips for training, validation and test: by clip, never by window or view, under a seed.
+"""Random splits of clips into training, validation and test sets.
 
-The released code of MAS takes the first tenth of an unsorted listing as its test set; here names
-are sorted first, so that neither the order of a listing nor a file system's can change a split.
+Splits are by clip, so that windows or views of a clip are never in two sets. Names are sorted
+first, so that a split depends on the seed only and not on the order of a file listing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["Split", "clip_of", "name_within_clip", "split_clips", "tracks_of_cli
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the clips of each part, sorted; no clip is in two."""
+    """Sorted names of the clips of each disjoint set."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -26,12 +26,12 @@ class Split:
 
 
 def clip_of(name: str) -> str:
-    """Return the clip of a track: what stands before the last ``/`` of its name, or all of it."""
+    """Return the clip of a track: its name up to the last ``/``, or all of it."""
     return name.rpartition("/")[0] or name
 
 
 def name_within_clip(name: str, word: str) -> str:
-    """Return the name of what was made of a track, such that it belongs to the same clip.
+    """Return a name derived from a track's that belongs to the same clip.
 
     ``"walk/left"`` gives ``"walk/left word"`` and ``"walk"`` gives ``"walk/word"``.
     """
@@ -46,38 +46,35 @@ def split_clips(
     Parameters
     ----------
     names : iterable of str
-        Names of clips, or of tracks, whose clips are taken (:func:`clip_of`). Order and repeats
-        do not matter.
+        Names of clips, or of tracks (:func:`clip_of`). Order and repeats do not matter.
     validation, test : float
-        Shares of the clips, rounded to whole clips, above 0 and together below 1.
+        Fractions of the clips, rounded to whole clips, above 0 and together below 1.
     seed : int
-        Seed of the choice.
+        Seed of the split.
 
     Returns
     -------
     split : Split
-        Every part has at least one clip.
+        Sets with at least one clip each.
 
     Raises
     ------
     ValueError
-        If a share is out of range, or so small or large that a part would be empty.
+        If a fraction is out of range, or a set would be empty.
     """
     check_positive("validation", validation)
     check_positive("test", test)
     if validation + test >= 1:
-        raise ValueError(
-            f"validation and test are {validation:g} and {test:g}, expected a sum below 1"
-        )
+        raise ValueError(f"validation + test must be below 1, got {validation:g} + {test:g}")
     if isinstance(names, str):
-        raise ValueError(f"names must be several names, got {names!r}")
+        raise ValueError(f"names must be a sequence of names, got {names!r}")
     clips = sorted({clip_of(name) for name in names})
     held, tried = round(validation * len(clips)), round(test * len(clips))
     counts = (len(clips) - held - tried, held, tried)
     if min(counts) < 1:
         raise ValueError(
-            f"names has {len(clips)} clips, of which train, validation and test would get "
-            f"{counts[0]}, {counts[1]} and {counts[2]}; expected at least one each"
+            "names must have at least one clip for each of train, validation and test, got "
+            f"{counts[0]}, {counts[1]} and {counts[2]} from {len(clips)}"
         )
     order = seeds.generator(seed, "split").permutation(len(clips))
     shuffled = [clips[place] for place in order]
@@ -89,18 +86,18 @@ def split_clips(
 
 
 def tracks_of_clips(tracks: Sequence[KeypointTrack], clips: Iterable[str]) -> list[KeypointTrack]:
-    """Return the tracks whose clip is one of ``clips``, in their order.
+    """Return the tracks of the given clips, in their order.
 
     Raises
     ------
     ValueError
-        If a clip has no track; the message names it. (A split is made from the tracks there are.)
+        If a clip has no track.
     """
     wanted = set(clips)
     missing = sorted(wanted - {clip_of(track.name) for track in tracks})
     if missing:
         raise ValueError(
-            f"clips has {missing[0]!r}, which names no clip of the {len(tracks)} tracks, expected "
-            "only clips that have tracks, of those that preparation has kept"
+            f"clips must have at least one of the {len(tracks)} tracks each, got none for "
+            f"{missing[0]!r}"
         )
     return [track for track in tracks if clip_of(track.name) in wanted]

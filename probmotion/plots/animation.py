@@ -1,47 +1,53 @@
-"""Skeletons that play in a browser: draws of several samplers, row under row, to be turned.
+"""Animated skeletons in a browser, with a canvas per sampler and a common clock.
 
-All is in one piece of HTML, which asks nothing of the network.
+The HTML is self-contained.
 """
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.files import written_whole
 from probmotion.motion.skeleton import Skeleton
-from probmotion.plots.colours import GREY, INK, LEFT, RIGHT
-from probmotion.validation import check_count, check_finite, check_positive, check_shape
+from probmotion.plots.motion_data import Shown, motion_numbers
+from probmotion.plots.skeletons import checked_rows
+from probmotion.plots.style import LEFT, RIGHT
+from probmotion.validation import check_positive
 
-__all__ = ["Playing", "play_skeletons", "playing_figure"]
+__all__ = [
+    "Animation",
+    "animate_skeletons",
+    "animation_html",
+    "animation_script",
+    "animation_style",
+]
 
-_MARGIN = 150
-"""Pixels beside the rows, for their labels."""
-_PLACE = 210
-"""Pixels that the larger side of a motion's place has."""
+_PLACE = 180
+"""Width of a motion's place in pixels."""
 _CONTROLS = 420
-"""Pixels that button, slider and key need."""
-_TILT = 0.3
-"""How far a view may be raised, radians, before it leaves the height of its place."""
+"""Least width of the page in pixels."""
+
+_LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
 
 
 @dataclass(frozen=True)
-class Playing:
-    """Skeletons that play.
+class Animation:
+    """Animated skeletons, which Jupyter shows in a frame.
 
     Parameters
     ----------
     html : str
-        A page of its own.
+        HTML page.
     width, height : int
-        What it takes, pixels.
+        Size of the page in pixels.
     """
 
     html: str
@@ -49,15 +55,15 @@ class Playing:
     height: int
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame, where nothing of a notebook can disturb it, nor it that."""
+        """Return the page in a frame that isolates it from the notebook."""
         return (
             f'<iframe srcdoc="{html.escape(self.html)}" sandbox="allow-scripts" '
-            f'title="Skeletons that play" width="{self.width}" height="{self.height}" '
+            f'title="Animated skeletons" width="{self.width}" height="{self.height}" '
             'style="border: 0; max-width: 100%"></iframe>'
         )
 
 
-def play_skeletons(
+def animate_skeletons(
     rows: Mapping[str, np.ndarray],
     skeleton: Skeleton,
     path: str | Path | None = None,
@@ -65,28 +71,28 @@ def play_skeletons(
     fps: float,
     draws: int = 4,
     title: str = "",
-) -> Playing:
-    """Return skeletons that play in a browser, and write them as an HTML page.
+) -> Animation:
+    """Return animated skeletons for a browser.
 
-    Drag a figure, or press the arrow keys on it, to turn all; the space bar stops and goes on; the
-    slider goes to a frame. The body's left is blue and its right red. Each body stays in the middle
-    of its place, and all are at the same scale.
+    Dragging or the arrow keys turn all skeletons, the space bar stops and resumes, and the slider
+    selects a frame. The left side of the body is blue and the right red. Bodies stay in the middle
+    of their places, at the same scale.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, L, J, 3)
-        Motions in metres by label, from the top down, all of one length; the first ``draws`` of
-        each are shown. The first row sets the scale; what leaves its place is cut off.
+        Motions in metres by label, from top to bottom, all of one length. The first row sets the
+        scale; larger motions are clipped.
     skeleton : Skeleton
         The J joints.
     path : str or Path, optional
-        Where to write, ``.html``; nowhere by default.
+        HTML file to write.
     fps : float
-        Frames per second to play at.
+        Frames per second.
     draws : int
-        Motions per row.
+        Number of motions per row, the first ones.
     title : str
-        Above the skeletons.
+        Title above the skeletons.
 
     Raises
     ------
@@ -96,128 +102,123 @@ def play_skeletons(
     OSError
         If the folder cannot be written to.
     """
-    figure = playing_figure(rows, skeleton, fps=fps, draws=draws, title=title)
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head><meta charset="utf-8">'
-        f"<title>{html.escape(title or 'Skeletons that play')}</title></head>\n"
-        f'<body style="margin: 8px">\n{figure}\n</body>\n</html>\n'
-    )
+    check_positive("fps", fps)
+    chosen = checked_rows(rows, skeleton, draws)
+    frames = [motions.shape[1] for motions in chosen.values()]
+    if len(set(frames)) > 1:
+        raise ValueError(f"rows must have motions of equal length, got {frames} frames")
+    shown = Shown(StoredProblem(skeleton, fps), chosen, turned=False)
+    captions = {label: label for label in chosen}
+    heading = f"<h1>{html.escape(title)}</h1>\n" if title else ""
+    page = f"""\
+<!DOCTYPE html>
+<html lang="en">
+<head><meta charset="utf-8"><title>{html.escape(title or "Animated skeletons")}</title>
+<style>
+{animation_style()}h1 {{ font-size: 1.1rem; margin: 0; }}
+.cards {{ grid-template-columns: 1fr; }}
+</style></head>
+<body>
+{heading}{animation_html(title or "the skeletons", shown, captions)}
+<script>document.querySelectorAll(".animation").forEach({animation_script()});</script>
+</body>
+</html>
+"""
     if path is not None:
         path = Path(path)
         if path.suffix.lower() != ".html":
-            raise ValueError(f"path must be a name that ends in .html, got {str(path)!r}")
+            raise ValueError(f"path must end in .html, got {str(path)!r}")
         with written_whole(path) as unfinished:
             unfinished.write_text(page, encoding="utf-8")
-    layout = _layout(_shown(rows, skeleton, draws))
-    width = max(layout["width"], _CONTROLS) + 30
-    return Playing(page, width, layout["height"] + (90 if title else 60))
+    data = motion_numbers(shown)
+    width = max(_PLACE * data["columns"], _CONTROLS)
+    height = len(chosen) * (width * data["up"] / (data["columns"] * data["across"]) + 50)
+    return Animation(page, width + 30, round(height) + (190 if title else 160))
 
 
-def playing_figure(
-    rows: Mapping[str, np.ndarray],
-    skeleton: Skeleton,
+def animation_html(
+    name: str,
+    shown: Shown,
+    captions: Mapping[str, str],
     *,
-    fps: float,
-    draws: int = 4,
-    title: str = "",
+    further_cards: Sequence[str] = (),
+    attributes: str = 'aria-label="Animated skeletons"',
 ) -> str:
-    """Return the ``<figure>`` of :func:`play_skeletons`, to stand in a page beside others.
+    """Return controls, canvases and data of an animation as HTML, without global names or ids.
 
-    It brings its script, and has neither global names nor ids.
+    ``captions`` are by row; ``further_cards`` are HTML cards without motions, and ``attributes``
+    label the group of canvases.
     """
-    check_positive("fps", fps)
-    shown = _shown(rows, skeleton, draws)
-    layout = _layout(shown)
-    first = next(iter(shown.values()))
-    data = layout | {
-        "fps": float(fps),
-        "frames": first.shape[1],
-        "joints": skeleton.n_joints,
-        "bones": _sided_bones(skeleton),
-        "colours": {"left": LEFT, "right": RIGHT, "middle": INK},
-        "floor": GREY,
-        "ink": INK,
-        "rows": [
-            {"label": label.split("\n"), "motions": _millimetres(motions)}
-            for label, motions in shown.items()
-        ],
-    }
-    script = files("probmotion.plots").joinpath("animation.js").read_text(encoding="utf-8")
-    # No label can end the script.
-    numbers = json.dumps(data, separators=(",", ":")).replace("<", r"\u003c")
-    words = ", ".join(
-        f"{len(motions)} of {' '.join(label.split())}" for label, motions in shown.items()
-    )
-    caption = f'<div style="font-size: 17px">{html.escape(title)}</div>' if title else ""
+    data = motion_numbers(shown)
+    problem = shown.problem
+    # Escaped so that nothing can end the script.
+    numbers = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c")
+    ratio = f"{data['columns'] * data['across']:.3f} / {data['up']:.3f}"
+    kind = "skeletons" if shown.frames == 1 else "animated skeletons"
+    with_truth = "" if problem.truth is None else ", the truth in grey behind each"
+    cards = []
+    for label in shown.rows:
+        description = f"{captions[label]}, on {name}, as {kind}{with_truth}."
+        cards.append(
+            f'<figure><canvas role="img" style="aspect-ratio: {ratio}" '
+            f'aria-label="{html.escape(description)}">This animation needs JavaScript.</canvas>'
+            f"<figcaption>{html.escape(captions[label])}</figcaption></figure>"
+        )
+    still, without_camera = data["frames"] == 1, problem.camera is None
     return f"""\
-<figure style="margin: 0; font-family: sans-serif; color: {INK}">
-{caption}
-<canvas role="img" tabindex="0" width="{data["width"]}" height="{data["height"]}"
- style="width: {data["width"]}px; height: auto; max-width: 100%; cursor: grab; touch-action: none"
- aria-label="{html.escape(f"Skeletons that move: {words}. The arrow keys turn them.")}"
->To be seen, they need a browser that runs scripts.</canvas>
-<div style="display: flex; gap: 12px; align-items: center;
- max-width: {max(data["width"], _CONTROLS)}px">
-<button type="button" style="width: 5em">Play</button>
-<input type="range" min="0" max="{data["frames"] - 1}" value="0" aria-label="Frame"
- style="flex: 1">
-<span><b style="color: {LEFT}">left side</b> <b style="color: {RIGHT}">right side</b></span>
+<div class="animation">
+<div class="controls"{_hidden(still and without_camera and problem.truth is None)}>
+<button type="button" data-does="play"{_hidden(still)}>Play</button>
+<input type="range" min="0" max="{data["frames"] - 1}" value="0" step="1" \
+aria-label="Frame of {html.escape(name)}"{_hidden(still)}>
+<output{_hidden(still)}></output>
+<button type="button" data-does="camera" aria-pressed="false"{_hidden(without_camera)}>\
+Camera’s view</button>
+<label{_hidden(problem.truth is None)}><input type="checkbox" data-does="truth" checked> \
+truth</label>
 </div>
-<script>({script})(document.currentScript.parentElement, {numbers});</script>
-</figure>"""
+<ul class="key quiet">{_key(problem)}</ul>
+<div class="cards" role="group" tabindex="0" {attributes}>
+{chr(10).join([*cards, *further_cards])}
+</div>
+<script type="application/json">{numbers}</script>
+</div>"""
 
 
-def _shown(rows: Mapping[str, np.ndarray], skeleton: Skeleton, draws: int) -> dict[str, np.ndarray]:
-    """The first motions of each row, the body's middle at the horizontal origin."""
-    check_count("draws", draws)
-    if not rows:
-        raise ValueError("rows must contain at least one label with motions, got none")
-    shown: dict[str, np.ndarray] = {}
-    frames: int | str = "L"
-    for label, motions in rows.items():
-        check_shape(f"rows[{label!r}]", motions, ("n", frames, skeleton.n_joints, 3))
-        if 0 in motions.shape[:2]:
-            raise ValueError(
-                f"rows[{label!r}] has shape {tuple(motions.shape)}, expected at least one motion "
-                "of at least one frame"
-            )
-        check_finite(f"rows[{label!r}]", np.asarray(motions))
-        frames = motions.shape[1]
-        bodies = np.asarray(motions, dtype=np.float64)[:draws]
-        middle = bodies[:, :, list(skeleton.roots)].mean(axis=2, keepdims=True)
-        shown[label] = bodies - middle * np.array([1.0, 0.0, 1.0])
-    return shown
+def animation_script() -> str:
+    """Return the JavaScript function that animates one element of class ``animation``."""
+    return _text("animation.js")
 
 
-def _layout(shown: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Sizes in pixels, and what of the world is seen: the first row sets the scale."""
-    first = next(iter(shown.values()))
-    reach = 1.05 * float(np.quantile(np.hypot(first[..., 0], first[..., 2]), 0.999)) + 1e-9
-    low, high = float(first[..., 1].min()), float(first[..., 1].max())
-    across = 2.1 * reach
-    up = 1.05 * (high - low) + 2 * reach * np.sin(_TILT)
-    scale = _PLACE / max(across, up)
-    place = {"width": round(scale * across), "height": round(scale * up)}
-    columns = max(len(motions) for motions in shown.values())
-    return {
-        "scale": round(scale, 2),
-        "place": place,
-        "margin": _MARGIN,
-        "width": _MARGIN + columns * place["width"],
-        "height": len(shown) * place["height"],
-        "low": round(low, 3),
-        "middle": round((low + high) / 2, 3),
-        "reach": round(reach, 3),
-    }
+def animation_style() -> str:
+    """Return the style sheet of animations, including the colours of the body's sides."""
+    return (
+        f"{_text('animation.css')}:root {{ --left: {LEFT}; --right: {RIGHT}; }}\n"
+        "@media screen and (prefers-color-scheme: dark) "
+        f"{{ :root {{ --left: {_LEFT_ON_DARK}; --right: {_RIGHT_ON_DARK}; }} }}\n"
+    )
 
 
-def _sided_bones(skeleton: Skeleton) -> list[tuple[int, int, str]]:
-    sides = dict.fromkeys(range(skeleton.n_joints), "middle")
-    for left, right in skeleton.mirrored_pairs:
-        sides[left], sides[right] = "left", "right"
-    return [(joint, parent, sides[joint]) for joint, parent in skeleton.bones]
+def _text(name: str) -> str:
+    return files("probmotion.plots").joinpath(name).read_text(encoding="utf-8")
 
 
-def _millimetres(motions: np.ndarray) -> list[list[int]]:
-    """Whole millimetres of each motion, (L J 3) in a row."""
-    return np.rint(1000 * motions).astype(int).reshape(len(motions), -1).tolist()
+def _hidden(hidden: bool) -> str:
+    return " hidden" if hidden else ""
+
+
+def _key(problem: StoredProblem) -> str:
+    entries = []
+    if problem.skeleton.mirrored_pairs:
+        entries += [("left", "left side"), ("right", "right side")]
+    if problem.truth is not None:
+        entries.append(("ghost", "truth"))
+    items = [
+        f'<li><span style="background: var(--{colour})"></span>{words}</li>'
+        for colour, words in entries
+    ]
+    if problem.joints is not None:
+        items.append('<li><span class="ring"></span>observed noisy 3D joints</li>')
+    if problem.keypoints is not None:
+        items.append('<li><span class="ring"></span>observed keypoints, in the camera’s view</li>')
+    return "".join(items)

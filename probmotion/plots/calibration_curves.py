@@ -1,4 +1,4 @@
-"""What a density says of real poses, of its seed and of its own draws."""
+"""Histograms of log densities of real poses, draws and the seed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.plots.colours import CYCLE, GREY, INK, save_figure
+from probmotion.plots.style import CYCLE, INK, finish_figure, legend_below, plain_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,39 +17,37 @@ __all__ = ["draw_calibration"]
 
 
 def draw_calibration(
-    levels: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None, title: str = ""
+    levels: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None
 ) -> Figure:
-    """Return a figure of the distributions of log densities, and write it as PNG.
+    """Return histograms of log densities with a panel per term of the density.
 
     Parameters
     ----------
     levels : mapping of mapping of ndarray, (n,)
-        By kind of pose (real, draws, the seed), then by part of the density, the same parts for
-        every kind: nats. A panel per part; a kind of a single pose is a line. What lies below the
-        lowest hundredth of all, or is −∞, stands in the lowest bar.
+        Log densities in nats by kind of pose (real, draws, seed) and term of the density, the same
+        terms for every kind. A single pose is drawn as a line. Values in the lowest hundredth
+        of all, including −∞, are drawn in the lowest bin.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
-    title : str
-        Above the picture.
+        PNG file to write.
 
     Raises
     ------
     ValueError
-        If there is no kind, or one has other parts than the first.
+        If there is no kind, or the kinds have different terms.
     """
     from matplotlib.figure import Figure
 
     if not levels:
         raise ValueError("levels must contain at least one kind of pose, got none")
-    parts = list(next(iter(levels.values())))
+    terms = list(next(iter(levels.values())))
     for kind, found in levels.items():
-        if list(found) != parts:
-            raise ValueError(f"levels[{kind!r}] has {list(found)}, expected {parts}")
-    figure = Figure(figsize=(0.4 + 3.4 * len(parts), 3.2), layout="constrained")
-    for axes, part in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
-        values = {kind: np.asarray(found[part]) for kind, found in levels.items()}
+        if list(found) != terms:
+            raise ValueError(f"levels[{kind!r}] must have the terms {terms}, got {list(found)}")
+    figure = Figure(figsize=(0.4 + 3.4 * len(terms), 3.2), layout="constrained")
+    for axes, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
+        values = {kind: np.asarray(found[term]) for kind, found in levels.items()}
         finite = np.concatenate([some[np.isfinite(some)] for some in values.values()])
-        # The lowest hundredth would leave no room for the rest.
+        # Outliers would compress the rest.
         low, high = np.quantile(finite, 0.01), finite.max()
         edges = np.linspace(low - 0.02 * (high - low) - 1e-9, high + 0.02 * (high - low) + 1e-9, 41)
         for place, (kind, some) in enumerate(values.items()):
@@ -57,21 +55,12 @@ def draw_calibration(
             if some.size == 1:
                 axes.axvline(float(some[0]), color=colour, linewidth=2, linestyle="--", label=kind)
                 continue
-            shares = np.full(some.size, 1 / some.size)
-            axes.hist(np.maximum(some, edges[0]), edges, weights=shares, color=colour, alpha=0.55,
+            weights = np.full(some.size, 1 / some.size)
+            axes.hist(np.maximum(some, edges[0]), edges, weights=weights, color=colour, alpha=0.55,
                       label=kind)  # fmt: skip
-        axes.set_title(part, loc="left", size=10.5, color=INK)
+        axes.set_title(term, loc="left", size=10.5, color=INK)
         axes.set_xlabel("nats", color=INK)
-        axes.tick_params(color=GREY, labelcolor=INK, labelsize=8.5)
-        for name in ("top", "right"):
-            axes.spines[name].set_visible(False)
-    figure.axes[0].set_ylabel("share", color=INK)
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(levels),
-        frameon=False, labelcolor=INK,
-    )  # fmt: skip
-    if title:
-        figure.suptitle(title, size=12, color=INK, x=0.02, ha="left")
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+        plain_axes(axes)
+    figure.axes[0].set_ylabel("proportion", color=INK)
+    legend_below(figure, len(levels))
+    return finish_figure(figure, path)

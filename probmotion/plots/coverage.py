@@ -1,4 +1,4 @@
-"""How draws cover real poses: an embedding of both, and coverage against the number of draws."""
+"""Coverage of real poses by draws: an embedding of both, and coverage per number of draws."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probmotion.plots.colours import GREY, INK, LEFT, save_figure, style_of
+from probmotion.plots.style import (
+    GREY,
+    INK,
+    LEFT,
+    finish_figure,
+    legend_below,
+    plain_axes,
+    style_of,
+)
 from probmotion.validation import check_count, check_finite, check_shape
 
 if TYPE_CHECKING:
@@ -24,11 +32,11 @@ _KINDS = {
     "posterior": ("#B8578F", "o", 9.0),
     "seed": ("#000000", "x", 70.0),
 }
-"""Colour, marker and size of each kind of pose, drawn in this order, the last on top."""
+"""Colour, marker and size of each kind of pose, in drawing order."""
 
 _COLUMNS = ("measure", "density", "draws", "coverage")
 
-_WORDS = {
+_TITLES = {
     "interaction": "interaction coordinates (m)",
     "cartesian": "Cartesian coordinates (m)",
     "shape-context": "shape contexts",
@@ -36,23 +44,23 @@ _WORDS = {
 
 
 def classical_scaling(distances: np.ndarray, dim: int = 2) -> np.ndarray:
-    """Return points whose distances are nearest to the given ones (Torgerson 1952).
+    """Return the points of classical multidimensional scaling (Torgerson 1952).
 
-    The leading eigenvectors of the doubly centred squares: exact for distances between points of
-    ``dim`` dimensions, up to a rigid motion. Negative eigenvalues, of distances that no points
-    have, count as 0. Each axis points to where its largest entry is positive.
+    The leading eigenvectors of the doubly centred squared distances; exact up to a rigid motion for
+    points of ``dim`` dimensions. Negative eigenvalues count as 0. The signs make the largest
+    entry of each axis positive.
 
     Parameters
     ----------
     distances : ndarray, (n, n)
-        Dissimilarities; the mean of d_ij and d_ji counts.
+        Dissimilarities; d_ij and d_ji are averaged.
     dim : int
         Dimensions of the points.
 
     Returns
     -------
     points : ndarray, (n, dim)
-        Centred, the axis of greatest variance first.
+        Centred points, the axis of greatest variance first.
 
     Raises
     ------
@@ -64,7 +72,7 @@ def classical_scaling(distances: np.ndarray, dim: int = 2) -> np.ndarray:
     check_shape("distances", distances, (len(distances), len(distances)))
     check_finite("distances", distances)
     if len(distances) < dim:
-        raise ValueError(f"distances is of {len(distances)} points, expected at least dim={dim}")
+        raise ValueError(f"distances must be of at least dim={dim} points, got {len(distances)}")
     squares = (0.5 * (distances + distances.T)) ** 2
     products = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
     values, vectors = np.linalg.eigh(-0.5 * products)
@@ -79,23 +87,20 @@ def draw_embedding(
     path: str | Path | None = None,
     *,
     counts: Mapping[str, int] | None = None,
-    title: str = "",
 ) -> Figure:
-    """Return a figure of embedded poses, and write it as PNG (Yin et al. 2018, figure 8).
+    """Return a figure of embedded poses (Yin et al. 2018, figure 8).
 
     Parameters
     ----------
     points : ndarray, (n, 2)
-        From :func:`classical_scaling`.
+        Result of :func:`classical_scaling`.
     kinds : sequence of str, (n,)
         ``"real"``, ``"prior"``, ``"posterior"`` or ``"seed"``.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
+        PNG file to write.
     counts : mapping of str to int, optional
-        A panel for each, by title, with so many draws of the prior and of the posterior, the first
-        ones; one panel with all by default.
-    title : str
-        Above the picture.
+        Number of draws of the prior and the posterior in each panel, by its title; one panel with
+        all draws by default.
 
     Raises
     ------
@@ -107,9 +112,8 @@ def draw_embedding(
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, ("n", 2))
     check_shape("kinds", np.asarray(kinds), (len(points),))
-    unknown = sorted(set(kinds) - set(_KINDS))
-    if unknown:
-        raise ValueError(f"kinds has {unknown}, expected some of {', '.join(_KINDS)}")
+    if unknown := sorted(set(kinds) - set(_KINDS)):
+        raise ValueError(f"kinds must be {', '.join(_KINDS)}, got {', '.join(unknown)}")
     panels: Mapping[str, int | None] = {"": None} if counts is None else counts
     figure = Figure(figsize=(0.3 + 3.6 * len(panels), 4.1), layout="constrained")
     shown = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
@@ -124,32 +128,21 @@ def draw_embedding(
         handles, labels, loc="outside lower center", frameon=False, labelcolor=INK,
         ncols=len(handles) if len(panels) > 1 else 2, markerscale=1.5,
     )  # fmt: skip
-    if title:
-        figure.suptitle(title, size=12, color=INK, x=0.02, ha="left")
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return finish_figure(figure, path)
 
 
-def draw_coverage(
-    table: pd.DataFrame,
-    path: str | Path | None = None,
-    *,
-    title: str = "",
-) -> Figure:
-    """Return a figure of coverage against the number of draws, and write it as PNG (figure 9).
+def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure:
+    """Return a figure of coverage against the number of draws (Yin et al. 2018, figure 9).
 
-    A panel per dissimilarity, a line per density.
+    Each dissimilarity has a panel and each density a line.
 
     Parameters
     ----------
     table : DataFrame
-        Columns ``measure``, ``density``, ``draws`` and ``coverage``; of several rows of one kind,
-        such as seeds, the mean is a point and least and greatest are its bar.
+        Columns ``measure``, ``density``, ``draws`` and ``coverage``. Repeated rows, such as seeds,
+        are drawn as their mean with a bar from least to greatest.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
-    title : str
-        Above the picture.
+        PNG file to write.
 
     Raises
     ------
@@ -160,10 +153,10 @@ def draw_coverage(
 
     missing = [name for name in _COLUMNS if name not in table]
     if missing or len(table) == 0:
-        problem = f"lacks the columns {missing}" if missing else "has no row"
-        raise ValueError(f"table {problem}, expected rows with {', '.join(_COLUMNS)}")
+        got = f"no columns {', '.join(missing)}" if missing else "no row"
+        raise ValueError(f"table must have rows with {', '.join(_COLUMNS)}, got {got}")
     if not (table["draws"] >= 1).all():
-        raise ValueError(f"table has {table['draws'].min()} draws, expected at least 1")
+        raise ValueError(f"draws in table must be at least 1, got {table['draws'].min()}")
     measures = list(dict.fromkeys(table["measure"]))
     densities = list(dict.fromkeys(table["density"]))
     figure = Figure(figsize=(0.4 + 3.4 * len(measures), 3.7), layout="constrained")
@@ -172,19 +165,11 @@ def draw_coverage(
         rows = table[table["measure"] == measure]
         for place, density in enumerate(densities):
             _draw_line(axes, rows[rows["density"] == density], str(density), place)
-        axes.set_title(_WORDS.get(measure, measure), loc="left", size=10.5, color=INK)
-        _dress(axes)
-    panels[0].set_ylabel("coverage: mean distance of a real pair\nfrom the nearest draw", color=INK)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False,
-        labelcolor=INK,
-    )  # fmt: skip
-    if title:
-        figure.suptitle(title, size=12, color=INK, x=0.02, ha="left")
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+        axes.set_title(_TITLES.get(measure, measure), loc="left", size=10.5, color=INK)
+        _style_coverage_axes(axes)
+    panels[0].set_ylabel("coverage: mean distance of a real pair\nto the nearest draw", color=INK)
+    legend_below(figure, len(densities))
+    return finish_figure(figure, path)
 
 
 def _draw_line(axes: Axes, rows: pd.DataFrame, density: str, place: int) -> None:
@@ -198,7 +183,7 @@ def _draw_line(axes: Axes, rows: pd.DataFrame, density: str, place: int) -> None
     )  # fmt: skip
 
 
-def _dress(axes: Axes) -> None:
+def _style_coverage_axes(axes: Axes) -> None:
     from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
     axes.set_xscale("log")
@@ -208,9 +193,7 @@ def _dress(axes: Axes) -> None:
     axes.set_xlabel("draws", color=INK)
     axes.grid(color=GREY, linewidth=0.5, alpha=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8.5)
-    for name in ("top", "right"):
-        axes.spines[name].set_visible(False)
+    plain_axes(axes)
 
 
 def _draw_points(axes: Axes, points: np.ndarray, kinds: np.ndarray, count: int | None) -> None:

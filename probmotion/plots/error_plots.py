@@ -1,4 +1,4 @@
-"""What a sampler's error is made of: parts stacked from exact draws' floor."""
+"""Error decomposition of a sampler as stacked bars."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probmotion.plots.colours import CYCLE, GREY, INK, save_figure
+from probmotion.plots.style import CYCLE, GREY, INK, finish_figure, plain_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,55 +37,59 @@ def draw_error_decomposition(
     words: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
 ) -> Figure:
-    """Return a figure of the parts of one setting's error, a panel per measure; write it as PNG.
+    """Return a figure of the parts of one setting's error with a panel per metric.
 
-    At the left of a panel the parts are stacked from 0, the floor that exact draws have: positive
-    ones up, negative ones down. The black line across them is the whole. To the right each part
-    stands alone with its interval. What is not told from chance is pale.
+    The parts are stacked from the error of exact draws at 0, positive ones upwards and negative
+    ones downwards; a black line marks their sum. Beside the stack each part is drawn with its
+    interval. Parts whose interval contains 0 are pale.
 
     Parameters
     ----------
     table : DataFrame
-        As :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table` of one setting.
+        As :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table`, for one setting.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
+        PNG file to write.
     words : mapping of str to str, optional
-        What to call the measures; their names by default.
+        Titles of the metrics; their names by default.
     notes : sequence of str
-        Below the picture.
+        Notes below the figure.
 
     Raises
     ------
     ValueError
-        If a column is missing, or the table is not of one setting.
+        If a column is missing, or the table has several settings.
     """
     from matplotlib.figure import Figure
 
-    missing = [name for name in _COLUMNS if name not in table]
-    if missing:
-        raise ValueError(f"table lacks the columns {', '.join(missing)}")
+    if missing := [name for name in _COLUMNS if name not in table]:
+        raise ValueError(
+            f"table must have the columns {', '.join(_COLUMNS)}, got none of {', '.join(missing)}"
+        )
     settings = list(dict.fromkeys(table["setting"]))
     if len(settings) != 1:
-        raise ValueError(f"table is of {len(settings)} settings, expected one")
+        raise ValueError(f"table must have one setting, got {len(settings)}")
     measures = list(dict.fromkeys(table["measure"]))
     parts = [part for part in dict.fromkeys(table["part"]) if part not in (_FLOOR, _WHOLE)]
-    colours = {part: _colour(part, place) for place, part in enumerate(parts)}
+    colours = {part: _COLOURS.get(part, CYCLE[6 + place % 2]) for place, part in enumerate(parts)}
     figure = Figure(figsize=(0.8 + 2.75 * len(measures), 4.6), layout="constrained")
     for axes, measure in zip(
         figure.subplots(1, len(measures), squeeze=False)[0], measures, strict=True
     ):
         rows = table[table["measure"] == measure].set_index("part")
         _draw_stack(axes, rows, colours)
-        _draw_alone(axes, rows, colours)
-        _dress(axes, len(parts))
+        _draw_intervals(axes, rows, colours)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        axes.set_xlim(-0.6, 0.25 + 0.55 * (len(parts) + 1) + 0.4)
+        axes.set_xticks([])
+        axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="y")
+        axes.set_axisbelow(True)
+        plain_axes(axes, ("top", "right", "bottom"))
         title = textwrap.fill((words or {}).get(measure, measure), _LETTERS)
         axes.set_title(title, loc="left", size=10, color=INK)
     figure.axes[0].set_ylabel("above exact draws", color=INK, size=9.5)
     _write_key(figure, colours, notes)
     figure.suptitle(settings[0], size=12, color=INK, x=0.01, ha="left", weight="bold")
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return finish_figure(figure, path)
 
 
 def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
@@ -102,7 +106,7 @@ def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> N
     axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [whole, whole], color="black", linewidth=2.2)
 
 
-def _draw_alone(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
+def _draw_intervals(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
     """Draw every part and the whole with their intervals, side by side."""
     for place, (part, colour) in enumerate([*colours.items(), (_WHOLE, "black")], start=1):
         row = rows.loc[part]
@@ -114,34 +118,18 @@ def _draw_alone(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> N
                   markersize=5.5)  # fmt: skip
 
 
-def _dress(axes: Axes, n_parts: int) -> None:
-    axes.axhline(0.0, color=INK, linewidth=0.8)
-    axes.set_xlim(-0.6, 0.25 + 0.55 * (n_parts + 1) + 0.4)
-    axes.set_xticks([])
-    axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="y")
-    axes.set_axisbelow(True)
-    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8.5)
-    for name in ("top", "right", "bottom"):
-        axes.spines[name].set_visible(False)
-
-
 def _write_key(figure: Figure, colours: Mapping[str, str], notes: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(color=colour, label=part) for part, colour in colours.items()]
     handles.append(Line2D([], [], color="black", marker="D", markersize=5, label=_WHOLE))
-    handles.append(Line2D([], [], linestyle="", label="pale: not told from chance"))
+    handles.append(Line2D([], [], linestyle="", label="pale: interval contains 0"))
     key = figure.legend(
         handles=handles, loc="outside lower center", ncols=len(handles), frameon=False,
         labelcolor=INK, fontsize=9, title="; ".join(notes), title_fontsize=8.5,
     )  # fmt: skip
     key.get_title().set_color(INK)
-
-
-def _colour(part: str, place: int) -> str:
-    """A part has one colour in all pictures; black is the whole's."""
-    return _COLOURS.get(part, CYCLE[6 + place % 2])
 
 
 def _opacity(row: Any) -> float:

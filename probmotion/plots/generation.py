@@ -1,4 +1,4 @@
-"""Tables of generated motion as a picture: a row per generator, a panel per measure."""
+"""Metrics of generated motion, with a row per generator and a panel per metric."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.plots.colours import GREY, INK, LEFT, RIGHT, save_figure
+from probmotion.plots.style import GREY, INK, LEFT, RIGHT, finish_figure, legend_below, plain_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,35 +17,32 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_generation"]
 
+_VIEWS = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
+"""Marker, colour and fill."""
+
 
 def draw_generation(
     table: pd.DataFrame,
     measures: Mapping[str, str],
     path: str | Path | None = None,
     *,
-    side: str = "_side",
     logarithmic: Sequence[str] = (),
-    title: str = "",
 ) -> Figure:
-    """Return a figure of every row's measures with their ±, and write it as PNG.
+    """Return a figure of metrics with error bars.
 
-    A filled mark is of views from all around, an open one of those from the side.
+    Filled markers are views from all around, open ones views from the side.
 
     Parameters
     ----------
     table : DataFrame
-        A row per generator: ``name``, the measures, and where they have one ``<measure>_sd``,
-        ``<measure><side>`` and ``<measure><side>_sd``. What is NaN is not drawn.
+        A row per generator with columns ``name``, the metrics and optionally ``<metric>_sd``,
+        ``<metric>_side`` and ``<metric>_side_sd``. NaN is not drawn.
     measures : mapping of str to str
-        What to call each measure, in the panels' order.
+        Titles of the panels by metric.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
-    side : str
-        What ends the names of measures from the side.
+        PNG file to write.
     logarithmic : sequence of str
-        Measures whose axis is logarithmic.
-    title : str
-        Above the picture.
+        Metrics with a logarithmic axis.
 
     Raises
     ------
@@ -56,64 +53,44 @@ def draw_generation(
 
     missing = [name for name in ("name", *measures) if name not in table]
     if missing or len(table) == 0:
-        problem = f"lacks the columns {', '.join(missing)}" if missing else "has no row"
-        raise ValueError(f"table {problem}, expected name and the measures")
+        got = f"no columns {', '.join(missing)}" if missing else "no row"
+        raise ValueError(f"table must have rows with name and the metrics, got {got}")
     figure = Figure(
         figsize=(1.6 + 2.4 * len(measures), 1.2 + 0.28 * len(table)), layout="constrained"
     )
     panels = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
     places = np.arange(len(table))[::-1]
-    for axes, (measure, words) in zip(panels, measures.items(), strict=True):
-        _draw_marks(axes, table, measure, places + 0.12, LEFT, filled=True)
-        if f"{measure}{side}" in table:
-            _draw_marks(axes, table, f"{measure}{side}", places - 0.12, RIGHT, filled=False)
-        axes.set_title(words, loc="left", size=10, color=INK)
-        _dress(axes, measure in logarithmic)
+    for axes, (measure, title) in zip(panels, measures.items(), strict=True):
+        _draw_markers(axes, table, measure, places + 0.12, "all around")
+        _draw_markers(axes, table, f"{measure}_side", places - 0.12, "from the side")
+        axes.set_title(title, loc="left", size=10, color=INK)
+        if measure in logarithmic:
+            axes.set_xscale("log")
+        else:
+            axes.set_xlim(left=0)
+        axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="both")
+        axes.set_axisbelow(True)
+        plain_axes(axes)
     panels[0].set_yticks(places, list(table["name"]))
-    _write_key(figure)
-    if title:
-        figure.suptitle(title, size=12, color=INK, x=0.02, ha="left")
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    legend_below(figure, 2)
+    return finish_figure(figure, path)
 
 
-def _draw_marks(
-    axes: Axes, table: pd.DataFrame, measure: str, places: np.ndarray, colour: str, filled: bool
+def _draw_markers(
+    axes: Axes, table: pd.DataFrame, measure: str, places: np.ndarray, label: str
 ) -> None:
+    if measure not in table:
+        return
+    shape, colour, face = _VIEWS[label]
     deviations = f"{measure}_sd"
     axes.errorbar(
         table[measure].to_numpy(dtype=float),
         places,
         xerr=table[deviations].to_numpy(dtype=float) if deviations in table else None,
-        fmt="o" if filled else "s",
+        fmt=shape,
         color=colour,
         markersize=5,
-        markerfacecolor=colour if filled else "white",
+        markerfacecolor=face,
         elinewidth=1.0,
-    )
-
-
-def _dress(axes: Axes, logarithmic: bool) -> None:
-    if logarithmic:
-        axes.set_xscale("log")
-    else:
-        axes.set_xlim(left=0)
-    axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="both")
-    axes.set_axisbelow(True)
-    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8.5)
-    for name in ("top", "right"):
-        axes.spines[name].set_visible(False)
-
-
-def _write_key(figure: Figure) -> None:
-    from matplotlib.lines import Line2D
-
-    kinds = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
-    handles = [
-        Line2D([], [], marker=shape, color=colour, markerfacecolor=face, linestyle="", label=words)
-        for words, (shape, colour, face) in kinds.items()
-    ]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=2, frameon=False, labelcolor=INK
+        label=label,
     )

@@ -1,4 +1,4 @@
-"""Where a label goes: beside what it names, where it covers least."""
+"""Placement of labels beside the markers that they name."""
 
 from __future__ import annotations
 
@@ -7,35 +7,28 @@ from collections.abc import Mapping
 __all__ = ["Box", "place_labels"]
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom."""
+"""Left, top, right, bottom; or left, bottom, right, top with the vertical axis upwards."""
 
 _AROUND = ((1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, 0), (-1, -1), (-1, 1))
 _DISTANCES = (3.0, 16.0, 30.0)
 
 
 def place_labels(
-    marks: Mapping[str, Box], sizes: Mapping[str, tuple[float, float]], room: Box
+    markers: Mapping[str, Box], sizes: Mapping[str, tuple[float, float]], room: Box
 ) -> dict[str, tuple[Box, bool]]:
-    """Return each label's box, and whether it is so far from its mark that it needs a line.
+    """Return the box of each label, and whether it is so far away that it needs a line.
 
-    One label after the other takes the first place around its mark that covers least of the marks,
-    of the labels before it and of what is outside the room.
+    The labels are placed in order, each where it covers the least of the markers, of earlier
+    labels and of the area outside the room.
 
-    Parameters
-    ----------
-    marks : mapping of Box
-        What the labels name, by label.
-    sizes : mapping of (width, height)
-        Of the labels.
-    room : Box
-        Where they may be.
+    ``sizes`` are (width, height) of the labels, and the room is the area available to them.
     """
-    taken = list(marks.values())
+    taken = list(markers.values())
     found = {}
-    for name, mark in marks.items():
+    for name, marker in markers.items():
         width, height = sizes[name]
         places = [
-            _beside(mark, across, down, distance, width, height)
+            _beside(marker, across, down, distance, width, height)
             for distance in _DISTANCES
             for across, down in _AROUND
         ]
@@ -46,9 +39,9 @@ def place_labels(
     return found
 
 
-def _beside(mark: Box, across: int, down: int, distance: float, width: float, height: float) -> Box:
-    x = (mark[0] + mark[2]) / 2 + across * (distance + (mark[2] - mark[0] + width) / 2)
-    y = (mark[1] + mark[3]) / 2 + down * (distance + (mark[3] - mark[1] + height) / 2)
+def _beside(box: Box, across: int, down: int, distance: float, width: float, height: float) -> Box:
+    x = (box[0] + box[2]) / 2 + across * (distance + (box[2] - box[0] + width) / 2)
+    y = (box[1] + box[3]) / 2 + down * (distance + (box[3] - box[1] + height) / 2)
     return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
 

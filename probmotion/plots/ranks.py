@@ -1,4 +1,4 @@
-"""Where truths stand among draws: rank histograms, distribution functions and coverage.
+"""Ranks of simulated truths among draws: histograms, distribution functions and coverage.
 
 After Talts et al. (2018), figures 1 and 2, and Säilynoja et al. (2022), figure 3.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import binom
 
 from probmotion.metrics.uniformity import ecdf_band, evaluation_points
-from probmotion.plots.colours import CYCLE, GREY, INK, save_figure
+from probmotion.plots.style import CYCLE, GREY, INK, finish_figure, plain_axes
 from probmotion.validation import check_shape
 
 if TYPE_CHECKING:
@@ -27,33 +27,33 @@ _LEVEL = 0.95
 _MOST_BINS, _PER_BIN = 20, 10
 _ACROSS = 5
 _LETTERS = 130
-# Inches: the figure's width; above a block's panels, a line of its title, and below; and a row.
-_WIDTH, _HEAD, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
+# Inches: width of the figure; space above a block, per title line and below; height of a row.
+_WIDTH, _HEADER, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
 
 
 def draw_ranks(
     blocks: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None
 ) -> Figure:
-    """Return a figure of simulated truths' ranks, a block per sampler, and write it as PNG.
+    """Return a figure of simulated truths' ranks with a block per sampler.
 
-    A block has a histogram per quantity, all quantities' F(z) − z (the empirical distribution
-    function less the uniform one), and the share of truths within credible sets against their
-    level. The grey bands are where uniform ranks stay with a probability of 95 %: all bars of a
-    histogram, or all points of a line, at once. A histogram like ∪, and a share below the level,
-    are of draws too close together; like ∩, and above, of draws too far apart.
+    A block has a histogram per quantity, the difference F(z) − z between the empirical and the
+    uniform distribution function, and the coverage of credible sets against their level. The grey
+    bands contain uniform ranks with a probability of 95 %, simultaneously for all bars of a
+    histogram or all points of a line. Overconfident samplers have ∪-shaped histograms and coverage
+    below the level, underconfident ones ∩-shaped histograms and coverage above it.
 
     Parameters
     ----------
     blocks : mapping of mapping of ndarray, (n,)
-        By what stands above the block, such as the sampler's verdict, then by quantity: ranks in
-        [0, 1], one per simulation, at least two.
+        Ranks in [0, 1], one per simulation and at least two, by title of the block, such as the
+        sampler's verdict, and by quantity.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
+        PNG file to write.
 
     Raises
     ------
     ValueError
-        If there is no block, one has no quantity, or ranks have another shape.
+        If there is no block, a block has no quantity, or ranks have another shape.
     """
     from matplotlib.figure import Figure
 
@@ -65,31 +65,29 @@ def draw_ranks(
         for name, values in ranks.items():
             check_shape(f"blocks[{title!r}][{name!r}]", values, ("n",))
     titles = [textwrap.fill(title, _LETTERS) for title in blocks]
-    heads = [_HEAD + _LINE * (1 + title.count("\n")) for title in titles]
+    headers = [_HEADER + _LINE * (1 + title.count("\n")) for title in titles]
     heights = [
-        head + _PANEL * max(2, -(-len(ranks) // _ACROSS)) + _FOOT
-        for head, ranks in zip(heads, blocks.values(), strict=True)
+        header + _PANEL * max(2, -(-len(ranks) // _ACROSS)) + _FOOT
+        for header, ranks in zip(headers, blocks.values(), strict=True)
     ]
-    # A layout that is solved for takes time with the square of the number of panels.
+    # The time of a constrained layout grows with the square of the number of panels.
     figure = Figure(figsize=(_WIDTH, sum(heights)))
     parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
-    for part, title, head, height, ranks in zip(
-        parts, titles, heads, heights, blocks.values(), strict=True
+    for part, title, header, height, ranks in zip(
+        parts, titles, headers, heights, blocks.values(), strict=True
     ):
         part.suptitle(
             title, size=12, color=INK, weight="bold", x=0.01, ha="left", va="top",
             y=1 - 0.3 * _LINE / height,
         )  # fmt: skip
-        place = {"top": 1 - head / height, "bottom": _FOOT / height}
+        place = {"top": 1 - header / height, "bottom": _FOOT / height}
         left, middle, right = part.subfigures(1, 3, width_ratios=[1.9, 1, 1])
         colours = {name: CYCLE[at % len(CYCLE)] for at, name in enumerate(ranks)}
         _draw_histograms(left, ranks, colours, {"left": 0.065, "right": 0.985, **place})
         wide = {"left": 0.13, "right": 0.97, **place}
         _draw_difference(middle.subplots(gridspec_kw=wide), ranks, colours)
         _draw_coverage(right.subplots(gridspec_kw=wide), ranks, colours)
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return finish_figure(figure, path)
 
 
 def _draw_histograms(
@@ -98,7 +96,7 @@ def _draw_histograms(
     colours: Mapping[str, str],
     place: Mapping[str, float],
 ) -> None:
-    """A panel per quantity; the band holds all its bars at once (Bonferroni)."""
+    """Draw a histogram per quantity with a simultaneous band (Bonferroni)."""
     columns = min(_ACROSS, len(ranks))
     panels = part.subplots(
         -(-len(ranks) // columns),
@@ -120,10 +118,10 @@ def _draw_histograms(
         axes.set_title(name, loc="left", size=9, color=colours[name])
         axes.set(xlim=(0, 1), xticks=[0, 0.5, 1], ylim=(0, max(1.05 * high, axes.get_ylim()[1])))
         axes.set_xticklabels(["0", "½", "1"])
-        _plain(axes)
+        plain_axes(axes, size=8)
     for axes in panels[len(ranks) :]:
         axes.set_visible(False)
-    part.supxlabel("rank of the truth among draws", size=9.5, color=INK)
+    part.supxlabel("rank of the truth among the draws", size=9.5, color=INK)
 
 
 def _draw_difference(
@@ -136,10 +134,10 @@ def _draw_difference(
         points = evaluation_points(len(values))
         counts = np.searchsorted(np.sort(values), points, side="right")
         axes.plot(points, counts / len(values) - points, color=colours[name], linewidth=1.2)
-    axes.set_title("distribution function less uniform", loc="left", size=9.5, color=INK)
+    axes.set_title("distribution function minus uniform", loc="left", size=9.5, color=INK)
     axes.set_xlabel("rank", size=9.5, color=INK)
     axes.set_xlim(0, 1)
-    _plain(axes)
+    plain_axes(axes, size=8)
 
 
 def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]) -> None:
@@ -151,30 +149,24 @@ def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping
     for name, values in ranks.items():
         points = evaluation_points(len(values))
         levels = np.sort(credible_level(name, values))
-        held = np.searchsorted(levels, points, side="right") / len(values)
+        coverage = np.searchsorted(levels, points, side="right") / len(values)
         axes.plot(
-            points, held, color=colours[name], label=words.get(name),
+            points, coverage, color=colours[name], label=words.get(name),
             linewidth=2.4 if name in words else 1.0,
         )  # fmt: skip
     if set(ranks) - set(words):
         axes.plot([], [], color=INK, linewidth=1.0, label="central intervals")
-    axes.set_title("truths within credible sets", loc="left", size=9.5, color=INK)
+    axes.set_title("coverage of credible sets", loc="left", size=9.5, color=INK)
     axes.set_xlabel("level", size=9.5, color=INK)
     axes.set(xlim=(0, 1), ylim=(0, 1))
-    _plain(axes)
+    plain_axes(axes, size=8)
     axes.legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left")
 
 
 def _draw_band(axes: Axes, n: int, less: float) -> None:
-    """Fill where uniform numbers' distribution function, ``less`` times the level, stays."""
+    """Draw the band of uniform ranks' distribution function minus ``less`` times the level."""
     points = evaluation_points(n)
     lower, upper = ecdf_band(n, _LEVEL)
-    off = less * points
-    axes.fill_between(points, lower - off, upper - off, color=GREY, alpha=0.6, linewidth=0)
+    shift = less * points
+    axes.fill_between(points, lower - shift, upper - shift, color=GREY, alpha=0.6, linewidth=0)
     axes.plot([0, 1], [0, 1 - less], color=INK, linewidth=0.7)
-
-
-def _plain(axes: Axes) -> None:
-    for name in ("top", "right"):
-        axes.spines[name].set_visible(False)
-    axes.tick_params(color=GREY, labelcolor=INK, labelsize=8)

@@ -1,8 +1,8 @@
-"""Filmstrips of skeletons: draws of several samplers, row under row, at one scale."""
+"""Filmstrips of skeletons, with a row of draws per sampler at one scale."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
-from probmotion.plots.colours import GREY, INK, LEFT, RIGHT, save_figure
+from probmotion.plots.style import GREY, INK, LEFT, RIGHT, finish_figure
 from probmotion.validation import check_count, check_finite, check_shape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_skeletons"]
+__all__ = ["checked_rows", "draw_skeletons", "face_heading", "joint_sides"]
 
 
 def draw_skeletons(
@@ -33,33 +33,31 @@ def draw_skeletons(
     truth: np.ndarray | None = None,
     title: str = "",
 ) -> Figure:
-    """Return a figure with one row of filmstrips per entry of ``rows``, and write it as PNG.
+    """Return a figure with a row of filmstrips per entry of ``rows``.
 
-    Every strip shows ``moments`` frames of one motion side by side, the body's left in blue and
-    its right in red. All are drawn at the same scale; what leaves its strip is cut off.
+    A strip shows ``moments`` frames of one motion side by side, the left side of the body in blue
+    and the right in red. All strips have the same scale and are clipped.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, L, J, 3)
-        Motions in metres by label, drawn from the top down; the first ``draws`` of each are shown.
-        The first row sets the scale.
+        Motions in metres by label, from top to bottom. The first row sets the scale.
     skeleton : Skeleton
         The J joints.
     path : str or Path, optional
-        Where to write, ``.png``; nowhere by default.
+        PNG file to write.
     draws : int
-        Motions per row.
+        Number of motions per row, the first ones.
     moments : int
-        Frames per motion, evenly spaced from the first to the last.
+        Number of evenly spaced frames per motion.
     azimuth, elevation : float
-        Where the motions are looked at from, radians, as in :meth:`Cameras.ring`.
+        Direction of the camera in radians, as in :meth:`Cameras.ring`.
     heading : float, optional
-        Turn every motion about the vertical so that its body faces this way on average, radians
-        from +Z towards +X; as drawn by default.
+        Turn every motion about the vertical to this mean heading, in radians from +Z towards +X.
     truth : ndarray, (L, J, 3), optional
-        Drawn in grey behind every motion, at the place it has relative to it.
+        Motion drawn in grey behind every strip, at its position relative to the motion.
     title : str
-        Above the picture.
+        Title of the figure.
 
     Raises
     ------
@@ -67,44 +65,63 @@ def draw_skeletons(
         If there is no row, a shape does not fit the skeleton, a value is not finite, or
         ``heading`` is given for a skeleton without named sides.
     """
-    check_count("draws", draws)
     check_count("moments", moments)
+    shown = checked_rows(rows, skeleton, draws)
+    if heading is not None:
+        shown = {
+            label: face_heading(motions, skeleton, heading) for label, motions in shown.items()
+        }
+    camera = Cameras.around(np.array([azimuth]), np.array([elevation]))
+    strips = {label: _project(camera, motions, moments) for label, motions in shown.items()}
+    behind = None if truth is None else _project(camera, np.asarray(truth)[None], moments)[0]
+    return finish_figure(_compose(strips, skeleton, behind, title), path)
+
+
+def checked_rows(
+    rows: Mapping[str, np.ndarray], skeleton: Skeleton, draws: int
+) -> dict[str, np.ndarray]:
+    """Return the first draws of each row, (n, L, J, 3), after checking shapes and values."""
+    check_count("draws", draws)
     if not rows:
         raise ValueError("rows must contain at least one label with motions, got none")
     shown = {}
     for label, motions in rows.items():
         check_shape(f"rows[{label!r}]", motions, ("n", "L", skeleton.n_joints, 3))
+        if 0 in motions.shape[:2]:
+            raise ValueError(
+                f"rows[{label!r}] must contain at least one motion of at least one frame, got "
+                f"shape {tuple(motions.shape)}"
+            )
         check_finite(f"rows[{label!r}]", np.asarray(motions))
         shown[label] = np.asarray(motions, dtype=np.float64)[:draws]
-    if heading is not None:
-        shown = {label: _facing(motions, skeleton, heading) for label, motions in shown.items()}
-    camera = Cameras.around(np.array([azimuth]), np.array([elevation]))
-    strips = {label: _seen(camera, motions, moments) for label, motions in shown.items()}
-    behind = None if truth is None else _seen(camera, np.asarray(truth)[None], moments)[0]
-    figure = _compose(strips, skeleton, behind, title)
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return shown
 
 
-def _facing(motions: np.ndarray, skeleton: Skeleton, heading: float) -> np.ndarray:
-    """Turn motions so that the left side of each is, on average, a quarter turn left of heading."""
+def face_heading(motions: np.ndarray, skeleton: Skeleton, heading: float) -> np.ndarray:
+    """Turn each motion, (n, L, J, 3), about the vertical to a mean heading in radians."""
     if not skeleton.mirrored_pairs:
-        raise ValueError("heading is given, but skeleton has no left-right pairs to take it from")
+        raise ValueError("heading must be None for a skeleton without left-right pairs")
     left, right = np.array(skeleton.mirrored_pairs).T
     across = (motions[:, :, left] - motions[:, :, right]).mean(axis=(1, 2))
-    # A body that faces +Z has its left on +X.
+    # The left side of a body facing +Z is at +X.
     yaw = heading - np.arctan2(-across[:, 2], across[:, 0])
     c, s = np.cos(yaw)[:, None, None], np.sin(yaw)[:, None, None]
     x, y, z = motions[..., 0], motions[..., 1], motions[..., 2]
     return np.stack([c * x + s * z, y, c * z - s * x], axis=-1)
 
 
-def _seen(camera: Cameras, motions: np.ndarray, moments: int) -> np.ndarray:
-    """Return ``(n, L, J, 3) → (n, moments, J, 2)``, metres on the picture, y up."""
+def joint_sides(skeleton: Skeleton) -> list[str]:
+    """Return "left", "right" or "middle" for each joint."""
+    sides = ["middle"] * skeleton.n_joints
+    for left, right in skeleton.mirrored_pairs:
+        sides[left], sides[right] = "left", "right"
+    return sides
+
+
+def _project(camera: Cameras, motions: np.ndarray, moments: int) -> np.ndarray:
+    """Project ``(n, L, J, 3) → (n, moments, J, 2)``, in metres with y up."""
     frames = np.linspace(0, motions.shape[1] - 1, moments).round().astype(int)
-    picture = camera.project(motions[:, frames])[:, 0]
-    return picture * np.array([1.0, -1.0])
+    return camera.project(motions[:, frames])[:, 0] * np.array([1.0, -1.0])
 
 
 def _compose(
@@ -118,11 +135,11 @@ def _compose(
     strip_width = max(2.35, 7.0 / columns)
     strip_height = strip_width * (high - low) / (slot * moments)
     # A letter of this size is about .09 inches wide.
-    label_width, head = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
+    label_width, top_margin = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
     width = label_width + columns * (strip_width + 0.1)
-    height = head + len(strips) * (strip_height + 0.08) + 0.05
+    height = top_margin + len(strips) * (strip_height + 0.08) + 0.05
     figure = Figure(figsize=(width, height))
-    top = height - head
+    top = height - top_margin
     for row, (label, motions) in enumerate(strips.items()):
         bottom = top - (row + 1) * (strip_height + 0.08) + 0.08
         middle = (bottom + strip_height / 2) / height
@@ -143,7 +160,7 @@ def _compose(
 
 
 def _anchor(motion: np.ndarray, truth: np.ndarray | None) -> np.ndarray:
-    """The point of each moment that stands in the middle of its slot, (moments,)."""
+    """Return the horizontal centre of each frame's slot, (moments,)."""
     body = motion if truth is None else truth
     return np.median(body[..., 0], axis=-1)
 
@@ -151,7 +168,7 @@ def _anchor(motion: np.ndarray, truth: np.ndarray | None) -> np.ndarray:
 def _extent(
     strips: Mapping[str, np.ndarray], truth: np.ndarray | None
 ) -> tuple[float, float, float]:
-    """Width of one moment's slot and the lowest and highest point of a strip, metres."""
+    """Return the width of a slot and the vertical range of the first row, metres."""
     reference = np.stack([*next(iter(strips.values()))])
     sideways = np.stack(
         [np.abs(motion[..., 0] - _anchor(motion, truth)[:, None]) for motion in reference]
@@ -179,27 +196,20 @@ def _draw_strip(
     if truth is not None:
         bones = _bones(truth + shift, skeleton.bones)
         axes.add_collection(LineCollection(bones, colors=GREY, linewidths=2.6, **style))
-    sides = _sides(skeleton)
-    # The middle first, so that limbs are seen before the trunk.
+    sides = joint_sides(skeleton)
+    # Limbs are drawn over the trunk.
     for side, colour in (("middle", INK), ("right", RIGHT), ("left", LEFT)):
         chosen = [bone for bone in skeleton.bones if sides[bone[0]] == side]
         lines = _bones(motion + shift, chosen)
         axes.add_collection(LineCollection(lines, colors=colour, linewidths=1.3, **style))
 
 
-def _bones(moments: np.ndarray, bones: list[tuple[int, int]] | tuple[tuple[int, int], ...]) -> list:
-    return [pose[[joint, parent]] for pose in moments for joint, parent in bones]
-
-
-def _sides(skeleton: Skeleton) -> list[str]:
-    sides = ["middle"] * skeleton.n_joints
-    for left, right in skeleton.mirrored_pairs:
-        sides[left], sides[right] = "left", "right"
-    return sides
+def _bones(frames: np.ndarray, bones: Sequence[tuple[int, int]]) -> list:
+    return [pose[[joint, parent]] for pose in frames for joint, parent in bones]
 
 
 def _write_key(figure: Figure, title: str, with_truth: bool, width: float, height: float) -> None:
-    """Write the title and, from the right, what each colour means."""
+    """Write the title and, from the right, the meaning of each colour."""
     top = 1 - 0.1 / height
     figure.text(0.12 / width, top, title, va="top", size=12, color=INK)
     entries = [("left side", LEFT), ("right side", RIGHT)]

@@ -1,21 +1,8 @@
-from .draws import (
-    MotionDraws as MotionDraws,
-    library_versions as library_versions,
-    settings_of as settings_of,
-)
-from .likelihoods import (
-    EntryNoise as EntryNoise,
-    Joints3D as Joints3D,
-    Keypoints2D as Keypoints2D,
-    LinearObservation as LinearObservation,
-)
-from .noise_schedule import NoiseSchedule as NoiseSchedule, PosteriorStep as PosteriorStep
+from .draws import MotionDraws as MotionDraws
+from .likelihoods import Joints3D as Joints3D, Keypoints2D as Keypoints2D
+from .noise_schedule import NoiseSchedule as NoiseSchedule
 from .posterior import MotionPosterior as MotionPosterior
-from .problem import (
-    Problem as Problem,
-    ScoresGeneration as ScoresGeneration,
-    simulated as simulated,
-)
+from .problem import Problem as Problem, simulated as simulated
 from .protocols import (
     ChecksObservations as ChecksObservations,
     ComparesViews as ComparesViews,
@@ -29,7 +16,9 @@ from .protocols import (
     HasExactPosterior as HasExactPosterior,
     HasInferenceNetwork as HasInferenceNetwork,
     HasLogDensity as HasLogDensity,
+    HasManifold as HasManifold,
     HasSeeds as HasSeeds,
+    HasStyles as HasStyles,
     InferenceNetwork as InferenceNetwork,
     Likelihood as Likelihood,
     Marginalises as Marginalises,
@@ -38,25 +27,13 @@ from .protocols import (
     NotConjugate as NotConjugate,
     Samplable as Samplable,
 )
-from .reference import (
-    HasPositionDensity as HasPositionDensity,
-    StoredReference as StoredReference,
-    fingerprint_of as fingerprint_of,
-    log_density_at as log_density_at,
-)
+from .reference import StoredReference as StoredReference
 from .sampling import (
     Interrupted as Interrupted,
     Sampler as Sampler,
     UnsupportedPosterior as UnsupportedPosterior,
-    importable_samplers as importable_samplers,
     load_sampler as load_sampler,
-    missing as missing,
-    progress_bar as progress_bar,
     require as require,
     sampler_names as sampler_names,
-    suited as suited,
 )
-from .truncation import (
-    TruncatedPosterior as TruncatedPosterior,
-    limit_for_dimension as limit_for_dimension,
-)
+from .truncation import TruncatedPosterior as TruncatedPosterior

@@ -1,4 +1,4 @@
-"""`MotionDraws`: what every sampler returns."""
+"""Draws of a sampler, with statistics and provenance."""
 
 from __future__ import annotations
 
@@ -33,15 +33,14 @@ class MotionDraws:
     Parameters
     ----------
     dataset : xarray.Dataset
-        ``positions`` (chain, draw, frame, joint, axis) in metres; where they exist ``theta``
-        (chain, draw, coordinate), ``log_density`` (chain, draw), per-draw statistics (chain, draw)
-        and per-chain ones (chain); ``state_*``: what the sampler needs to go on. Attributes hold
-        the skeleton, fps, sampler, settings, seed, versions and the run's counts: seconds and
-        evaluations of the denoiser, density and gradient.
+        ``positions`` (chain, draw, frame, joint, axis), metres; optionally ``theta`` (chain, draw,
+        coordinate), ``log_density`` (chain, draw), statistics per draw (chain, draw) or chain
+        (chain), and ``state_*``, the sampler state needed to continue. Attributes: skeleton, fps,
+        sampler, settings, seed, versions, seconds and evaluation counts.
 
     Notes
     -----
-    Make one with :meth:`of`, or :meth:`load` one that was saved.
+    Constructed by :meth:`of` or :meth:`load`.
     """
 
     dataset: xr.Dataset
@@ -67,34 +66,28 @@ class MotionDraws:
         Parameters
         ----------
         posterior : MotionPosterior
-            What was drawn from.
+            The posterior that was sampled.
         sampler : Sampler
             A dataclass with a ``name``; its fields become the settings.
         positions : ndarray, (chains, draws, L, J, 3)
             Metres.
         seed : int
-            The seed that was given.
+            Seed of the run.
         seconds : float
             Wall-clock time of the run.
         theta : ndarray, (chains, draws, dim), optional
-            The draws in the posterior's coordinates.
+            Draws in the posterior's coordinates.
         log_density : ndarray, (chains, draws), optional
             log p(θ) + log p(y | θ) at each draw.
         statistics : mapping of ndarray, optional
             Arrays over (chain,) or (chain, draw): ``acceptance``, ``divergent``, …
         counts : mapping of int, optional
-            ``denoiser``, ``density``, ``gradient``: evaluations, each of one motion (one view of
-            one motion for a 2D denoiser).
+            Evaluations of ``denoiser``, ``density`` and ``gradient``, each of one motion (2D
+            denoiser: one view of one motion).
         state : mapping of ndarray, optional
-            What the sampler needs to go on where it stopped.
+            Sampler state needed to continue.
         independent : bool
-            Whether the draws are independent of each other by construction, so that
-            chain diagnostics say nothing.
-
-        Raises
-        ------
-        ValueError
-            If a shape disagrees or a position is NaN or infinite.
+            Whether draws are independent by construction; chain diagnostics then do not apply.
         """
         skeleton = posterior.skeleton
         positions = np.asarray(positions, dtype=np.float64)
@@ -184,7 +177,7 @@ class MotionDraws:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """What the sampler needs to go on where it stopped; empty for independent draws."""
+        """Sampler state needed to continue; empty for independent draws."""
         return {
             str(name).removeprefix("state_"): values.values
             for name, values in self.dataset.data_vars.items()
@@ -192,7 +185,7 @@ class MotionDraws:
         }
 
     def flat(self) -> np.ndarray:
-        """Return all draws in a row, (chains × draws, L, J, 3), chain by chain."""
+        """Return all draws, (chains × draws, L, J, 3), chain by chain."""
         positions = self.positions.values
         return positions.reshape(-1, *positions.shape[2:])
 
@@ -203,19 +196,13 @@ class MotionDraws:
         return Motion(positions, self.skeleton, self.fps, name=name)
 
     def playback(self, chain: int = 0) -> Motion:
-        """Return a chain's draws one after the other, as one motion to be looked through.
-
-        Of single poses (L = 1) that shows how the chain walks; any draw that pleases can be where
-        another run starts: ``initial=draws.dataset["theta"].values[:, k]``.
-        """
+        """Return a chain's draws concatenated into one motion, to animate how the chain moves."""
         chains = self.positions.sizes["chain"]
         if not 0 <= chain < chains:
-            raise ValueError(f"chain must be a number from 0 to {chains - 1}, got {chain!r}")
-        positions = self.positions.isel(chain=chain).values
+            raise ValueError(f"chain must be between 0 and {chains - 1}, got {chain!r}")
+        positions = self.positions.isel(chain=chain).values.reshape(-1, *self.positions.shape[3:])
         name = f"{self.dataset.attrs['sampler']}-{chain}"
-        return Motion(
-            positions.reshape(-1, *positions.shape[2:]), self.skeleton, self.fps, name=name
-        )
+        return Motion(positions, self.skeleton, self.fps, name=name)
 
     def motions(self) -> Iterator[Motion]:
         """Yield every draw, chain by chain."""
@@ -224,7 +211,7 @@ class MotionDraws:
                 yield self.motion(draw, chain)
 
     def to_arviz(self) -> xr.DataTree:
-        """Return the ArviZ tree: ``posterior`` (positions, theta) and ``sample_stats``."""
+        """Return an ArviZ tree: ``posterior`` (positions, theta) and ``sample_stats``."""
         inside = [name for name in ("positions", "theta") if name in self.dataset]
         statistics = {
             ("lp" if name == "log_density" else str(name)): values
@@ -247,15 +234,9 @@ class MotionDraws:
         return citations_of(attributes["sampler"], attributes["settings"], people)
 
     def save(self, path: str | Path) -> None:
-        """Write the draws as netCDF, ``.nc``; nothing is left at ``path`` if writing fails.
-
-        Raises
-        ------
-        ValueError
-            If ``path`` has another ending.
-        """
+        """Write the draws atomically as netCDF; ``path`` must end in ``.nc``."""
         if Path(path).suffix != ".nc":
-            raise ValueError(f"path must be a name that ends in .nc, got {str(path)!r}")
+            raise ValueError(f"path must end in .nc, got {str(path)!r}")
         # netCDF's integers have 32 bits; seeds and counts may need more.
         wide = {
             str(name): str(value)
@@ -267,45 +248,31 @@ class MotionDraws:
 
     @classmethod
     def load(cls, path: str | Path) -> MotionDraws:
-        """Read draws that :meth:`save` wrote.
-
-        Raises
-        ------
-        ValueError
-            If the file is not one that :meth:`save` wrote.
-        """
+        """Read draws written by :meth:`save`; raise ``ValueError`` if the file is not one."""
         try:
             with xr.open_dataset(path, engine="scipy") as opened:
                 dataset = opened.load()
         except FileNotFoundError:
             raise
         except Exception as error:
-            raise ValueError(
-                f"path is {str(path)!r}, which is no netCDF file, expected one that save() wrote"
-            ) from error
-        if dataset.attrs.get("format_version") != _VERSION:
-            raise ValueError(
-                f"path is {str(path)!r} with format version "
-                f"{dataset.attrs.get('format_version')}, expected {_VERSION}"
-            )
+            raise ValueError(f"path must be a netCDF file of draws, got {str(path)!r}") from error
+        found = dataset.attrs.get("format_version")
+        if found != _VERSION:
+            raise ValueError(f"{path} must have format version {_VERSION}, got {found}")
         counted = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
         return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counted]}))
 
 
 def settings_of(sampler: Any) -> dict[str, Any]:
-    """Return a sampler's settings as JSON holds them; none of one that is no dataclass."""
+    """Return a sampler's settings as JSON values; empty if it is not a dataclass."""
     if not is_dataclass(sampler) or isinstance(sampler, type):
         return {}
     return json.loads(json.dumps(asdict(sampler), default=repr))
 
 
-def library_versions() -> dict[str, str]:
-    """Return the versions of the packages that draws, and what is measured of them, depend on."""
-    return dict(_versions())
-
-
 @cache
-def _versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
+    """Return the versions of the packages that draws and their metrics depend on."""
     samplers = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
     packages = (*samplers, "arviz-stats", "scikit-learn")
     return {package: version(package) for package in packages}

@@ -1,7 +1,7 @@
-"""Evidence about a motion: 2D keypoints in known cameras, noisy 3D joints.
+"""Likelihoods of observed 2D keypoints and noisy 3D joints.
 
-Both are y = A X + c + noise, entry by entry, where the cameras are orthographic; a confidence
-multiplies the precision and 0 hides an entry.
+With orthographic cameras, y = A X + c + noise, entry by entry. A confidence multiplies the
+precision; 0 marks an occluded entry.
 """
 
 from __future__ import annotations
@@ -20,25 +20,20 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import NotConjugate
 from probmotion.validation import check_finite, check_positive, check_shape
 
-__all__ = [
-    "EntryNoise",
-    "Joints3D",
-    "Keypoints2D",
-    "LinearObservation",
-]
+__all__ = ["Joints3D", "Keypoints2D", "LinearObservation", "entry_noise"]
 
 
 class LinearObservation(NamedTuple):
-    """y_v = A_v X + noise of precision w_v, per frame and joint, Gaussian.
+    """Linear Gaussian observation y_v = A_v X + noise of precision w_v, per frame and joint.
 
     Attributes
     ----------
     axes : ndarray, (V, M, 3)
-        A: the rows that a position is multiplied by, M numbers per view.
+        A: M rows per view.
     target : ndarray, (V, L, J, M)
-        y less the observation of the origin; 0 where hidden.
+        y minus the projection of the origin; 0 where occluded.
     precision : ndarray, (V, L, J)
-        1 / variance of each of the M numbers; 0 where hidden.
+        1 / variance of each of the M numbers; 0 where occluded.
     """
 
     axes: np.ndarray
@@ -48,21 +43,16 @@ class LinearObservation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EntryNoise:
-    """Independent noise of observed entries: Gaussian, or Student-t against outliers.
+    """Independent Gaussian or Student-t noise of observed entries.
 
     Parameters
     ----------
     noise : float
         Standard deviation (Student-t: scale) of an entry of confidence 1.
     confidence : ndarray
-        Multiplies the precision, one number per observed joint; 0 hides it.
+        Multiplies the precision, one number per observed joint; 0 marks an occluded one.
     degrees_of_freedom : float or None
-        Of the Student-t; ``None`` for Gaussian noise.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range or not finite.
+        Degrees of freedom of Student-t noise; ``None`` for Gaussian noise.
     """
 
     noise: float
@@ -73,24 +63,22 @@ class EntryNoise:
         check_positive("noise", self.noise)
         check_finite("confidence", self.confidence)
         if self.confidence.size and self.confidence.min() < 0:
-            raise ValueError(
-                f"confidence is {self.confidence.min():g} at its least, expected 0 or more"
-            )
+            raise ValueError(f"confidence must be at least 0, got {self.confidence.min():g}")
         if self.degrees_of_freedom is not None:
             check_positive("degrees_of_freedom", self.degrees_of_freedom)
 
     @property
     def visible(self) -> np.ndarray:
-        """Where the evidence says anything, in the shape of ``confidence``."""
+        """Mask of observed entries, in the shape of ``confidence``."""
         return self.confidence > 0
 
     @property
     def precision(self) -> np.ndarray:
-        """1 / variance (Student-t: 1 / scale²) per entry; 0 where hidden."""
+        """1 / variance (Student-t: 1 / scale²) per entry; 0 where occluded."""
         return self.confidence / self.noise**2
 
     def log_density(self, residual: Array) -> Array:
-        """Return Σ log p(residual): ``(…, *confidence.shape, M) → (…)``; hidden ones count 0."""
+        """Return Σ log p(residual) of visible entries: ``(…, *confidence.shape, M) → (…)``."""
         xp = array_namespace(residual)
         n_seen = residual.shape[-1] * int(self.visible.sum())
         log_scale = residual.shape[-1] * 0.5 * float(np.log(self.precision[self.visible]).sum())
@@ -108,7 +96,7 @@ class EntryNoise:
         return xp.sum(terms, axis=axes) + (log_scale + n_seen * normaliser)
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Return noise of shape ``(*confidence.shape, size)``; 0 where hidden."""
+        """Return noise of shape ``(*confidence.shape, size)``; 0 where occluded."""
         shape = (*self.confidence.shape, size)
         if self.degrees_of_freedom is None:
             unit = rng.standard_normal(shape)
@@ -118,40 +106,67 @@ class EntryNoise:
         return np.where(self.visible[..., None], unit * self.noise / np.sqrt(shown), 0.0)
 
     def require_gaussian(self) -> None:
-        """Raise :class:`~probmotion.posteriors.protocols.NotConjugate` if the noise is
-        Student-t."""
+        """Raise ``NotConjugate`` if the noise is Student-t."""
         if self.degrees_of_freedom is not None:
             raise NotConjugate(
-                f"the noise is Student-t with {self.degrees_of_freedom:g} degrees of freedom, "
-                "which leaves no closed form; only Gaussian noise does"
+                f"the noise is Student-t with {self.degrees_of_freedom:g} degrees of freedom, not "
+                "Gaussian"
             )
 
 
+class _Entries:
+    """Properties and shapes of observed entries."""
+
+    confidence: np.ndarray | None
+    entries: EntryNoise
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return self.entries.confidence.shape[-2]
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints J."""
+        return self.entries.confidence.shape[-1]
+
+    def _set_entries(
+        self,
+        name: str,
+        noise: float,
+        degrees_of_freedom: float | None,
+        shape: tuple[int | str, ...],
+    ) -> None:
+        """Check the observed array ``name`` and set it, its confidence and its noise."""
+        observed = np.asarray(getattr(self, name), dtype=np.float64)
+        check_shape(name, observed, shape)
+        entries = entry_noise(noise, self.confidence, degrees_of_freedom, observed.shape[:-1])
+        check_finite(name, observed[entries.visible])
+        object.__setattr__(self, "entries", entries)
+        object.__setattr__(self, "confidence", entries.confidence)
+        object.__setattr__(self, name, np.where(entries.visible[..., None], observed, 0.0))
+
+
 @dataclass(frozen=True, eq=False)
-class Keypoints2D:
+class Keypoints2D(_Entries):
     """Noisy keypoints of one motion in V known cameras.
 
     Parameters
     ----------
     keypoints : ndarray, (V, L, J, 2)
-        Image units. Entries with confidence 0 are not read and may be NaN.
+        Image units. Entries with confidence 0 are ignored and may be NaN.
     cameras : Cameras
         The V cameras.
     noise : float
         Standard deviation of a keypoint of confidence 1, image units.
     confidence : ndarray, (V, L, J), optional
-        Multiplies the precision; 0 hides an entry; 1 everywhere by default.
+        Multiplies the precision; 0 marks an occluded entry; 1 everywhere by default.
     degrees_of_freedom : float, optional
-        Student-t noise with this many; Gaussian by default.
+        Degrees of freedom of Student-t noise; Gaussian by default.
     skeleton : Skeleton, optional
-        Whose joints they are, where it is known; a posterior refuses a prior over another.
+        Skeleton of the joints; if given, it must match the prior's.
     fps : float, optional
-        Frames per second, where it is known; a posterior refuses a prior at another.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a visible keypoint is not finite, or a number is out of range.
+        Frames per second; if given, it must match the prior's.
     """
 
     keypoints: np.ndarray
@@ -164,14 +179,8 @@ class Keypoints2D:
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        keypoints = np.asarray(self.keypoints, dtype=np.float64)
-        check_shape("keypoints", keypoints, (self.cameras.n_views, "L", "J", 2))
-        entries = _entry_noise(
-            self.noise, self.confidence, self.degrees_of_freedom, keypoints.shape[:-1]
-        )
-        object.__setattr__(self, "entries", entries)
-        object.__setattr__(self, "confidence", entries.confidence)
-        object.__setattr__(self, "keypoints", _seen("keypoints", keypoints, entries.visible))
+        shape = (self.cameras.n_views, "L", "J", 2)
+        self._set_entries("keypoints", self.noise, self.degrees_of_freedom, shape)
 
     @classmethod
     def observe(
@@ -184,34 +193,15 @@ class Keypoints2D:
         hidden: np.ndarray | None = None,
         degrees_of_freedom: float | None = None,
     ) -> Keypoints2D:
-        """Return what noisy detectors in ``cameras`` would report of ``motion``.
+        """Return simulated noisy detections of ``motion`` in ``cameras``.
 
-        Parameters
-        ----------
-        motion : Motion
-            The true motion.
-        cameras : Cameras
-            The V cameras.
-        noise : float
-            Standard deviation, image units.
-        seed : int
-            Seed of the noise.
-        hidden : ndarray of bool, (L, J) or (V, L, J), optional
-            Entries that no detector sees.
-        degrees_of_freedom : float, optional
-            Student-t noise with this many; Gaussian by default.
+        ``hidden``, bool, (L, J) or (V, L, J), marks occluded entries; ``noise`` and
+        ``degrees_of_freedom`` are those of the class.
         """
         shape = (cameras.n_views, *motion.positions.shape[:2])
         confidence = _confidence_of(hidden, shape)
-        blank = cls(
-            np.zeros((*shape, 2)),
-            cameras,
-            noise,
-            confidence,
-            degrees_of_freedom,
-            motion.skeleton,
-            motion.fps,
-        )
+        origin, of = np.zeros((*shape, 2)), (motion.skeleton, motion.fps)
+        blank = cls(origin, cameras, noise, confidence, degrees_of_freedom, *of)
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
     @classmethod
@@ -226,16 +216,6 @@ class Keypoints2D:
             fps=track.fps,
         )
 
-    @property
-    def frames(self) -> int:
-        """Number of frames L."""
-        return self.keypoints.shape[1]
-
-    @property
-    def n_joints(self) -> int:
-        """Number of joints J."""
-        return self.keypoints.shape[2]
-
     def log_density(self, positions: Array) -> Array:
         """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
         check_shape("positions", positions, ("…", self.frames, self.n_joints, 3))
@@ -243,13 +223,13 @@ class Keypoints2D:
         return self.entries.log_density(residual)
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Keypoints2D:
-        """Return the likelihood of evidence drawn from p(y | X), X of shape (L, J, 3)."""
+        """Return the likelihood of observations drawn from p(y | X), X of shape (L, J, 3)."""
         check_shape("positions", positions, (self.frames, self.n_joints, 3))
         seen = self.cameras.project(to_numpy(positions)) + self.entries.draw(rng, 2)
         return replace(self, keypoints=seen)
 
     def linear(self) -> LinearObservation:
-        """Return the evidence as linear Gaussian entries.
+        """Return the observations in linear Gaussian form.
 
         Raises
         ------
@@ -258,10 +238,7 @@ class Keypoints2D:
         """
         self.entries.require_gaussian()
         if not self.cameras.orthographic:
-            raise NotConjugate(
-                "the cameras are perspective, which leaves no closed form; only orthographic "
-                "cameras do"
-            )
+            raise NotConjugate("the cameras are perspective, not orthographic")
         shifted = self.keypoints - self.cameras.offset[:, None, None, :]
         return LinearObservation(
             axes=self.cameras.image_axes,
@@ -271,28 +248,19 @@ class Keypoints2D:
 
 
 @dataclass(frozen=True, eq=False)
-class Joints3D:
+class Joints3D(_Entries):
     """Noisy 3D joints of one motion.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres. Entries with confidence 0 are not read and may be NaN.
+        Metres. Entries with confidence 0 are ignored and may be NaN.
     noise : float
         Standard deviation of a coordinate of confidence 1, metres.
     confidence : ndarray, (L, J), optional
-        Multiplies the precision; 0 hides an entry; 1 everywhere by default.
-    degrees_of_freedom : float, optional
-        Student-t noise with this many; Gaussian by default.
-    skeleton : Skeleton, optional
-        Whose joints they are, where it is known; a posterior refuses a prior over another.
-    fps : float, optional
-        Frames per second, where it is known; a posterior refuses a prior at another.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a visible joint is not finite, or a number is out of range.
+        As for :class:`Keypoints2D`.
+    degrees_of_freedom, skeleton, fps
+        As for :class:`Keypoints2D`.
     """
 
     joints: np.ndarray
@@ -304,14 +272,7 @@ class Joints3D:
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        joints = np.asarray(self.joints, dtype=np.float64)
-        check_shape("joints", joints, ("L", "J", 3))
-        entries = _entry_noise(
-            self.noise, self.confidence, self.degrees_of_freedom, joints.shape[:-1]
-        )
-        object.__setattr__(self, "entries", entries)
-        object.__setattr__(self, "confidence", entries.confidence)
-        object.__setattr__(self, "joints", _seen("joints", joints, entries.visible))
+        self._set_entries("joints", self.noise, self.degrees_of_freedom, ("L", "J", 3))
 
     @classmethod
     def observe(
@@ -323,27 +284,11 @@ class Joints3D:
         hidden: np.ndarray | None = None,
         degrees_of_freedom: float | None = None,
     ) -> Joints3D:
-        """Return noisy joints of ``motion``; ``hidden`` (L, J) marks those that are not seen."""
+        """Return simulated noisy joints of ``motion``; ``hidden`` (L, J) marks occluded ones."""
         shape = motion.positions.shape[:2]
-        blank = cls(
-            np.zeros((*shape, 3)),
-            noise,
-            _confidence_of(hidden, shape),
-            degrees_of_freedom,
-            motion.skeleton,
-            motion.fps,
-        )
+        origin, of = np.zeros((*shape, 3)), (motion.skeleton, motion.fps)
+        blank = cls(origin, noise, _confidence_of(hidden, shape), degrees_of_freedom, *of)
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
-
-    @property
-    def frames(self) -> int:
-        """Number of frames L."""
-        return self.joints.shape[0]
-
-    @property
-    def n_joints(self) -> int:
-        """Number of joints J."""
-        return self.joints.shape[1]
 
     def log_density(self, positions: Array) -> Array:
         """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
@@ -351,12 +296,12 @@ class Joints3D:
         return self.entries.log_density(constant(self.joints, positions) - positions)
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Joints3D:
-        """Return the likelihood of evidence drawn from p(y | X), X of shape (L, J, 3)."""
+        """Return the likelihood of observations drawn from p(y | X), X of shape (L, J, 3)."""
         check_shape("positions", positions, (self.frames, self.n_joints, 3))
         return replace(self, joints=to_numpy(positions) + self.entries.draw(rng, 3))
 
     def linear(self) -> LinearObservation:
-        """Return the evidence as linear Gaussian entries.
+        """Return the observations in linear Gaussian form.
 
         Raises
         ------
@@ -369,12 +314,13 @@ class Joints3D:
         )
 
 
-def _entry_noise(
+def entry_noise(
     noise: float,
     confidence: np.ndarray | None,
     degrees_of_freedom: float | None,
     shape: tuple[int, ...],
 ) -> EntryNoise:
+    """Return the noise of entries of ``shape``; confidence 1 by default."""
     check_positive("noise", noise)
     shown = np.ones(shape) if confidence is None else np.asarray(confidence, dtype=np.float64)
     check_shape("confidence", shown, shape)
@@ -387,9 +333,3 @@ def _confidence_of(hidden: np.ndarray | None, shape: tuple[int, ...]) -> np.ndar
     hidden = np.asarray(hidden, dtype=bool)
     check_shape("hidden", hidden, shape[len(shape) - hidden.ndim :])
     return np.broadcast_to(~hidden, shape).astype(np.float64)
-
-
-def _seen(name: str, entries: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Return ``entries`` with hidden ones 0; a visible one that is not finite is an error."""
-    check_finite(name, entries[visible])
-    return np.where(visible[..., None], entries, 0.0)

@@ -1,6 +1,6 @@
-"""The noise schedule and the DDPM posterior, shared by training and sampling.
+"""Noise schedule and DDPM posterior, for training and sampling.
 
-x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε; level 0 is clean, level T is (almost) pure noise.
+x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε; level 0 is clean, level T almost pure noise.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ import numpy as np
 from probmotion.validation import check_count
 
 __all__ = ["NoiseSchedule", "PosteriorStep"]
+
+# Keeps β_t from vanishing near t = 0.
+_OFFSET = 0.008
 
 
 class PosteriorStep(NamedTuple):
@@ -30,10 +33,9 @@ class NoiseSchedule:
     Parameters
     ----------
     alpha_bar : ndarray, (T + 1,)
-        Share of the signal's variance left at each level.
+        ᾱ_t, the fraction of the signal's variance at each level.
     times : ndarray, (T + 1,), optional
-        The level's number in the schedule it was taken from, which a network was trained with;
-        0..T by default.
+        Index of each level in the schedule that a network was trained with; 0..T by default.
     """
 
     alpha_bar: np.ndarray
@@ -43,17 +45,18 @@ class NoiseSchedule:
         levels = np.asarray(self.alpha_bar, dtype=np.float64)
         if levels.ndim != 1 or len(levels) < 2 or levels[0] != 1.0 or levels[-1] <= 0:
             raise ValueError(
-                f"alpha_bar must have shape (T + 1,) numbers falling from 1, got {levels.shape}"
+                "alpha_bar must have shape (T + 1,), start at 1 and stay above 0, got shape "
+                f"{levels.shape}"
             )
         if (np.diff(levels) >= 0).any():
-            raise ValueError("alpha_bar does not fall at every level, expected it to")
+            raise ValueError("alpha_bar must decrease at every level")
         times = np.arange(len(levels)) if self.times is None else np.asarray(self.times)
         object.__setattr__(self, "alpha_bar", levels)
         object.__setattr__(self, "times", times)
 
     @classmethod
-    def cosine(cls, steps: int, *, power: int = 2, offset: float = 0.008) -> NoiseSchedule:
-        """Return the cosine schedule of Nichol and Dhariwal (2021), equation 17.
+    def cosine(cls, steps: int, *, power: int = 2) -> NoiseSchedule:
+        """Return the cosine schedule of Nichol and Dhariwal (2021), equation 17; β_t ≤ 0.999.
 
         Parameters
         ----------
@@ -61,15 +64,9 @@ class NoiseSchedule:
             Number of steps T.
         power : int
             ᾱ ∝ cos^power; 2 as published, 4 in the MAS authors' code.
-        offset : float
-            Keeps the first steps from being too small.
-
-        Notes
-        -----
-        As published, β_t is at most 0.999.
         """
         check_count("steps", steps)
-        angle = (np.arange(steps + 1) / steps + offset) / (1 + offset) * np.pi / 2
+        angle = (np.arange(steps + 1) / steps + _OFFSET) / (1 + _OFFSET) * np.pi / 2
         raw = np.cos(angle) ** power
         beta = np.minimum(1 - raw[1:] / raw[:-1], 0.999)
         return cls(np.concatenate([[1.0], np.cumprod(1 - beta)]))
@@ -80,19 +77,13 @@ class NoiseSchedule:
         return len(self.alpha_bar) - 1
 
     def strided(self, steps: int) -> NoiseSchedule:
-        """Return a schedule of ``steps`` steps whose levels are a subset of these.
-
-        Raises
-        ------
-        ValueError
-            If ``steps`` is more than the schedule has.
-        """
+        """Return a schedule of ``steps`` steps with a subset of these levels."""
         check_count("steps", steps)
         if steps > self.steps:
             raise ValueError(f"steps must be at most the schedule's {self.steps}, got {steps}")
         assert self.times is not None
-        kept = np.round(np.linspace(0, self.steps, steps + 1)).astype(int)
-        return NoiseSchedule(self.alpha_bar[kept], self.times[kept])
+        levels = np.round(np.linspace(0, self.steps, steps + 1)).astype(int)
+        return NoiseSchedule(self.alpha_bar[levels], self.times[levels])
 
     def posterior(self, t: int) -> PosteriorStep:
         """Return q(x_{t−1} | x_t, x₀), t = 1..T (Ho et al. 2020, equations 6 and 7).
@@ -100,7 +91,7 @@ class NoiseSchedule:
         ``deviation`` is √β̃_t, β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t), and 0 at the last step.
         """
         if not 1 <= t <= self.steps:
-            raise ValueError(f"t must be a level from 1 to {self.steps}, got {t}")
+            raise ValueError(f"t must be between 1 and {self.steps}, got {t}")
         now, after = self.alpha_bar[t], self.alpha_bar[t - 1]
         alpha = now / after
         beta = 1 - alpha

@@ -1,4 +1,4 @@
-"""A user's recording of 3D joints as evidence for a prior: every doubt about it is said."""
+"""Likelihood of a recording of 3D joints, with checks of units, axes and gaps."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 
 __all__ = ["noisy_joints"]
 
-# Mean cosine with an axis from which a body is thought to stand along it.
+# Mean cosine with an axis above which a body counts as standing along it.
 _UPRIGHT = 0.8
+# Plausible longest chain of bones, metres: a three-year-old has 0.5 from pelvis to ankle, an adult
+# 1.15 from pelvis to wrist.
 _SIZES = (0.5, 3.0)
-"""Metres, the longest chain of bones. A person of ``person14`` has .95 (a child of three .5) from
-the pelvis to an ankle and 1.15 to a wrist; a joint more or less at the ends changes little."""
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "kilometres": 1000.0}
+# Quantile of the lowest joints' height, robust to noise, and its largest distance from the floor.
 _LOW, _FAR = 0.05, 0.5
-"""The share of frames whose lowest joints may be noise, and metres from the floor that are far."""
+# Relative: files round frame times (0.0333 s), but 29.97 and 30 frames per second differ.
 _SAME_RATE = 5e-4
-"""Of the rate: files round frame times (0.0333 s), but 29.97 and 30 a second are two rates."""
 
 
 def noisy_joints(
@@ -39,55 +39,50 @@ def noisy_joints(
     resample: bool = False,
     longest_gap: int | None = None,
 ) -> Joints3D:
-    """Return what a recording says to a prior: its joints, on its skeleton and at its rate.
+    """Return the likelihood of recorded joints, on the prior's skeleton and frame rate.
 
-    A joint that is NaN is hidden. Nothing is moved, rescaled, filled in or, unasked, resampled:
-    where the prior knows a floor, as a Motion-DVAE does at Y = 0, the recording's has to be there.
+    NaN joints count as occluded. Joints are never moved, rescaled or filled in, and only resampled
+    on request. If the prior has a floor (a Motion-DVAE: Y = 0), the recording must share it.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres, Y up. NaN where a joint was not seen.
+        Metres, Y up; NaN where a joint was not observed.
     skeleton : Skeleton
-        Whose joints they are; see
-        :func:`~probmotion.motion.occlusion.joints_on_skeleton` for one that is not the prior's.
+        Skeleton of the joints, mapped to the prior's by
+        :func:`~probmotion.motion.occlusion.joints_on_skeleton`.
     fps : float
         Frames per second.
     prior : MotionPrior
-        Its ``skeleton``, ``fps`` and ``frames`` are what the evidence is made for; the recording
-        may be longer than ``frames``.
+        Provides the target ``skeleton``, ``fps`` and ``frames``; the recording may be longer.
     noise : float
         Standard deviation (Student-t: scale) of a coordinate of confidence 1, metres.
     confidence : ndarray, (L, J), optional
-        Multiplies the precision; 0 hides a joint; 1 by default.
+        Multiplies the precision; 0 marks an occluded joint; 1 by default.
     degrees_of_freedom : float, optional
-        Student-t noise with this many; Gaussian by default.
+        Degrees of freedom of Student-t noise; Gaussian by default.
     resample : bool
-        Bring a recording of another rate to the prior's, by
-        :func:`~probmotion.motion.occlusion.joints_at_rate`.
+        Resample to the prior's frame rate with :func:`~probmotion.motion.occlusion.joints_at_rate`.
     longest_gap : int, optional
-        Frames, at the prior's rate, for which no joint at all may be seen are fewer than this; by
-        default the window of the prior's networks where it has such, else its ``frames``.
+        Every run of fully occluded frames, at the prior's rate, must be shorter than this; by
+        default the window of the prior's networks, else its ``frames``.
 
     Returns
     -------
     Joints3D
-        With the prior's skeleton and rate.
+        Likelihood with the prior's skeleton and frame rate.
 
     Warns
     -----
     UserWarning
-        If no joint is seen in some frames, the body is of no size in metres, or it is and the
-        noise is above a metre or the lowest joints are far from the prior's floor, or the body
-        stands along another axis than Y.
+        If frames are fully occluded, or unit, noise, floor or up axis look implausible.
 
     Raises
     ------
     ValueError
-        If a joint is infinite or NaN in some coordinates only, no joint is seen for
-        ``longest_gap`` frames, the rate is another and ``resample`` is not asked for, the prior's
-        skeleton has a joint that cannot be taken from the recording, or a shape, a number or a
-        type does not fit.
+        If a joint is infinite or partly NaN, all joints are occluded for ``longest_gap`` frames,
+        the frame rate differs without ``resample``, the skeleton lacks a joint of the prior's, or
+        an argument is invalid.
     """
     for name, value, kind in (("skeleton", skeleton, Skeleton), ("prior", prior, MotionPrior)):
         if not isinstance(value, kind):
@@ -96,21 +91,21 @@ def noisy_joints(
     joints = np.asarray(joints, dtype=np.float64)
     check_shape("joints", joints, ("L", skeleton.n_joints, 3))
     if len(joints) == 0:
-        raise ValueError("joints has no frame, expected at least one")
+        raise ValueError("joints must have at least one frame, got 0")
     check_positive("fps", fps)
-    seen = _seen_joints(joints, skeleton)
+    seen = _observed(joints, skeleton)
     weight = np.ones(seen.shape) if confidence is None else np.array(confidence, dtype=np.float64)
     check_shape("confidence", weight, seen.shape)
     check_finite("confidence", weight)
     if weight.min() < 0:
-        raise ValueError(f"confidence is {weight.min():g} at its least, expected 0 or more")
+        raise ValueError(f"confidence must be at least 0, got {weight.min():g}")
     weight = np.where(seen, weight, 0.0)
     joints, weight = joints_on_skeleton(joints, weight, skeleton, prior.skeleton)
     if abs(fps - prior.fps) > _SAME_RATE * prior.fps:
         if not resample:
             raise ValueError(
-                f"fps is {fps:g}, expected {prior.fps:g}, the prior's; give resample=True to "
-                "interpolate the joints linearly in time"
+                f"fps must be the prior's {prior.fps:g}, got {fps:g}; pass resample=True to "
+                "interpolate linearly in time"
             )
         joints, weight = joints_at_rate(joints, weight, fps, prior.fps)
     window = getattr(getattr(prior, "settings", None), "frames", prior.frames)
@@ -118,93 +113,84 @@ def noisy_joints(
     check_count("longest_gap", gap)
     _check_frames(weight, gap)
     if _check_size(joints, weight, prior.skeleton):
-        _check_noise(noise)
+        if noise > 1:
+            warnings.warn(
+                f"noise is {noise:g} m, more than a body is wide; is it in metres?", stacklevel=2
+            )
         _check_floor(joints, weight, getattr(prior, "floor", None))
     _check_upright(joints, weight, prior.skeleton)
     return Joints3D(joints, noise, weight, degrees_of_freedom, prior.skeleton, prior.fps)
 
 
-def _seen_joints(joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return which joints are seen (L, J); one that is infinite or partly NaN is an error."""
+def _observed(joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Return the mask of observed joints (L, J); raise if one is infinite or partly NaN."""
     unknown = np.isnan(joints)
     for problem, where in (
-        ("is infinite", np.isinf(joints).any(axis=-1)),
-        ("is NaN in some coordinates but not in all", unknown.any(-1) & ~unknown.all(-1)),
+        ("infinite values", np.isinf(joints).any(axis=-1)),
+        ("NaN in only some coordinates", unknown.any(-1) & ~unknown.all(-1)),
     ):
         if where.any():
             frame, joint = np.argwhere(where)[0]
             raise ValueError(
-                f"joints {problem} at frame {frame}, joint {joint} "
-                f"({skeleton.joint_names[joint]}), expected three finite numbers, or three NaN for "
-                "a joint that is hidden"
+                f"joints must be finite, or all NaN where occluded, got {problem} at frame "
+                f"{frame}, joint {joint} ({skeleton.joint_names[joint]})"
             )
     return ~unknown.any(axis=-1)
 
 
 def _check_frames(confidence: np.ndarray, longest_gap: int) -> None:
-    """Warn of frames without a joint; raise where there are as many as a window in a row."""
     empty = np.logical_not((confidence > 0).any(axis=1))
     frames = len(confidence)
     if empty.all():
-        raise ValueError("joints are hidden in every frame, expected some to be seen")
+        raise ValueError("joints must be observed in some frame, got every frame occluded")
     edges = np.flatnonzero(np.diff(empty, prepend=False, append=False)).reshape(-1, 2)
     for start, stop in edges.tolist():
         if stop - start >= longest_gap:
             raise ValueError(
-                f"joints are all hidden in the {stop - start} frames from frame {start}, expected "
-                f"one to be seen in any {longest_gap} frames"
+                f"joints must include an observed one in any {longest_gap} consecutive frames, got "
+                f"none in the {stop - start} frames from frame {start}"
             )
     if empty.any():
         warnings.warn(
-            f"joints are all hidden in {empty.sum()} of {frames} frames, where the prior "
-            "alone says what the motion is",
+            f"all joints are occluded in {empty.sum()} of {frames} frames; only the prior informs "
+            "them",
             stacklevel=3,
         )
 
 
 def _check_size(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> bool:
-    """Warn, and return False, if the longest chain of bones has no size of a body in metres."""
+    """Warn and return False if the longest chain of bones is implausible in metres."""
     size = _longest_chain(joints, confidence, skeleton)
     if size is None or _SIZES[0] <= size <= _SIZES[1]:
         return True
     middle = math.sqrt(_SIZES[0] * _SIZES[1])
     if size == 0:
-        raise ValueError("joints are all in one place, expected the joints of a body")
+        raise ValueError("joints must be distinct, got all joints at one point")
     unit = min(_UNITS, key=lambda name: abs(math.log(size * _UNITS[name] / middle)))
     guess = f"; are these {unit}?" if _SIZES[0] <= size * _UNITS[unit] <= _SIZES[1] else ""
     warnings.warn(
-        f"joints has a body whose longest chain of bones is {size:.4g} long, which is no size in "
-        f"metres{guess}",
+        f"the longest chain of bones is {size:.4g} long, implausible in metres{guess}",
         stacklevel=3,
     )
     return False
 
 
-def _check_noise(noise: float) -> None:
-    """Warn if noise is in another unit than the joints, which are in metres."""
-    if noise > 1:
-        warnings.warn(
-            f"noise is {noise:g} m, more than a body is wide; is it in metres, as the joints are?",
-            stacklevel=3,
-        )
-
-
 def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float | None) -> None:
-    """Warn if no foot comes near the prior's floor; a lowest joint may be an ankle or a knee."""
+    """Warn if the lowest joints (feet, or knees if those are occluded) are far from the floor."""
     if floor is None:
         return
     heights = np.where(confidence > 0, joints[..., 1], np.inf).min(axis=1)
     lowest = np.quantile(heights[np.isfinite(heights)], _LOW)
     if abs(lowest - floor) > _FAR:
         warnings.warn(
-            f"the lowest joints are at {lowest:.2g} m, and the prior's floor is at {floor:g}; is "
-            f"the world's Y up, its floor at {floor:g}?",
+            f"the lowest joints are at {lowest:.2g} m, far from the prior's floor at {floor:g}; is "
+            "Y up and the floor at that height?",
             stacklevel=3,
         )
 
 
 def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> None:
-    """Warn if the neck is along another axis from the ankles than Y, all the time."""
+    """Warn if the body stands along another axis than Y throughout."""
     names = skeleton.canonical_names
     if not {"neck", "left_ankle", "right_ankle"} <= set(names):
         return
@@ -219,14 +205,13 @@ def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleto
     if abs(along[axis]) > _UPRIGHT and not (axis == 1 and along[1] > 0):
         sign = "" if along[axis] > 0 else "-"
         warnings.warn(
-            f"joints has a body that stands along {sign}{'XYZ'[axis]}, expected Y to be up; does "
-            "it lie?",
+            f"the body stands along {sign}{'XYZ'[axis]}, but Y must be up; is it lying down?",
             stacklevel=3,
         )
 
 
 def _longest_chain(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> float | None:
-    """Return the largest sum of median bone lengths from a root down, None if no bone is seen."""
+    """Return the largest sum of median bone lengths from a root; None if no bone is observed."""
     length = np.zeros(skeleton.n_joints)
     any_seen = False
     for joint in skeleton.topological_order:

@@ -1,7 +1,7 @@
-"""What a prior over motions can do, as small protocols.
+"""Protocols of priors, likelihoods and inference networks.
 
-A sampler lists the protocols it requires; a prior implements those it can. Neither imports the
-other. Diffusion works in normalised units: a motion in metres divided by the prior's ``scale``.
+A sampler lists the protocols it requires; a prior implements those it supports. Diffusion uses
+normalised units: metres divided by the prior's ``scale``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ __all__ = [
     "HasExactPosterior",
     "HasInferenceNetwork",
     "HasLogDensity",
+    "HasManifold",
     "HasSeeds",
+    "HasStyles",
     "InferenceNetwork",
     "Likelihood",
     "Marginalises",
@@ -41,7 +43,7 @@ __all__ = [
 
 
 class NotConjugate(ValueError):  # noqa: N818 (a condition, not a fault)
-    """The posterior has no closed form; the message says which part of the likelihood is why."""
+    """The posterior has no closed form; the message names the reason."""
 
 
 @runtime_checkable
@@ -52,31 +54,28 @@ class Likelihood(Protocol):
         """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Likelihood:
-        """Return the likelihood of evidence drawn from p(y | X), X of shape (L, J, 3)."""
+        """Return the likelihood of observations drawn from p(y | X), X of shape (L, J, 3)."""
 
 
 @runtime_checkable
 class ComparesViews(Protocol):
-    """Evidence that compares a pose's views with annotations, and knows how those move."""
+    """Likelihood that compares a pose's views with annotations of known joint speeds."""
 
     def evaluate(
         self, positions: np.ndarray, generators: Sequence[np.random.Generator] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return log L and the closest annotations: ``(…, L, J, 3) → (…), (…, m)``.
 
-        With generators, one per pose, log L is of views that each draws anew.
+        With generators, one per pose, log L is that of randomly drawn views.
         """
 
     def joint_speeds(self, closest: np.ndarray) -> np.ndarray:
-        """Return joints' mean squared turn and stretch there: ``(…, m) → (…, J, 2)``."""
+        """Return mean squared rotation and stretch per joint: ``(…, m) → (…, J, 2)``."""
 
 
 @runtime_checkable
 class MotionPrior(Protocol):
-    """A belief about motions of one skeleton, L frames long.
-
-    θ is a flat unconstrained vector of length ``dim``.
-    """
+    """Distribution of motions of one skeleton and L frames; θ is unconstrained, (dim,)."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -108,68 +107,87 @@ class Samplable(Protocol):
 
 @runtime_checkable
 class HasLogDensity(Protocol):
-    """The prior's log density in θ, and points to start a chain from.
+    """Log density in θ, normalised if possible, and initial points of chains.
 
-    It is normalised where it can be. A prior or likelihood without a gradient says so by an
-    attribute ``differentiable = False``.
+    A prior or likelihood without a gradient sets ``differentiable = False``.
     """
 
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ): ``(…, dim) → (…)``."""
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n points to start at, (n, dim): draws from the prior unless it `HasSeeds`."""
+        """Return n initial points, (n, dim): draws from the prior unless it `HasSeeds`."""
 
 
 @runtime_checkable
 class HasSeeds(Protocol):
-    """A prior that cannot be drawn from, and says itself where chains start."""
+    """A prior that provides initial points because it cannot be sampled."""
 
     def seed_coordinates(self) -> np.ndarray:
-        """Return θ of the seeds, (S, dim); chain k starts at the k-th, and so on round."""
+        """Return θ of the seeds, (S, dim); chain k starts at seed k mod S."""
 
 
 @runtime_checkable
 class HasCoordinateSpeeds(Protocol):
-    """What joints' movement in a picture means for θ."""
+    """Conversion of joint speeds in an image to steps of θ."""
 
     def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
         """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
 
-        ``joint_speeds`` holds the squared turns, radians², and stretches, metres², of joints.
+        ``joint_speeds`` holds squared rotations, radians², and stretches, metres².
         """
 
 
 @runtime_checkable
 class ChecksObservations(Protocol):
-    """A prior that knows of evidence it cannot have."""
+    """A prior that rejects some observations."""
 
     def check_observations(self, likelihood: Likelihood) -> None:
-        """Raise ``ValueError`` if no motion of the prior can have made the evidence."""
+        """Raise ``ValueError`` if no motion of the prior explains the observations."""
 
 
 @runtime_checkable
 class Marginalises(Protocol):
-    """A prior whose θ leaves variables integrated out (a style, a yaw, small noise).
+    """A prior that marginalises variables not in θ (a style, a yaw, small noise).
 
-    Its likelihood is then not a function of one motion, and a motion at θ is a draw.
+    Its likelihood is not a function of a single motion, and a motion at θ is a draw.
     """
 
     def log_likelihood(self, theta: Array, likelihood: Likelihood) -> Array:
-        """Return log p(y | θ), everything else integrated out: ``(…, dim) → (…)``."""
+        """Return log p(y | θ), marginalised: ``(…, dim) → (…)``."""
 
     def complete(
         self, rng: RandomNumbers, theta: np.ndarray, likelihood: Likelihood | None
     ) -> np.ndarray:
         """Return one draw of p(X | θ, y) per θ: ``(n, dim) → (n, L, J, 3)``, metres.
 
-        The i-th draw must use the i-th rows of what ``rng`` gives, and nothing else.
+        The i-th draw must use only the i-th rows of the arrays that ``rng`` returns.
         """
 
 
 @runtime_checkable
+class HasStyles(Protocol):
+    """A prior over motions of K styles."""
+
+    @property
+    def styles(self) -> Sequence[str]:
+        """Names of the K styles."""
+
+    def style_responsibilities(self, positions: np.ndarray) -> np.ndarray:
+        """Return p(style | X): ``(n, L, J, 3) → (n, K)``."""
+
+
+@runtime_checkable
+class HasManifold(Protocol):
+    """A prior concentrated near a manifold."""
+
+    def off_manifold(self, positions: np.ndarray) -> np.ndarray:
+        """Return the variance off the manifold over its expectation: ``(n, L, J, 3) → (n,)``."""
+
+
+@runtime_checkable
 class Denoises2D(Protocol):
-    """The posterior mean of clean 2D views, given noisy ones."""
+    """Posterior mean of clean 2D views given noisy ones."""
 
     @property
     def scale(self) -> float:
@@ -185,14 +203,13 @@ class Denoises2D(Protocol):
         alpha_bar : float
             ᾱ, in (0, 1].
         cameras : Cameras
-            The V views. The exact prior needs their elevation; a network trained on views of
-            unknown cameras ignores them.
+            The V views. The exact prior uses their elevation; trained networks ignore them.
         """
 
 
 @runtime_checkable
 class Denoises3D(Protocol):
-    """The posterior mean of the clean motion, given a noisy one."""
+    """Posterior mean of the clean motion given a noisy one."""
 
     @property
     def scale(self) -> float:
@@ -204,10 +221,7 @@ class Denoises3D(Protocol):
 
 @runtime_checkable
 class DenoisesCoordinates(HasLogDensity, Protocol):
-    """The posterior mean of θ, given a noisy θ; and a log density in the same coordinates.
-
-    A prior with θ ~ N(0, I) has it exactly: √ᾱ θ_t.
-    """
+    """Posterior mean of θ given a noisy θ, √ᾱ θ_t for θ ~ N(0, I), and a log density in θ."""
 
     def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
         """Return E[θ | θ_t], θ_t = √ᾱ θ + √(1−ᾱ) ε: ``(…, dim) → (…, dim)``.
@@ -247,30 +261,30 @@ class ExactPosterior(Protocol):
 
 
 class MotionInference(Protocol):
-    """Networks that have read one recording, and may be fitted to it alone."""
+    """Inference of one recording, with parameters that may be fine-tuned to it."""
 
     def parameters(self) -> list[Any]:
-        """Return the torch parameters that may be fitted."""
+        """Return the torch parameters to optimise."""
 
     def loss(self, rng: np.random.Generator, *, initial_entropy: bool, latent_weight: float) -> Any:
-        """Return minus the evidence lower bound, summed over windows, at one draw: a tensor."""
+        """Return a one-draw estimate of the negative ELBO, summed over windows: a tensor."""
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return draws (n, L, J, 3), metres, and their θ (n, dim) where they have one.
+        """Return draws (n, L, J, 3), metres, and their θ (n, dim) if there is one.
 
-        The i-th draw uses the i-th rows of what ``streams`` gives, and nothing else.
+        The i-th draw uses only the i-th rows of the arrays that ``streams`` returns.
         """
 
     def predict(self, rng: np.random.Generator, *, average: bool) -> np.ndarray:
-        """Return the predicted motion (L, J, 3), metres; of q's means where not ``average``."""
+        """Return the predicted motion (L, J, 3), metres: the average, or that of q's means."""
 
 
 @runtime_checkable
 class InferenceNetwork(Protocol):
-    """Networks trained to infer motion from evidence, in one prior."""
+    """Networks trained to infer a prior's motions from observations."""
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether evidence of this kind can be read."""
+        """Whether the network supports this kind of observations."""
 
     def on(
         self,
@@ -280,21 +294,21 @@ class InferenceNetwork(Protocol):
         degrees_of_freedom: float | None,
         overlap: int,
     ) -> MotionInference:
-        """Return the inference of one recording; ``prior`` may be of its length and body."""
+        """Return the inference of one recording; ``prior`` may have its length and body."""
 
 
 @runtime_checkable
 class HasInferenceNetwork(Protocol):
-    """A prior beside which an inference network was trained."""
+    """A prior with an optional inference network."""
 
     @property
     def inference_network(self) -> InferenceNetwork | None:
-        """The network, if there is one."""
+        """The network, if one was trained."""
 
 
 @runtime_checkable
 class HasExactPosterior(Protocol):
-    """The posterior in closed form, where the likelihood allows one."""
+    """Closed-form posterior for conjugate likelihoods."""
 
     def exact_posterior(self, likelihood: Likelihood | None) -> ExactPosterior:
         """Return p(X | y).

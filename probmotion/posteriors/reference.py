@@ -1,9 +1,8 @@
-"""`StoredReference`: reference draws of a long run, with a certificate of what they are.
+"""Reference draws of long runs, stored with a certificate.
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
-``certificate.json``. It is known to be of a posterior by that posterior's density at some of the
-draws, which is the same on every machine to many digits, as the bits of a fitted prior are not; or,
-where only θ has a density, by that of points to start from, and where their motions are.
+``certificate.json``. Its fingerprint is the posterior's log density at some draws or, if only θ has
+a density, at initial points; unlike the bits of a fitted prior, it is reproducible across machines.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _NEEDED = ("problem", "draws", "exact", "sampler", "settings", "agreement", "see
 
 @runtime_checkable
 class HasPositionDensity(Protocol):
-    """A prior whose density of positions is known, whatever its θ is."""
+    """A prior with a density of positions."""
 
     def log_prior(self, positions: Array) -> Array:
         """Return the log density of positions: ``(…, L, J, 3) → (…)``."""
@@ -50,7 +49,7 @@ class HasPositionDensity(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class StoredReference:
-    """Draws that were made once, and how they are known to be right.
+    """Stored reference draws with a certificate of their quality.
 
     Parameters
     ----------
@@ -59,12 +58,7 @@ class StoredReference:
     certificate : mapping
         ``problem``, ``draws``, ``exact``, ``sampler``, ``settings``, ``rhat``, ``ess_bulk``,
         ``ess_tail``, ``agreement`` of two independent runs (``agreement_wherever_they_stand``:
-        of motions turned and moved onto each other), ``seed``, ``versions`` and ``fingerprint``.
-
-    Raises
-    ------
-    ValueError
-        If the draws are not finite or the certificate lacks something.
+        after rigid alignment), ``seed``, ``versions`` and ``fingerprint``.
     """
 
     positions: np.ndarray
@@ -75,11 +69,10 @@ class StoredReference:
         check_finite("positions", self.positions)
         lacking = [name for name in _NEEDED if name not in self.certificate]
         if lacking:
-            raise ValueError(f"certificate lacks {', '.join(lacking)}, expected all of a reference")
+            raise ValueError(f"certificate must have {', '.join(_NEEDED)}; missing {lacking}")
         if self.certificate["draws"] != self.n:
             raise ValueError(
-                f"certificate is of {self.certificate['draws']} draws, expected the {self.n} that "
-                "are beside it"
+                f"certificate must be of the {self.n} stored draws, got {self.certificate['draws']}"
             )
 
     @property
@@ -88,23 +81,17 @@ class StoredReference:
         return len(self.positions)
 
     def choose(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n of the draws, without replacement, (n, L, J, 3), metres, float64.
-
-        Raises
-        ------
-        ValueError
-            If fewer are kept.
-        """
+        """Return n of the draws, without replacement, (n, L, J, 3), metres, float64."""
         if n > self.n:
             name = self.certificate["problem"]
             raise ValueError(
-                f"n is {n}, expected at most the {self.n} reference draws that are kept of {name}; "
-                f"probmotion reference '{name}' --draws {n} makes more"
+                f"n must be at most the {self.n} stored reference draws of {name}, got {n}; "
+                f"make more with: probmotion reference '{name}' --draws {n}"
             )
         return self.positions[rng.permutation(self.n)[:n]].astype(np.float64)
 
     def check(self, name: str, posterior: MotionPosterior) -> None:
-        """Raise ``ValueError`` unless the draws are of this posterior."""
+        """Raise ``ValueError`` unless the draws belong to this posterior."""
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         wanted = self.certificate["fingerprint"]
         found = None
@@ -112,9 +99,8 @@ class StoredReference:
             found = fingerprint_of(posterior, self.positions)
         if found is None or not _same(found, wanted):
             raise ValueError(
-                f"certificate is of another posterior than {name}'s ({wanted} beside {found}), "
-                f"expected one of the same evidence and prior; probmotion reference '{name}' makes "
-                "it"
+                f"certificate must have {name}'s fingerprint {found}, got {wanted}; make the "
+                f"reference with: probmotion reference '{name}'"
             )
 
     def save(self, folder: str | Path) -> Path:
@@ -123,7 +109,7 @@ class StoredReference:
         Raises
         ------
         OSError
-            If it cannot be written; what was there before stays.
+            If it cannot be written; an earlier reference is left intact.
         """
         folder = Path(folder)
         try:
@@ -136,7 +122,7 @@ class StoredReference:
             text = json.dumps(self.certificate, indent=1, allow_nan=False)
             (unfinished / _CERTIFICATE).write_text(text + "\n", encoding="utf-8")
             unfinished.chmod(0o755)
-            _take_the_place_of(unfinished, folder)
+            _replace_folder(unfinished, folder)
         except OSError as error:
             raise _unwritable(folder, error) from error
         finally:
@@ -145,14 +131,14 @@ class StoredReference:
 
     @classmethod
     def load(cls, folder: str | Path) -> StoredReference:
-        """Read what :meth:`save` wrote.
+        """Read a reference written by :meth:`save`.
 
         Raises
         ------
         FileNotFoundError
             If a file is missing.
         ValueError
-            If one is not what it should be.
+            If a file is invalid.
         """
         folder = Path(folder)
         try:
@@ -162,26 +148,25 @@ class StoredReference:
             return cls(positions, dict(certificate))
         except (ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise ValueError(
-                f"{folder} holds no reference ({error}), expected {_DRAWS} and {_CERTIFICATE} that "
-                "probmotion reference wrote"
+                f"{folder} must hold {_DRAWS} and {_CERTIFICATE} of probmotion reference ({error})"
             ) from error
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:
-    """Return the numbers that a reference is known by.
+    """Return the numbers that identify a reference's posterior.
 
-    The posterior's log density at the first draws; where positions have none, that of four θ to
-    start from, and the mean distance of their joints from the origin, metres. Of a density that is
-    cut, the levels of the cuts as well.
+    They are the log density at the first draws; without a density of positions, the log density at
+    four initial θ and the mean distance of their joints from the origin, metres. The truncation
+    levels are appended if there are any.
 
     Raises
     ------
     ValueError
-        If the prior has a density neither of positions nor of θ, or draws of it have none.
+        If the prior has no density, or it is not finite at the draws.
     """
     prior = posterior.prior
     if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):
-        # Whoever wrote them and whoever reads them must ask at the same points: as they are kept.
+        # Evaluated at the points as stored, in float32.
         some = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
         known = [log_density_at(posterior, some)]
     else:
@@ -190,16 +175,16 @@ def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[fl
         known = [to_numpy(posterior.log_density(theta)), distances.mean(axis=(1, 2))]
         if not np.isfinite(known).all():
             raise ValueError(
-                f"posterior has log densities of {known[0].tolist()} at draws of its prior, "
-                "expected finite ones, which a reference is known by"
+                "posterior must have finite log densities at draws of its prior, got "
+                f"{known[0].tolist()}"
             )
-    if isinstance(posterior, TruncatedPosterior) and posterior.reshaped:
+    if isinstance(posterior, TruncatedPosterior) and posterior.truncated:
         known.append(np.array([posterior.log_floor, posterior.log_cap]))
     return [round(float(value), 6) for value in np.concatenate(known)]
 
 
 def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndarray:
-    """Return log p(X) + log p(y | X), up to a constant of y: ``(n, L, J, 3) → (n,)``.
+    """Return log p(X) + log p(y | X), unnormalised: ``(n, L, J, 3) → (n,)``.
 
     Raises
     ------
@@ -209,8 +194,8 @@ def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndar
     prior, likelihood = posterior.prior, posterior.likelihood
     if not isinstance(prior, HasPositionDensity):
         raise ValueError(
-            f"prior {type(prior).__name__} has no density, expected one of positions, "
-            "log_prior(positions), or of θ, log_density(theta)"
+            "prior must have log_prior(positions) or log_density(theta), got "
+            f"{type(prior).__name__}"
         )
     value = to_numpy(prior.log_prior(positions))
     if likelihood is not None:
@@ -224,8 +209,8 @@ def _same(found: list[float], wanted: Any) -> bool:
     return bool(np.allclose(found, np.asarray(wanted, dtype=float), rtol=_TOLERANCE, atol=1e-3))
 
 
-def _take_the_place_of(unfinished: Path, folder: Path) -> None:
-    """Rename a folder to where another may be, which comes back if that fails."""
+def _replace_folder(unfinished: Path, folder: Path) -> None:
+    """Rename a folder, replacing another, which is restored if that fails."""
     if not folder.exists():
         unfinished.rename(folder)
         return
@@ -240,5 +225,4 @@ def _take_the_place_of(unfinished: Path, folder: Path) -> None:
 
 
 def _unwritable(folder: Path, error: OSError) -> OSError:
-    reason = error.strerror or str(error)
-    return OSError(f"cannot write {folder}: {reason}; expected a folder that is writable")
+    return OSError(f"cannot write {folder}: {error.strerror or error}; choose a writable folder")

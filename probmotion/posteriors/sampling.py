@@ -1,4 +1,4 @@
-"""What a sampler is, which samplers there are, and what to say when one does not fit."""
+"""Sampler protocol, the registry of samplers, and compatibility checks."""
 
 from __future__ import annotations
 
@@ -35,13 +35,12 @@ __all__ = [
 class Sampler(Protocol):
     """A frozen dataclass of settings that draws from a posterior.
 
-    ``name`` is what tables call it; ``requires`` lists the protocols of
-    :mod:`probmotion.posteriors.protocols` that the posterior's prior must implement. Where one of
-    two is enough it holds their union, ``A | B``.
+    ``requires`` lists the protocols of :mod:`probmotion.posteriors.protocols` that the prior must
+    implement; a union ``A | B`` requires either.
     """
 
     name: ClassVar[str]
-    # Of type | UnionType; Any, because a sampler that needs no union may say tuple[type, ...].
+    # Any: a sampler without unions may annotate tuple[type, ...].
     requires: ClassVar[tuple[Any, ...]]
 
     def sample(
@@ -54,67 +53,56 @@ class Sampler(Protocol):
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` draws.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the posterior is not one that this sampler can draw from.
-        """
+        """Return ``chains`` × ``draws`` draws."""
 
 
 class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
-    """A sampler cannot draw from a posterior.
+    """A sampler does not support a posterior.
 
     Parameters
     ----------
     sampler : str
         The sampler's name.
     reason : str
-        Why, as the rest of a sentence that begins with the sampler's name.
+        Reason, as the rest of a sentence that begins with the sampler's name.
     word : str
-        The same in one word, for tables.
+        The reason in one word, for tables.
     others : iterable of str, optional
-        Samplers that would do.
+        Suitable samplers.
     """
 
     def __init__(self, sampler: str, reason: str, word: str, others: Iterable[str] = ()) -> None:
-        would_do = ", ".join(others)
-        hint = f"; {would_do} would do" if would_do else ""
+        names = ", ".join(others)
+        hint = f"; try {names}" if names else ""
         super().__init__(f"{sampler} {reason}{hint}")
         self.word = word
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C stopped a sampler; what it had finished is not lost.
-
-    It is a ``KeyboardInterrupt``, so that a program that does not know it stops as usual.
+    """Ctrl-C stopped a sampler; ``draws`` holds the finished draws.
 
     Parameters
     ----------
     draws : MotionDraws
-        The finished draws, the same number in every chain. A chain sampler goes on from them:
+        Finished draws, equally many per chain. A chain sampler continues from them with
         ``sampler.sample(posterior, …, initial=interrupted.draws)``.
     """
 
     def __init__(self, draws: MotionDraws) -> None:
         finished = draws.dataset.sizes["draw"]
-        super().__init__(f"interrupted after {finished} draws per chain, kept in .draws")
+        super().__init__(f"interrupted after {finished} draws per chain, stored in .draws")
         self.draws = draws
 
 
 def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[type | UnionType]:
-    """Return the protocols that ``sampler`` requires and the posterior's prior lacks.
-
-    A union is lacking where none of its protocols is there.
-    """
+    """Return the protocols that ``sampler`` requires and the posterior's prior lacks."""
     return [needed for needed in sampler.requires if not isinstance(posterior.prior, needed)]
 
 
 def require(sampler: Sampler, posterior: MotionPosterior) -> None:
     """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires.
 
-    A prior that another can be made from says how in a mapping ``stand_ins``, by protocol's name.
+    A prior may name substitutes by protocol in a mapping ``stand_ins``, appended to the message.
     """
     lacking = missing(sampler, posterior)
     if lacking:
@@ -123,20 +111,18 @@ def require(sampler: Sampler, posterior: MotionPosterior) -> None:
         hints = [f"; {stand_ins[one]}" for some in names for one in some if one in stand_ins]
         raise UnsupportedPosterior(
             sampler.name,
-            f"needs a prior with {' and '.join(map(' or '.join, names))}, which "
-            f"{type(posterior.prior).__name__} is not{''.join(hints)}",
+            f"needs a prior with {' and '.join(map(' or '.join, names))}, got "
+            f"{type(posterior.prior).__name__}{''.join(hints)}",
             word=names[0][0],
             others=suited(posterior),
         )
 
 
 def suited(posterior: MotionPosterior) -> list[str]:
-    """Return the names of the registered samplers that can draw from a posterior.
+    """Return the names of the importable registered samplers that support a posterior.
 
-    The prior has what they require, a gradient where they need one (``needs_gradient``), no more
-    dimensions than they take by default (``largest_dim``), and what a static method ``draws_from``
-    asks of the posterior. One that cannot be imported, as of
-    a package that is half removed, is none.
+    Besides ``requires``, a sampler may declare ``needs_gradient``, ``largest_dim`` and a static
+    method ``draws_from(posterior)``.
     """
     return [
         name
@@ -149,10 +135,9 @@ def suited(posterior: MotionPosterior) -> list[str]:
 
 
 def importable_samplers() -> dict[str, type[Any]]:
-    """Return the classes of all registered samplers that have defaults, by name.
+    """Return the classes of all registered samplers with default settings, by name.
 
-    One that cannot be imported, as of a package that is half removed, or not be made without
-    settings, is left out, and a warning says so: whoever asks for all is not stopped by one.
+    Samplers that cannot be imported or constructed are skipped with a warning.
     """
     refused: dict[str, ValueError] = {}
     found = {}
@@ -163,11 +148,12 @@ def importable_samplers() -> dict[str, type[Any]]:
         except ValueError as error:
             refused[name] = error
     for reason in refused.values():
-        warnings.warn(f"{reason}; it is left out", stacklevel=2)
+        warnings.warn(f"{reason}; sampler skipped", stacklevel=2)
     return found
 
 
 def _imported(refused: dict[str, ValueError]) -> dict[str, type[Any]]:
+    """Return the importable samplers; add the others' errors to ``refused``."""
     found = {}
     for name in sampler_names():
         try:
@@ -179,18 +165,18 @@ def _imported(refused: dict[str, ValueError]) -> dict[str, type[Any]]:
 
 @cache
 def _registered() -> dict[str, EntryPoint]:
-    kept: dict[str, EntryPoint] = {}
-    # The library's own first: nobody else's takes the place of one.
+    """Return the entry points by name; the library's own take precedence."""
+    registered: dict[str, EntryPoint] = {}
     points = entry_points(group="probmotion.samplers")
     for point in sorted(points, key=lambda point: _package_of(point) != "the package probmotion"):
-        first = kept.setdefault(point.name, point)
+        first = registered.setdefault(point.name, point)
         if first.value != point.value:
             warnings.warn(
-                f"sampler {point.name!r} of {_package_of(point)} is left out: "
+                f"sampler {point.name!r} of {_package_of(point)} is skipped: "
                 f"{_package_of(first)} has one of that name",
                 stacklevel=3,
             )
-    return kept
+    return registered
 
 
 def _package_of(point: EntryPoint) -> str:
@@ -198,10 +184,7 @@ def _package_of(point: EntryPoint) -> str:
 
 
 def sampler_names() -> list[str]:
-    """Return the names of all registered samplers, ours and other packages'.
-
-    A package registers a sampler by an entry point of the group ``probmotion.samplers``.
-    """
+    """Return the names of all samplers registered in the entry-point group probmotion.samplers."""
     return list(_registered())
 
 
@@ -211,8 +194,7 @@ def load_sampler(name: str) -> type[Any]:
     Raises
     ------
     ValueError
-        If no sampler has that name; the message lists the known ones. Or it cannot be imported;
-        the message says from where, whose it is and why.
+        If no sampler has that name, or it cannot be imported.
     """
     known = _registered()
     if name not in known:
@@ -220,11 +202,11 @@ def load_sampler(name: str) -> type[Any]:
     point = known[name]
     try:
         return point.load()
-    # A package of somebody else's may fail in any way as it is imported.
+    # Third-party packages may raise anything on import.
     except Exception as error:
         raise ValueError(
-            f"sampler is {name!r}, which {_package_of(point)} registers as {point.value!r}, "
-            f"expected one that can be imported ({_in_a_line(error)})"
+            f"sampler {name!r} of {_package_of(point)} must be importable from {point.value!r}, "
+            f"got {_in_a_line(error)}"
         ) from error
 
 
@@ -234,15 +216,15 @@ def default_sampler(name: str) -> Any:
     Raises
     ------
     ValueError
-        As :func:`load_sampler`, or if it cannot be made without settings.
+        As :func:`load_sampler`, or if a setting has no default.
     """
     kind = load_sampler(name)
     try:
         return kind()
     except Exception as error:
         raise ValueError(
-            f"sampler is {name!r}, which cannot be made without settings ({_in_a_line(error)}), "
-            "expected an object with its settings"
+            f"sampler {name!r} must have default settings, got {_in_a_line(error)}; pass an object "
+            "with settings"
         ) from error
 
 
@@ -251,7 +233,7 @@ def _in_a_line(error: Exception) -> str:
 
 
 class _Silent:
-    """A progress bar that shows nothing."""
+    """A hidden progress bar."""
 
     def update(self, n: int = 1) -> None:
         """Count ``n`` more."""
@@ -259,10 +241,7 @@ class _Silent:
 
 @contextmanager
 def progress_bar(total: int, label: str, show: bool) -> Iterator[Any]:
-    """Show a bar that counts to ``total`` on standard error; yields an object with ``update(n)``.
-
-    A bar never touches what is computed.
-    """
+    """Show a progress bar on standard error; yield an object with ``update(n)``."""
     if not show:
         yield _Silent()
         return

@@ -1,4 +1,4 @@
-"""`TruncatedPosterior`: a density that is cut off far below its seed and level far above it."""
+"""Truncated posterior: a density bounded below and above relative to its seed (eq. 11)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["TruncatedPosterior", "limit_for_dimension"]
 
-# A draw this near the floor, nats, clings to it.
+# Nats above the floor within which a draw counts as near it.
 _NEAR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class TruncatedPosterior(MotionPosterior):
-    """f* = 0 where f < f₀/c, c f₀ where f > c f₀, else f; f₀ is the seed's (eq. 11).
+    """f* = 0 where f < f₀/c, c f₀ where f > c f₀, else f, with f₀ = f(seed) (eq. 11).
 
-    f is relative to the prior's ``log_measure``, where it has one: what is cut is plausibility,
-    not the volume that a point stands for. A point whose prior is so low that no evidence can lift
-    it above the floor is not compared with the evidence.
+    f is the density relative to the prior's ``log_measure``, if it has one. The likelihood is not
+    evaluated where its upper bound cannot lift f above the floor.
 
     Parameters
     ----------
@@ -33,12 +32,7 @@ class TruncatedPosterior(MotionPosterior):
     seed : ndarray, (dim,), optional
         θ of f₀; 0 by default.
     limit : float
-        c, above 1; infinity leaves the density as it is.
-
-    Raises
-    ------
-    ValueError
-        If ``limit`` is not above 1, or the seed has density 0.
+        c, above 1; infinity disables the truncation.
     """
 
     seed: np.ndarray | None = None
@@ -48,7 +42,7 @@ class TruncatedPosterior(MotionPosterior):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (isinstance(self.limit, int | float) and self.limit > 1):
-            raise ValueError(f"limit must be c above 1, or infinity, got {self.limit!r}")
+            raise ValueError(f"limit must be above 1, got {self.limit!r}")
         theta = np.zeros(self.dim) if self.seed is None else np.asarray(self.seed, np.float64)
         check_shape("seed", theta, (self.dim,))
         check_finite("seed", theta)
@@ -56,13 +50,13 @@ class TruncatedPosterior(MotionPosterior):
         whole = MotionPosterior(self.prior, self.likelihood)
         log_density = float(whole.log_density(theta[None])[0])
         if not math.isfinite(log_density):
-            raise ValueError(f"seed has log density {log_density}, expected one of density above 0")
+            raise ValueError(f"seed must have positive density, got log density {log_density}")
         log_seed = log_density - float(self._log_measure(theta[None])[0])
         object.__setattr__(self, "log_seed", log_seed)
 
     @property
-    def reshaped(self) -> bool:
-        """Whether the density is cut."""
+    def truncated(self) -> bool:
+        """Whether ``limit`` is finite."""
         return math.isfinite(self.limit)
 
     @property
@@ -83,17 +77,17 @@ class TruncatedPosterior(MotionPosterior):
         Raises
         ------
         ValueError
-            With generators where the density is cut: a truncated estimate is not unbiased.
+            With generators and a finite limit: truncating an unbiased estimate biases it.
         """
-        if generators is not None and math.isfinite(self.limit):
+        if generators is not None and self.truncated:
             raise ValueError(
-                f"limit is {self.limit:g}, expected infinity where views are drawn anew: the "
-                "truncation of an unbiased estimate is biased"
+                "limit must be infinite with randomly drawn views (truncating an unbiased estimate "
+                f"biases it), got {self.limit:g}"
             )
         return super().evaluate(theta, generators)
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
-        """Return which draws are at the cap, and which within 1 nat of the floor, as 1 and 0.
+        """Return flags (0 or 1) of draws at the cap and of draws within 1 nat of the floor.
 
         Parameters
         ----------
@@ -113,7 +107,7 @@ class TruncatedPosterior(MotionPosterior):
         measure = getattr(self.prior, "log_measure", None)
         return super()._log_measure(theta) if measure is None else measure(theta)
 
-    def _worth_asking(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
+    def _needs_likelihood(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         bound = getattr(self.likelihood, "log_bound", math.inf)
         with np.errstate(invalid="ignore"):
             most = log_prior - log_measure + bound
@@ -127,9 +121,9 @@ class TruncatedPosterior(MotionPosterior):
 
 
 def limit_for_dimension(dim: int) -> float:
-    """Return a c that does not cut the typical set off: that of a Gaussian in ``dim`` dimensions.
+    """Return a limit c that keeps the typical set of a Gaussian in ``dim`` dimensions.
 
-    There log f lies dim/2 nats below the mode on average, with a standard deviation of √(dim/2);
-    c leaves three of them.
+    log f is dim/2 nats below the mode on average, with standard deviation √(dim/2); log c is the
+    mean plus three standard deviations.
     """
     return math.exp(0.5 * dim + 3 * math.sqrt(0.5 * dim))

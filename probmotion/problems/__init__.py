@@ -1,4 +1,4 @@
-"""The catalogue of problems whose posterior is known."""
+"""Catalogue of test problems with known or certified posteriors."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Posteriors with an answer: what a comparison of samplers is made on."""
+"""Catalogue of test problems for comparing samplers."""
 
 from __future__ import annotations
 
@@ -10,25 +10,20 @@ from functools import cache
 from typing import Any
 
 from probmotion.posteriors.problem import Problem
-from probmotion.posteriors.reference import StoredReference
-from probmotion.problems.clips import CLIP_PROBLEMS, clips_problem
+from probmotion.problems.clips import CLIP_PROBLEMS
 from probmotion.problems.denoising import DENOISING_PROBLEMS
 from probmotion.problems.gait import GAIT_OUTLIER_PROBLEMS, GAIT_PROBLEMS
 from probmotion.problems.learnt import LEARNT_PROBLEMS
-from probmotion.problems.pairs import PAIR_PROBLEMS, pairs_problem
+from probmotion.problems.pairs import PAIR_PROBLEMS
 from probmotion.problems.references.store import find_reference
 from probmotion.threads import one_thread
 
 __all__ = [
-    "Problem",
-    "StoredReference",
-    "clips_problem",
+    "available_problems",
     "load_problem",
-    "pairs_problem",
     "problem_descriptions",
     "problem_names",
     "problem_without_reference",
-    "problems_at_hand",
 ]
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
@@ -37,74 +32,71 @@ _SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")
 
 
 def problem_names() -> list[str]:
-    """Return the names of all problems that :func:`load_problem` knows."""
+    """Return the names of all problems."""
     return [*_GAITS, *_OTHERS]
 
 
-def problems_at_hand() -> tuple[list[str], dict[str, str]]:
-    """Return the names of the problems whose data is here, and of the others why they are not."""
-    found, left_out = [], {}
+def available_problems() -> tuple[list[str], dict[str, str]]:
+    """Return the names of loadable problems, and error messages by name of those without data."""
+    available, missing = [], {}
     for name in problem_names():
         try:
             load_problem(name)
         except FileNotFoundError as error:
-            left_out[name] = str(error)
+            missing[name] = str(error)
         else:
-            found.append(name)
-    return found, left_out
+            available.append(name)
+    return available, missing
 
 
 def problem_descriptions() -> dict[str, str]:
-    """Return one sentence on each problem, by name; none is made for it."""
-    gaits = {name: made.description for name, made in _GAITS.items()}
+    """Return a one-sentence description of every problem, by name, without loading it."""
+    gaits = {name: problem.description for name, problem in _GAITS.items()}
     return gaits | {name: description for name, (description, _) in _OTHERS.items()}
 
 
 def load_problem(name: str, **scale: Any) -> Problem:
-    """Return a problem by name; it is made once per process.
+    """Load a problem by name; cached per process.
 
     Parameters
     ----------
     name : str
-        One of :func:`problem_names`; or what a problem with other numbers calls itself, such as
+        One of :func:`problem_names`, or such a name with parameters, as in
         ``"gait-monocular(frames=20, noise=0.05)"``.
     **scale
-        Numbers that say how hard it is: problems on gaits know ``frames`` and ``components`` and,
-        where there is evidence, ``joints``, ``noise``, ``hidden`` and ``seed``; see
-        :mod:`probmotion.problems.gait`.
+        Parameters of gait problems: ``frames`` and ``components`` and, with observations,
+        ``joints``, ``noise``, ``hidden`` and ``seed``; see :mod:`probmotion.problems.gait`.
 
     Raises
     ------
     ValueError
-        If no problem has that name or it does not know a number, with those that are known; or
-        the kept reference draws are of another posterior.
+        If the problem or a parameter is unknown, or the stored reference draws belong to another
+        posterior.
     FileNotFoundError
-        If it is made from data that is not there; the message says how to get it.
+        If its data are missing; the message says how to get them.
     """
-    return _made(*_asked(name, scale))
+    return _load(*_resolve(name, scale))
 
 
 def problem_without_reference(name: str, **scale: Any) -> Problem:
-    """Return a problem as :func:`load_problem` does, but for reference draws that are kept."""
-    return _bare(*_asked(name, scale))
+    """Load a problem without its stored reference draws."""
+    return _load_without_reference(*_resolve(name, scale))
 
 
 Scale = tuple[tuple[str, Any], ...]
 
 
-def _asked(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
-    """Return the name and what differs from its own numbers, which then address the problem."""
+def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
+    """Return the name and the parameters that differ from the defaults: the cache key."""
     if scaled := _SCALED.fullmatch(name):
-        name, scale = scaled["name"], _read(name, scaled["scale"]) | scale
+        name, scale = scaled["name"], _parse(scaled["scale"]) | scale
     if name not in problem_names():
         raise ValueError(f"problem must be one of {', '.join(problem_names())}, got {name!r}")
     known = _GAITS[name].defaults if name in _GAITS else {}
     for number in scale:
         if number not in known:
-            raise ValueError(
-                f"{name} knows no {number!r}, expected "
-                + (f"one of {', '.join(known)}" if known else "no numbers: it has no scale")
-            )
+            allowed = f"be one of {', '.join(known)}" if known else "not be set"
+            raise ValueError(f"parameters of {name} must {allowed}, got {number!r}")
         if not isinstance(scale[number], Hashable):
             raise ValueError(
                 f"{number} must be a number such as {known[number]!r}, got {scale[number]!r}"
@@ -112,7 +104,7 @@ def _asked(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
     return name, tuple((n, scale[n]) for n in known if n in scale and scale[n] != known[n])
 
 
-def _read(name: str, words: str) -> dict[str, Any]:
+def _parse(words: str) -> dict[str, Any]:
     try:
         call = ast.parse(f"f({words})", mode="eval").body
         assert isinstance(call, ast.Call)
@@ -120,28 +112,28 @@ def _read(name: str, words: str) -> dict[str, Any]:
         return {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise ValueError(
-            f"problem must be numbers such as (frames=20, noise=0.05), got {name!r}"
+            f"parameters must be given as in (frames=20, noise=0.05), got ({words})"
         ) from error
 
 
-def _called(name: str, scale: Scale) -> str:
+def _full_name(name: str, scale: Scale) -> str:
     return f"{name}({', '.join(f'{n}={value}' for n, value in scale)})" if scale else name
 
 
 @cache
-def _made(name: str, scale: Scale) -> Problem:
-    problem = _bare(name, scale)
-    # Nothing is kept of what is exact.
-    kept = None if problem.has_reference else find_reference(problem.name)
-    return problem if kept is None else replace(problem, kept=kept)
+def _load(name: str, scale: Scale) -> Problem:
+    problem = _load_without_reference(name, scale)
+    # Exact problems need no stored draws.
+    stored = None if problem.has_reference else find_reference(problem.name)
+    return problem if stored is None else replace(problem, stored=stored)
 
 
 @cache
-def _bare(name: str, scale: Scale) -> Problem:
-    # Every process of a comparison must make the same problem to the last bit.
+def _load_without_reference(name: str, scale: Scale) -> Problem:
+    # One thread makes problems bit-identical in every process of a comparison.
     with one_thread():
         if name in _GAITS:
-            problem = _GAITS[name](_called(name, scale), **dict(scale))
+            problem = _GAITS[name](_full_name(name, scale), **dict(scale))
             if not scale:
                 return problem
             numbers = ", ".join(f"{number}={value}" for number, value in scale)

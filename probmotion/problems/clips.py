@@ -1,4 +1,4 @@
-"""Problems made from clips, one's own or CMU's: one is held out, a prior fitted to the others."""
+"""Problems made from motion clips: one clip is held out, a prior is fitted to the others."""
 
 from __future__ import annotations
 
@@ -35,41 +35,40 @@ def clips_problem(
     seed: int = 0,
     name: str = "clips",
 ) -> Problem:
-    """Return the problem of a held-out clip's motion, given noisy keypoints of one camera.
+    """Return the problem of recovering a held-out clip from keypoints of one camera.
 
-    The prior is fitted to windows of all other clips, on the joints that all clips share: about
-    1000, evenly apart, or all there are. The truth is the middle window of the held-out clip, its
-    root centred.
+    The prior is fitted to about 1000 evenly spaced windows of the other clips, on the joints common
+    to all clips. The truth is the centred middle window of the held-out clip.
 
     Parameters
     ----------
     motions : sequence of Motion
-        At least two clips, of any skeletons.
+        At least two clips with any skeletons.
     frames : int
         Frames L of the motions.
     fps : float, optional
-        Resample every clip to this rate; needed where they differ.
+        Frame rate to resample to; required if the clips' rates differ.
     rank : int
-        Latent dimensions of each style.
+        Latent dimensions per style.
     styles : int
-        Number of styles, found by clustering.
+        Number of styles, determined by clustering.
     observe : str
-        What is seen of the held-out window: a name of
+        Observations of the held-out window: a name of
         :data:`~probmotion.problems.observations.OBSERVATIONS`; ``"none"`` for generation.
     noise : float
         Standard deviation of a keypoint, metres.
     held_out : int or str
-        Index or name of the clip to hold out.
+        Index or name of the held-out clip.
     seed : int
-        Seed of the clustering and of the keypoints' noise.
+        Seed of clustering and keypoint noise.
     name : str
-        What tables call the problem.
+        Name of the problem in tables.
 
     Raises
     ------
     ValueError
-        If there are too few clips or too short ones, frame rates differ and ``fps`` is not
-        given, no clip has the name ``held_out``, or a style has too few windows for ``rank``.
+        If there are too few or too short clips, frame rates differ without ``fps``, ``held_out`` is
+        unknown, or a style has too few windows for ``rank``.
     """
     check_count("frames", frames, least=2)
     check_positive("noise", noise)
@@ -77,24 +76,21 @@ def clips_problem(
         raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {observe!r}")
     if len(motions) < 2:
         raise ValueError(
-            f"motions has {len(motions)} clip{'s' * (len(motions) != 1)}, expected at least 2: one "
-            "is held out and the prior is fitted to the others"
+            "motions must contain at least 2 clips, one to hold out and others to fit the prior, "
+            f"got {len(motions)}"
         )
-    _refuse_copies(motions)
+    _check_distinct(motions)
     index = _index(motions, held_out)
     with one_thread():
-        clips = _on_common_ground(motions, fps)
+        clips = _harmonised(motions, fps)
         hidden = clips.pop(index)
         if hidden.frames < frames:
-            raise ValueError(
-                f"held_out is {hidden}, expected a clip of at least frames={frames}; hold out "
-                "another or give fewer frames"
-            )
+            raise ValueError(f"held_out must be a clip of at least frames={frames}, got {hidden}")
         long = [clip for clip in clips if clip.frames >= frames]
         if not long:
             raise ValueError(
-                f"motions has at most {max(clip.frames for clip in clips)} frames in the clips "
-                f"that are not held out, expected at least frames={frames} in one"
+                f"motions must contain a clip of at least frames={frames} besides the held-out "
+                f"one, got at most {max(clip.frames for clip in clips)}"
             )
         starts = sum(clip.frames - frames + 1 for clip in long)
         prior = GaussianMixtureMotion.fit(
@@ -106,28 +102,28 @@ def clips_problem(
             seed=seed,
         )
         truth = hidden.window((hidden.frames - frames) // 2, frames).centred()
-        evidence = _observe(truth, observe, noise, seed)
+        likelihood = _observe(truth, observe, noise, seed)
     problem = Problem(
         name,
         _description(long, len(clips) - len(long), hidden, frames, observe, noise),
-        MotionPosterior(prior, evidence),
-        None if evidence is None else truth.positions,
+        MotionPosterior(prior, likelihood),
+        None if likelihood is None else truth.positions,
     )
     return simulated(problem)
 
 
-_observe = observe  # the function, which the argument of the same name hides
+_observe = observe  # shadowed by the argument of the same name
 
 
-def _refuse_copies(motions: Sequence[Motion]) -> None:
-    """A clip that is there twice would be held out and fitted to at once."""
+def _check_distinct(motions: Sequence[Motion]) -> None:
+    """Raise ``ValueError`` for duplicate clips, which would leak the held-out motion."""
     seen: dict[bytes, Motion] = {}
     for motion in motions:
         key = motion.positions.tobytes()
         if key in seen:
             raise ValueError(
-                f"motions has {motion} twice (as {seen[key].name or 'unnamed'} and "
-                f"{motion.name or 'unnamed'}), expected every clip once"
+                f"motions must be distinct, got {motion} twice (as {seen[key].name or 'unnamed'} "
+                f"and {motion.name or 'unnamed'})"
             )
         seen[key] = motion
 
@@ -137,8 +133,7 @@ def _index(motions: Sequence[Motion], held_out: int | str) -> int:
     if isinstance(held_out, str):
         if names.count(held_out) != 1:
             raise ValueError(
-                f"held_out is {held_out!r}, which names {names.count(held_out)} clips, expected "
-                f"one of {', '.join(names)}"
+                f"held_out must name exactly one of {', '.join(names)}, got {held_out!r}"
             )
         return names.index(held_out)
     if not -len(motions) <= held_out < len(motions):
@@ -146,8 +141,8 @@ def _index(motions: Sequence[Motion], held_out: int | str) -> int:
     return held_out % len(motions)
 
 
-def _on_common_ground(motions: Sequence[Motion], fps: float | None) -> list[Motion]:
-    """The clips at one frame rate and with one skeleton."""
+def _harmonised(motions: Sequence[Motion], fps: float | None) -> list[Motion]:
+    """Return the clips with a common frame rate and skeleton."""
     from probmotion.motion.retargeting import common_skeleton
 
     rates = sorted({motion.fps for motion in motions})
@@ -156,7 +151,7 @@ def _on_common_ground(motions: Sequence[Motion], fps: float | None) -> list[Moti
     elif len(rates) > 1:
         listed = ", ".join(f"{rate:.6g}" for rate in rates)
         raise ValueError(
-            f"motions has clips of {listed} frames per second, expected one rate; give fps= to "
+            f"motions must have one frame rate, got {listed} frames per second; set fps= to "
             "resample them"
         )
     skeleton = common_skeleton([motion.skeleton for motion in motions])
@@ -177,18 +172,18 @@ def _description(
     )
 
 
-def _of_cmu(name: str, description: str, observe: str) -> Problem:
-    """Return the problem on the clips of subject 02: walks, runs, jumps, blows and others."""
+def _cmu_problem(name: str, description: str, observe: str) -> Problem:
+    """Return a problem on ten clips of CMU subject 02."""
     clips = [cmu_clip(f"cmu_02_{trial:02}") for trial in range(1, _TRIALS + 1)]
     problem = clips_problem(clips, observe=observe, held_out=_HELD_OUT, name=name)
     return replace(problem, description=description)
 
 
 CLIP_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
-    name: (description, partial(_of_cmu, name, description, observe))
+    name: (description, partial(_cmu_problem, name, description, observe))
     for name, description, observe in (
         ("cmu", f"a second of CMU's subject 02, {_HELD_OUT} held out: generation", "none"),
         ("cmu-monocular", f"{_HELD_OUT}, 2D keypoints of one camera (σ 2 cm)", "monocular"),
     )
 }
-"""What each problem is, and the function that makes it, by name."""
+"""Description and factory of each problem, by name."""

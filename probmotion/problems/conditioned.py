@@ -1,4 +1,4 @@
-"""A posterior as a prior of its own, with exact denoisers: what guidance tries to be."""
+"""Posteriors as priors with exact denoisers, the reference for guidance."""
 
 from __future__ import annotations
 
@@ -14,23 +14,21 @@ __all__ = ["Conditions", "conditioned"]
 
 @runtime_checkable
 class Conditions(Protocol):
-    """A prior that can be had given evidence, with the denoisers that it then has."""
+    """A prior with denoisers conditioned on observations."""
 
     def given(self, likelihood: Likelihood) -> MotionPrior:
-        """Return the prior of motions given the evidence."""
+        """Return the conditioned prior."""
 
 
 def conditioned(posterior: MotionPosterior) -> MotionPosterior:
-    """Return the same distribution with the evidence inside the prior; itself without evidence.
-
-    The denoisers of the prior that is returned are given the evidence.
+    """Return the same distribution with the observations absorbed into the prior.
 
     Raises
     ------
     ValueError
-        If there is evidence, and the prior is neither a Gaussian mixture nor has ``given``.
+        If there are observations and the prior is neither a Gaussian mixture nor has ``given``.
     NotConjugate
-        If a Gaussian mixture's evidence is not linear in the positions with Gaussian noise.
+        If a mixture's likelihood is not linear in the positions with Gaussian noise.
     """
     prior, likelihood = posterior.prior, posterior.likelihood
     if likelihood is None:
@@ -40,6 +38,6 @@ def conditioned(posterior: MotionPosterior) -> MotionPosterior:
     if isinstance(prior, GaussianMixtureMotion):
         return MotionPosterior(ConditionedMixture(prior, likelihood))
     raise ValueError(
-        f"posterior has the prior {type(prior).__name__}, whose denoisers given evidence nobody "
-        "knows, expected GaussianMixtureMotion or one with given(likelihood)"
+        "prior must be GaussianMixtureMotion or have given(likelihood) for exact conditional "
+        f"denoisers, got {type(prior).__name__}"
     )

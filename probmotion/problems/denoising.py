@@ -1,7 +1,6 @@
-"""Problems of denoising: a real motion that was held out, seen as noisy 3D joints.
+"""Denoising problems: a held-out motion observed as noisy 3D joints.
 
-The prior is a Motion-DVAE that learnt other clips, its body is estimated from the noisy joints:
-nothing but the truth's own evidence is known of it.
+The prior is a Motion-DVAE trained on other clips; the body is estimated from the noisy joints.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ __all__ = [
     "body_prior",
     "denoising_problem",
     "gaussian_noise",
-    "limbs_hidden",
+    "limb_occlusions",
 ]
 
 _CLIP = "cmu_02_02"
@@ -37,13 +36,7 @@ _SEED = 0
 
 
 def body_prior(name: str = "body-dvae") -> MotionDVAE:
-    """Return a Motion-DVAE that comes with the package, with its inference network.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the package has no such prior.
-    """
+    """Load a shipped Motion-DVAE with its inference network."""
     from probmotion.models.dvae.motion_denoiser import MotionDenoiser
     from probmotion.models.dvae.motion_dvae import MotionDVAE
 
@@ -62,81 +55,84 @@ def denoising_problem(
     name: str = "denoise",
     description: str = "noisy 3D joints of a motion",
 ) -> Problem:
-    """Return the problem of finding a motion from noisy joints of it.
+    """Return the problem of recovering a motion from its noisy joints.
 
     Parameters
     ----------
     truth : Motion
-        The motion, of the prior's skeleton and frame rate, metres; of any length.
+        The motion, with the prior's skeleton and frame rate, metres; of any length.
     prior : MotionDVAE
-        What is believed; it is taken for the truth's length and for the body whose bone lengths
-        the evidence shows.
+        The prior, adapted to the length of the truth and the observed bone lengths.
     noise : float
         Standard deviation (Student-t: scale) of a coordinate, metres.
     degrees_of_freedom : float, optional
-        Student-t noise with this many; Gaussian by default.
+        Of Student-t noise; Gaussian by default.
     hidden : ndarray of bool, (L, J), optional
-        What is not seen.
+        Occluded joints.
     seed : int
-        Of the noise.
+        Seed of the noise.
     name, description : str
-        What tables call it, and a sentence.
+        Name in tables, and a sentence.
     """
-    evidence = Joints3D.observe(
+    likelihood = Joints3D.observe(
         truth, noise, seed, hidden=hidden, degrees_of_freedom=degrees_of_freedom
     )
-    fitted = prior.of(frames=truth.frames, body=body_of(evidence, prior))
-    return simulated(Problem(name, description, MotionPosterior(fitted, evidence), truth.positions))
+    fitted = prior.of(frames=truth.frames, body=body_of(likelihood, prior))
+    return simulated(
+        Problem(name, description, MotionPosterior(fitted, likelihood), truth.positions)
+    )
 
 
-def body_of(evidence: Joints3D, prior: MotionDVAE) -> np.ndarray:
-    """Return the body that noisy joints show, rest offsets (J, 3), metres.
+def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
+    """Estimate a body from noisy joints; returns rest offsets (J, 3), metres.
 
-    The design's average of the observed body. Bones are as long as observed. Where a joint has
-    several children, such as hips, their directions are those of smoothed joints (Kalman's), which
-    say how wide a body is; where a joint is never seen, all are those of the usual body.
+    Bone lengths are those observed. Bone directions at joints with several children, such as hips,
+    come from Kalman-smoothed joints; if a joint is never visible, they are the prior's.
     """
     from probmotion.data.joint_filters import kalman_smooth
 
-    seen = evidence.entries.visible
+    seen = likelihood.entries.visible
     usual = np.linalg.norm(prior.body, axis=-1)
     lengths = bone_lengths(
-        evidence.joints,
-        evidence.entries.confidence,
+        likelihood.joints,
+        likelihood.entries.confidence,
         prior.skeleton,
-        evidence.noise,
-        evidence.entries.degrees_of_freedom,
+        likelihood.noise,
+        likelihood.entries.degrees_of_freedom,
         typical=usual,
     )
     if not seen.any(axis=0).all():
         return prior.states.of_lengths(lengths)
     smooth, _ = kalman_smooth(
-        evidence.joints, evidence.entries.confidence, noise=gaussian_noise(evidence), fps=prior.fps
+        likelihood.joints,
+        likelihood.entries.confidence,
+        noise=gaussian_noise(likelihood),
+        fps=prior.fps,
     )
     shown = prior.states.body(smooth[seen.all(axis=1)] if seen.all(axis=1).any() else smooth)
     bones = np.linalg.norm(shown, axis=-1)
     return shown * (lengths / np.where(bones > 0, bones, 1.0))[:, None]
 
 
-def gaussian_noise(evidence: Joints3D) -> float:
-    """Return the scale of Gaussian noise for a smoother that knows no other, metres.
+def gaussian_noise(likelihood: Joints3D) -> float:
+    """Return an equivalent Gaussian noise scale for smoothers, metres.
 
-    Of Student-t noise it is that of as much variance, or thrice the scale where it has none.
+    Student-t noise gives its standard deviation, or three times its scale if that is infinite.
     """
-    freedom = evidence.entries.degrees_of_freedom
+    freedom = likelihood.entries.degrees_of_freedom
     if freedom is None:
-        return evidence.noise
-    return evidence.noise * (math.sqrt(freedom / (freedom - 2)) if freedom > 2.25 else 3.0)
+        return likelihood.noise
+    return likelihood.noise * (math.sqrt(freedom / (freedom - 2)) if freedom > 2.25 else 3.0)
 
 
-def limbs_hidden(motion: Motion, *, cut_off: bool = False) -> np.ndarray:
-    """Return what is hidden (L, J): the right arm for a third of the time, then the left leg.
+def limb_occlusions(motion: Motion, *, cut_off: bool = False) -> np.ndarray:
+    """Return the mask of occluded joints (L, J): right arm, then left leg.
 
-    A sixth of the time before and after all is seen. With ``cut_off`` the arm hides from the first
-    frame for a half, the leg from then to the last, so that nothing is known on the other side.
+    Each is occluded for a third of the time, between the first and last sixth. With ``cut_off``
+    each is occluded for a whole half, up to the first or last frame.
     """
     hidden = np.zeros(motion.positions.shape[:2], dtype=bool)
-    first, middle, last = (motion.frames * share // 6 for share in (1, 3, 5))
+    first, middle, last = (motion.frames * sixth // 6 for sixth in (1, 3, 5))
     if cut_off:
         first, last = 0, motion.frames
     for frames, joints in (
@@ -148,12 +144,12 @@ def limbs_hidden(motion: Motion, *, cut_off: bool = False) -> np.ndarray:
 
 
 def _problem(
-    name: str, description: str, noise: float, freedom: float | None, hides: bool
+    name: str, description: str, noise: float, freedom: float | None, occluded: bool
 ) -> Problem:
     prior = body_prior()
     clip = cmu_clip(_CLIP).retarget(prior.skeleton)
     truth = clip.window((clip.frames - prior.frames) // 2, prior.frames)
-    # Nothing is known of where it was recorded.
+    # Move the clip to the origin, as its position carries no information.
     ground = truth.positions[:, prior.skeleton.roots[0]].mean(axis=0) * [1.0, 0.0, 1.0]
     truth = Motion(truth.positions - ground, truth.skeleton, truth.fps, name=name)
     return denoising_problem(
@@ -161,7 +157,7 @@ def _problem(
         prior,
         noise=noise,
         degrees_of_freedom=freedom,
-        hidden=limbs_hidden(truth) if hides else None,
+        hidden=limb_occlusions(truth) if occluded else None,
         seed=_SEED,
         name=name,
         description=description,
@@ -169,9 +165,9 @@ def _problem(
 
 
 def _named(
-    name: str, description: str, noise: float, freedom: float | None = None, hides: bool = False
+    name: str, description: str, noise: float, freedom: float | None = None, occluded: bool = False
 ) -> tuple[str, tuple[str, Callable[[], Problem]]]:
-    return name, (description, partial(_problem, name, description, noise, freedom, hides))
+    return name, (description, partial(_problem, name, description, noise, freedom, occluded))
 
 
 DENOISING_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = dict(
@@ -192,8 +188,8 @@ DENOISING_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = dict(
             "denoise-cmu-occluded",
             "the same (σ 4 cm), an arm and then a leg hidden for a third of a second each",
             0.04,
-            hides=True,
+            occluded=True,
         ),
     ]
 )
-"""What each problem is, and the function that makes it, by name."""
+"""Description and factory of each problem, by name."""

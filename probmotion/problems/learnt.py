@@ -1,5 +1,8 @@
-"""Problems whose prior was learnt from 2D tracks: no one knows the posterior, but what it films
-like can be compared with real 2D motion that was held out, and draws from it with what was seen."""
+"""Problems with priors learnt from 2D tracks.
+
+Generation is scored against held-out 2D motion; posterior sampling uses observations of a prior
+draw.
+"""
 
 from __future__ import annotations
 
@@ -23,58 +26,48 @@ if TYPE_CHECKING:
     from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
     from probmotion.models.vae.motion_vae import MotionVAE
 
-__all__ = ["LEARNT_PROBLEMS", "learnt_problem", "seen_draw_problem"]
+__all__ = ["LEARNT_PROBLEMS", "learnt_problem", "observed_draw_problem"]
 
 _NOISE = 0.02
 
 
 def learnt_problem(name: str, description: str, kind: str) -> Problem:
-    """Return the generation problem of a prior that comes with the package.
+    """Return the generation problem of a shipped prior of class ``kind``.
 
-    Its kind is named, so that a process loads no networks but those of the problems it works on.
-    Beside the prior's weights lie those of the evaluator, ``<name>-evaluator``, and the features
-    of real 2D motion, held out and learnt from, ``<name>-features.npz``; the motion itself is not.
+    The class is given by name, so that importing this module loads no networks. The evaluator is
+    ``<name>-evaluator``; ``<name>-features.npz`` contains features of held-out and training motion.
 
     Raises
     ------
     FileNotFoundError
-        If the package has no such prior.
+        If there is no such prior.
     """
     from probmotion.models.evaluation.evaluator import TrackEvaluator
 
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
-    with np.load(weights / f"{name}-features.npz") as kept:
+    with np.load(weights / f"{name}-features.npz") as features:
         reference = GenerationReference(
             evaluator,
-            kept["held_out"].astype(np.float64),
-            kept["learnt"].astype(np.float64),
-            float(kept["elevation"]),
-            float(kept["distance"]),
+            features["held_out"].astype(np.float64),
+            features["learnt"].astype(np.float64),
+            float(features["elevation"]),
+            float(features["distance"]),
         )
     prior: MotionDiffusion | MotionVAE = getattr(models, kind).load(name)
     problem = Problem(name, description, MotionPosterior(prior), generation=reference)
     return simulated(problem) if isinstance(prior, Samplable) else problem
 
 
-def seen_draw_problem(
+def observed_draw_problem(
     name: str, description: str, prior: str, how: str, *, seed: int = 0
 ) -> Problem:
-    """Return the problem of a motion VAE's draw that one camera sees; the draw is the truth.
+    """Return the problem of recovering a draw of a shipped motion VAE from one camera.
 
-    Parameters
-    ----------
-    name, description : str
-        As in tables.
-    prior : str
-        A motion VAE that comes with the package.
-    how : str
-        What is seen; see :func:`~probmotion.problems.observations.observe`.
-    seed : int
-        Of the draw and its noise.
+    ``how`` is as for :func:`~probmotion.problems.observations.observe`.
     """
     vae = models.MotionVAE.load(prior)
-    # Where the body stands is known here: the draw and its evidence are of one that stands there.
+    # The rigid path is known here.
     vae = vae.placed(vae.rigid)
     truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
     seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
@@ -106,10 +99,10 @@ LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
         (
             "walk-vae-monocular",
             "a draw of walk-vae, 2D keypoints of one camera (σ 2 cm)",
-            seen_draw_problem,
+            observed_draw_problem,
             "walk-vae",
             "monocular",
         ),
     )
 }
-"""What each problem is, and the function that makes it, by name."""
+"""Description and factory of each problem, by name."""

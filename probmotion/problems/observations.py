@@ -1,4 +1,4 @@
-"""What is seen of a problem's true motion, by name."""
+"""Simulated keypoint observations of a true motion, by name."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from probmotion.validation import check_count
 
 __all__ = [
     "OBSERVATIONS",
-    "in_one_camera",
-    "limb_hidden",
+    "limb_occlusion",
+    "middle_frame",
     "nearest_joints",
     "observe",
-    "one_frame",
+    "one_camera_keypoints",
 ]
 
 _ELEVATION = math.pi / 12
@@ -29,48 +29,36 @@ _SPARSE_JOINTS = 6
 def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | None:
     """Return noisy keypoints of ``motion`` in one orthographic camera 15° above the horizon.
 
-    Parameters
-    ----------
-    motion : Motion
-        The true motion, centred.
-    how : str
-        A name of :data:`OBSERVATIONS`.
-    noise : float
-        Standard deviation, metres (the camera shows one image unit per metre).
-    seed : int
-        Seed of the noise.
+    ``how`` is a name of :data:`OBSERVATIONS`; ``noise`` is a standard deviation in metres, with one
+    image unit per metre.
 
     Raises
     ------
     ValueError
-        If ``how`` is unknown; the message lists the known names.
+        If ``how`` is unknown.
     """
     if how not in OBSERVATIONS:
         raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {how!r}")
-    hides = OBSERVATIONS[how]
-    if hides is None:
+    occlusion = OBSERVATIONS[how]
+    if occlusion is None:
         return None
-    return in_one_camera(motion, noise, seed, hides(motion))
+    return one_camera_keypoints(motion, noise, seed, occlusion(motion))
 
 
-def in_one_camera(motion: Motion, noise: float, seed: int, hidden: np.ndarray) -> Keypoints2D:
-    """Return noisy keypoints as :func:`observe` does, but for those ``hidden`` (L, J)."""
+def one_camera_keypoints(
+    motion: Motion, noise: float, seed: int, hidden: np.ndarray
+) -> Keypoints2D:
+    """Return noisy keypoints as :func:`observe` does, with ``hidden`` (L, J) joints occluded."""
     camera = Cameras.ring(1, elevation=_ELEVATION)
     return Keypoints2D.observe(motion, camera, noise, seed, hidden=hidden)
 
 
-def limb_hidden(motion: Motion, share: float) -> np.ndarray:
-    """Return what is hidden (L, J): the longest limb, in the middle ``share`` of the frames.
-
-    Raises
-    ------
-    ValueError
-        If the share is not between 0 and 1.
-    """
+def limb_occlusion(motion: Motion, share: float) -> np.ndarray:
+    """Return a mask (L, J) of the longest limb in the middle ``share`` of the frames."""
     if not 0 <= share <= 1:
-        raise ValueError(f"hidden must be a share of the frames between 0 and 1, got {share!r}")
+        raise ValueError(f"hidden must be between 0 and 1, got {share!r}")
     hidden = _nothing(motion)
-    # As many as the share has, counted in whole frames; the start likewise.
+    # Whole frames, rounded down; the constant absorbs rounding errors.
     start = int((1 - share) / 2 * motion.frames + 1e-9)
     frames = slice(start, start + int(share * motion.frames + 1e-9))
     for joint in _longest_limb(motion.skeleton):
@@ -79,22 +67,16 @@ def limb_hidden(motion: Motion, share: float) -> np.ndarray:
 
 
 def nearest_joints(skeleton: Skeleton, n: int) -> list[int]:
-    """Return the n joints with the fewest ancestors, the root first.
-
-    Raises
-    ------
-    ValueError
-        If the skeleton has fewer.
-    """
+    """Return the n joints with the fewest ancestors, root first."""
     check_count("joints", n)
     if n > skeleton.n_joints:
-        raise ValueError(f"joints must be at most the {skeleton.n_joints} there are, got {n}")
+        raise ValueError(f"joints must be at most {skeleton.n_joints}, got {n}")
     order = sorted(range(skeleton.n_joints), key=lambda joint: len(skeleton.ancestors(joint)))
     return order[:n]
 
 
-def one_frame(motion: Motion) -> np.ndarray:
-    """Return what of the motion is its middle frame, (L, J)."""
+def middle_frame(motion: Motion) -> np.ndarray:
+    """Return the mask (L, J) of the middle frame."""
     seen = _nothing(motion)
     seen[motion.frames // 2] = True
     return seen
@@ -104,19 +86,19 @@ def _nothing(motion: Motion) -> np.ndarray:
     return np.zeros(motion.positions.shape[:2], dtype=bool)
 
 
-def _limb_for_half(motion: Motion) -> np.ndarray:
-    return limb_hidden(motion, 0.5)
+def _limb_half_the_time(motion: Motion) -> np.ndarray:
+    return limb_occlusion(motion, 0.5)
 
 
-def _all_but_a_few(motion: Motion) -> np.ndarray:
-    hidden = ~one_frame(motion)
-    shown = nearest_joints(motion.skeleton, min(_SPARSE_JOINTS, motion.skeleton.n_joints))
-    hidden[:, [j for j in range(motion.skeleton.n_joints) if j not in shown]] = True
+def _all_but_central_joints(motion: Motion) -> np.ndarray:
+    hidden = ~middle_frame(motion)
+    visible = nearest_joints(motion.skeleton, min(_SPARSE_JOINTS, motion.skeleton.n_joints))
+    hidden[:, [j for j in range(motion.skeleton.n_joints) if j not in visible]] = True
     return hidden
 
 
 def _longest_limb(skeleton: Skeleton) -> list[int]:
-    """Return the longest chain of joints from a leaf up to below the nearest branching."""
+    """Return the longest chain of joints from a leaf to below the nearest branching."""
     children = np.bincount([p for p in skeleton.parents if p >= 0], minlength=skeleton.n_joints)
     limbs = []
     for leaf in np.flatnonzero(children == 0):
@@ -132,10 +114,12 @@ def _longest_limb(skeleton: Skeleton) -> list[int]:
 OBSERVATIONS: Mapping[str, Callable[[Motion], np.ndarray] | None] = {
     "none": None,
     "monocular": _nothing,
-    "occluded": _limb_for_half,
-    "sparse": _all_but_a_few,
+    "occluded": _limb_half_the_time,
+    "sparse": _all_but_central_joints,
 }
-"""``none``: no evidence, so that the posterior is the prior; ``monocular``: every joint of every
-frame; ``occluded``: the longest limb hidden in the middle half of the frames; ``sparse``: the
-six joints nearest to the root in the middle frame, and nothing else. Each says what is hidden,
-(L, J)."""
+"""Masks of occluded joints (L, J), by name.
+
+``none``: no observations, the posterior is the prior; ``monocular``: all joints visible;
+``occluded``: longest limb occluded in the middle half of the frames; ``sparse``: only the six
+joints closest to the root visible, in the middle frame.
+"""

@@ -1,7 +1,7 @@
-"""Problems on people who interact closely: annotated 2D pairs, one 3D seed, whole clips held out.
+"""Problems on close interaction: annotated 2D pairs and one 3D seed.
 
-There is no exact answer; what a run is judged by is how well its draws cover the 3D pose-pairs of
-clips that neither the annotations nor the seed are from.
+There is no exact posterior. Runs are scored by how well their draws cover the 3D pose pairs of
+held-out clips, from which neither annotations nor seed are taken.
 """
 
 from __future__ import annotations
@@ -30,34 +30,33 @@ def pairs_problem(
     name: str = "pairs",
     description: str = "",
 ) -> Problem:
-    """Return the problem of covering the pose-pairs of clips that were held out.
+    """Return the problem of covering the pose pairs of held-out clips.
 
-    Frames of the dance of all other clips are annotated in 2D, each in a view drawn at random;
-    their medoid is the one 3D seed.
+    Dance frames of the other clips are annotated in random 2D views; their medoid is the 3D seed.
 
     Parameters
     ----------
     motions : sequence of Motion
-        Clips of ``pair17``.
+        Clips with the skeleton ``pair17``.
     held_out : sequence of str
-        Names of the clips to hold out, whole.
+        Names of the held-out clips.
     n_annotations : int
-        Annotated frames, at most as many as there are.
+        Number of annotated frames, limited by the available ones.
     n_held_out : int
-        Pose-pairs of the held-out clips to be covered, evenly apart.
+        Number of evenly spaced pose pairs of the held-out clips to cover.
     settings : PairSettings, optional
-        The posterior's numbers.
+        Settings of the posterior.
     seed : int
         Seed of frames, views and the likelihood's views.
     name, description : str
-        What tables call the problem.
+        Name in tables, and a sentence.
 
     Raises
     ------
     ValueError
-        If no clip is left or held out, or a clip has another skeleton than ``pair17``.
+        If no clip is left or held out, or a clip has another skeleton.
     """
-    # Compiled code is imported by those who use it.
+    # Import compiled code lazily.
     from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth, hold_out
     from probmotion.interaction.annotations.sources import draw_annotations
     from probmotion.models.pose_pairs.pair_posterior import pair_posterior
@@ -69,16 +68,16 @@ def pairs_problem(
     poses, _, _ = ground_truth(shown)
     first = poses[choose_seed(poses)]
     posterior = pair_posterior(first, annotations, settings, fps=shown[0].fps, view_seed=seed)
-    there = sum(int(dance_frames(motion).sum()) for motion in hidden)
-    covered, _, _ = ground_truth(hidden, min(n_held_out, there))
+    available = sum(int(dance_frames(motion).sum()) for motion in hidden)
+    covered, _, _ = ground_truth(hidden, min(n_held_out, available))
     return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=first[None])
 
 
-_MADE = "two made people who dance, 300 annotated 2D pairs and one 3D seed: coverage"
+_DANCE = "two made people who dance, 300 annotated 2D pairs and one 3D seed: coverage"
 _SALSA = "salsa (CMU 60 and 61), 5599 annotated 2D pairs of 7 clips and one 3D seed: coverage"
 
 
-def _made() -> Problem:
+def _dance() -> Problem:
     from probmotion.data.synthetic.dances import synthetic_dances
     from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
@@ -89,7 +88,7 @@ def _made() -> Problem:
         n_held_out=60,
         settings=PairSettings(n_views=16, n_near=16),
         name="dance-pairs",
-        description=_MADE,
+        description=_DANCE,
     )
 
 
@@ -110,8 +109,8 @@ def _salsa(name: str, description: str, paper: bool) -> Problem:
 _PAPER = "the same with a density that is cut at 100 times the seed's, as published"
 
 PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
-    "dance-pairs": (_MADE, _made),
+    "dance-pairs": (_DANCE, _dance),
     "salsa-pairs": (_SALSA, partial(_salsa, "salsa-pairs", _SALSA, False)),
     "salsa-pairs-paper": (_PAPER, partial(_salsa, "salsa-pairs-paper", _PAPER, True)),
 }
-"""What each problem is, and the function that makes it, by name."""
+"""Description and factory of each problem, by name."""

@@ -1,4 +1,4 @@
-"""What stands around the tables of a comparison's page: what was compared, how to read, notes."""
+"""Header, reading guide and notes of the report."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from probmotion.comparison.results.table import ComparisonTable
 if TYPE_CHECKING:
     from probmotion.comparison.results.grid_results import GridResults
 
-__all__ = ["contents", "facts", "note_ids", "notes", "reading"]
+__all__ = ["contents", "facts", "note_ids", "notes", "reading_guide"]
 
 
-def facts(comparison: GridResults, table: ComparisonTable) -> str:
-    """Return what was compared as a list in HTML: problems, samplers, numbers, versions."""
+def facts(comparison: GridResults) -> str:
+    """Return problems, samplers, sizes and versions as an HTML list."""
     plan = comparison.plan
     failed = len(comparison.failures)
     total = len(plan.problems) * len(plan.samplers) * plan.seeds
-    cells = f"{len(comparison.results)} of {total} finished, {failed} of them without draws"
     entries = {
         "problems": ", ".join(plan.problems),
         "samplers": ", ".join(plan.samplers),
-        "draws": f"{plan.draws} of every sampler, on {plan.chains} chain{'s' * (plan.chains != 1)}",
-        "seeds": f"{plan.seeds}: numbers are mean ± standard deviation over them"
+        "draws": f"{plan.draws} per sampler, on {plan.chains} chain{'s' * (plan.chains != 1)}",
+        "seeds": f"{plan.seeds}; numbers are mean ± standard deviation"
         if plan.seeds > 1
-        else "1: there is no spread to judge a difference by",
-        "cells": cells,
+        else "1; the spread is unknown",
+        "runs": f"{len(comparison.results)} of {total} finished, {failed} of them without draws",
         "versions": _versions(comparison),
     }
     listed = "".join(
@@ -37,7 +36,7 @@ def facts(comparison: GridResults, table: ComparisonTable) -> str:
 
 
 def _versions(comparison: GridResults) -> str:
-    """What the draws say they were made with; they all say the same, or are not reused."""
+    """Return the library versions, which are the same for all draws."""
     for result in comparison.results:
         if result.failure is None:
             draws = comparison.draws(result.problem, result.sampler, result.seed)
@@ -47,7 +46,7 @@ def _versions(comparison: GridResults) -> str:
 
 
 def contents(comparison: GridResults, with_calibration: bool) -> str:
-    """Return the links to all sections as HTML."""
+    """Return links to all sections as HTML."""
     links = [(f"problem-{place}", name) for place, name in enumerate(comparison.plan.problems)]
     links += [("calibration", "calibration")] if with_calibration else []
     links.append(("notes", "notes"))
@@ -55,43 +54,44 @@ def contents(comparison: GridResults, with_calibration: bool) -> str:
     return f'<nav aria-label="Sections"><ul>{items}</ul></nav>'
 
 
-def reading(comparison: GridResults, table: ComparisonTable) -> str:
-    """Return how the measures and the skeletons are to be read, as HTML."""
+def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
+    """Return explanations of metrics, highlights and controls as HTML."""
     legends = "".join(f"<p>{escape(legend)}</p>" for legend in table.legends())
-    marks = (
-        "With one seed no sampler can be told from another, and none is marked."
+    highlights = (
+        "With one seed no sampler can be distinguished from another, so none is highlighted."
         if comparison.plan.seeds == 1
-        else "★ is the best of its column, of those with draws at every seed, ☆ cannot be told "
-        "from it: 95 % intervals of the differences seed by seed, at Holm's levels, hold zero."
+        else "★ is the best of its column among samplers with draws at every seed; ☆ is "
+        "statistically tied with it: 95 % intervals of the paired differences over seeds, at "
+        "Holm's levels, contain 0."
     )
     return f"""\
-<details open><summary>How to read this page</summary>
+<details open><summary>How to read this report</summary>
 {legends}
-<p>{marks}</p>
-<p>A press on a table's head sorts by it, least first, then greatest first. –: does not apply, or
-was not measured. A word in place of numbers says why there are none; it leads to the notes.</p>
-<p id="keys">Skeletons of one problem play and turn together. Drag them, or click on them and use
+<p>{highlights}</p>
+<p>Click a column heading to sort by it, in ascending and then in descending order. –: not
+applicable or not measured. A word in place of numbers links to the note with the reason.</p>
+<p id="keys">All skeletons of a problem move and turn together. Drag them, or click on them and use
 the keys: <kbd>space</kbd> plays and stops, the arrow keys turn, <kbd>,</kbd> and <kbd>.</kbd> go
-one frame back and forth, <kbd>Home</kbd> and <kbd>End</kbd> to the first and the last,
-<kbd>c</kbd> to the camera's view and back.</p>
+one frame back and forth, <kbd>Home</kbd> and <kbd>End</kbd> go to the first and the last frame,
+<kbd>c</kbd> switches the camera's view on and off.</p>
 </details>"""
 
 
 def note_ids(comparison: GridResults) -> dict[tuple[str, str], str]:
-    """Return the id of the note on each problem and sampler that failed."""
+    """Return the id of the note on each failure by problem and sampler."""
     sentences = comparison.notes
     ids: dict[tuple[str, str], str] = {}
     for result in comparison.failures:
         assert result.failure is not None
-        begins = f"{result.sampler} on {result.problem}: {result.failure.message}"
+        beginning = f"{result.sampler} on {result.problem}: {result.failure.message}"
         for place, sentence in enumerate(sentences):
-            if sentence.startswith(begins):
+            if sentence.startswith(beginning):
                 ids.setdefault((result.problem, result.sampler), f"note-{place}")
     return ids
 
 
 def notes(comparison: GridResults) -> str:
-    """Return the sentences to read with the tables as HTML."""
+    """Return the notes as HTML."""
     items = "".join(
         f'<li id="note-{place}">{escape(sentence)}</li>'
         for place, sentence in enumerate(comparison.notes)

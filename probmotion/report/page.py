@@ -1,6 +1,6 @@
-"""The page of a comparison: tables, quality against cost, and every sampler's draws that play.
+"""HTML report of a comparison with tables, plots and animated draws.
 
-One file that asks nothing of the network: what is in it can be put into a paper's supplement.
+The page is self-contained and opens offline.
 """
 
 from __future__ import annotations
@@ -8,21 +8,24 @@ from __future__ import annotations
 import base64
 import io
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
+from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.files import written_whole
-from probmotion.plots.colours import CYCLE, LEFT, RIGHT
-from probmotion.report.animations import BUDGET, players, shown_problems
-from probmotion.report.header import contents, facts, note_ids, notes, reading
-from probmotion.report.motions import Shown
-from probmotion.report.overview import overview
-from probmotion.report.plots import quality_against_cost
-from probmotion.report.tables import Outcome, problem_tables
+from probmotion.plots.animation import animation_script, animation_style
+from probmotion.plots.motion_data import Shown
+from probmotion.plots.quality import plot_quality_against_cost, quality_points
+from probmotion.plots.style import CYCLE
+from probmotion.report.animations import BUDGET, animation, shown_problems
+from probmotion.report.header import contents, facts, note_ids, notes, reading_guide
+from probmotion.report.tables import Outcome, overview, problem_tables
 
 if TYPE_CHECKING:
     from probmotion.calibration.result import Calibration
@@ -34,25 +37,24 @@ _ON_DARK = (
     "#FFFFFF", "#5BB3E8", "#F58A4B", "#2FC79B", "#E39BC2", "#DDA92E", "#9CD0F5", "#C2A27E",
     "#A8A8A8",
 )  # fmt: skip
-"""The colours of CYCLE where paper is dark."""
-_LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
+"""Colours of CYCLE on a dark background."""
 _LEAST = BUDGET // 9
-"""Bytes that are left for motions however large a calibration's picture is."""
+"""Bytes reserved for motions beside large figures."""
 
 
 def write_report(
     comparison: GridResults, path: str | Path, calibration: Calibration | None = None
 ) -> Path:
-    """Write a comparison as one HTML page and return where.
+    """Write the report of a comparison as one HTML page and return its path.
 
     Parameters
     ----------
     comparison : GridResults
-        What was drawn; what is not finished is left out.
+        Results; unfinished runs are left out.
     path : str or Path
-        Where to write, ``.html``.
+        HTML file to write.
     calibration : Calibration, optional
-        Of the same samplers: its table and its plot are shown.
+        Calibration of the same samplers, added as a table and a figure.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def write_report(
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
-        raise ValueError(f"path must be a name that ends in .html, got {str(path)!r}")
+        raise ValueError(f"path must end in .html, got {str(path)!r}")
     page = _page(comparison, calibration)
     with written_whole(path) as unfinished:
         unfinished.write_text(page, encoding="utf-8")
@@ -72,24 +74,26 @@ def write_report(
 
 def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     plan, table = comparison.plan, comparison.table()
-    picture = b"" if calibration is None or not calibration.ranked else _picture(calibration)
-    shown = shown_problems(comparison, max(_LEAST, BUDGET - len(picture)))
+    plots = {name: _quality_plot(table, name) for name in plan.problems}
+    ranks = b"" if calibration is None or not calibration.ranked else _png(calibration.plot)
+    size = len(ranks) + sum(map(len, plots.values()))
+    shown = shown_problems(comparison, max(_LEAST, BUDGET - size))
     ids = note_ids(comparison)
     outcomes = {
         name: {sampler: _outcome(comparison, name, sampler, ids) for sampler in plan.samplers}
         for name in plan.problems
     }
     sections = [
-        _section(comparison, table, name, place, shown.get(name), outcomes[name])
+        _section(comparison, table, name, place, shown.get(name), outcomes[name], plots[name])
         for place, name in enumerate(plan.problems)
     ]
     if calibration is not None:
-        sections.append(_calibration(calibration, picture))
+        sections.append(_calibration(calibration, ranks))
     count = len(plan.samplers), len(plan.problems)
     title = " on ".join(
         f"{n} {kind}{'s' * (n != 1)}" for n, kind in zip(count, ("sampler", "problem"), strict=True)
     )
-    # What the page may load: nothing.
+    # The page loads nothing from elsewhere.
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
     policy += "script-src 'unsafe-inline'"
     return f"""\
@@ -99,23 +103,23 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
 <meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title} — a comparison</title>
+<title>{title} — comparison</title>
 <style>
-{_text("page.css")}{_colours()}</style>
+{animation_style()}{_text("page.css")}{_sampler_colours()}</style>
 </head>
 <body>
 <main>
 <h1>{title}</h1>
-{facts(comparison, table)}
+{facts(comparison)}
 {contents(comparison, calibration is not None)}
-{reading(comparison, table)}
-{overview(comparison, table, outcomes)}
+{reading_guide(comparison, table)}
+{overview(plan, table, outcomes)}
 {chr(10).join(sections)}
 {notes(comparison)}
 </main>
 <script>
 document.querySelectorAll("table").forEach({_text("tables.js")});
-document.querySelectorAll(".player").forEach({_text("animations.js")});
+document.querySelectorAll(".animation").forEach({animation_script()});
 </script>
 </body>
 </html>
@@ -129,32 +133,31 @@ def _section(
     place: int,
     shown: Shown | None,
     outcomes: Mapping[str, Outcome],
+    plot: bytes,
 ) -> str:
-    samplers = list(comparison.plan.samplers)
-    words = {sampler: outcomes[sampler].word for sampler in samplers}
-    seen = '<p class="quiet">No sampler drew from it: there is nothing to be seen.</p>'
+    draws = '<p class="quiet">There are no draws.</p>'
     if shown is not None:
         missing = {
             sampler: outcome.link()
             for sampler, outcome in outcomes.items()
             if outcome.failed == outcome.seeds
         }
-        seen = players(name, shown, place, missing)
+        draws = animation(name, shown, place, missing)
     return f"""\
 <section id="problem-{place}" aria-labelledby="problem-{place}-name">
 <header><h2 id="problem-{place}-name">{escape(name)}</h2></header>
 <p>{escape(comparison.plan.problems[name])}</p>
-{problem_tables(table, name, samplers, outcomes)}
-{quality_against_cost(table, name, words, place)}
+{problem_tables(table, name, list(outcomes), outcomes)}
+{_image(plot, f"Quality against cost on {name}; the tables hold the numbers.")}
 <h3 id="skeletons-{place}">Draws on {escape(name)}</h3>
-{seen}
+{draws}
 </section>"""
 
 
 def _outcome(
     comparison: GridResults, problem: str, sampler: str, ids: Mapping[tuple[str, str], str]
 ) -> Outcome:
-    """How a sampler fared: a cell that is not there was not run."""
+    """Return why a sampler has missing draws; runs without a result are unfinished."""
     seeds = comparison.plan.seeds
     found = [r for r in comparison.results if (r.problem, r.sampler) == (problem, sampler)]
     failures = [result.failure for result in found if result.failure is not None]
@@ -172,58 +175,68 @@ def _outcome(
     )
 
 
-def _picture(calibration: Calibration) -> bytes:
-    """Return the plot of a calibration as it is written for paper: PNG of as few bytes as serve."""
+def _quality_plot(table: ComparisonTable, problem: str) -> bytes:
+    """Return the plot of quality against cost as a PNG file; empty if no sampler has a point."""
+    rows = pd.DataFrame(table[table["problem"] == problem])
+    rows.attrs = table.attrs
+    quality = headline_metric(rows)
+    if quality is None or not quality_points(rows, quality):
+        return b""
+    return _png(lambda path: plot_quality_against_cost(rows, path))
+
+
+def _png(plot: Callable[[Path], object]) -> bytes:
+    """Return a figure as a small PNG file."""
     from PIL import Image
 
     with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder) / "calibration.png"
-        calibration.plot(picture)
-        with Image.open(picture) as drawn:
-            # A palette takes a third of the bytes, and nobody sees it in lines and bars.
-            few = drawn.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    coded = io.BytesIO()
-    few.save(coded, "png")
-    return coded.getvalue()
+        path = Path(folder) / "figure.png"
+        plot(path)
+        with Image.open(path) as image:
+            # A palette needs a third of the bytes, without visible change of lines and bars.
+            small = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    encoded = io.BytesIO()
+    small.save(encoded, "png")
+    return encoded.getvalue()
 
 
-def _calibration(calibration: Calibration, picture: bytes) -> str:
-    """The plot, where there is one, and its numbers and verdicts as words."""
-    coded = base64.b64encode(picture).decode("ascii")
-    shown = (
-        f"""<img class="calibration" src="data:image/png;base64,{coded}"
- alt="Rank histograms and expected coverage of each sampler; their numbers follow as text.">"""
-        if picture
-        else "<p>No sampler has ranks; why is said below.</p>"
-    )
+def _image(png: bytes, description: str, kind: str = "plot") -> str:
+    if not png:
+        return ""
+    encoded = base64.b64encode(png).decode("ascii")
+    source = f"data:image/png;base64,{encoded}"
+    return f'<img class="{kind}" src="{source}" alt="{escape(description)}">'
+
+
+def _calibration(calibration: Calibration, figure: bytes) -> str:
+    """Return the figure, if there is one, and the table of a calibration as HTML."""
+    description = "Rank histograms and expected coverage; the numbers follow as text."
+    shown = _image(figure, description, "plot calibration")
+    if not figure:
+        shown = "<p>No sampler has ranks; the table states the reasons.</p>"
     return f"""\
 <section id="calibration" aria-labelledby="calibration-name">
 <header><h2 id="calibration-name">Calibration</h2></header>
-<p>Truths are drawn from the prior and evidence from the truths: a truth's rank among an honest
-sampler's draws is uniform, and its intervals hold the truth as often as they say.</p>
+<p>Truths are drawn from the prior and observations are simulated from them. For a calibrated
+sampler the rank of a truth among the draws is uniform, and credible sets have nominal coverage.</p>
 {shown}
-<details><summary>The numbers</summary><pre tabindex="0">{escape(str(calibration.table()))}</pre>
+<details><summary>Table</summary><pre tabindex="0">{escape(str(calibration.table()))}</pre>
 </details>
 </section>"""
 
 
-def _colours() -> str:
-    """The package's colours as properties, on light paper and on dark."""
-
-    def properties(left: str, right: str, cycle: tuple[str, ...]) -> str:
-        samplers = "".join(f"--sampler-{place}: {colour}; " for place, colour in enumerate(cycle))
-        return f":root {{ --left: {left}; --right: {right}; {samplers}}}\n"
-
-    classes = "".join(
-        f".sampler-{place} {{ fill: var(--sampler-{place}); stroke: none; }}\n"
-        f".bar.sampler-{place} {{ stroke: var(--sampler-{place}); stroke-width: 1.5; }}\n"
-        for place in range(len(CYCLE))
+def _sampler_colours() -> str:
+    """Return the colours of samplers as CSS, for light and dark backgrounds."""
+    light, dark = (
+        "".join(f"--sampler-{place}: {colour}; " for place, colour in enumerate(cycle))
+        for cycle in (CYCLE, _ON_DARK)
     )
-    dark = properties(_LEFT_ON_DARK, _RIGHT_ON_DARK, _ON_DARK)
+    classes = "".join(
+        f".sampler-{place} {{ fill: var(--sampler-{place}); }}\n" for place in range(len(CYCLE))
+    )
     return (
-        properties(LEFT, RIGHT, CYCLE)
-        + f"@media screen and (prefers-color-scheme: dark) {{ {dark}}}\n"
-        + classes
+        f":root {{ {light}}}\n"
+        f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}\n{classes}"
     )
 
 

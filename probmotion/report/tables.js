@@ -1,10 +1,10 @@
-// Tables that are sorted by a press on a head: least first, then greatest first. report.py calls
-// this function with each table. What has no number stays last.
+// Sort a table by clicks on its headings, ascending and then descending. page.py calls this function
+// with each table. Rows without a number stay last.
 (table) => {
   const body = table.tBodies[0];
-  const heads = [...table.tHead.rows[0].cells];
+  const headings = [...table.tHead.rows[0].cells];
   const value = (row, column) => {
-    // What failed has one cell for all columns.
+    // Rows of failures have one cell for all columns.
     const cell = row.cells[column];
     const number = cell ? Number.parseFloat(cell.dataset.value) : NaN;
     return column === 0 ? row.cells[0].dataset.value.toLowerCase() : number;
@@ -13,11 +13,11 @@
     const missing = Number.isNaN(one) - Number.isNaN(other);
     return missing || (one > other) - (one < other);
   };
-  heads.forEach((head, column) => {
-    head.querySelector("button")?.addEventListener("click", () => {
-      const down = head.getAttribute("aria-sort") === "ascending";
-      heads.forEach((other) => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", down ? "descending" : "ascending");
+  headings.forEach((heading, column) => {
+    heading.querySelector("button")?.addEventListener("click", () => {
+      const down = heading.getAttribute("aria-sort") === "ascending";
+      headings.forEach((other) => other.removeAttribute("aria-sort"));
+      heading.setAttribute("aria-sort", down ? "descending" : "ascending");
       const keyed = [...body.rows].map((row) => [value(row, column), row]);
       keyed.sort(([one], [other]) => {
         const last = Number.isNaN(one) || Number.isNaN(other);

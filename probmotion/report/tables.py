@@ -1,4 +1,4 @@
-"""The tables of a comparison's page: one per problem and kind of measure, to be sorted."""
+"""Sortable tables of the report: an overview, and one per problem and group of metrics."""
 
 from __future__ import annotations
 
@@ -8,32 +8,43 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
-from probmotion.comparison.results.qualities import best_of
-from probmotion.comparison.results.table import _BLOCKS, _mean_and_sd
-from probmotion.report.plots import marker
+import pandas as pd
+
+from probmotion.comparison.results.headline_metrics import (
+    HEADLINE_METRICS,
+    best_of,
+    headline_metric,
+)
+from probmotion.comparison.results.table import BLOCKS, mean_and_sd
+from probmotion.plots.style import CYCLE, style_of
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from probmotion.comparison.results.plan import Plan
 
-__all__ = ["Outcome", "problem_tables", "value_cell"]
+__all__ = ["Outcome", "overview", "problem_tables"]
 
 _FAILURES = ("unsupported", "failed")
+_MARKERS = {
+    "o": "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0z",
+    "s": "M-4.5-4.5h9v9h-9z",
+    "D": "M0-6L6 0L0 6L-6 0z",
+    "^": "M0-6L5.5 4.5h-11z",
+    "v": "M0 6L5.5-4.5h-11z",
+    "P": "M-2-6h4v4h4v4h-4v4h-4v-4h-4v-4h4z",
+    "X": "M-5.5-3L-3-5.5L0-2.5L3-5.5L5.5-3L2.5 0L5.5 3L3 5.5L0 2.5L-3 5.5L-5.5 3L-2.5 0z",
+    "p": "M0-6L5.7-1.9L3.5 4.9H-3.5L-5.7-1.9z",
+    "<": "M-6 0L4.5-5.5v11z",
+    ">": "M6 0L-4.5-5.5v11z",
+}
+"""SVG paths of the markers of :func:`~probmotion.plots.style.style_of`."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a sampler fared on a problem, beside its numbers.
+    """Missing draws of a sampler on a problem.
 
-    Parameters
-    ----------
-    word : str
-        Why it has no draws, at one seed or more; empty where it has them all.
-    sentences : str
-        The same, in full.
-    note : str
-        Where the page says so: an id.
-    failed, seeds : int
-        Seeds without draws, and all seeds.
+    ``word`` and ``sentences`` hold the reason, ``note`` the id of its note, and ``failed`` the
+    number of seeds without draws.
     """
 
     word: str = ""
@@ -43,49 +54,72 @@ class Outcome:
     seeds: int = 1
 
     def link(self) -> str:
-        """Return the word as HTML: the sentence as its title, and a way to the note."""
-        said = escape(self.sentences)
-        return f'<a href="#{self.note}" title="{said}">{escape(self.word)}</a>'
+        """Return the word as a link to the note, with the sentences as its title."""
+        title = escape(self.sentences)
+        return f'<a href="#{self.note}" title="{title}">{escape(self.word)}</a>'
+
+
+def overview(plan: Plan, table: pd.DataFrame, outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
+    """Return the headline metrics of all problems and samplers as an HTML table.
+
+    Empty for a single problem; ``outcomes`` are by problem and sampler.
+    """
+    if len(plan.problems) < 2:
+        return ""
+    header = "".join(
+        f'<th scope="col">{_name(place, sampler)}</th>'
+        for place, sampler in enumerate(plan.samplers)
+    )
+    rows, used = [], set()
+    for place, problem in enumerate(plan.problems):
+        own = table[table["problem"] == problem]
+        metric = headline_metric(own) or "–"
+        used.add(metric)
+        values = {
+            str(name): group.set_index("seed")["value"]
+            for name, group in own[own["metric"] == metric].groupby("sampler", sort=False)
+        }
+        best = best_of(metric, values, range(plan.seeds))
+        entries = "".join(
+            f'<td class="failed">{outcome.link()}</td>'
+            if outcome.failed == outcome.seeds
+            else _value(values.get(sampler), sampler, best)
+            for sampler, outcome in outcomes[problem].items()
+        )
+        link = f'<a href="#problem-{place}">{escape(problem)}</a>'
+        rows.append(f'<tr><th scope="row">{link}</th><td>{escape(metric)}</td>{entries}</tr>')
+    legend = "; ".join(f"{name}: {text}" for name, text in HEADLINE_METRICS.items() if name in used)
+    return f"""\
+<div class="scroll" tabindex="0" role="region" aria-label="overview"><table class="overview">
+<caption>headline metric of every sampler on every problem</caption>
+<thead><tr><th scope="col">problem</th><th scope="col">metric</th>{header}</tr></thead>
+<tbody>
+{chr(10).join(rows)}
+</tbody></table></div>
+<p class="quiet">{escape(legend)}</p>"""
 
 
 def problem_tables(
-    table: pd.DataFrame,
-    problem: str,
-    samplers: Sequence[str],
-    outcomes: Mapping[str, Outcome],
+    table: pd.DataFrame, problem: str, samplers: Sequence[str], outcomes: Mapping[str, Outcome]
 ) -> str:
-    """Return one problem's tables as HTML; measures of no kind are in one that is folded.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Columns problem, sampler, seed, metric, value.
-    problem : str
-        Its name.
-    samplers : sequence of str
-        All of the comparison's, in order.
-    outcomes : mapping of Outcome
-        By sampler.
-    """
+    """Return the tables of one problem as HTML, with further metrics in a folded one."""
     rows = table[(table["problem"] == problem) & ~table["metric"].isin(_FAILURES)]
     values = {
-        (str(sampler), str(metric)): cells.set_index("seed")["value"]
-        for (sampler, metric), cells in rows.groupby(["sampler", "metric"], sort=False)
+        (str(sampler), str(metric)): group.set_index("seed")["value"]
+        for (sampler, metric), group in rows.groupby(["sampler", "metric"], sort=False)
     }
     measured = list(dict.fromkeys(str(name) for name in rows["metric"]))
     draws = table.attrs.get("draws")
     parts, shown = [], {"seconds"}
-    for title, columns in _BLOCKS:
-        heads = {name: words for name, words in columns.items() if name in measured}
-        if set(heads) - {"seconds"}:
-            shown |= set(heads)
-            parts.append(_table(title, heads, samplers, values, outcomes, draws))
+    for title, columns in BLOCKS.items():
+        headings = {name: words for name, words in columns.items() if name in measured}
+        if set(headings) - {"seconds"}:
+            shown |= set(headings)
+            parts.append(_table(title, headings, samplers, values, outcomes, draws))
     others = {name: name for name in measured if name not in shown}
     if others:
-        inside = _table("further measures", others, samplers, values, outcomes, draws)
-        parts.append(
-            f"<details><summary>{len(others)} further measures</summary>{inside}</details>"
-        )
+        inside = _table("further metrics", others, samplers, values, outcomes, draws)
+        parts.append(f"<details><summary>{len(others)} further metrics</summary>{inside}</details>")
     if not parts:
         parts.append(_table("no draws", {"seconds": "seconds"}, samplers, values, outcomes, draws))
     return "\n".join(parts)
@@ -93,7 +127,7 @@ def problem_tables(
 
 def _table(
     title: str,
-    heads: Mapping[str, str],
+    headings: Mapping[str, str],
     samplers: Sequence[str],
     values: Mapping[tuple[str, str], pd.Series],
     outcomes: Mapping[str, Outcome],
@@ -101,29 +135,28 @@ def _table(
 ) -> str:
     seeds = range(max(outcome.seeds for outcome in outcomes.values()))
     best = {}
-    for metric in heads:
-        found = {name: values[name, metric] for name in samplers if (name, metric) in values}
-        best[metric] = best_of(metric, found, seeds, {other for _, other in values}, draws)
+    for metric in headings:
+        own = {name: values[name, metric] for name in samplers if (name, metric) in values}
+        best[metric] = best_of(metric, own, seeds, {other for _, other in values}, draws)
     body = []
     for place, sampler in enumerate(samplers):
         outcome = outcomes[sampler]
         some = f" ({outcome.seeds - outcome.failed} of {outcome.seeds} seeds; {outcome.link()})"
         name = (
-            f'<th scope="row" data-value="{escape(sampler)}">'
-            f'<svg viewBox="-8 -8 16 16" width="12" height="12" aria-hidden="true">{marker(place)}'
-            f"</svg> {escape(sampler)}{some if 0 < outcome.failed < outcome.seeds else ''}</th>"
+            f'<th scope="row" data-value="{escape(sampler)}">{_name(place, sampler)}'
+            f"{some if 0 < outcome.failed < outcome.seeds else ''}</th>"
         )
         if outcome.failed == outcome.seeds:
-            cells = f'<td class="failed" colspan="{len(heads)}">{outcome.link()}</td>'
+            entries = f'<td class="failed" colspan="{len(headings)}">{outcome.link()}</td>'
         else:
-            cells = "".join(
-                value_cell(values.get((sampler, metric)), sampler, best[metric]) for metric in heads
+            entries = "".join(
+                _value(values.get((sampler, metric)), sampler, best[metric]) for metric in headings
             )
-        body.append(f"<tr>{name}{cells}</tr>")
+        body.append(f"<tr>{name}{entries}</tr>")
     row = "".join(
         f'<th scope="col"><button type="button" title="{escape(metric)} in table.csv">'
         f"{escape(words)}</button></th>"
-        for metric, words in heads.items()
+        for metric, words in headings.items()
     )
     return f"""\
 <div class="scroll" tabindex="0" role="region" aria-label="{escape(title)}"><table>
@@ -134,18 +167,29 @@ def _table(
 </tbody></table></div>"""
 
 
-def value_cell(values: pd.Series | None, sampler: str, best: tuple[str | None, set[str]]) -> str:
-    """Return a sampler's number as a cell in HTML, marked where it is the best or tied with it."""
+def _name(place: int, sampler: str) -> str:
+    """Return a sampler's marker and name as HTML."""
+    path = f'<path class="sampler-{place % len(CYCLE)}" d="{_MARKERS[style_of(place)[1]]}"/>'
+    return (
+        f'<svg viewBox="-8 -8 16 16" width="12" height="12" aria-hidden="true">{path}</svg> '
+        f"{escape(sampler)}"
+    )
+
+
+def _value(values: pd.Series | None, sampler: str, best: tuple[str | None, set[str]]) -> str:
+    """Return a sampler's number as an HTML cell, highlighted if it is the best or tied with it."""
     if values is None:
-        return '<td><span class="quiet" title="does not apply, or was not measured">–</span></td>'
-    text = _mean_and_sd(values)
+        return '<td><span class="quiet" title="not applicable or not measured">–</span></td>'
+    text = mean_and_sd(values)
     each = "; ".join(f"seed {seed}: {value:.6g}" for seed, value in values.items())
     mean = float(values.mean())
     sortable = f' data-value="{mean:.8g}"' if math.isfinite(mean) else ""
     kind = ""
     if sampler == best[0]:
-        kind, text = ' class="best"', f'{text}<span class="mark" title="best">★</span>'
+        kind, text = ' class="best"', text + '<span class="highlight" title="best">★</span>'
     elif sampler in best[1]:
-        kind = ' class="tied"'
-        text = f'{text}<span class="mark" title="not to be told from the best">☆</span>'
+        kind, text = (
+            ' class="tied"',
+            f'{text}<span class="highlight" title="tied with the best">☆</span>',
+        )
     return f'<td{kind}{sortable} title="{each}">{text}</td>'

@@ -1,4 +1,4 @@
-"""Samplers that denoise: ancestral, multi-view and score distillation."""
+"""Samplers based on denoisers: ancestral, multi-view and score distillation."""
 
 import lazy_loader
 

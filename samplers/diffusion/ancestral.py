@@ -1,98 +1,71 @@
-"""The ancestral loop that `ancestral3d`, `mas` and `mvpc` share.
+"""DDPM ancestral sampling (Ho et al. 2020, algorithm 2).
 
-From noise at level T down to a clean motion: at every level the state gives an estimate of the
-clean motion, and the next state is drawn from the DDPM posterior around it.
+From noise at level T to a clean motion: at every level the clean motion is estimated, and the next
+state is drawn from the DDPM posterior around the estimate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from probmotion.posteriors.noise_schedule import NoiseSchedule, PosteriorStep
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.noise_schedule import NoiseSchedule
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.sampling import require
+from probmotion.samplers.diffusion.guidance import Guide, can_guide
+from probmotion.samplers.diffusion.views import StateDenoiser
+from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.seeds import NormalStreams
+from probmotion.validation import check_count
 
 __all__ = [
+    "AncestralSampler",
     "Corrector",
-    "Guide",
     "MotionState",
     "State",
-    "StateDenoiser",
-    "Watch",
     "ancestral",
     "cosine_schedule",
     "sigma",
 ]
 
 
-class StateDenoiser(Protocol):
-    """A denoiser of one noisy 3D motion, exact or made of 2D ones."""
-
-    gram: np.ndarray
-    counts: dict[str, int]
-
-    def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
-        """Return the estimate of the clean motion, all arrays (B, L, J, 3)."""
-
-    def covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return (symmetric) covariance of the clean motion times v, all arrays (B, L, J, 3)."""
-
-
-Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
-"""(x_t, ᾱ, estimate, posterior step) → the estimate given the evidence, (B, L, J, 3)."""
-
-
 class State(Protocol):
-    """What the loop carries from level to level."""
+    """Representation of a noisy motion in the loop, one motion or several views."""
 
     schedule: NoiseSchedule
     counts: dict[str, int]
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
-        """Return fresh unit noise for a state at level t."""
+        """Return unit noise for a state at level t."""
 
     def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
         """Return the estimate of the clean motion from the state at level t, (B, L, J, 3)."""
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
-        """Return clean motions (B, L, J, 3) in the state's form."""
+        """Convert clean motions (B, L, J, 3) to the representation of the state."""
 
 
+@dataclass
 class MotionState:
-    """One noisy 3D motion per draw, (B, L, J, 3).
+    """One noisy 3D motion per draw, (B, L, J, 3), with ``shape`` (L, J, 3).
 
-    Parameters
-    ----------
-    denoiser : StateDenoiser
-        What estimates the clean motion.
-    schedule : NoiseSchedule
-        The noise levels.
-    shape : tuple of int
-        (L, J, 3).
-    guide : Guide, optional
-        Corrects the estimate for the evidence.
-    noise_factor : callable, optional
-        σ → a matrix F (3, 3) by which unit noise ε is turned into F ε, or ``None`` for ε itself.
+    ``guide`` corrects the estimate of the clean motion for the observations. ``noise_factor`` maps
+    σ to a matrix F, (3, 3), for noise F ε, or to ``None`` for the identity.
     """
 
-    def __init__(
-        self,
-        denoiser: StateDenoiser,
-        schedule: NoiseSchedule,
-        shape: tuple[int, ...],
-        guide: Guide | None = None,
-        noise_factor: Callable[[float], np.ndarray | None] | None = None,
-    ) -> None:
-        self.denoiser = denoiser
-        self.counts = denoiser.counts
-        self.schedule = schedule
-        self.shape = shape
-        self.guide = guide
-        self.noise_factor = noise_factor
+    denoiser: StateDenoiser
+    schedule: NoiseSchedule
+    shape: tuple[int, ...]
+    guide: Guide | None = None
+    noise_factor: Callable[[float], np.ndarray | None] | None = None
+    counts: dict[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.counts = self.denoiser.counts
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
         """Return F(σ_t) ε, ε ~ N(0, I)."""
@@ -101,7 +74,7 @@ class MotionState:
         return noise if factor is None else noise @ factor.T
 
     def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
-        """Return the denoiser's estimate, given the evidence where there is any."""
+        """Return the guided estimate of the clean motion."""
         alpha_bar = float(self.schedule.alpha_bar[t])
         clean = self.denoiser.denoise(x_t, alpha_bar)
         if self.guide is None:
@@ -109,15 +82,12 @@ class MotionState:
         return self.guide(x_t, alpha_bar, clean, self.schedule.posterior(t))
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
-        """Return the motions as they are."""
+        """Return the motions."""
         return motions
 
 
 Corrector = Callable[[State, NormalStreams, np.ndarray, int], np.ndarray]
 """(state, streams, x_t, t) → another state at the same level t."""
-
-Watch = Callable[[np.ndarray | None, np.ndarray | None], None]
-"""(estimate, unit noise added to it): first (None, the first noise), last (the result, None)."""
 
 
 def cosine_schedule(steps: int, trained_steps: int | None, power: int) -> NoiseSchedule:
@@ -135,26 +105,14 @@ def ancestral(
     stop: int = 1,
     variance_for_deviation: bool = False,
     corrector: Corrector | None = None,
-    watch: Watch | None = None,
+    watch: Callable[[np.ndarray | None, np.ndarray | None], None] | None = None,
 ) -> np.ndarray:
-    """Return one motion per stream, (B, L, J, 3): the last estimate.
+    """Return one motion per stream, (B, L, J, 3): the estimate at level ``stop``.
 
-    Parameters
-    ----------
-    state : State
-        What is carried, and how to denoise it.
-    streams : NormalStreams
-        One per draw.
-    tick : callable
-        Called after every level.
-    stop : int
-        The level whose estimate is returned.
-    variance_for_deviation : bool
-        Multiply the noise by β̃_t, as MAS's Algorithm 1 is printed, in place of √β̃_t.
-    corrector : Corrector, optional
-        Applied to every new state.
-    watch : Watch, optional
-        Told every estimate and every noise.
+    ``tick`` is called after every level. With ``variance_for_deviation`` the noise is multiplied
+    by β̃_t, as printed in algorithm 1 of MAS, instead of √β̃_t. ``corrector`` is applied to every
+    new state. ``watch`` is called with every estimate and the unit noise added to it: first with
+    (None, initial noise), last with (result, None).
     """
     schedule = state.schedule
     x = state.noise(streams, schedule.steps)
@@ -171,7 +129,7 @@ def ancestral(
         if corrector is not None:
             x = corrector(state, streams, x, t - 1)
         tick()
-    # Level 0 is the estimate itself: q(x₀ | x₁, x̂₀) has all its mass there.
+    # q(x₀ | x₁, x̂₀) is a point mass at the estimate.
     clean = state.estimate(x, stop)
     if watch is not None:
         watch(clean, None)
@@ -183,3 +141,79 @@ def sigma(schedule: NoiseSchedule, t: int) -> float:
     """Return the noise level σ = √((1−ᾱ)/ᾱ)."""
     alpha_bar = float(schedule.alpha_bar[t])
     return float(np.sqrt((1 - alpha_bar) / alpha_bar))
+
+
+class AncestralSampler:
+    """Base of the ancestral samplers of 3D motions: frozen dataclasses with these settings."""
+
+    name: ClassVar[str]
+    requires: ClassVar[tuple[type, ...]]
+    draws_from = staticmethod(can_guide)
+    effort: ClassVar[tuple[str, ...]] = ("steps",)
+    least_effort: ClassVar[int] = 2
+
+    steps: int
+    trained_steps: int | None
+    schedule_power: int
+    batch: int
+
+    def __post_init__(self) -> None:
+        check_count("batch", self.batch)
+        cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
+
+    @property
+    def schedule(self) -> NoiseSchedule:
+        """The noise levels."""
+        return cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
+
+    def sample(
+        self,
+        posterior: MotionPosterior,
+        *,
+        draws: int = 1000,
+        chains: int = 1,
+        seed: int = 0,
+        initial: MotionDraws | np.ndarray | None = None,
+        progress: bool = True,
+    ) -> MotionDraws:
+        """Return ``chains`` × ``draws`` independent draws.
+
+        Warns
+        -----
+        UserWarning
+            If the sampler uses views with elevation 0.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the prior lacks the denoiser, the likelihood is not linear Gaussian, or the guidance
+            or the views do not support the prior or observations.
+        """
+        require(self, posterior)
+        refuse_initial(self, initial)
+        state = self._state(posterior)
+        return draw_independently(
+            self,
+            posterior,
+            lambda streams, tick: self._run(state, streams, tick),
+            draws=draws,
+            chains=chains,
+            seed=seed,
+            batch=self.batch,
+            steps=self.steps - self._last_level + 1,
+            scale=posterior.prior.scale,  # type: ignore[attr-defined]
+            counts=state.counts,
+            progress=progress,
+        )
+
+    @property
+    def _last_level(self) -> int:
+        return 1
+
+    def _state(self, posterior: MotionPosterior) -> State:
+        raise NotImplementedError
+
+    def _run(
+        self, state: State, streams: NormalStreams, tick: Callable[[], Any], **options: Any
+    ) -> np.ndarray:
+        return ancestral(state, streams, tick, stop=self._last_level, **options)

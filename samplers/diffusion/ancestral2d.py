@@ -1,12 +1,9 @@
-"""`Ancestral2D`: DDPM ancestral sampling of one view, the upper bound of MAS's table 2.
-
-A motion in 3D can be no better, seen from a side, than what the 2D denoiser draws by itself.
-"""
+"""Ancestral sampling of a single view."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +13,13 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
-from probmotion.posteriors.sampling import UnsupportedPosterior, batches, progress_bar, suited
+from probmotion.posteriors.sampling import (
+    UnsupportedPosterior,
+    batches,
+    progress_bar,
+    require,
+    suited,
+)
 from probmotion.samplers.diffusion.ancestral import ancestral, cosine_schedule
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
@@ -26,10 +29,9 @@ __all__ = ["Ancestral2D"]
 
 @dataclass(frozen=True)
 class Ancestral2D:
-    """Ancestral sampling (Ho et al. 2020, algorithm 2) of one view of a motion.
+    """DDPM ancestral sampling of one view with a 2D denoiser: the upper bound in table 2 of MAS.
 
-    It returns pictures, not motions, and therefore is no
-    :class:`~probmotion.posteriors.sampling.Sampler` and not among the registered ones.
+    It returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
 
     Parameters
     ----------
@@ -38,18 +40,13 @@ class Ancestral2D:
     trained_steps : int, optional
         Steps of the schedule that the T levels are taken from; ``steps`` by default.
     schedule_power : int
-        Of the cosine schedule: 2 as published by Nichol and Dhariwal (2021), 4 in the MAS
-        authors' code.
+        Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
     batch : int
-        Draws at a time; changes memory and speed, never the draws.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
+        Maximum batch size; does not affect the draws.
     """
 
     name: ClassVar[str] = "ancestral2d"
+    requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
 
     steps: int = 100
     trained_steps: int | None = None
@@ -74,21 +71,21 @@ class Ancestral2D:
         camera: Cameras | None = None,
         progress: bool = True,
     ) -> np.ndarray:
-        """Return independent draws of what one camera sees.
+        """Return independent draws of one view.
 
         Parameters
         ----------
         posterior : MotionPosterior
-            A prior without evidence.
+            A prior without observations.
         draws : int
-            Number of draws; draw i is the same however many there are.
+            Number of draws; does not affect a draw.
         seed : int
-            Of the noise.
+            Seed of the noise.
         camera : Cameras, optional
-            The one view, which a network ignores and an exact denoiser needs; by default
-            orthographic, elevation π/16.
+            The view, for exact denoisers; networks ignore it. By default orthographic with
+            elevation π/16.
         progress : bool
-            Show a bar.
+            Show a progress bar.
 
         Returns
         -------
@@ -98,70 +95,56 @@ class Ancestral2D:
         Raises
         ------
         UnsupportedPosterior
-            If the prior has no 2D denoiser, or there is evidence.
+            If the prior has no 2D denoiser, or there are observations.
         ValueError
-            If a number is out of range or ``camera`` has several views.
+            If ``camera`` has several views.
         """
         prior = self._prior(posterior)
         check_count("draws", draws)
-        seen = Cameras.ring(1, elevation=math.pi / 16) if camera is None else camera
-        if seen.n_views != 1:
-            raise ValueError(f"camera has {seen.n_views} views, expected one")
+        view = Cameras.ring(1, elevation=math.pi / 16) if camera is None else camera
+        if view.n_views != 1:
+            raise ValueError(f"camera must have one view, got {view.n_views}")
         shape = (posterior.frames, posterior.skeleton.n_joints, 2)
-        state = _ViewState(prior, seen, self.schedule, shape)
+        state = _ViewState(prior, view, self.schedule, shape)
         bars = progress_bar(self.steps * -(-draws // self.batch), self.name, progress)
         done: list[np.ndarray] = []
-        # How a product is split over threads depends on its size, and its rounding on the split.
+        # Multithreaded products round differently for different batch sizes.
         with threadpool_limits(1, user_api="blas"), bars as bar:
-
-            def tick() -> None:
-                bar.update(1)
-
             for some in batches([(0, draw) for draw in range(draws)], self.batch):
                 streams = NormalStreams.of_draws(seed, list(some))
-                done.append(ancestral(state, streams, tick) * prior.scale)
+                done.append(ancestral(state, streams, lambda: bar.update(1)) * prior.scale)
         return np.concatenate(done)
 
     def _prior(self, posterior: MotionPosterior) -> Denoises2D:
-        prior = posterior.prior
-        if not isinstance(prior, Denoises2D):
-            raise UnsupportedPosterior(
-                self.name,
-                f"needs a prior with Denoises2D, which {type(prior).__name__} is not",
-                word="Denoises2D",
-            )
+        require(self, posterior)  # type: ignore[arg-type]
+        assert isinstance(posterior.prior, Denoises2D)
         if posterior.likelihood is not None:
             raise UnsupportedPosterior(
                 self.name,
-                "draws single views of a prior and has no place for evidence",
+                "does not support observations",
                 word="observations",
                 others=suited(posterior),
             )
-        return prior
+        return posterior.prior
 
 
+@dataclass
 class _ViewState:
     """One noisy view per draw, (B, L, J, 2), normalised units."""
 
-    def __init__(
-        self, prior: Denoises2D, camera: Cameras, schedule: NoiseSchedule, shape: tuple[int, ...]
-    ) -> None:
-        self.prior = prior
-        self.camera = camera
-        self.schedule = schedule
-        self.shape = shape
-        self.counts = {"denoiser": 0}
+    prior: Denoises2D
+    camera: Cameras
+    schedule: NoiseSchedule
+    shape: tuple[int, ...]
+    counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
-        """Return unit noise."""
         return streams.normal(*self.shape)
 
     def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
-        """Return the denoised view."""
         self.counts["denoiser"] += len(x_t)
         alpha_bar = float(self.schedule.alpha_bar[t])
         return self.prior.denoise(x_t[:, None], alpha_bar, self.camera)[:, 0]
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
-        """Return the views as they are."""
         return motions

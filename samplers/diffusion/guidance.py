@@ -1,14 +1,13 @@
-"""Guidance: how evidence corrects a denoiser's estimate of the clean motion.
+"""Guidance of denoisers by observations.
 
-Evidence y = A X + noise of precision W, in normalised units. A guidance sees the estimate D of
-E[X₀ | X_t] and returns one of E[X₀ | X_t, y].
+Linear Gaussian observations y = A X + noise of precision W, in normalised units. A guidance maps
+the estimate D of E[X₀ | X_t] to an estimate of E[X₀ | X_t, y].
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -16,25 +15,26 @@ from probmotion.posteriors.noise_schedule import PosteriorStep
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import NotConjugate
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, suited
-from probmotion.samplers.diffusion.ancestral import Guide, StateDenoiser
-from probmotion.samplers.diffusion.views import symmetric_power
+from probmotion.samplers.diffusion.views import StateDenoiser, symmetric_power
 from probmotion.validation import check_count, check_positive
 
 __all__ = [
     "DPS",
     "AnyGuidance",
-    "Evidence",
+    "Guide",
     "MomentMatched",
     "Replacement",
     "WeightedTriangulation",
     "can_guide",
-    "conjugate_gradients",
     "guide_towards",
 ]
 
+Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
+"""(x_t, ᾱ, estimate, posterior step) → the estimate given the observations, (B, L, J, 3)."""
+
 
 def can_guide(posterior: MotionPosterior) -> bool:
-    """Return whether there is no evidence, or such as a guidance can follow."""
+    """Return whether the likelihood is linear Gaussian, or there are no observations."""
     try:
         return posterior.likelihood is None or bool(_linear(posterior))
     except NotConjugate:
@@ -42,25 +42,19 @@ def can_guide(posterior: MotionPosterior) -> bool:
 
 
 def _linear(posterior: MotionPosterior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, y and W of the evidence, metres."""
+    """Return A, y and W of the likelihood, metres."""
     linear = getattr(posterior.likelihood, "linear", None)
     if linear is None:
-        raise NotConjugate(f"{type(posterior.likelihood).__name__} does not offer linear()")
+        raise NotConjugate(f"{type(posterior.likelihood).__name__} has no method linear()")
     return linear()
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Linear Gaussian evidence in normalised units: y_v = A_v X + noise of precision W.
+class LinearObservations:
+    """Linear Gaussian observations y_v = A_v X + noise of precision W, in normalised units.
 
-    Parameters
-    ----------
-    axes : ndarray, (V, M, 3)
-        A_v.
-    target : ndarray, (V, L, J, M)
-        y.
-    precision : ndarray, (V, L, J)
-        W; 0 hides an entry.
+    ``axes`` are A_v, (V, M, 3); ``target`` is y, (V, L, J, M); ``precision`` is W, (V, L, J), and 0
+    for missing entries.
     """
 
     axes: np.ndarray
@@ -68,20 +62,14 @@ class Evidence:
     precision: np.ndarray
 
     @classmethod
-    def of(cls, sampler: Sampler, posterior: MotionPosterior) -> Evidence:
-        """Return the posterior's evidence, metres turned into normalised units.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If it is not linear in the positions with Gaussian noise.
-        """
+    def of(cls, sampler: Sampler, posterior: MotionPosterior) -> LinearObservations:
+        """Return the observations of a posterior; raise an error if they are not linear."""
         try:
             axes, target, precision = _linear(posterior)
         except NotConjugate as error:
             raise UnsupportedPosterior(
                 sampler.name,
-                f"is guided by linear evidence with Gaussian noise, but {error}",
+                f"supports only linear Gaussian likelihoods, but {error}",
                 word="observations",
                 others=suited(posterior),
             ) from error
@@ -90,7 +78,7 @@ class Evidence:
 
     @property
     def confidence(self) -> np.ndarray:
-        """Precision relative to the surest entry, (V, L, J)."""
+        """Precision relative to the largest, (V, L, J)."""
         top = self.precision.max(initial=0.0)
         return self.precision / top if top > 0 else self.precision
 
@@ -109,19 +97,18 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MomentMatched:
-    """X₀ | X_t as the Gaussian N(D, C), C from the denoiser's Jacobian, conditioned on y.
+    """Moment matching: X₀ | X_t ~ N(D, C) conditioned on y, C from the denoiser's Jacobian.
 
         D + C Aᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D)
 
     Exact for a Gaussian prior with its exact 3D denoiser. The system is solved by conjugate
-    gradients from products with C alone (Finzi et al. 2023; Boys et al. 2024).
+    gradients (Finzi et al. 2023; Boys et al. 2024).
 
     Parameters
     ----------
     steps : int
-        Conjugate-gradient steps, one product with C each. The method supposes that C is a
-        covariance, which a learnt denoiser's Jacobian is not quite: a draw's system is left as it
-        is where that shows, so that more steps than the default bring such draws nothing.
+        Maximum conjugate-gradient steps, one product with C each. The Jacobian of a learnt
+        denoiser is only approximately a covariance; a draw stops earlier where this shows.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -130,29 +117,29 @@ class MomentMatched:
     def __post_init__(self) -> None:
         check_count("steps", self.steps)
 
-    def prepare(self, evidence: Evidence, denoiser: StateDenoiser) -> Guide:
+    def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
         """Return the guide of one run."""
-        root = np.sqrt(evidence.precision)[..., None]
+        root = np.sqrt(observations.precision)[..., None]
 
         def guide(
             x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
         ) -> np.ndarray:
             def spread(entries: np.ndarray) -> np.ndarray:
                 """C Aᵀ W^½ u."""
-                pulled = evidence.adjoint(root * entries)
+                pulled = observations.adjoint(root * entries)
                 return denoiser.covariance_product(x_t, alpha_bar, pulled)
 
             def whiten(motions: np.ndarray) -> np.ndarray:
                 """W^½ A X."""
-                return root * evidence.observe(motions)
+                return root * observations.observe(motions)
 
-            residual = root * (evidence.target - evidence.observe(clean))
-            # W^½ on both sides keeps hidden entries (W = 0) in the system at no cost.
+            residual = root * (observations.target - observations.observe(clean))
+            # Symmetric weighting by W^½, because W⁻¹ does not exist for missing entries.
             guided = clean + conjugate_gradients(spread, whiten, residual, self.steps)
             if not np.isfinite(guided).all():
                 raise ValueError(
-                    f"guidance with steps {self.steps} diverged at alpha_bar {alpha_bar:.3g}, "
-                    "expected fewer steps: the denoiser's Jacobian is not symmetric"
+                    f"guidance with steps={self.steps} diverged at alpha_bar={alpha_bar:.3g}, "
+                    "because the denoiser's Jacobian is not symmetric; use fewer steps"
                 )
             return guided
 
@@ -161,14 +148,14 @@ class MomentMatched:
 
 @dataclass(frozen=True)
 class DPS:
-    """A step down the gradient of ‖y − A D(X_t)‖ after every denoising step.
+    """Diffusion posterior sampling: a gradient step on ‖y − A D(X_t)‖ per denoising step.
 
-    Diffusion posterior sampling (Chung et al. 2023, algorithm 1, ζ_i = ζ/‖y − A D‖).
+    Chung et al. (2023, algorithm 1) with ζ_i = ζ/‖y − A D‖.
 
     Parameters
     ----------
     step_size : float
-        ζ.
+        Step size ζ.
     """
 
     kind: str = field(default="dps", init=False)
@@ -177,22 +164,22 @@ class DPS:
     def __post_init__(self) -> None:
         check_positive("step_size", self.step_size)
 
-    def prepare(self, evidence: Evidence, denoiser: StateDenoiser) -> Guide:
+    def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
         """Return the guide of one run."""
-        confidence = evidence.confidence[..., None]
+        confidence = observations.confidence[..., None]
         half = symmetric_power(denoiser.gram, 0.5)
         inverse_half = symmetric_power(denoiser.gram, -0.5)
 
         def guide(
             x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
         ) -> np.ndarray:
-            residual = evidence.target - evidence.observe(clean)
+            residual = observations.target - observations.observe(clean)
             length = np.sqrt((confidence * residual**2).sum(axis=(1, 2, 3, 4), keepdims=True))
-            pulled = evidence.adjoint(confidence * residual / np.maximum(length, 1e-300))
+            pulled = observations.adjoint(confidence * residual / np.maximum(length, 1e-300))
             # ∇‖y − A D‖ = −Jᵀ Aᵀ (y − A D)/‖y − A D‖ with J = √ᾱ/(1−ᾱ) M^(-½) C M^(½).
             product = denoiser.covariance_product(x_t, alpha_bar, pulled @ inverse_half)
             gradient = -(np.sqrt(alpha_bar) / (1 - alpha_bar)) * (product @ half)
-            # Moving x_{t−1} by −ζ ∇ is moving the estimate by −ζ ∇ over its weight in x_{t−1}.
+            # The estimate has weight step.clean in x_{t−1}, which is to move by −ζ ∇.
             return clean - (self.step_size / step.clean) * gradient
 
         return guide
@@ -200,36 +187,29 @@ class DPS:
 
 @dataclass(frozen=True)
 class Replacement:
-    """The observed coordinates of the estimate are overwritten by the evidence.
+    """Replacement of the observed coordinates of the estimate by the observations.
 
-    As motion diffusion models edit motions (Tevet et al. 2023, section 4.3); noise in y is
-    ignored, but where entries disagree they are averaged by precision.
+    As in motion editing (Tevet et al. 2023, section 4.3). Observations are treated as exact;
+    inconsistent ones are averaged by precision.
     """
 
     kind: str = field(default="replacement", init=False)
 
-    def prepare(self, evidence: Evidence, denoiser: StateDenoiser) -> Guide:
+    def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
         """Return the guide of one run."""
-        confidence = evidence.confidence
-        inverse = np.linalg.pinv(evidence.information(confidence), hermitian=True)
-
-        def guide(
-            x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
-        ) -> np.ndarray:
-            residual = confidence[..., None] * (evidence.target - evidence.observe(clean))
-            return clean + np.einsum("ljxy,bljy->bljx", inverse, evidence.adjoint(residual))
-
-        return guide
+        confidence = observations.confidence
+        inverse = np.linalg.pinv(observations.information(confidence), hermitian=True)
+        return _least_squares(observations, confidence, inverse)
 
 
 @dataclass(frozen=True)
 class WeightedTriangulation:
-    """The evidence enters the triangulation as further views, M⁻¹ Σ P_vᵀ x̂_v being the others.
+    """Observations as additional views in the triangulation M⁻¹ Σ P_vᵀ x̂_v.
 
     Parameters
     ----------
     weight : float
-        Of an observed entry of highest confidence; the sampler's own views have 1 each.
+        Weight of the most precise observations; the views of the sampler have weight 1.
     """
 
     kind: str = field(default="weighted-triangulation", init=False)
@@ -238,47 +218,50 @@ class WeightedTriangulation:
     def __post_init__(self) -> None:
         check_positive("weight", self.weight)
 
-    def prepare(self, evidence: Evidence, denoiser: StateDenoiser) -> Guide:
+    def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
         """Return the guide of one run."""
-        weight = self.weight * evidence.confidence
-        inverse = np.linalg.inv(denoiser.gram + evidence.information(weight))
+        weight = self.weight * observations.confidence
+        inverse = np.linalg.inv(denoiser.gram + observations.information(weight))
+        return _least_squares(observations, weight, inverse)
 
-        def guide(
-            x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
-        ) -> np.ndarray:
-            residual = weight[..., None] * (evidence.target - evidence.observe(clean))
-            return clean + np.einsum("ljxy,bljy->bljx", inverse, evidence.adjoint(residual))
 
-        return guide
+def _least_squares(
+    observations: LinearObservations, weight: np.ndarray, inverse: np.ndarray
+) -> Guide:
+    """Return the guide D + ``inverse`` Aᵀ w (y − A D)."""
+
+    def guide(
+        x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
+    ) -> np.ndarray:
+        residual = weight[..., None] * (observations.target - observations.observe(clean))
+        return clean + np.einsum("ljxy,bljy->bljx", inverse, observations.adjoint(residual))
+
+    return guide
 
 
 AnyGuidance = MomentMatched | DPS | Replacement | WeightedTriangulation
 
 
 def guide_towards(
-    sampler: Sampler, posterior: MotionPosterior, guidance: AnyGuidance, denoiser: Any
+    sampler: Sampler, posterior: MotionPosterior, guidance: AnyGuidance, denoiser: StateDenoiser
 ) -> Guide | None:
-    """Return the guide to the posterior's evidence; ``None`` where there is none.
+    """Return the guide of a posterior; ``None`` without observations.
 
-    Raises
-    ------
-    UnsupportedPosterior
-        If the evidence is not linear with Gaussian noise, or the guidance needs products with the
-        denoiser's covariance and the prior has none.
+    Raises :class:`UnsupportedPosterior` if the likelihood is not linear Gaussian, or the guidance
+    needs the covariance of the denoiser and the prior does not provide it.
     """
     if posterior.likelihood is None:
         return None
-    evidence = Evidence.of(sampler, posterior)
+    observations = LinearObservations.of(sampler, posterior)
     protocol = denoiser.covariance_protocol
     if isinstance(guidance, MomentMatched | DPS) and not isinstance(posterior.prior, protocol):
         raise UnsupportedPosterior(
             sampler.name,
-            f"with guidance {guidance.kind} needs a prior with {protocol.__name__}, which "
-            f"{type(posterior.prior).__name__} is not; expected one, or guidance replacement or "
-            "weighted-triangulation",
+            f"with guidance {guidance.kind} needs a prior with {protocol.__name__}, got "
+            f"{type(posterior.prior).__name__}; use guidance replacement or weighted-triangulation",
             word=protocol.__name__,
         )
-    return guidance.prepare(evidence, denoiser)
+    return guidance.prepare(observations, denoiser)
 
 
 def conjugate_gradients(
@@ -287,26 +270,17 @@ def conjugate_gradients(
     residual: np.ndarray,
     steps: int,
 ) -> np.ndarray:
-    """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``.
+    """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``, (B, …).
 
-    One system per row of the first axis, solved side by side; a row that has converged stays. So
-    does one whose system shows that it comes of no covariance: it is smaller than the identity
-    along a direction, or directions are not conjugate (:func:`_of_covariance`).
-
-    Parameters
-    ----------
-    spread, whiten : callable
-        Linear maps whose product ``whiten(spread(·))`` is symmetric and not negative.
-    residual : ndarray, (B, …)
-        Right-hand sides.
-    steps : int
-        Steps, one ``spread`` each.
+    Rows of the first axis are independent systems. A row stops when it has converged, or when its
+    matrix turns out not to be the identity plus a covariance (:func:`_of_covariance`).
+    Each step evaluates ``spread`` once.
     """
     size = _products(residual, residual)
     enough = 1e-28 * size
     active = np.ones(len(residual), dtype=bool)
     direction, before = residual, (np.zeros_like(residual), np.zeros(len(residual)))
-    answer: np.ndarray | None = None
+    solution: np.ndarray | None = None
     for _ in range(steps):
         moved = spread(direction)
         image = direction + whiten(moved)
@@ -314,15 +288,15 @@ def conjugate_gradients(
         active &= (size > enough) & _of_covariance(direction, image, curvature, *before)
         length = np.where(active, size / np.where(active, curvature, 1.0), 0.0)
         part = moved * _rows(length, moved)
-        answer = part if answer is None else answer + part
+        solution = part if solution is None else solution + part
         residual = residual - image * _rows(length, image)
         after = _products(residual, residual)
         ratio = np.where(active, after / np.where(active, size, 1.0), 0.0)
         before = direction, curvature
         direction = residual + direction * _rows(ratio, direction)
         size = after
-    assert answer is not None
-    return answer
+    assert solution is not None
+    return solution
 
 
 _ROUNDING = 1e-9
@@ -336,11 +310,10 @@ def _of_covariance(
     before: np.ndarray,
     curvature_before: np.ndarray,
 ) -> np.ndarray:
-    """Return of which rows the system A = I + K may be one with a covariance K, (B,).
+    """Return for which rows the matrix A = I + K is consistent with a covariance K, (B,).
 
-    d · A d is |d|² at least where K is not negative, and the direction before is conjugate,
-    d′ · A d = 0, where K is symmetric. With a learnt denoiser's Jacobian neither holds for sure,
-    and steps of conjugate gradients may grow without end.
+    If K is positive semidefinite, d · A d ≥ |d|²; if it is symmetric, the previous direction is
+    conjugate, d′ · A d = 0. Otherwise conjugate gradients may diverge.
     """
     square = _products(direction, direction)
     rounding = _ROUNDING * np.sqrt(square * _products(image, image))
@@ -350,7 +323,7 @@ def _of_covariance(
 
 
 def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the inner product of each row, ``(B, …), (B, …) → (B,)``."""
+    """Return row-wise inner products, ``(B, …), (B, …) → (B,)``."""
     return (one * other).sum(axis=tuple(range(1, one.ndim)))
 
 

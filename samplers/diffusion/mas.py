@@ -1,30 +1,24 @@
-"""`MultiViewAncestral`: multi-view ancestral sampling (MAS), Algorithm 1 of the paper.
+"""Multi-view ancestral sampling (MAS, algorithm 1).
 
-V views of one 3D motion are denoised together by a 2D denoiser; after every step a consistency
-block turns the V estimates into one 3D motion and back.
+A 2D denoiser is applied to V views of one 3D motion. After every step the V estimates are
+triangulated to one 3D motion, which is projected back.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from probmotion.geometry.cameras import Cameras
-from probmotion.posteriors.draws import MotionDraws
-from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import UnsupportedPosterior, require
-from probmotion.samplers.diffusion.ancestral import MotionState, ancestral, cosine_schedule
-from probmotion.samplers.diffusion.guidance import (
-    AnyGuidance,
-    MomentMatched,
-    can_guide,
-    guide_towards,
-)
+from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State
+from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.diffusion.separate_views import SeparateViews
 from probmotion.samplers.diffusion.views import (
     MultiViewDenoiser,
@@ -32,7 +26,6 @@ from probmotion.samplers.diffusion.views import (
     views_around,
     warn_of_level_views,
 )
-from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive, check_shape
 
@@ -40,61 +33,51 @@ __all__ = ["MultiViewAncestral", "MultiViewTrace"]
 
 
 @dataclass(frozen=True)
-class MultiViewAncestral:
-    """Multi-view ancestral sampling (MAS, Algorithm 1) with a 2D denoiser.
+class MultiViewAncestral(AncestralSampler):
+    """Multi-view ancestral sampling (MAS, algorithm 1) with a 2D denoiser.
 
     With orthographic views and shared noise the V noisy views are projections of one noisy 3D
-    motion, which is kept in their place.
-
-    A budget sets ``steps`` (:mod:`probmotion.comparison.results.budgets`).
+    motion, which then is the state of the sampler.
 
     Parameters
     ----------
     steps : int
         Number of denoising steps T.
     n_views : int
-        V, evenly around the motion; two are 120° apart.
+        Number of views V, evenly spaced in azimuth; two are 120° apart.
     elevation : float
-        Of all views, radians.
+        Elevation of all views, radians.
     perspective : bool
-        Perspective views; the noise is projected orthographically in any case (section 4.2).
-        The prior's denoiser must take them: an exact one does not.
+        Use perspective views; the noise is projected orthographically (section 4.2). Exact
+        denoisers do not support them.
     distance : float
-        Metres from the views to the origin; matters to perspective views alone.
+        Distance of perspective views from the origin, metres.
     shared_noise : bool
-        Project one 3D noise into all views, rather than independent noise per view.
+        Project one 3D noise into all views instead of drawing independent noise per view.
     view_weights : tuple of float, optional
-        How much each view counts in the triangulation; 1 each by default.
+        Weights of the views in the triangulation; 1 by default.
     trained_steps : int, optional
         Steps of the schedule that the T levels are taken from; ``steps`` by default.
     schedule_power : int
-        Of the cosine schedule: 2 as published, 4 in the authors' code.
+        Power of the cosine schedule: 2 as published, 4 in the authors' code.
     stop_level : int
-        The level whose estimate is returned; the authors' code stops at 2.
+        Last level, whose estimate is returned; 2 in the authors' code.
     variance_for_deviation : bool
-        Multiply the noise by the DDPM posterior's variance, as line 8 of Algorithm 1 is printed,
-        rather than by its standard deviation.
+        Multiply the noise by the variance of the DDPM posterior, as printed in line 8 of
+        algorithm 1, instead of its standard deviation.
     guidance : AnyGuidance
-        How evidence enters.
+        Conditioning on the observations.
     batch : int
-        Draws at a time; changes memory and speed, never the draws.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
+        Maximum batch size; does not affect the draws.
 
     Notes
     -----
-    Line 8 of Algorithm 1 also prints the factors of x_t and of the reprojected estimate the wrong
-    way round; here each has its own (Ho et al. 2020, equation 7).
+    Line 8 of algorithm 1 also swaps the factors of x_t and of the reprojected estimate; here they
+    are those of Ho et al. (2020, equation 7).
     """
 
     name: ClassVar[str] = "mas"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
-    draws_from = staticmethod(can_guide)
-    effort: ClassVar[tuple[str, ...]] = ("steps",)
-    least_effort: ClassVar[int] = 2
 
     steps: int = 100
     n_views: int = 5
@@ -111,8 +94,8 @@ class MultiViewAncestral:
     batch: int = 256
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_count("n_views", self.n_views, least=2)
-        check_count("batch", self.batch)
         check_count("stop_level", self.stop_level)
         check_positive("distance", self.distance)
         if self.stop_level > self.schedule.steps:
@@ -126,9 +109,9 @@ class MultiViewAncestral:
 
     @classmethod
     def reference_code(cls) -> MultiViewAncestral:
-        """Return the settings of the authors' released code, where they differ from the paper.
+        """Return the settings of the authors' released code.
 
-        Not reproduced: its triangulation by an optimiser that stops before the minimum.
+        Its triangulation by an optimiser that stops before convergence is not reproduced.
         """
         return cls(n_views=7, perspective=True, schedule_power=4, stop_level=2)
 
@@ -139,64 +122,11 @@ class MultiViewAncestral:
             self.n_views, self.elevation, distance=self.distance, perspective=self.perspective
         )
 
-    @property
-    def schedule(self) -> NoiseSchedule:
-        """The noise levels."""
-        return cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
-
-    def sample(
-        self,
-        posterior: MotionPosterior,
-        *,
-        draws: int = 1000,
-        chains: int = 1,
-        seed: int = 0,
-        initial: MotionDraws | np.ndarray | None = None,
-        progress: bool = True,
-    ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` independent draws.
-
-        Warns
-        -----
-        UserWarning
-            If the elevation is 0.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the prior has no 2D denoiser or none for such views, the evidence is not linear
-            with Gaussian noise, the guidance needs what the prior lacks, or there is evidence and
-            the views are perspective or their noise is not shared.
-        """
-        require(self, posterior)
-        refuse_initial(self, initial)
-        warn_of_level_views(self.name, self.elevation)
-        state = self._state(posterior)
-        return draw_independently(
-            self,
-            posterior,
-            lambda streams, tick: ancestral(
-                state,
-                streams,
-                tick,
-                stop=self.stop_level,
-                variance_for_deviation=self.variance_for_deviation,
-            ),
-            draws=draws,
-            chains=chains,
-            seed=seed,
-            batch=self.batch,
-            steps=self.steps - self.stop_level + 1,
-            scale=posterior.prior.scale,  # type: ignore[attr-defined]
-            counts=state.counts,
-            progress=progress,
-        )
-
     def trace(self, posterior: MotionPosterior, *, draws: int, seed: int = 0) -> MultiViewTrace:
-        """Return what :meth:`sample` estimates and adds on its way to its first chain's draws."""
+        """Return the estimates and noises of the draws of :meth:`sample` in its first chain."""
         require(self, posterior)
         if not self.shared_noise:
-            raise ValueError("shared_noise is False, expected True: a new view needs the 3D noise")
+            raise ValueError("shared_noise must be True to project the noise to a new view")
         state = self._state(posterior)
         views = Views(self.cameras)
         estimates: list[np.ndarray] = []
@@ -209,18 +139,16 @@ class MultiViewAncestral:
                 noises.append(noise if noise.shape[-1] == 3 else views.combine(noise))
 
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
-        ancestral(
-            state,
-            streams,
-            lambda: None,
-            stop=self.stop_level,
-            variance_for_deviation=self.variance_for_deviation,
-            watch=watch,
-        )
+        self._run(state, streams, lambda: None, watch=watch)
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return MultiViewTrace(self, np.stack(estimates), np.stack(noises), scale)
 
-    def _state(self, posterior: MotionPosterior) -> MotionState | SeparateViews:
+    @property
+    def _last_level(self) -> int:
+        return self.stop_level
+
+    def _state(self, posterior: MotionPosterior) -> State:
+        warn_of_level_views(self.name, self.elevation)
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
@@ -232,25 +160,31 @@ class MultiViewAncestral:
         if posterior.likelihood is not None:
             raise UnsupportedPosterior(
                 self.name,
-                "is guided by evidence only where the views are orthographic and share their "
-                f"noise, and perspective is {self.perspective}, shared_noise {self.shared_noise}",
+                "supports observations only with perspective=False and shared_noise=True, got "
+                f"perspective={self.perspective} and shared_noise={self.shared_noise}",
                 word="observations",
             )
         return SeparateViews(prior, self.cameras, views, self.schedule, shape, self.shared_noise)
 
+    def _run(
+        self, state: State, streams: NormalStreams, tick: Callable[[], Any], **options: Any
+    ) -> np.ndarray:
+        power = self.variance_for_deviation
+        return super()._run(state, streams, tick, variance_for_deviation=power, **options)
+
 
 @dataclass(frozen=True, eq=False)
 class MultiViewTrace:
-    """The estimates and noises of a run of MAS, to be seen from new views (MAS, appendix D).
+    """Estimates and noises of a run of MAS, from which new views are computed (appendix D).
 
     Parameters
     ----------
     sampler : MultiViewAncestral
-        The run's settings.
+        Settings of the run.
     estimates : ndarray, (T − stop + 1, B, L, J, 3)
         X⁽ⁱ⁾, the triangulated estimate at each level from T down, normalised units.
     noises : ndarray, (T − stop + 1, B, L, J, 3)
-        ε₃D⁽ⁱ⁾: the first state, then the noise that was added after each estimate but the last.
+        ε₃D⁽ⁱ⁾: the initial noise, then the noise added after each estimate except the last.
     scale : float
         Metres per normalised unit.
     """
@@ -261,14 +195,14 @@ class MultiViewTrace:
     scale: float
 
     def replay(self, cameras: Cameras, level: int = 0) -> np.ndarray:
-        """Return the noisy 2D motion at a level as new views would have carried it.
+        """Return the noisy 2D motion at a level in new views.
 
         Parameters
         ----------
         cameras : Cameras
-            The new views.
+            New views.
         level : int
-            From T, pure noise, to 0, the finished motion.
+            Between T, pure noise, and 0, the clean motion.
 
         Returns
         -------
@@ -278,26 +212,25 @@ class MultiViewTrace:
         Raises
         ------
         ValueError
-            If the run did not come to that level.
+            If the run did not reach the level.
         """
         sampler, schedule = self.sampler, self.sampler.schedule
-        reached = [0, *range(sampler.stop_level, schedule.steps + 1)]
-        if level not in reached:
+        if level not in [0, *range(sampler.stop_level, schedule.steps + 1)]:
             raise ValueError(
-                f"level must be 0 or one from {sampler.stop_level} to {schedule.steps}, got {level}"
+                f"level must be 0 or between {sampler.stop_level} and {schedule.steps}, got {level}"
             )
         if level == 0:
-            return self._see(cameras, self.estimates[-1])
+            return self._project(cameras, self.estimates[-1])
         views = Views(cameras)
         x = views.project(self.noises[0])
         for i, t in enumerate(range(schedule.steps, level, -1)):
             step = schedule.posterior(t)
             power = 2 if sampler.variance_for_deviation else 1
             noise = step.deviation**power * views.project(self.noises[i + 1])
-            x = step.clean * self._see(cameras, self.estimates[i]) + step.noisy * x + noise
+            x = step.clean * self._project(cameras, self.estimates[i]) + step.noisy * x + noise
         return x
 
-    def _see(self, cameras: Cameras, motions: np.ndarray) -> np.ndarray:
+    def _project(self, cameras: Cameras, motions: np.ndarray) -> np.ndarray:
         if cameras.orthographic:
             return Views(cameras).project(motions)
         return cameras.project(motions * self.scale) / self.scale

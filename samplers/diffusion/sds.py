@@ -1,10 +1,7 @@
-"""`ScoreDistillation`: SDS, the adaptation of DreamFusion that MAS is compared with.
+"""Score distillation sampling (SDS), the adaptation of DreamFusion in MAS.
 
-The motion is optimised directly: see it from a random view, add noise, ask the 2D denoiser what
-the noise was, and descend w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
-It seeks modes rather than drawing from the prior. A prior that denoises its own coordinates is
-optimised in those, with evidence or without
-(:mod:`~probmotion.samplers.diffusion.coordinate_distillation`).
+The motion is optimised: project it to a random view, add noise, estimate the noise with the 2D
+denoiser, and descend w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["ScoreDistillation", "score_distillation_gradient"]
+__all__ = ["ScoreDistillation"]
 
 Levels = Literal["uniform", "annealed"]
 Weighting = Literal["constant", "variance", "residual"]
@@ -38,50 +35,41 @@ Weighting = Literal["constant", "variance", "residual"]
 
 @dataclass(frozen=True)
 class ScoreDistillation:
-    """Score distillation sampling with a 2D denoiser, or one of the prior's own coordinates.
+    """Score distillation sampling with a 2D denoiser, or a denoiser of the prior's coordinates.
 
-    Every draw has its own start and its own noise. The level t and the views of an iteration are
-    those of all draws of a run, because a denoiser takes one level at a time. It seeks modes: draws
-    of a posterior huddle at its modes, and their spread is far too small (over-confident).
-
-    In coordinates there are no views: ``n_views``, ``elevation``, ``azimuths``, ``arc`` and
-    ``shared_noise`` are of a 2D denoiser only.
-
-    A budget sets ``iterations`` (:mod:`probmotion.comparison.results.budgets`).
+    SDS seeks modes: its draws are overconfident, with a spread far below that of the posterior.
+    Draws have independent starts and noises, but all draws of a run share the level t and the
+    views of an iteration. Priors without a 2D denoiser are optimised in their coordinates, with or
+    without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`).
 
     Parameters
     ----------
     iterations : int
         Gradient steps per draw.
     n_views : int
-        Views per iteration, at different random azimuths.
+        Views per iteration, at different random azimuths; 2D denoisers only.
     elevation : float
-        Of all views, radians.
+        Elevation of all views, radians; 2D denoisers only.
     azimuths : int
-        The views are drawn from this many azimuths evenly along the arc; an exact prior prepares
-        each of them once.
+        Number of evenly spaced azimuths to choose from; 2D denoisers only.
     arc : float
-        Radians of the circle that azimuths are drawn from, from 0; all by default.
+        Range of the azimuths from 0, radians; the full circle by default. 2D denoisers only.
     shared_noise : bool
-        Project one 3D noise into the views of an iteration, rather than independent noise.
+        Project one 3D noise into the views of an iteration instead of drawing independent noise;
+        2D denoisers only.
     levels : {"uniform", "annealed"}
-        t ~ U{1..T−1}, or t falling from T − 1 to 1 over the iterations.
+        t ~ U{1..T−1}, or t decreasing from T − 1 to 1 over the iterations.
     weighting : {"constant", "variance", "residual"}
-        w(t): 1; 1 − ᾱ_t (DreamFusion); √(1−ᾱ_t)/√ᾱ_t, with which the gradient is the residual
-        p(X) − x̂₀, that of MAS's loss (appendix B).
+        w(t): 1; 1 − ᾱ_t (DreamFusion); or √(1−ᾱ_t)/√ᾱ_t, for which the gradient is the residual
+        p(X) − x̂₀, as in the loss of MAS (appendix B).
     learning_rate : float
-        Of Adam, normalised units; in coordinates, units of θ.
+        Learning rate of Adam, in normalised units, or in units of θ.
     steps : int
-        T of the cosine schedule.
+        Number of levels T of the cosine schedule.
     schedule_power : int
-        Of the cosine schedule: 2 as published, 4 in the MAS authors' code.
+        Power of the cosine schedule: 2 as published, 4 in the code of MAS.
     batch : int
-        Draws at a time; changes memory and speed, never the draws.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range or a name unknown.
+        Maximum batch size; does not affect the draws.
     """
 
     name: ClassVar[str] = "sds"
@@ -109,19 +97,19 @@ class ScoreDistillation:
         check_positive("learning_rate", self.learning_rate)
         check_positive("arc", self.arc)
         if self.arc > 2 * math.pi:
-            raise ValueError(f"arc must be at most the circle, 2 pi, got {self.arc}")
+            raise ValueError(f"arc must be at most 2 pi, got {self.arc}")
         for name, known in (("levels", Levels), ("weighting", Weighting)):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(
-                    f"{name} is {getattr(self, name)!r}, expected one of "
-                    f"{', '.join(get_args(known))}"
+                    f"{name} must be one of {', '.join(get_args(known))}, got "
+                    f"{getattr(self, name)!r}"
                 )
 
     @classmethod
     def reference_code(cls) -> ScoreDistillation:
-        """Return the settings of the MAS authors' released code, where they differ from the paper.
+        """Return the settings of the released code of MAS.
 
-        Its azimuths, uniform on [0, 1), are radians, so that it sees a sixth of the circle.
+        Its azimuths are uniform on [0, 1) radians, a sixth of the circle.
         """
         return cls(iterations=1000, weighting="residual", arc=1.0, schedule_power=4)
 
@@ -132,7 +120,7 @@ class ScoreDistillation:
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether the evidence, if any, has a place in what it optimises."""
+        """Return whether there are no observations, or the coordinates are optimised."""
         return posterior.likelihood is None or not isinstance(posterior.prior, Denoises2D)
 
     def sample(
@@ -150,8 +138,8 @@ class ScoreDistillation:
         Raises
         ------
         UnsupportedPosterior
-            If the prior has neither denoiser; if there is evidence, and the prior's denoiser is of
-            2D views, or the log likelihood has no gradient by torch.
+            If the prior has neither denoiser, or there are observations and the denoiser is 2D or
+            the log likelihood is not differentiable by torch.
         """
         require(self, posterior)
         refuse_initial(self, initial)
@@ -163,7 +151,7 @@ class ScoreDistillation:
         if not self.draws_from(posterior):
             raise UnsupportedPosterior(
                 self.name,
-                "optimises towards the modes of the prior and has no place for evidence",
+                "does not support observations with a 2D denoiser",
                 word="observations",
                 others=suited(posterior),
             )
@@ -197,7 +185,7 @@ class ScoreDistillation:
         return math.sqrt((1 - alpha_bar) / alpha_bar)
 
     def plan(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return t (iterations,) and the views' azimuth numbers (iterations, V) of a run."""
+        """Return the levels t, (iterations,), and azimuth indices, (iterations, V), of a run."""
         rng = seeds.generator(seed, "views")
         views = np.stack(
             [rng.permutation(self.azimuths)[: self.n_views] for _ in range(self.iterations)]
@@ -235,20 +223,9 @@ class ScoreDistillation:
 def score_distillation_gradient(
     prior: Denoises2D, views: Views, motions: np.ndarray, noise: np.ndarray, alpha_bar: float
 ) -> np.ndarray:
-    """Return Σ_v (ε_φ(x_t) − ε) ∂p/∂X, x_t = √ᾱ p(X) + √(1−ᾱ) ε: ``(B, L, J, 3)``.
+    """Return Σ_v (ε_φ(x_t) − ε) ∂p/∂X for x_t = √ᾱ p(X) + √(1−ᾱ) ε = √ᾱ x̂₀ + √(1−ᾱ) ε_φ.
 
-    Parameters
-    ----------
-    prior : Denoises2D
-        Its estimate x̂₀ is ε_φ in other words: x_t = √ᾱ x̂₀ + √(1−ᾱ) ε_φ.
-    views : Views
-        The V views.
-    motions : ndarray, (B, L, J, 3)
-        X, normalised units.
-    noise : ndarray, (B, V, L, J, 2)
-        ε.
-    alpha_bar : float
-        ᾱ.
+    Motions X are (B, L, J, 3), in normalised units, and noises ε are (B, V, L, J, 2).
     """
     signal, spread = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
     noisy = signal * views.project(motions) + spread * noise

@@ -1,9 +1,8 @@
-"""MAS's state where the noisy views are not projections of one noisy 3D motion.
-
-That is so where the views are perspective, or where each has noise of its own.
-"""
+"""State of MAS with perspective views or independent noise per view."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,45 +17,24 @@ from probmotion.seeds import NormalStreams
 __all__ = ["SeparateViews"]
 
 
+@dataclass
 class SeparateViews:
-    """V noisy views per draw, (B, V, L, J, 2), normalised units.
+    """V noisy views per draw, (B, V, L, J, 2), normalised units; ``shape`` is (L, J, 3).
 
-    Parameters
-    ----------
-    prior : Denoises2D
-        Its denoiser is called on all views at once.
-    cameras : Cameras
-        The V cameras.
-    views : Views
-        Their orthographic counterparts, which project the noise, and their weights.
-    schedule : NoiseSchedule
-        The noise levels.
-    shape : tuple of int
-        (L, J, 3).
-    shared_noise : bool
-        Project one 3D noise into all views.
+    ``views`` are the orthographic counterparts of ``cameras``, to which shared noise is projected.
     """
 
-    def __init__(
-        self,
-        prior: Denoises2D,
-        cameras: Cameras,
-        views: Views,
-        schedule: NoiseSchedule,
-        shape: tuple[int, ...],
-        shared_noise: bool,
-    ) -> None:
-        self.prior = prior
-        self.cameras = cameras
-        self.views = views
-        self.schedule = schedule
-        self.shape = shape
-        self.shared_noise = shared_noise
-        self.counts = {"denoiser": 0}
-        self._last: np.ndarray | None = None
+    prior: Denoises2D
+    cameras: Cameras
+    views: Views
+    schedule: NoiseSchedule
+    shape: tuple[int, ...]
+    shared_noise: bool
+    counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
+    _last: np.ndarray | None = None
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
-        """Return unit noise in every view; at the first level a new batch begins."""
+        """Return unit noise in every view; the first level starts a new batch."""
         if t == self.schedule.steps:
             self._last = None
         if self.shared_noise:
@@ -75,7 +53,7 @@ class SeparateViews:
         return motions / scale
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
-        """Return what the cameras see of clean motions, (B, V, L, J, 2)."""
+        """Return the projections of clean motions, (B, V, L, J, 2)."""
         if self.cameras.orthographic:
             return self.views.project(motions)
         scale = self.prior.scale
@@ -89,7 +67,7 @@ class SeparateViews:
                 raise
             raise UnsupportedPosterior(
                 "mas",
-                "with perspective views needs a denoiser of such views, but "
-                f"{type(self.prior).__name__} says: {error}",
+                "with perspective views needs a denoiser that supports them, but "
+                f"{type(self.prior).__name__} raised: {error}",
                 word="perspective",
             ) from error

@@ -1,7 +1,7 @@
-"""Views of one motion, and the 3D denoiser that is made of 2D ones.
+"""Orthographic views of a motion, and 3D denoisers built from 2D ones.
 
-Normalised units throughout: P_v are the image axes of orthographic cameras and
-M = Σ_v w_v P_vᵀ P_v, w_v the views' weights (1 by default).
+P_v are the image axes of the cameras, w_v the weights of the views and M = Σ_v w_v P_vᵀ P_v. All
+motions are in normalised units.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from probmotion.posteriors.protocols import (
 __all__ = [
     "MotionDenoiser",
     "MultiViewDenoiser",
+    "StateDenoiser",
     "Views",
     "symmetric_power",
     "views_around",
@@ -31,15 +32,14 @@ __all__ = [
 
 
 class Views:
-    """V orthographic views: projecting a motion into them and combining them into one.
+    """Projection of motions to V orthographic views, and triangulation.
 
     Parameters
     ----------
     cameras : Cameras
-        The V cameras; perspective ones are replaced by the orthographic ones that agree with them
-        at the origin.
+        The V cameras; perspective ones are replaced by orthographic ones that agree at the origin.
     weights : sequence of float, optional
-        How much each view counts where views are combined; 1 each by default.
+        Weights w_v; 1 by default.
     """
 
     def __init__(self, cameras: Cameras, weights: Sequence[float] | None = None) -> None:
@@ -85,9 +85,9 @@ class Views:
 def views_around(
     n_views: int, elevation: float, *, distance: float = 7.0, perspective: bool = False
 ) -> Cameras:
-    """Return V views evenly around the motion, the first at azimuth 0.
+    """Return V views evenly spaced in azimuth from 0.
 
-    Two stand 120° apart (MAS, table 2): opposite ones would see the same, and nothing of the depth.
+    Two views are 120° apart (MAS, table 2), since opposite views do not determine the depth.
     """
     azimuth = 2 * np.pi * np.arange(n_views) / max(3, n_views)
     tilt = np.full(n_views, elevation)
@@ -95,17 +95,17 @@ def views_around(
 
 
 def warn_of_level_views(sampler: str, elevation: float) -> None:
-    """Warn a caller's caller if views are level: then a motion and its mirror image look alike."""
+    """Warn if the elevation is 0; the warning is attributed to the caller of the sampler."""
     if elevation == 0:
         warnings.warn(
-            "elevation is 0: views that never tilt leave a mirror ambiguity that "
-            f"{sampler} cannot resolve, expected an elevation such as pi/16",
-            stacklevel=3,
+            f"{sampler} cannot distinguish a motion from its mirror image with elevation 0; "
+            "use an elevation such as pi/16",
+            stacklevel=4,
         )
 
 
 class MotionDenoiser:
-    """E[X₀ | X_t] and Cov[X₀ | X_t] of a prior that knows them in 3D; counts its evaluations."""
+    """E[X₀ | X_t] and Cov[X₀ | X_t] of a prior with a 3D denoiser; counts evaluations."""
 
     covariance_protocol = DenoiserCovariance3D
 
@@ -129,16 +129,9 @@ class MotionDenoiser:
 
 
 class MultiViewDenoiser:
-    """D(X, t) = M⁻¹ Σ_v w_v P_vᵀ E[x₀ | P_v X, t]: what MAS uses for E[X₀ | X_t].
+    """D(X, t) = M⁻¹ Σ_v w_v P_vᵀ E[x₀ | P_v X, t], the approximation of E[X₀ | X_t] in MAS.
 
-    It conditions on one view at a time, where E[X₀ | X_t] conditions on all of X_t.
-
-    Parameters
-    ----------
-    prior : Denoises2D
-        Its denoiser is called on all views at once.
-    views : Views
-        The V views.
+    Each term conditions on a single view instead of X_t.
     """
 
     covariance_protocol = DenoiserCovariance2D
@@ -152,22 +145,22 @@ class MultiViewDenoiser:
     def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return D(X_t): ``(B, L, J, 3) → (B, L, J, 3)``."""
         self.counts["denoiser"] += len(x_t) * self.views.n_views
-        seen = self.views.project(x_t)
-        return self.views.combine(self.prior.denoise(seen, alpha_bar, self.views.cameras))
+        noisy = self.views.project(x_t)
+        return self.views.combine(self.prior.denoise(noisy, alpha_bar, self.views.cameras))
 
     def covariance_product(
         self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
     ) -> np.ndarray:
         """Return C v with C = M^(-½) (Σ_v w_v P_vᵀ Cov[x₀ | P_v X_t] P_v) M^(-½).
 
-        By Tweedie's formula D's Jacobian times (1−ᾱ)/√ᾱ is M⁻¹ Σ_v w_v P_vᵀ Cov_v P_v, which is
-        self-adjoint in the inner product uᵀ M v: C is the symmetric matrix similar to it.
+        By Tweedie's formula the Jacobian of D times (1−ᾱ)/√ᾱ is M⁻¹ Σ_v w_v P_vᵀ Cov_v P_v; C is
+        the symmetric matrix similar to it.
         """
         assert isinstance(self.prior, DenoiserCovariance2D)
         _count(self.counts, "covariance", len(x_t) * self.views.n_views)
-        seen = self.views.project(x_t)
+        noisy = self.views.project(x_t)
         inside = self.views.project(vectors @ self._half)
-        product = self.prior.view_covariance_product(seen, alpha_bar, self.views.cameras, inside)
+        product = self.prior.view_covariance_product(noisy, alpha_bar, self.views.cameras, inside)
         return self.views.scatter(product) @ self._half
 
     @cached_property
@@ -175,8 +168,12 @@ class MultiViewDenoiser:
         return symmetric_power(self.gram, -0.5)
 
 
+StateDenoiser = MotionDenoiser | MultiViewDenoiser
+"""Denoiser of noisy 3D motions."""
+
+
 def symmetric_power(matrix: np.ndarray, exponent: float) -> np.ndarray:
-    """Return a symmetric positive matrix to a power."""
+    """Return a power of a symmetric positive definite matrix."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * values**exponent) @ vectors.T
 

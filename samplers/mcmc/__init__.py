@@ -1,4 +1,4 @@
-"""Markov chain Monte Carlo: Metropolis-Hastings, NUTS and the ensemble."""
+"""Markov chain Monte Carlo: Metropolis-Hastings, NUTS and the affine-invariant ensemble."""
 
 import lazy_loader
 

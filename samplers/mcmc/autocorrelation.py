@@ -1,4 +1,4 @@
-"""How many iterations of an ensemble are worth one independent one."""
+"""Integrated autocorrelation time of an ensemble."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import numpy as np
 __all__ = ["autocorrelation_time"]
 
 _WINDOW = 5
-"""Sokal's c: lags are summed up to the first that is c times the sum so far."""
+"""Sokal's c: the window is the smallest lag of at least c times the running estimate."""
 
 
 def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation time of every coordinate of an ensemble.
+    """Return the integrated autocorrelation time of every coordinate.
 
     Sokal's estimate (1989, with the automatic window of his equation C.2), averaged over walkers.
 
     Parameters
     ----------
     trace : ndarray, (iterations, walkers, dim)
-        At least four iterations of all walkers.
+        States of all walkers, at least four iterations.
 
     Returns
     -------
     ndarray, (dim,)
-        Iterations; 1 for independent ones, NaN for a coordinate that never moved.
+        In iterations: 1 for independent iterations, NaN for a coordinate that never moved.
 
     Notes
     -----
-    emcee's own estimate centres each walker at its own mean, which hides the slow part of a run
-    that is not much longer than the answer (5 times too small at 2 autocorrelation times). Here
-    all walkers, which have one distribution, share their mean.
+    Unlike in emcee, all walkers are centred at their common mean. With a mean per walker the slow
+    part of short runs is lost: the estimate is 5 times too small for a run of 2 autocorrelation
+    times.
     """
     n = len(trace)
     apart = trace - trace.mean(axis=(0, 1))
@@ -40,6 +40,6 @@ def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     correlation = covariance / np.where(still, np.nan, covariance[0])
     times = 2 * np.cumsum(correlation, axis=0) - 1
     long_enough = np.arange(n // 2)[:, None] >= _WINDOW * times
-    # Where the run is too short for its window the largest sum is the safest.
+    # If the run is too short for the window, the largest sum is the conservative estimate.
     windowed = np.take_along_axis(times, long_enough.argmax(axis=0)[None], axis=0)[0]
     return np.where(long_enough.any(axis=0), windowed, times.max(axis=0))

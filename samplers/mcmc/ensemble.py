@@ -1,4 +1,4 @@
-"""`Ensemble`: emcee's affine-invariant walkers on a posterior's log density."""
+"""Affine-invariant ensemble sampling with emcee."""
 
 from __future__ import annotations
 
@@ -20,34 +20,31 @@ from probmotion.validation import check_count
 
 __all__ = ["Ensemble"]
 
-_TIMES_TO_TELL = 3
-"""Autocorrelation times that a run has to be long for its own to be believed."""
+_LEAST_TIMES = 3
+"""Length of a run, in autocorrelation times, above which its own estimate of them is used."""
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The affine-invariant stretch move (Goodman and Weare 2010) of emcee (Foreman-Mackey 2013).
+    """The stretch move (Goodman and Weare 2010) of emcee (Foreman-Mackey et al. 2013).
 
-    A chain is one ensemble of walkers, independent of the other chains. Its draws are the walkers
-    in turn, one iteration after the other: walkers of one ensemble depend on each other, so that
-    neither R-hat nor ESS of a chain is valid, and its autocorrelation time is stored instead.
-
-    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.results.budgets`).
+    A chain is one ensemble; its draws are all walkers of the first recorded iteration, then of the
+    next. Walkers of an ensemble depend on each other, so R-hat and ESS of a chain are not valid;
+    the draws have an autocorrelation time instead.
 
     Parameters
     ----------
     walkers : int, optional
-        Walkers per ensemble, at least twice the dimension; four times by default.
+        Walkers per ensemble, at least 2 dim; 4 dim by default.
     warmup : int
         Iterations before the first draw.
     thin : int
-        Iterations from one kept to the next.
+        Iterations per recorded iteration.
     largest_dim : int
-        A posterior of more dimensions is refused: there the stretch move hardly moves and its
-        draws look right when they are not (Huijser et al. 2015).
+        Maximum dimension of the posterior. In high dimension the stretch move mixes poorly without
+        showing it in the draws (Huijser et al. 2015).
     candidates : int
-        Draws from the prior per ensemble; its walkers start at some of them, chosen in proportion
-        to their likelihood.
+        Prior draws per ensemble, among which its walkers are resampled by likelihood.
     """
 
     name: ClassVar[str] = "ensemble"
@@ -78,25 +75,19 @@ class Ensemble:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``draws`` states of walkers of each of ``chains`` ensembles.
+        """Return ``draws`` walker states of each of ``chains`` ensembles.
 
-        Parameters
-        ----------
-        posterior, draws, chains, seed, progress
-            As in :class:`~probmotion.posteriors.sampling.Sampler`.
-        initial : MotionDraws or ndarray, (chains, walkers, dim), optional
-            An earlier run, to go on from as if it had not stopped (without a warm-up); or the
-            walkers' starting points. Some of ``candidates`` draws from the prior by
-            default.
+        ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
+        shape (chains, walkers, dim).
 
         Raises
         ------
         UnsupportedPosterior
             If the posterior has no density or too many dimensions.
         ValueError
-            If there are fewer walkers than twice the dimension.
+            If there are fewer than 2 dim walkers.
         Interrupted
-            On Ctrl-C; it carries the draws that were finished.
+            On Ctrl-C, with the finished draws.
         """
         check_count("draws", draws)
         start = time.perf_counter()
@@ -108,22 +99,22 @@ class Ensemble:
             points = starting_points(
                 posterior, density.likelihood, initial, shape, seed, self.candidates
             )
-            rest = _Rest.begin(density, points, seed)
+            state = _State.begin(density, points, seed)
         else:
-            rest = _Rest.of_state(earlier)
+            state = _State.of_arrays(earlier)
         warmup = self.warmup if earlier is None else 0
-        run = _Run(density, rest, self.thin)
-        iterations = -(-max(0, draws - rest.unused) // walkers)
+        run = _Run(density, state, self.thin)
+        iterations = -(-max(0, draws - state.unused) // walkers)
         try:
             with progress_bar(warmup + iterations * self.thin, self.name, progress) as bar:
                 for _ in range(warmup):
                     run.warm_up()
                     bar.update(1)
                 for _ in range(iterations):
-                    run.keep()
+                    run.record()
                     bar.update(self.thin)
         except KeyboardInterrupt as stop:
-            if run.last is rest:
+            if run.last is state:
                 raise
             raise Interrupted(self._result(posterior, run, draws, seed, start)) from stop
         return self._result(posterior, run, draws, seed, start)
@@ -133,24 +124,22 @@ class Ensemble:
         if dim > self.largest_dim:
             raise UnsupportedPosterior(
                 self.name,
-                f"is for at most {self.largest_dim} dimensions (largest_dim), and the posterior "
-                f"has {dim}",
+                f"supports at most {self.largest_dim} dimensions (largest_dim), got {dim}",
                 word="dimension",
                 others=suited(posterior),
             )
         walkers = 4 * dim if self.walkers is None else self.walkers
         if walkers < 2 * dim:
             raise ValueError(
-                f"walkers is {walkers}, expected at least {2 * dim}, twice the posterior's "
-                "dimension"
+                f"walkers must be at least {2 * dim}, twice the dimension, got {walkers}"
             )
         return walkers
 
     def _result(
         self, posterior: MotionPosterior, run: _Run, draws: int, seed: int, start: float
     ) -> MotionDraws:
-        theta, log_density, rest = run.draws(draws)
-        first = rest.draws - theta.shape[1]
+        theta, log_density, state = run.draws(draws)
+        first = state.draws - theta.shape[1]
         return MotionDraws.of(
             posterior,
             self,
@@ -161,16 +150,12 @@ class Ensemble:
             log_density=log_density,
             statistics=run.statistics(),
             counts={"density": run.density.evaluations},
-            state=rest.state(),
+            state=state.arrays(),
         )
 
 
-class _Rest(NamedTuple):
-    """Ensembles between two iterations, and how many of their walkers are draws not given out.
-
-    The draws of an ensemble are one stream, all walkers at each kept iteration; a run takes as
-    many as it was asked for and leaves the others to the run that goes on.
-    """
+class _State(NamedTuple):
+    """Ensembles after an iteration, of which the last ``unused`` walkers are the next draws."""
 
     coordinates: np.ndarray
     log_density: np.ndarray
@@ -179,7 +164,7 @@ class _Rest(NamedTuple):
     draws: int
 
     @classmethod
-    def begin(cls, density: Density, points: np.ndarray, seed: int) -> _Rest:
+    def begin(cls, density: Density, points: np.ndarray, seed: int) -> _State:
         chains, walkers, dim = points.shape
         log_density = density.at_start(points.reshape(-1, dim))[0].reshape(chains, walkers)
         sources = [np.random.MT19937(seeds.sequence(seed, "chain", k)) for k in range(chains)]
@@ -187,105 +172,103 @@ class _Rest(NamedTuple):
         return cls(points, log_density, random, unused=0, draws=0)
 
     @classmethod
-    def of_state(cls, state: Mapping[str, np.ndarray]) -> _Rest:
+    def of_arrays(cls, state: Mapping[str, np.ndarray]) -> _State:
         unused, draws = int(state["unused"]), int(state["draws"])
         return cls(state["coordinates"], state["log_density"], state["random"], unused, draws)
 
-    def state(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         counts = {"unused": self.unused, "draws": self.draws}
         return {**self._asdict(), **{k: np.array(v, dtype=np.int32) for k, v in counts.items()}}
 
 
 class _Run:
-    """Ensembles that emcee advances in turn, and what they have kept."""
+    """emcee samplers of all ensembles, and their recorded iterations."""
 
-    def __init__(self, density: Density, start: _Rest, thin: int) -> None:
+    def __init__(self, density: Density, start: _State, thin: int) -> None:
         import emcee
 
         self.density = density
         self.start = start
         self.thin = thin
-        self.kept: list[tuple[np.ndarray, np.ndarray]] = []
+        self.recorded: list[tuple[np.ndarray, np.ndarray]] = []
         self.last = start
         self.chains: list[Iterator[Any]] = []
         for coordinates, log_density, words in zip(*start[:3], strict=True):
             sampler = emcee.EnsembleSampler(*coordinates.shape, density, vectorize=True)
             state = emcee.State(coordinates, log_density, random_state=_random_state(words))
-            # The walkers of a run that goes on need not pass emcee's check a second time.
-            unchecked = start.draws > 0
             self.chains.append(
                 sampler.sample(
-                    state, iterations=None, store=False, skip_initial_state_check=unchecked
+                    state,
+                    iterations=None,
+                    store=False,
+                    # emcee rejects linearly dependent walkers, which may occur in a resumed run.
+                    skip_initial_state_check=start.draws > 0,
                 )
             )
         self.trace: list[list[np.ndarray]] = []
         self.first_coordinates: list[list[np.ndarray]] = []
 
     def warm_up(self) -> None:
-        """Move every ensemble once and remember nothing."""
+        """Advance every ensemble by one iteration."""
         for chain in self.chains:
             next(chain)
 
-    def keep(self) -> None:
-        """Move every ensemble ``thin`` times and keep where its walkers are then.
-
-        An interrupt between two kept iterations loses neither.
-        """
+    def record(self) -> None:
+        """Advance every ensemble by ``thin`` iterations and record the last; interruptible."""
         for iteration in range(self.thin):
             states = [next(chain) for chain in self.chains]
-            # emcee moves walkers in place: what is remembered is a copy.
+            # emcee changes its arrays in place.
             self.first_coordinates.append([state.coords[:, 0].copy() for state in states])
             if iteration % self._stride == 0:
                 self.trace.append([state.coords.copy() for state in states])
         coordinates = np.stack([state.coords for state in states])
         log_density = np.stack([state.log_prob for state in states])
         random = np.stack([_words(state.random_state) for state in states])
-        self.kept.append((coordinates, log_density))
-        self.last = _Rest(coordinates, log_density, random, 0, len(self.kept))
+        self.recorded.append((coordinates, log_density))
+        self.last = _State(coordinates, log_density, random, 0, len(self.recorded))
 
-    def draws(self, wanted: int) -> tuple[np.ndarray, np.ndarray, _Rest]:
-        """Return θ, log densities and what is left, once all or some iterations are kept."""
+    def draws(self, wanted: int) -> tuple[np.ndarray, np.ndarray, _State]:
+        """Return θ and log densities of at most ``wanted`` draws, and the state after them."""
         walkers = self.start.coordinates.shape[1]
         n = self.last.draws if self.last is not self.start else 0
         begin = walkers - self.start.unused
         first = (self.start.coordinates[:, begin:], self.start.log_density[:, begin:])
         theta, log_density = (
-            np.concatenate(parts, axis=1) for parts in zip(first, *self.kept[:n], strict=True)
+            np.concatenate(parts, axis=1) for parts in zip(first, *self.recorded[:n], strict=True)
         )
         given = min(wanted, theta.shape[1])
-        rest = self.last._replace(unused=theta.shape[1] - given, draws=self.start.draws + given)
-        return theta[:, :given], log_density[:, :given], rest
+        state = self.last._replace(unused=theta.shape[1] - given, draws=self.start.draws + given)
+        return theta[:, :given], log_density[:, :given], state
 
     def statistics(self) -> dict[str, np.ndarray]:
-        """Return per ensemble the share of moves accepted and the autocorrelation time.
+        """Return the acceptance rate and autocorrelation time of every ensemble.
 
-        The latter is the slowest coordinate's, in draws: 1 where kept iterations are independent,
-        NaN after too few iterations to tell, which have no share of moves either. Of a run that is
-        not three times as long, which its own estimate is too short for, it is all kept
-        iterations: then one of them counts, whose walkers the target has independent of each other
-        (Goodman and Weare 2010). Whether they have come there, R-hat of several ensembles tells.
+        The time is that of the slowest coordinate in recorded iterations, at least 1. Runs shorter
+        than three times their estimate get the number of recorded iterations instead: they count
+        as one iteration, whose walkers are independent under the target (Goodman and Weare 2010).
+        It is NaN, and there is no acceptance rate, after fewer than four iterations.
         """
         if len(self.trace) < 4:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
-        # A stretch is never by a factor of exactly 1: a walker that moved has changed.
+        # An accepted stretch move changes every coordinate.
         moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
         traces = zip(*self.trace, strict=True)
         slowest = np.array([autocorrelation_time(np.array(trace)).max() for trace in traces])
         times = np.maximum(slowest * self._stride / self.thin, 1.0)
-        too_short = len(self.trace) < _TIMES_TO_TELL * slowest
-        times = np.where(too_short, np.maximum(times, len(self.kept)), times)
+        too_short = len(self.trace) < _LEAST_TIMES * slowest
+        times = np.where(too_short, np.maximum(times, len(self.recorded)), times)
         return {"acceptance": moved.mean(axis=(0, 2)), "autocorrelation_time": times}
 
     @property
     def _stride(self) -> int:
-        """Iterations from one entry of the trace to the next."""
+        """Iterations per entry of the trace."""
         return max(1, self.thin // 10)
 
 
 def _words(state: Any) -> np.ndarray:
-    """Return a RandomState's state as signed 32-bit words, all that netCDF can hold.
+    """Return a RandomState's state as signed 32-bit words, for netCDF.
 
-    emcee's stretch move draws no normal numbers, so that none is ever in store.
+    The cached normal number is left out: emcee's stretch move draws none.
     """
     _, key, position, *_ = state
     return np.append(key.view(np.int32), np.int32(position))

@@ -1,4 +1,4 @@
-"""`MetropolisHastings`: random walks with any proposal, all chains side by side."""
+"""Metropolis-Hastings with interchangeable proposals."""
 
 from __future__ import annotations
 
@@ -23,24 +23,22 @@ __all__ = ["MetropolisHastings"]
 
 @dataclass(frozen=True)
 class MetropolisHastings:
-    """Metropolis et al. (1953), Hastings (1970); one density evaluation per chain and step.
-
-    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.results.budgets`).
+    """Metropolis-Hastings (Metropolis et al. 1953, Hastings 1970), all chains vectorised.
 
     Parameters
     ----------
     proposal : Proposal
-        Where a chain might go next.
+        Proposal distribution.
     warmup : int
-        Steps before the first draw, in which the proposal learns.
+        Steps before the first draw, in which the proposal adapts.
     thin : int
-        Steps from one draw to the next.
+        Steps per draw.
     candidates : int
-        Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
+        Prior draws per chain, among which its start is resampled by likelihood.
     pseudo_marginal : bool
-        Draw views anew for every proposal and keep the estimate with the state: chains are then
-        exact for the integral over views (Andrieu and Roberts 2009). By default annotated pairs
-        are seen from the views that the likelihood fixed.
+        Estimate the likelihood of every proposal from freshly drawn views and keep the estimate
+        with the state, so that chains target the integral over views (Andrieu and Roberts 2009).
+        By default the views of the likelihood are fixed.
     """
 
     name: ClassVar[str] = "mh"
@@ -56,8 +54,7 @@ class MetropolisHastings:
     def __post_init__(self) -> None:
         if isinstance(self.proposal, type) or not hasattr(self.proposal, "propose"):
             raise ValueError(
-                f"proposal is {self.proposal!r}, expected an object with settings such as "
-                "Isotropic()"
+                f"proposal must be a proposal object such as Isotropic(), got {self.proposal!r}"
             )
         check_count("candidates", self.candidates)
         check_count("warmup", self.warmup, least=0)
@@ -75,21 +72,15 @@ class MetropolisHastings:
     ) -> MotionDraws:
         """Return ``draws`` states of each of ``chains`` chains, ``thin`` steps apart.
 
-        Parameters
-        ----------
-        posterior, draws, chains, seed, progress
-            As in :class:`~probmotion.posteriors.sampling.Sampler`.
-        initial : MotionDraws or ndarray, (chains, dim), optional
-            An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from, such as any kept draw's θ. One of ``candidates`` draws
-            from the prior by default.
+        ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
+        shape (chains, dim).
 
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no density, or has no views where the settings ask for them.
+            If the posterior has no density, or the settings need views and it has none.
         Interrupted
-            On Ctrl-C; it carries the draws that were finished.
+            On Ctrl-C, with the finished draws.
         """
         check_count("draws", draws)
         start = time.perf_counter()
@@ -97,7 +88,7 @@ class MetropolisHastings:
         self._require_views(posterior)
         earlier = continued(self, posterior.log_density, initial, chains, seed)
         warmup = self.warmup if earlier is None else 0
-        kept = _Kept(chains, draws, posterior.dim)
+        finished: list[_Draw] = []
         try:
             with progress_bar(warmup + draws * self.thin, self.name, progress) as bar:
                 if earlier is None:
@@ -110,37 +101,41 @@ class MetropolisHastings:
                 else:
                     walk = _Walk.resume(self, density, earlier)
                 for _ in range(draws):
-                    kept.add(walk, walk.advance(self.thin))
+                    finished.append(walk.advance(self.thin))
                     bar.update(self.thin)
         except KeyboardInterrupt as stop:
-            if not kept.last[0]:
+            if not finished:
                 raise
-            result = self._result(posterior, kept, density, seed, start)
+            result = self._result(posterior, finished, density, seed, start)
             raise Interrupted(result) from stop
-        return self._result(posterior, kept, density, seed, start)
+        return self._result(posterior, finished, density, seed, start)
 
     def _require_views(self, posterior: MotionPosterior) -> None:
-        wanting = "pseudo_marginal=True" if self.pseudo_marginal else type(self.proposal).__name__
         if not (self.pseudo_marginal or self.proposal.guided):
             return
         if not isinstance(posterior.likelihood, ComparesViews):
+            setting = (
+                "pseudo_marginal=True" if self.pseudo_marginal else type(self.proposal).__name__
+            )
             raise UnsupportedPosterior(
                 self.name,
-                f"with {wanting} needs evidence that compares views with annotations, and "
-                + (
-                    "there is no evidence"
-                    if posterior.likelihood is None
-                    else f"{type(posterior.likelihood).__name__} does not"
-                ),
+                f"with {setting} needs a likelihood with ComparesViews, got "
+                f"{type(posterior.likelihood).__name__}",
                 word="views",
             )
 
     def _result(
-        self, posterior: MotionPosterior, kept: _Kept, density: Density, seed: int, start: float
+        self,
+        posterior: MotionPosterior,
+        finished: list[_Draw],
+        density: Density,
+        seed: int,
+        start: float,
     ) -> MotionDraws:
-        n, state = kept.last
-        theta = kept.theta[:, :n]
-        positions = motions(posterior, theta, seed, first=int(state["draws"]) - n)
+        *values, states = zip(*finished, strict=True)
+        theta, log_density, acceptance = (np.stack(rows, axis=1) for rows in values)
+        state = states[-1]
+        positions = motions(posterior, theta, seed, first=int(state["draws"]) - len(finished))
         return MotionDraws.of(
             posterior,
             self,
@@ -148,46 +143,40 @@ class MetropolisHastings:
             seed=seed,
             seconds=time.perf_counter() - start,
             theta=theta,
-            log_density=kept.log_density[:, :n],
+            log_density=log_density,
             statistics={
-                "acceptance": kept.acceptance[:, :n],
-                **posterior.draw_statistics(theta, kept.log_density[:, :n]),
+                "acceptance": acceptance,
+                **posterior.draw_statistics(theta, log_density),
             },
             counts={"density": density.evaluations},
             state=state,
         )
 
 
+_Draw = tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]
+"""θ, log density and mean acceptance of all chains, and the state to continue from."""
+
+
+@dataclass
 class _Walk:
-    """Chains that walk side by side; nothing that one does depends on another."""
+    """Current states of all chains, which are independent of each other."""
 
-    log_density: np.ndarray
-    guide: np.ndarray
-
-    def __init__(
-        self,
-        sampler: MetropolisHastings,
-        density: Density,
-        generators: list[np.random.Generator],
-        theta: np.ndarray,
-        memory: ProposalState,
-        draws: int,
-    ) -> None:
-        self.proposal = sampler.proposal
-        self.fresh_views = sampler.pseudo_marginal
-        self.density = density
-        self.generators = generators
-        self.theta = theta
-        self.memory = memory
-        self.draws = draws
+    sampler: MetropolisHastings
+    density: Density
+    generators: list[np.random.Generator]
+    theta: np.ndarray
+    memory: ProposalState
+    draws: int = 0
+    log_density: np.ndarray = field(init=False)
+    guide: np.ndarray = field(init=False)
 
     @classmethod
     def begin(
         cls, sampler: MetropolisHastings, density: Density, theta: np.ndarray, seed: int
     ) -> _Walk:
         generators = [seeds.generator(seed, "chain", chain) for chain in range(len(theta))]
-        walk = cls(sampler, density, generators, theta, sampler.proposal.begin(theta), draws=0)
-        walk.log_density, walk.guide = density.at_start(theta, *walk._how())
+        walk = cls(sampler, density, generators, theta, sampler.proposal.begin(theta))
+        walk.log_density, walk.guide = density.at_start(theta, *walk._evaluation())
         return walk
 
     @classmethod
@@ -205,41 +194,45 @@ class _Walk:
         walk.guide = state.get("guide", np.empty((len(walk.theta), 0)))
         return walk
 
+    @property
+    def proposal(self) -> Proposal:
+        return self.sampler.proposal
+
     def state(self) -> dict[str, np.ndarray]:
-        """Return all that :meth:`resume` needs."""
+        """Return the arrays that :meth:`resume` needs."""
         memory = self.proposal.settled(self.memory)
         return {
             "theta": self.theta,
             "log_density": self.log_density,
-            # netCDF holds no array without width.
+            # netCDF cannot store an array without columns.
             **({"guide": self.guide} if self.proposal.guided else {}),
-            # An estimate does not tell which posterior it is of.
-            **({"fixed": self.density(self.theta)} if self.fresh_views else {}),
+            # A deterministic value identifies the posterior; an estimate does not.
+            **({"fixed": self.density(self.theta)} if self.sampler.pseudo_marginal else {}),
             "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
             "draws": np.array(self.draws, dtype=np.int32),
             **{_MEMORY + name: values for name, values in memory.items()},
         }
 
     def warm_up(self, steps: int, tick: Callable[[], Any]) -> None:
-        """Take steps from which the proposal learns."""
+        """Take steps and adapt the proposal."""
         for _ in range(steps):
             acceptance = self._step()
             self.memory = self.proposal.learn(self.memory, self.theta, acceptance)
             tick()
 
-    def advance(self, steps: int) -> np.ndarray:
-        """Take the steps to the next draw; return their mean acceptance, (chains,)."""
+    def advance(self, steps: int) -> _Draw:
+        """Take the steps to the next draw."""
         acceptance = np.mean([self._step() for _ in range(steps)], axis=0)
         self.draws += 1
-        return acceptance
+        return self.theta, self.log_density, acceptance, self.state()
 
     def _step(self) -> np.ndarray:
         """Take one step; return its probability of acceptance, (chains,)."""
         proposed = self.proposal.propose(self.generators, self.theta, self.guide, self.memory)
-        log_density, guide = self.density.evaluate(proposed, *self._how())
+        log_density, guide = self.density.evaluate(proposed, *self._evaluation())
         log_ratio = self.proposal.log_ratio(self.theta, self.guide, proposed, guide, self.memory)
         log_acceptance = np.minimum(0.0, log_density - self.log_density + log_ratio)
-        # −log of a number uniform on (0, 1].
+        # −log U is standard exponential for U uniform on (0, 1].
         level = np.array([rng.standard_exponential() for rng in self.generators])
         accepted = -level < log_acceptance
         self.theta = np.where(accepted[:, None], proposed, self.theta)
@@ -247,27 +240,9 @@ class _Walk:
         self.guide = np.where(accepted[:, None], guide, self.guide)
         return np.exp(log_acceptance)
 
-    def _how(self) -> tuple[list[np.random.Generator] | None, bool]:
-        """How the density is to be evaluated: with which generators, and whether for a guide."""
-        return (self.generators if self.fresh_views else None), self.proposal.guided
+    def _evaluation(self) -> tuple[list[np.random.Generator] | None, bool]:
+        """Return the ``generators`` and ``guided`` arguments of :meth:`Density.evaluate`."""
+        return (self.generators if self.sampler.pseudo_marginal else None), self.proposal.guided
 
 
 _MEMORY = "proposal_"
-
-
-class _Kept:
-    """The draws so far and the state after the last; an interrupt between two leaves it whole."""
-
-    def __init__(self, chains: int, draws: int, dim: int) -> None:
-        self.theta = np.empty((chains, draws, dim))
-        self.log_density = np.empty((chains, draws))
-        self.acceptance = np.empty((chains, draws))
-        self.last: tuple[int, dict[str, np.ndarray]] = (0, {})
-
-    def add(self, walk: _Walk, acceptance: np.ndarray) -> None:
-        """Keep where the chains are."""
-        draw, _ = self.last
-        self.theta[:, draw] = walk.theta
-        self.log_density[:, draw] = walk.log_density
-        self.acceptance[:, draw] = acceptance
-        self.last = (draw + 1, walk.state())

@@ -1,10 +1,10 @@
-"""`NUTS`: the No-U-Turn sampler of NumPyro on a posterior's log density."""
+"""The No-U-Turn sampler of NumPyro."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,30 +29,27 @@ __all__ = ["NUTS"]
 
 @dataclass(frozen=True)
 class NUTS:
-    """The No-U-Turn sampler (Hoffman and Gelman 2014), NumPyro's (Phan et al. 2019).
-
-    A budget sets ``thin`` and ``warmup`` (:mod:`probmotion.comparison.results.budgets`).
+    """The No-U-Turn sampler (Hoffman and Gelman 2014) of NumPyro (Phan et al. 2019).
 
     Parameters
     ----------
     warmup : int
         Iterations before the first draw, which adapt the step size and the diagonal mass matrix.
     target_acceptance : float
-        Mean acceptance that the step size is adapted towards.
+        Target mean acceptance of the step size adaptation.
     max_tree_depth : int
-        A trajectory has at most 2^max_tree_depth − 1 steps.
+        Maximum doublings of a trajectory, which has at most 2^max_tree_depth − 1 steps.
     thin : int
-        Iterations per draw. Of those that a draw stands for, ``acceptance`` is the mean,
-        ``divergent`` whether any was, ``steps`` the sum.
+        Iterations per draw. For each draw ``acceptance`` is their mean, ``divergent`` is whether
+        any diverged, and ``steps`` is their sum.
     candidates : int
-        Draws from the prior per chain; it starts at one, chosen in proportion to its likelihood.
+        Prior draws per chain, among which its start is resampled by likelihood.
 
     Notes
     -----
-    Chains run one after the other with the same compiled code, so that chain k is the same to the
-    last bit however many there are. Everything runs in float64, whatever JAX is set to elsewhere.
-    ``seconds`` of the draws leave out compiling: some seconds, once per posterior in a process.
-    Another ``warmup`` is compiled again.
+    Chains run one after the other in float64, so that a chain is bit-identical for any number of
+    chains. Compilation takes some seconds per posterior and ``warmup``, which ``seconds`` of the
+    draws excludes.
     """
 
     name: ClassVar[str] = "nuts"
@@ -67,14 +64,11 @@ class NUTS:
     candidates: int = 1000
 
     def __post_init__(self) -> None:
-        check_count("candidates", self.candidates)
-        check_count("warmup", self.warmup)
-        check_count("max_tree_depth", self.max_tree_depth)
-        check_count("thin", self.thin)
+        for name in ("candidates", "warmup", "max_tree_depth", "thin"):
+            check_count(name, getattr(self, name))
         if not 0 < self.target_acceptance < 1:
             raise ValueError(
-                f"target_acceptance is {self.target_acceptance!r}, expected a number between 0 "
-                "and 1"
+                f"target_acceptance must be between 0 and 1, got {self.target_acceptance!r}"
             )
 
     def sample(
@@ -89,20 +83,15 @@ class NUTS:
     ) -> MotionDraws:
         """Return ``draws`` states of each of ``chains`` chains.
 
-        Parameters
-        ----------
-        posterior, draws, chains, seed, progress
-            As in :class:`~probmotion.posteriors.sampling.Sampler`.
-        initial : MotionDraws or ndarray, (chains, dim), optional
-            An earlier run, to go on from as if it had not stopped (without a warm-up); or points
-            to start from. One of ``candidates`` draws from the prior by default.
+        ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
+        shape (chains, dim).
 
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no density, or one without a gradient.
+            If the posterior has no differentiable density.
         Interrupted
-            On Ctrl-C; it carries the draws that were finished.
+            On Ctrl-C, with the finished draws.
         """
         import jax
 
@@ -110,7 +99,7 @@ class NUTS:
         require(self, posterior)
         self._require_gradient(posterior)
         with jax.enable_x64(True):
-            # What the compiled code does not depend on is the same for all.
+            # The cache key omits the settings that do not affect the compiled code.
             kernel = compiled(replace(self, thin=1, candidates=1), posterior)
             start = time.perf_counter()
             earlier = continued(self, kernel.log_densities, initial, chains, seed)
@@ -138,7 +127,7 @@ class NUTS:
             if not getattr(part, "differentiable", True):
                 raise UnsupportedPosterior(
                     self.name,
-                    f"needs a density with a gradient, which {type(part).__name__} has not",
+                    f"needs a differentiable density, which {type(part).__name__} does not have",
                     word="gradient",
                     others=suited(posterior),
                 )
@@ -146,10 +135,9 @@ class NUTS:
     def _result(
         self, posterior: MotionPosterior, run: _Run, seed: int, start: float
     ) -> MotionDraws:
-        n = run.finished
-        kept = {name: values[:, :n] for name, values in run.kept.items()}
-        theta = kept.pop("theta")
-        log_density = kept.pop("log_density")
+        statistics = dict(run.recorded)
+        theta = statistics.pop("theta")
+        log_density = statistics.pop("log_density")
         return MotionDraws.of(
             posterior,
             self,
@@ -158,38 +146,34 @@ class NUTS:
             seconds=time.perf_counter() - start,
             theta=theta,
             log_density=log_density,
-            statistics=kept,
+            statistics=statistics,
             counts={"gradient": run.gradients, "density": run.densities},
             state=run.state(),
         )
 
 
+@dataclass
 class _Run:
-    """The chains of one call: where each is, and the draws that all of them have finished."""
+    """Chains of one call, and the draws that all of them have finished."""
 
-    def __init__(
-        self,
-        sampler: NUTS,
-        kernel: NutsKernel,
-        points: np.ndarray,
-        earlier: Mapping[str, np.ndarray] | None,
-        seed: int,
-        densities: int,
-    ) -> None:
-        self.sampler = sampler
-        self.kernel = kernel
-        self.densities = densities
-        self.earlier = earlier
-        self.first = 0 if earlier is None else int(earlier["draws"])
-        self.finished = 0
-        self.gradients = 0
-        self.kept: dict[str, np.ndarray] = {}
-        self.points = points
-        self.seed = seed
-        self.chains: list[Any] = []
+    sampler: NUTS
+    kernel: NutsKernel
+    points: np.ndarray
+    earlier: Mapping[str, np.ndarray] | None
+    seed: int
+    densities: int
+    finished: int = 0
+    gradients: int = 0
+    recorded: dict[str, np.ndarray] = field(default_factory=dict)
+    chains: list[Any] = field(default_factory=list)
+
+    @property
+    def first(self) -> int:
+        """Number of the first draw in its chain."""
+        return 0 if self.earlier is None else int(self.earlier["draws"])
 
     def sample(self, draws: int, progress: bool) -> None:
-        """Warm up all chains, unless they go on, then draw with each in turn, chunk by chunk."""
+        """Warm up new chains, then draw from all chains in turn, chunk by chunk."""
         chains, thin = len(self.points), self.sampler.thin
         warmup = self.sampler.warmup if self.earlier is None else 0
         with progress_bar(chains * (warmup + draws * thin), self.sampler.name, progress) as bar:
@@ -201,13 +185,13 @@ class _Run:
             for some in _chunks(draws, thin):
                 rows = []
                 for chain in range(chains):
-                    states[chain], kept = self._advance(states[chain], some, thin)
-                    rows.append(kept)
+                    states[chain], row = self._advance(states[chain], some, thin)
+                    rows.append(row)
                     bar.update(some * thin)
-                self._keep(rows, list(states))
+                self._record(rows, list(states))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all that going on needs, after the last draw that all chains have finished."""
+        """Return the state after the last finished draw, to continue from."""
         leaves = [self.kernel.leaves(state) for state in self.chains]
         stacked = {f"leaf_{i}": np.stack(rows) for i, rows in enumerate(zip(*leaves, strict=True))}
         theta = np.stack([np.asarray(state.z) for state in self.chains])
@@ -224,16 +208,16 @@ class _Run:
 
     def _advance(self, state: Any, draws: int, thin: int) -> tuple[Any, dict[str, np.ndarray]]:
         state, rows = self.kernel.advance(state, draws, thin)
-        kept = {name: np.asarray(values)[:draws] for name, values in rows.items()}
-        self.gradients += int(kept["steps"].sum())
-        return state, kept
+        finished = {name: np.asarray(values)[:draws] for name, values in rows.items()}
+        self.gradients += int(finished["steps"].sum())
+        return state, finished
 
-    def _keep(self, rows: list[dict[str, np.ndarray]], states: list[Any]) -> None:
-        """Take in one chunk of every chain."""
+    def _record(self, rows: list[dict[str, np.ndarray]], states: list[Any]) -> None:
+        """Append one chunk of every chain."""
         grown = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        if self.kept:
-            grown = {name: np.concatenate([self.kept[name], grown[name]], 1) for name in grown}
-        self.kept, self.chains, self.finished = grown, states, grown["log_density"].shape[1]
+        if self.recorded:
+            grown = {name: np.concatenate([self.recorded[name], grown[name]], 1) for name in grown}
+        self.recorded, self.chains, self.finished = grown, states, grown["log_density"].shape[1]
 
 
 def _chunks(draws: int, thin: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""NumPyro's No-U-Turn kernel on a posterior's log density, compiled."""
+"""Compiled No-U-Turn kernel of NumPyro."""
 
 from __future__ import annotations
 
@@ -19,73 +19,69 @@ __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 
 class NutsSettings(Sampler, Protocol):
-    """What is read of :class:`~probmotion.samplers.mcmc.nuts.NUTS`."""
+    """Settings of :class:`~probmotion.samplers.mcmc.nuts.NUTS` that the kernel depends on."""
 
     @property
-    def warmup(self) -> int:
-        """Iterations that adapt."""
+    def warmup(self) -> int: ...
 
     @property
-    def target_acceptance(self) -> float:
-        """Mean acceptance that the step size is adapted to."""
+    def target_acceptance(self) -> float: ...
 
     @property
-    def max_tree_depth(self) -> int:
-        """Doublings of a trajectory."""
+    def max_tree_depth(self) -> int: ...
 
 
 CHUNK = 50
-"""Most draws in one call, between two looks at the progress bar and at Ctrl-C; and most iterations,
-unless one draw takes more."""
+"""Maximum draws per compiled call, between updates of the progress bar. Also the maximum
+iterations, unless a single draw takes more."""
 
 
 @lru_cache(maxsize=8)
 def compiled(sampler: NutsSettings, posterior: MotionPosterior) -> NutsKernel:
-    """Return the kernel, compiled: that takes seconds, and serves every seed and restart."""
+    """Return the compiled kernel, cached for other seeds and restarts."""
     return NutsKernel(sampler, posterior)
 
 
 class NutsKernel:
-    """NumPyro's kernel on a posterior, compiled."""
+    """NumPyro's NUTS on the log density of a posterior."""
 
     def __init__(self, sampler: NutsSettings, posterior: MotionPosterior) -> None:
         import jax
         from numpyro.infer import NUTS as Kernel  # noqa: N811
 
-        let_in = _bridge(sampler, posterior)
-        log_density = let_in(posterior.log_density)
+        to_jax = _bridge(sampler, posterior)
+        log_density = to_jax(posterior.log_density)
         self.sampler = sampler
         self.kernel = Kernel(
             potential_fn=lambda theta: -log_density(theta),
             target_accept_prob=sampler.target_acceptance,
             max_tree_depth=sampler.max_tree_depth,
         )
-        # Once per chain: not worth compiling.
+        # Evaluated once per chain, so not compiled.
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
-        self.log_likelihood = jax.jit(let_in(posterior.log_likelihood))
+        self.log_likelihood = jax.jit(to_jax(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
         self._compile(posterior)
 
     def begin(self, key: Any, theta: np.ndarray) -> Any:
-        """Return NumPyro's state at ``theta``; one evaluation of the gradient."""
+        """Return the initial state at ``theta``; evaluates the gradient once."""
         potential, gradient = self.value_and_gradient(theta)
         if not np.isfinite(potential):
             raise ValueError(
-                f"initial has log density {-float(potential)} at theta {theta}, expected starting "
-                "points of density above 0"
+                f"initial must have a finite log density, got {-float(potential)} at theta {theta}"
             )
         return self._init(key, theta, potential, gradient)
 
     def log_densities(self, theta: np.ndarray) -> np.ndarray:
-        """Return the log density of points in a row: ``(n, dim) → (n,)``."""
+        """Return the log density: ``(n, dim) → (n,)``."""
         return np.array([-float(self.value_and_gradient(point)[0]) for point in theta])
 
     def log_likelihoods(self, theta: np.ndarray) -> np.ndarray:
-        """Return log p(y | θ) of points in a row: ``(n, dim) → (n,)``."""
+        """Return log p(y | θ): ``(n, dim) → (n,)``."""
         return np.array([float(self.log_likelihood(point)) for point in theta])
 
     def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
-        """Return the state that :meth:`leaves` was taken of; no evaluation."""
+        """Return the state with given :meth:`leaves`; evaluates nothing."""
         import jax
 
         like = self._init(jax.random.key(0), theta, 0.0, np.zeros_like(theta))
@@ -99,7 +95,7 @@ class NutsKernel:
         return jax.tree.unflatten(structure, restored)
 
     def leaves(self, state: Any) -> list[np.ndarray]:
-        """Return a state as arrays that netCDF can hold."""
+        """Return a state as arrays for netCDF."""
         import jax
 
         out = []
@@ -111,7 +107,7 @@ class NutsKernel:
         return out
 
     def _compile(self, posterior: MotionPosterior) -> None:
-        """Go through all that runs go through, so that their clocks count no compiling."""
+        """Compile all functions, so that timed runs do not."""
         import jax
 
         theta = posterior.initial(seeds.generator(0, "compile"), 1)[0]
@@ -128,7 +124,7 @@ class NutsKernel:
         return self.kernel.init(key, self.sampler.warmup, start)
 
     def _advance(self, state: Any, draws: Any, thin: Any) -> tuple[Any, dict[str, Any]]:
-        """Take at most ``CHUNK`` draws, of ``thin`` iterations each; return what each kept."""
+        """Return the state after ``draws`` ≤ CHUNK draws, and their values in CHUNK rows."""
         import jax
         import jax.numpy as jnp
 
@@ -144,14 +140,14 @@ class NutsKernel:
             state, accepted, divergent, steps = jax.lax.fori_loop(
                 0, thin, iteration, (state, *none)
             )
-            kept = {
+            values = {
                 "theta": state.z,
                 "log_density": -state.potential_energy,
                 "acceptance": accepted / thin,
                 "divergent": divergent,
                 "steps": steps,
             }
-            return state, {name: rows[name].at[i].set(value) for name, value in kept.items()}
+            return state, {name: rows[name].at[i].set(value) for name, value in values.items()}
 
         empty = {
             "theta": jnp.zeros((CHUNK, *state.z.shape)),
@@ -166,12 +162,9 @@ class NutsKernel:
 def _bridge(
     sampler: NutsSettings, posterior: MotionPosterior
 ) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
-    """Return what makes a density a JAX function of one θ: nothing, or a way through torch.
+    """Return the conversion of densities to JAX: the identity, or :func:`jax_from_torch`.
 
-    Raises
-    ------
-    UnsupportedPosterior
-        If neither library can differentiate it.
+    Raises :class:`UnsupportedPosterior` if neither JAX nor torch can differentiate the density.
     """
     import jax
 
@@ -181,7 +174,7 @@ def _bridge(
     except NotConjugate as error:
         raise not_conjugate(sampler, error) from error
     except Exception as refused:
-        # A density that lets JAX not in may raise anything; whether torch is let in decides.
+        # A density that does not accept JAX arrays may raise any exception. Try torch.
         bridged = jax_from_torch(posterior.log_density)
         try:
             theta = posterior.initial(seeds.generator(0, "probe"), 1)[0]
@@ -189,7 +182,7 @@ def _bridge(
         except Exception:
             raise UnsupportedPosterior(
                 sampler.name,
-                "needs a gradient of the log density, by JAX or torch, but JAX met "
+                "needs a log density that JAX or torch can differentiate, but JAX raised "
                 f"{type(refused).__name__}: {str(refused).splitlines()[0]}",
                 word="gradient",
             ) from refused

@@ -1,4 +1,4 @@
-"""Variational inference by networks that read the observations."""
+"""Variational inference with networks that map observations to motions."""
 
 import lazy_loader
 

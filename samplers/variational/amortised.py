@@ -1,8 +1,7 @@
-"""A posterior learnt from its own simulations, for priors that nobody has a network of.
+"""Amortised inference with a conditional VAE trained on simulated pairs.
 
-One network learns p(X | y) for every y that the prior and likelihood can make, from simulated
-pairs; given the real evidence it draws by one forward pass. Its bias is what the network has not
-learnt, which a problem with exact draws measures.
+A network learns p(X | y) from pairs simulated from the prior and the likelihood. Draws given the
+actual observations take one forward pass.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["AmortisedPosterior", "AmortisedSettings"]
 
-# Pairs that the coordinates and the remainder are learnt from.
+# Number of pairs from which the coordinates are computed.
 _FIRST = 12_000
-# Share of the pairs that the decoder's covariance is measured on, which weights never see.
+# Fraction of held-out pairs, for the covariance of the decoder.
 _HELD_OUT = 0.1
 _WARMUP = 100
-# KL(r ‖ p) counts this much at the first step and fully from this share of the steps on.
+# Initial weight of KL(r ‖ p), and the fraction of steps in which it increases to 1.
 _FIRST_WEIGHT, _ANNEALED = 0.05, 0.3
 
 
 @dataclass(frozen=True)
 class AmortisedSettings:
-    """Size of the network, and how long it learns.
+    """Size of the network and length of its training.
 
     Parameters
     ----------
@@ -52,24 +51,13 @@ class AmortisedSettings:
     batch : int
         Pairs per step.
     pairs : int
-        Simulated pairs, made once.
+        Simulated pairs.
     coordinates : int
-        Most principal coordinates of motions, and of evidence; the rest is Gaussian noise.
-    latent : int
-        Length of z.
-    components : int
-        Gaussians that p(z | y) mixes.
-    experts : int
-        Linear maps that the decoder mixes.
-    hidden : int
-        Width of the networks.
+        Maximum number of principal coordinates of motions, and of observations.
+    latent, components, experts, hidden : int
+        Sizes of the network (:class:`ConditionalVAE`).
     learning_rate : float
-        The largest of Adam, which falls along a cosine to 0.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
+        Maximum learning rate of Adam, with cosine decay to 0.
     """
 
     steps: int = 4000
@@ -89,67 +77,42 @@ class AmortisedSettings:
         check_positive("learning_rate", self.learning_rate)
 
     def rate(self, step: int) -> float:
-        """Return the learning rate of a step, from 1."""
+        """Return the learning rate of a step, counted from 1."""
         fall = 0.5 * (1 + math.cos(math.pi * step / self.steps))
         return self.learning_rate * fall * min(1.0, step / _WARMUP)
 
     def weight(self, step: int) -> float:
-        """Return how much KL(r ‖ p) counts at a step: little at first, lest z is never used."""
+        """Return the weight of KL(r ‖ p) at a step; small at first to avoid posterior collapse."""
         done = min(1.0, step / (_ANNEALED * self.steps))
         return _FIRST_WEIGHT + (1 - _FIRST_WEIGHT) * done
 
 
 @dataclass(frozen=True, eq=False)
 class AmortisedPosterior:
-    """p(X | y) as a network has learnt it, at the evidence y of one posterior.
+    """Approximation of p(X | y) at the observations y of one posterior.
 
-    Parameters
-    ----------
-    network : ConditionalVAE
-        In double precision, so that a draw's rounding does not depend on its batch.
-    motions : MotionCoordinates
-        What the network's x are coordinates of.
-    root : ndarray, (C, C)
-        Of the decoder's covariance S.
-    observed : ndarray, (L, M)
-        The evidence.
-    evidence : PrincipalCoordinates
-        Of evidence.
+    ``network`` is in double precision, so that draws do not depend on their batch. ``root`` is the
+    root of the decoder's covariance S, (C, C), and ``observed`` are the observations, (L, M).
     """
 
     network: ConditionalVAE
     motions: MotionCoordinates
     root: np.ndarray
     observed: np.ndarray
-    evidence: PrincipalCoordinates
+    observations: PrincipalCoordinates
 
     @classmethod
     def fit(
         cls, posterior: MotionPosterior, settings: AmortisedSettings, seed: int, progress: bool
     ) -> AmortisedPosterior:
-        """Return what a network learns from simulated pairs.
+        """Train a network on simulated pairs; the result does not depend on the number of cores.
 
-        Parameters
-        ----------
-        posterior : MotionPosterior
-            Its prior can be sampled and its likelihood simulated.
-        settings : AmortisedSettings
-            Size and length.
-        seed : int
-            Of pairs, first weights and batches; the same on any number of cores.
-        progress : bool
-            Show a bar.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the prior cannot be sampled, or the evidence is neither keypoints nor joints.
-        ValueError
-            If training diverges.
+        Raises :class:`UnsupportedPosterior` if the observations are neither keypoints nor joints,
+        and ``ValueError`` if training diverges.
         """
         observed = observed_entries(posterior.likelihood, posterior.frames)
         with one_thread():
-            motions, evidence, x, y = _coordinates(posterior, settings, seed)
+            motions, observations, x, y = _coordinates(posterior, settings, seed)
             held = max(1, int(_HELD_OUT * len(x)))
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(seeds.integer(seed, "network"))
@@ -163,7 +126,7 @@ class AmortisedPosterior:
                 )
             _train(network, x[held:], y[held:], settings, seed, progress)
             root = _decoder_root(network.double(), x[:held].double(), y[:held].double(), seed)
-        return cls(network, motions, root, observed, evidence)
+        return cls(network, motions, root, observed, observations)
 
     def draw(self, streams: NormalStreams) -> np.ndarray:
         """Return one motion per stream, (B, L, J, 3), metres."""
@@ -172,11 +135,11 @@ class AmortisedPosterior:
         chosen, z_noise = streams.uniform(), streams.normal(self.network.latent)
         x_noise, left_noise = streams.normal(C), streams.normal(L, self.motions.root.shape[1])
         with one_thread(), torch.no_grad():
-            y = self.evidence.coordinates(self.observed[None]).repeat(B, axis=0)
+            y = self.observations.coordinates(self.observed[None]).repeat(B, axis=0)
             given = torch.from_numpy(y)
             mixture = self.network.prior(given[:1])
             log_weight, means, log_scales = (part[0].numpy() for part in mixture)
-            # The last sum may round to less than 1.
+            # Without the last sum, which may round to less than 1.
             steps = np.cumsum(np.exp(log_weight))[:-1]
             k = np.searchsorted(steps, chosen, side="right")
             z = torch.from_numpy(means[k] + np.exp(log_scales[k]) * z_noise)
@@ -188,7 +151,7 @@ class AmortisedPosterior:
 def _coordinates(
     posterior: MotionPosterior, settings: AmortisedSettings, seed: int
 ) -> tuple[MotionCoordinates, PrincipalCoordinates, torch.Tensor, torch.Tensor]:
-    """Return what coordinates of motions and evidence are, and all pairs' x and y."""
+    """Return the coordinates of motions and observations, and x and y of all pairs."""
     first: list[SimulatedPairs] = []
     chunks = simulate_pairs(posterior, seed, settings.pairs)
     for pairs in chunks:
@@ -199,16 +162,16 @@ def _coordinates(
         np.concatenate([some.positions for some in first]),
         np.concatenate([some.observed for some in first]),
     )
-    evidence = PrincipalCoordinates.of(known.observed, settings.coordinates)
+    observations = PrincipalCoordinates.of(known.observed, settings.coordinates)
     motions = MotionCoordinates.learn(
-        known, evidence.coordinates(known.observed), settings.coordinates
+        known, observations.coordinates(known.observed), settings.coordinates
     )
     x, y = [], []
     for pairs in chain([known], chunks):
-        y.append(evidence.coordinates(pairs.observed))
+        y.append(observations.coordinates(pairs.observed))
         x.append(motions.coordinates(pairs.positions, y[-1]))
-    wanted, given = (torch.from_numpy(np.concatenate(part)).float() for part in (x, y))
-    return motions, evidence, wanted, given
+    all_x, all_y = (torch.from_numpy(np.concatenate(part)).float() for part in (x, y))
+    return motions, observations, all_x, all_y
 
 
 def _train(
@@ -219,13 +182,7 @@ def _train(
     seed: int,
     progress: bool,
 ) -> None:
-    """Change the network's weights, step by step.
-
-    Raises
-    ------
-    ValueError
-        If a loss is not finite.
-    """
+    """Train the network; raise ``ValueError`` if the loss is not finite."""
     optimiser = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
     rng = seeds.torch_generator(seed, "training")
     with progress_bar(settings.steps, "simulated pairs", progress) as bar:
@@ -237,8 +194,8 @@ def _train(
             loss = network.loss(x[chosen], y[chosen], noise, settings.weight(step))
             if not math.isfinite(loss.item()):
                 raise ValueError(
-                    f"learning_rate is {settings.learning_rate:g}, with which training on "
-                    f"simulated pairs diverged at step {step}; expected a smaller one"
+                    f"training on simulated pairs diverged at step {step} with learning_rate "
+                    f"{settings.learning_rate:g}; use a smaller one"
                 )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -250,11 +207,7 @@ def _train(
 def _decoder_root(
     network: ConditionalVAE, x: torch.Tensor, y: torch.Tensor, seed: int
 ) -> np.ndarray:
-    """Return the root of the best S for pairs that no weight has seen, (C, C).
-
-    Given μ, E log N(x; μ, S) is largest at the covariance of the misfits; on pairs that were
-    learnt from it would be too small.
-    """
+    """Return the root of S, the covariance of the residuals of held-out pairs, (C, C)."""
     rng = seeds.torch_generator(seed, "misfits")
     noise = torch.randn(len(x), network.latent, generator=rng, dtype=x.dtype)
     misfits = network.misfits(x, y, noise).numpy()

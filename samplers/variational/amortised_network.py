@@ -1,11 +1,10 @@
-"""A conditional VAE of motions in principal coordinates, given the evidence in its own.
+"""Conditional VAE of motions given observations, both in principal coordinates.
 
     p(x, z | y) = p(z | y) N(x; μ(z, y), S),   r(z | x, y) = N(z; a(x, y), b(x, y)²)
 
-x are a motion's coordinates, y the evidence's. p(z | y) is a mixture of Gaussians, because a
-posterior over motions has modes; μ is a mixture of linear maps, because many posteriors are
-nearly linear around each mode, plus a bounded network. Learnt from simulated pairs by
-max E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015), it needs no density of either.
+x are the coordinates of a motion and y those of its observations. p(z | y) is a mixture of
+Gaussians, one or more per mode; μ is a mixture of linear maps plus a bounded network. Training
+maximises E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015).
 """
 
 from __future__ import annotations
@@ -15,25 +14,23 @@ from torch import nn
 
 __all__ = ["ConditionalVAE"]
 
-# Logarithms of scales stay within these, so that no early step can explode.
+# Bounds of log scales, for stability of the first training steps.
 _LEAST, _MOST = -7.0, 2.0
 
 
 class ConditionalVAE(nn.Module):
-    """The three networks; the first weights come from torch's current random numbers.
+    """Encoder, prior and decoder networks.
 
     Parameters
     ----------
-    coordinates : int
-        C, of motions.
-    evidence : int
-        E, of evidence; 0 for generation.
+    coordinates, observed : int
+        Dimensions C of x and E of y; E = 0 without observations.
     latent : int
-        Length of z.
+        Dimension of z.
     components : int
-        K, Gaussians of p(z | y).
+        Number K of Gaussians in p(z | y).
     experts : int
-        Linear maps that μ mixes.
+        Number of linear maps in μ.
     hidden : int
         Width of every network.
     """
@@ -41,7 +38,7 @@ class ConditionalVAE(nn.Module):
     def __init__(
         self,
         coordinates: int,
-        evidence: int,
+        observed: int,
         latent: int,
         components: int,
         experts: int,
@@ -50,12 +47,12 @@ class ConditionalVAE(nn.Module):
         super().__init__()
         self.latent = latent
         self.encoder = nn.Sequential(
-            nn.Linear(coordinates + evidence, hidden), nn.SiLU(),
+            nn.Linear(coordinates + observed, hidden), nn.SiLU(),
             nn.Linear(hidden, hidden), nn.SiLU(),
             nn.Linear(hidden, 2 * latent),
         )  # fmt: skip
-        self.prior = _MixtureOfGaussians(evidence, latent, components, hidden)
-        self.decoder = _MixtureOfLinearMaps(latent + evidence, coordinates, experts, hidden)
+        self.prior = _MixtureOfGaussians(observed, latent, components, hidden)
+        self.decoder = _MixtureOfLinearMaps(latent + observed, coordinates, experts, hidden)
         self.log_scale = nn.Parameter(torch.zeros(coordinates))
 
     def encode(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -70,9 +67,9 @@ class ConditionalVAE(nn.Module):
     def loss(
         self, x: torch.Tensor, y: torch.Tensor, noise: torch.Tensor, weight: float
     ) -> torch.Tensor:
-        """Return −E[log N(x; μ, S)] + ``weight`` · KL(r ‖ p) but for a constant, mean over pairs.
+        """Return −E[log N(x; μ, S)] + ``weight`` · KL(r ‖ p) up to a constant, averaged over pairs.
 
-        S is diagonal here; both expectations are over the one z = a + b · ``noise``.
+        S is diagonal, and both expectations use the single z = a + b · ``noise``.
         """
         mean, log_scale = self.encode(x, y)
         z = mean + log_scale.exp() * noise
@@ -89,18 +86,18 @@ class ConditionalVAE(nn.Module):
 
 
 class _MixtureOfGaussians(nn.Module):
-    """p(z | y) = Σ_k π_k(y) N(m_k + m(y), (s_k s(y))²): the evidence weighs, moves and scales."""
+    """p(z | y) = Σ_k π_k(y) N(m_k + m(y), (s_k s(y))²)."""
 
-    def __init__(self, evidence: int, latent: int, components: int, hidden: int) -> None:
+    def __init__(self, observed: int, latent: int, components: int, hidden: int) -> None:
         super().__init__()
         self.sizes = [components, latent, latent]
         self.log_weight = nn.Parameter(torch.zeros(components))
         self.mean = nn.Parameter(torch.randn(components, latent))
         self.log_scale = nn.Parameter(torch.full((components, latent), -0.5))
         self.network = None
-        if evidence:
+        if observed:
             self.network = nn.Sequential(
-                nn.Linear(evidence, hidden), nn.SiLU(),
+                nn.Linear(observed, hidden), nn.SiLU(),
                 nn.Linear(hidden, hidden), nn.SiLU(),
                 nn.Linear(hidden, sum(self.sizes)),
             )  # fmt: skip
@@ -120,7 +117,7 @@ class _MixtureOfGaussians(nn.Module):
         return torch.log_softmax(log_weight, dim=1), mean, log_scale.clamp(_LEAST, _MOST)
 
     def log_density(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """Return log p(z | y) but for a constant: ``(B, latent), (B, E) → (B,)``."""
+        """Return log p(z | y) up to a constant: ``(B, latent), (B, E) → (B,)``."""
         log_weight, mean, log_scale = self(y)
         apart = (z[:, None] - mean) * torch.exp(-log_scale)
         each = log_weight - (0.5 * apart**2 + log_scale).sum(dim=2)
@@ -128,7 +125,7 @@ class _MixtureOfGaussians(nn.Module):
 
 
 class _MixtureOfLinearMaps(nn.Module):
-    """f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v), with g and h of one network."""
+    """f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v), with g and h from one network."""
 
     def __init__(self, inputs: int, outputs: int, experts: int, hidden: int) -> None:
         super().__init__()

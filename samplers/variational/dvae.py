@@ -1,7 +1,7 @@
-"""`DVAEInference`: variational inference with a dynamical VAE (Motion-DVAE).
+"""Variational inference with a dynamical VAE (Motion-DVAE).
 
-A network reads the evidence and answers with a distribution over motions: at once, as it learnt
-from other recordings (regression), or after it was fitted to this one (optimisation).
+A network maps the observations to a distribution over motions, either directly (regression) or
+after optimisation for these observations.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from probmotion.posteriors.protocols import (
     MotionInference,
     Samplable,
 )
-from probmotion.posteriors.sampling import Interrupted, UnsupportedPosterior, progress_bar, require
-from probmotion.samplers.independent import draw_independently, refuse_initial, with_coordinates
+from probmotion.posteriors.sampling import UnsupportedPosterior, progress_bar, require
+from probmotion.samplers.independent import draw_independently, refuse_initial
 from probmotion.samplers.variational.amortised import AmortisedPosterior, AmortisedSettings
 from probmotion.samplers.variational.simulated_pairs import observed_entries
 from probmotion.seeds import NormalStreams
@@ -38,56 +38,45 @@ __all__ = ["DVAEInference"]
 
 Mode = Literal["regression", "optimization"]
 
-
-# Greatest norm of the fit's gradient: what the network answers to something unlike all that it
-# learnt from can be off by thousands of nats, and one such step must not spoil Adam's memory.
+# Maximum gradient norm: far from the training data initial losses reach thousands of nats, and
+# such a step would dominate the moments of Adam.
 _CLIP = 30.0
 
 
 @dataclass(frozen=True)
 class DVAEInference:
-    """Variational inference with networks that read the evidence (Motion-DVAE, B to E).
+    """Variational inference with networks that map observations to motions (Motion-DVAE, B to E).
 
-    A prior beside which such networks were trained brings them; without evidence, draws are its
-    own. For any other prior that can be sampled, and for evidence they do not read, a network is
-    trained here first, on motions of the prior with evidence simulated of each
-    (:mod:`~probmotion.samplers.variational.amortised`), and not fitted: the settings of a fit have
-    no say.
-
-    A budget sets ``training_steps`` and ``iterations``
-    (:mod:`probmotion.comparison.results.budgets`).
+    Uses ``network`` or the inference network of the prior; without observations, draws are those
+    of a prior with such a network. Otherwise a network is trained first on pairs simulated from
+    the prior and likelihood (:mod:`~probmotion.samplers.variational.amortised`), without
+    optimisation.
 
     Parameters
     ----------
     network : InferenceNetwork, optional
-        Used in place of the prior's own.
+        Inference network; that of the prior by default.
     mode : {"regression", "optimization"}
-        Draw from what the network answers, or fit it to this evidence first.
+        Use the network as it is, or optimise it for these observations first.
     iterations : int
-        Of the fit; 50 to 200 as published.
+        Optimisation steps; 50 to 200 as published.
     learning_rate : float
-        Of Adam at the fit's beginning; it falls to 0 by half a cosine. Chosen, with that, on the
-        clips that ``body-dvae`` was watched on.
+        Initial learning rate of Adam, with half-cosine decay to 0. The default was chosen on the
+        validation clips of ``body-dvae``.
     degrees_of_freedom : float, optional
-        λ of the noise that is supposed, ``inf`` for Gaussian; by default the evidence's own. A
-        small one is robust against outliers that the evidence does not know of.
+        λ of the assumed noise, ``inf`` for Gaussian; that of the likelihood by default. Small
+        values are robust to outliers.
     initial_entropy : bool
-        Whether the bound has the entropy of the first pose and its prior. The paper leaves them
-        out (C.2.2), which fits better and makes first frames over-confident.
+        Include the entropy of the first pose and its prior in the bound. The paper omits them
+        (C.2.2), which improves the fit but makes the first frames overconfident.
     latent_weight : float
-        Weight of the motion prior in the fit; 0 leaves it out (the ablation "no prior").
+        Weight of the motion prior in the optimisation; 0 for the ablation "no prior".
     overlap : int
-        Frames that windows of a long motion share, from 1 to one less than a window has.
+        Number of frames shared by consecutive windows of a long motion, less than a window.
     training_steps, training_pairs : int
-        Where a network has to be trained first: gradient steps, and simulated pairs of a motion
-        and its evidence.
+        Gradient steps and simulated pairs, if a network is trained.
     batch : int
-        Draws at a time; changes memory and speed, never the draws.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range, the mode is unknown or the network is none.
+        Maximum batch size; does not affect the draws.
     """
 
     name: ClassVar[str] = "dvae"
@@ -124,14 +113,14 @@ class DVAEInference:
 
     @classmethod
     def paper(cls) -> DVAEInference:
-        """Return the optimisation as published: robust noise, no entropy of the first pose."""
+        """Return the published optimisation: robust noise, no entropy of the first pose."""
         return cls(
             mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
         )
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether the prior's network reads the evidence, or one can be shown it."""
+        """Return whether a network supports the observations or can be trained on them."""
         network = getattr(posterior.prior, "inference_network", None)
         if posterior.likelihood is None or (network and network.reads(posterior.likelihood)):
             return True
@@ -151,16 +140,16 @@ class DVAEInference:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` independent draws from the fitted distribution.
+        """Return ``chains`` × ``draws`` independent draws from the variational posterior.
 
-        Where the motion is one window of the network's, they have θ and a log density.
+        They have θ and log densities if the motion fits into one window of the network.
 
         Raises
         ------
         UnsupportedPosterior
-            If the prior cannot be sampled, or no network can read the evidence.
+            If the prior cannot be sampled, or no network supports the observations.
         ValueError
-            If the fit or the training diverges, or a window shows nothing.
+            If the optimisation or training diverges, or a window has no observations.
         """
         require(self, posterior)
         refuse_initial(self, initial)
@@ -168,35 +157,29 @@ class DVAEInference:
         thetas: list[np.ndarray] = []
 
         @cache
-        def answer() -> Callable[[NormalStreams], np.ndarray]:
-            return self._answer(posterior, seed, counts, thetas, progress)
+        def draw() -> Callable[[NormalStreams], np.ndarray]:
+            return self._draw_function(posterior, seed, counts, thetas, progress)
 
         def draw_batch(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
-            # The first batch trains and fits, so that their seconds are the run's.
+            # The first batch includes training and optimisation in the timed run.
             tick()
             with one_thread():
-                return answer()(streams)
+                return draw()(streams)
 
-        def finished(found: MotionDraws) -> MotionDraws:
-            return with_coordinates(found, posterior, thetas) if thetas else found
-
-        try:
-            found = draw_independently(
-                self,
-                posterior,
-                draw_batch,
-                draws=draws,
-                chains=chains,
-                seed=seed,
-                batch=self.batch,
-                steps=1,
-                scale=1.0,
-                counts=counts,
-                progress=progress,
-            )
-        except Interrupted as stop:
-            raise Interrupted(finished(stop.draws)) from stop
-        return finished(found)
+        return draw_independently(
+            self,
+            posterior,
+            draw_batch,
+            draws=draws,
+            chains=chains,
+            seed=seed,
+            batch=self.batch,
+            steps=1,
+            scale=1.0,
+            counts=counts,
+            progress=progress,
+            thetas=thetas,
+        )
 
     def predict(
         self,
@@ -206,30 +189,35 @@ class DVAEInference:
         average: bool = True,
         progress: bool = True,
     ) -> Motion:
-        """Return the motion predicted (D, equation 11): between joints observed and decoded.
+        """Return a point estimate: the average of observed and decoded joints (D, equation 11).
 
-        ``seed`` is of the draws that it is the mean of; without ``average`` the means are decoded
-        instead, once (the ablation "NN output"). All of torch's threads work on it, and their
-        number may show in the last digits; draws are made on one.
+        Parameters
+        ----------
+        posterior, progress
+            As in :meth:`sample`.
+        seed : int
+            Seed of the draws to average.
+        average : bool
+            Average draws; otherwise decode the means once (the ablation "NN output").
 
         Raises
         ------
         UnsupportedPosterior
-            If no network was trained beside the prior, or it cannot read the evidence.
+            If there is no inference network for the observations.
         """
         network = self._network_of(posterior)
         if network is None or posterior.likelihood is None:
             raise UnsupportedPosterior(
                 self.name,
-                "predicts one motion only where a network was trained beside the prior and reads "
-                "the evidence; draw from the posterior and take the mean",
+                "predicts a motion only with an inference network that supports the observations; "
+                "use the mean of draws instead",
                 word="network",
             )
         inference = self._fitted(network, posterior, seed, {"gradient": 0}, progress)
-        found = inference.predict(seeds.generator(seed, "predict"), average=average)
-        return Motion(found, posterior.skeleton, posterior.fps, name="predicted")
+        positions = inference.predict(seeds.generator(seed, "predict"), average=average)
+        return Motion(positions, posterior.skeleton, posterior.fps, name="predicted")
 
-    def _answer(
+    def _draw_function(
         self,
         posterior: MotionPosterior,
         seed: int,
@@ -237,11 +225,11 @@ class DVAEInference:
         thetas: list[np.ndarray],
         progress: bool,
     ) -> Callable[[NormalStreams], np.ndarray]:
-        """Return what draws motions (B, L, J, 3), metres, and notes their θ where they have one."""
+        """Return a function that draws motions, (B, L, J, 3), and appends θ to ``thetas``."""
         prior = posterior.prior
         if posterior.likelihood is None and isinstance(prior, HasInferenceNetwork):
             assert isinstance(prior, Samplable)
-            # Streams give each draw its own numbers, in the shapes a generator would.
+            # NormalStreams have the methods of a generator, with one stream per draw.
             return lambda streams: prior.sample(streams, len(streams.generators))  # type: ignore[arg-type]
         network = self._network_of(posterior)
         if network is None:
@@ -259,14 +247,14 @@ class DVAEInference:
         return drawn
 
     def _network_of(self, posterior: MotionPosterior) -> InferenceNetwork | None:
-        """Return the network that reads the evidence, or None where one has to be trained."""
+        """Return the network for the observations, or None if one must be trained."""
         prior, likelihood = posterior.prior, posterior.likelihood
         if likelihood is None:
             return None
         if self.network is not None and not self.network.reads(likelihood):
             raise UnsupportedPosterior(
                 self.name,
-                f"was given a network that does not read {type(likelihood).__name__}",
+                f"got a network that does not support {type(likelihood).__name__}",
                 word="observations",
             )
         network = self.network
@@ -282,7 +270,7 @@ class DVAEInference:
         counts: dict[str, int],
         progress: bool,
     ) -> MotionInference:
-        """Return the inference of the evidence, fitted to it where that is the mode."""
+        """Return the inference for the observations, optimised if that is the mode."""
         inference = network.on(
             posterior.prior,
             posterior.likelihood,
@@ -292,19 +280,19 @@ class DVAEInference:
         if self.mode == "regression":
             return inference
         losses = self._fit(inference, seed, counts, progress)
-        # A nat for every number of the motion is more than chance.
+        # The loss is noisy; a rise of one nat per coordinate is more than that.
         chance = 3 * posterior.frames * posterior.skeleton.n_joints
         if not all(map(math.isfinite, losses)) or losses[-1] > losses[0] + chance:
             raise ValueError(
-                f"learning_rate is {self.learning_rate:g}, with which the fit diverged: its loss "
-                f"went from {losses[0]:g} to {losses[-1]:g}; expected a smaller one"
+                f"optimisation diverged with learning_rate {self.learning_rate:g} from loss "
+                f"{losses[0]:g} to {losses[-1]:g}; use a smaller one"
             )
         return inference
 
     def _fit(
         self, inference: MotionInference, seed: int, counts: dict[str, int], progress: bool
     ) -> list[float]:
-        """Fit, and return every iteration's loss and at last that with the first one's numbers."""
+        """Optimise; return all losses, and the final one with the random numbers of the first."""
         import torch
 
         parameters = inference.parameters()

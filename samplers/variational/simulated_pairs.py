@@ -1,9 +1,6 @@
-"""Pairs (motion, evidence) that a posterior's own prior and likelihood make.
+"""Simulated pairs of motions and observations, and their principal coordinates.
 
-A network that learns from them learns the posterior without either density (amortised inference;
-Cranmer, Brehmer and Louppe 2020, "The frontier of simulation-based inference"). It meets them in
-principal coordinates; what those leave over is small noise, which
-:class:`MotionCoordinates` gives back.
+Simulation-based inference (Cranmer, Brehmer and Louppe 2020) learns the posterior from such pairs.
 """
 
 from __future__ import annotations
@@ -30,45 +27,28 @@ __all__ = [
 _LEAST_FREEDOM = 2.0
 _SAMPLER = "dvae"
 _CHUNK = 2000
-# Below this share of the largest variance a coordinate is rounding.
+# Minimum variance of a coordinate relative to the largest; smaller ones are rounding errors.
 _NOTHING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPairs:
-    """n motions and what was seen of each.
-
-    Parameters
-    ----------
-    positions : ndarray, (n, L, J, 3)
-        Draws from the prior, metres.
-    observed : ndarray, (n, L, M)
-        Evidence of each motion, the M numbers of every frame, in the likelihood's units; 0 where
-        hidden; M = 0 without evidence.
-    """
+    """n motions, (n, L, J, 3), metres, and their observations, (n, L, M)."""
 
     positions: np.ndarray
     observed: np.ndarray
 
 
 def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
-    """Return the evidence as numbers, those of one frame in one row: (L, M); 0 where hidden.
+    """Return the observations of L frames, (L, M), 0 for missing entries.
 
-    The pattern of what is hidden and the noise are a posterior's own, the same in all of its
-    pairs, so that a network need not be told them.
-
-    Parameters
-    ----------
-    likelihood : Likelihood or None
-        With ``keypoints`` (V, L, J, 2) or ``joints`` (L, J, 3); ``None`` gives M = 0.
-    frames : int
-        L.
+    They are ``keypoints`` (V, L, J, 2) or ``joints`` (L, J, 3) of the likelihood; M = 0 for
+    ``None``.
 
     Raises
     ------
     UnsupportedPosterior
-        If the likelihood has neither, or its noise has no variance: a single outlier would then
-        drown all that a network learns from.
+        If the likelihood has neither, or its noise has infinite variance.
     """
     if likelihood is None:
         return np.zeros((frames, 0))
@@ -76,8 +56,8 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
     if freedom is not None and freedom <= _LEAST_FREEDOM:
         raise UnsupportedPosterior(
             _SAMPLER,
-            f"learns from simulated evidence, which noise of {freedom:g} degrees of freedom "
-            f"drowns; it needs more than {_LEAST_FREEDOM:g}",
+            f"trains on simulated observations and needs more than {_LEAST_FREEDOM:g} degrees of "
+            f"freedom of the noise, got {freedom:g}",
             word="outliers",
         )
     if hasattr(likelihood, "keypoints"):
@@ -86,61 +66,34 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
         return np.asarray(likelihood.joints).reshape(frames, -1)
     raise UnsupportedPosterior(
         _SAMPLER,
-        f"needs evidence of keypoints or joints to show its network, which "
-        f"{type(likelihood).__name__} is not",
+        f"needs observed keypoints or joints, got {type(likelihood).__name__}",
         word="observations",
     )
 
 
 def simulate_pairs(posterior: MotionPosterior, seed: int, n: int) -> Iterator[SimulatedPairs]:
-    """Yield n pairs, some thousands at a time: whole motions take more memory than what is kept.
-
-    Parameters
-    ----------
-    posterior : MotionPosterior
-        Whose prior is :class:`~probmotion.posteriors.protocols.Samplable`.
-    seed : int
-        The run's seed.
-    n : int
-        Number of pairs.
-
-    Raises
-    ------
-    UnsupportedPosterior
-        If the prior cannot be sampled, or the evidence is neither keypoints nor joints.
-    """
+    """Yield n pairs in chunks, to limit the memory."""
     check_count("n", n)
     prior, likelihood = posterior.prior, posterior.likelihood
-    if not isinstance(prior, Samplable):
-        raise UnsupportedPosterior(
-            _SAMPLER,
-            f"needs a prior with Samplable, which {type(prior).__name__} is not",
-            word="Samplable",
-        )
+    assert isinstance(prior, Samplable)
     observed_entries(likelihood, posterior.frames)
     for number, start in enumerate(range(0, n, _CHUNK)):
         size = min(_CHUNK, n - start)
         positions = prior.sample(seeds.generator(seed, "pairs", number), size)
         rng = seeds.generator(seed, "pairs", number, "evidence")
-        seen = [
+        simulated = [
             None if likelihood is None else likelihood.simulate(rng, motion) for motion in positions
         ]
-        rows = [observed_entries(one, posterior.frames) for one in seen]
+        rows = [observed_entries(one, posterior.frames) for one in simulated]
         yield SimulatedPairs(positions, np.stack(rows))
 
 
 @dataclass(frozen=True, eq=False)
 class PrincipalCoordinates:
-    """The directions in which arrays vary most, each in units of its standard deviation.
+    """Whitened principal coordinates of flattened arrays.
 
-    Parameters
-    ----------
-    mean : ndarray, (D,)
-        Of the flattened arrays.
-    axes : ndarray, (D, C)
-        Orthonormal columns, the largest variance first.
-    deviation : ndarray, (C,)
-        Standard deviations along them.
+    ``mean`` is (D,), ``axes`` are orthonormal columns, (D, C), the largest variance first, and
+    ``deviation`` the standard deviations along them, (C,).
     """
 
     mean: np.ndarray
@@ -149,7 +102,7 @@ class PrincipalCoordinates:
 
     @classmethod
     def of(cls, values: np.ndarray, most: int) -> PrincipalCoordinates:
-        """Return at most ``most`` coordinates of arrays ``(n, …)``, those that vary at all."""
+        """Compute at most ``most`` coordinates, of non-zero variance, from arrays ``(n, …)``."""
         from scipy.linalg import eigh
 
         flat = values.reshape(len(values), -1)
@@ -172,31 +125,31 @@ class PrincipalCoordinates:
         return self.mean + (coordinates * self.deviation) @ self.axes.T
 
     def without(self, flat: np.ndarray) -> np.ndarray:
-        """Return what the coordinates do not see of ``(n, D)``."""
+        """Return ``(n, D)`` without its component along the axes."""
         return flat - flat @ self.axes @ self.axes.T
 
 
 @dataclass(frozen=True, eq=False)
 class MotionCoordinates:
-    """What a network learns of motions, and what it need not.
+    """Decomposition of motions into a linear prediction, coordinates x and a Gaussian remainder.
 
-    A motion is a linear regression on its evidence, plus principal coordinates x of what that
-    misses, plus a remainder: small noise, frame by frame Gaussian, whose mean is linear in what
-    the evidence has that x does not explain. The network learns x alone; without the remainder
-    draws would lack the small noise of the prior.
+    A motion is its linear regression on the observations, plus the principal coordinates x of the
+    residual, plus a remainder. The remainder is Gaussian and independent between frames; its mean
+    is linear in the part of the observations that x does not explain. Only x is modelled by the
+    network.
 
     Parameters
     ----------
     linear : ndarray, (1 + E, D)
-        Regression of flattened motions on 1 and the evidence's coordinates y, metres.
+        Regression of flattened motions, metres, on 1 and the observations' coordinates y.
     basis : PrincipalCoordinates
-        Of what it misses.
+        Coordinates x of the residual.
     explained : ndarray, (1 + E + C, L·M)
-        Regression of the evidence on 1, y and x.
+        Regression of the observations on 1, y and x.
     gain : ndarray, (L, M, 3J)
-        Regression of the remainder on the rest of the evidence.
+        Regression of the remainder on the unexplained observations.
     root : ndarray, (L, 3J, 3J)
-        Of the covariance that is left.
+        Root of the covariance of the remainder.
     """
 
     linear: np.ndarray
@@ -207,17 +160,7 @@ class MotionCoordinates:
 
     @classmethod
     def learn(cls, pairs: SimulatedPairs, y: np.ndarray, most: int) -> MotionCoordinates:
-        """Return the least-squares fit to pairs, with at most ``most`` coordinates.
-
-        Parameters
-        ----------
-        pairs : SimulatedPairs
-            n of them.
-        y : ndarray, (n, E)
-            Coordinates of their evidence.
-        most : int
-            Of x.
-        """
+        """Fit to n pairs with observation coordinates y, (n, E), and at most ``most`` x."""
         n, L = pairs.observed.shape[:2]
         flat = pairs.positions.reshape(n, -1)
         linear = np.linalg.lstsq(_with_one(y), flat, rcond=None)[0]
@@ -231,35 +174,27 @@ class MotionCoordinates:
         gain = np.stack(fits)
         left = left - np.einsum("nlm,lmj->nlj", rest, gain, optimize=True)
         covariance = np.einsum("nli,nlj->lij", left, left, optimize=True) / n
-        # A draw loses its share of the axes when they are taken out of it again.
+        # Correction for the component along the axes, which is removed from every draw.
         dim, axes = basis.axes.shape
         variance, directions = np.linalg.eigh(covariance * dim / max(1, dim - axes))
         root = directions * np.sqrt(np.maximum(variance, 0.0))[:, None, :]
         return cls(linear, basis, explained, gain, root)
 
     def coordinates(self, positions: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return x of motions with evidence y: ``(n, L, J, 3), (n, E) → (n, C)``."""
+        """Return x of motions with observations y: ``(n, L, J, 3), (n, E) → (n, C)``."""
         flat = positions.reshape(len(positions), -1)
         return self.basis.coordinates(flat - _with_one(y) @ self.linear)
 
     def motions(
         self, x: np.ndarray, y: np.ndarray, observed: np.ndarray, normal: np.ndarray
     ) -> np.ndarray:
-        """Return motions with these coordinates and a drawn remainder, flattened: (B, D), metres.
+        """Return flattened motions with a random remainder, (B, D), metres.
 
-        Parameters
-        ----------
-        x : ndarray, (B, C)
-            Of the motions.
-        y : ndarray, (B, E)
-            Of the evidence.
-        observed : ndarray, (L, M)
-            The evidence itself.
-        normal : ndarray, (B, L, 3J)
-            Standard normal numbers.
+        Motions have coordinates ``x``, (B, C), and observations ``observed``, (L, M), with
+        coordinates ``y``, (B, E); ``normal``, (B, L, 3J), are standard normal numbers.
         """
-        told = _with_one(y, x) @ self.explained
-        rest = observed - told.reshape(len(x), *observed.shape)
+        explained = _with_one(y, x) @ self.explained
+        rest = observed - explained.reshape(len(x), *observed.shape)
         left = np.einsum("nlm,lmj->nlj", rest, self.gain, optimize=True)
         left += np.einsum("lij,nlj->nli", self.root, normal, optimize=True)
         noise = self.basis.without(left.reshape(len(x), -1))

@@ -1,6 +1,4 @@
-"""Calibration: what is right passes with the stated level, what is wrong is found and named."""
-
-from __future__ import annotations
+"""Calibration: exact samplers pass at the nominal level, wrong ones are detected and named."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +21,7 @@ from probmotion.calibration.ranks import independent_draws, rank
 from probmotion.calibration.result import Calibration
 from probmotion.calibration.table import LEVELS, coverage_curve
 from probmotion.comparison import Budget
-from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
+from probmotion.metrics.credible_sets import DENSITY, DISTANCE
 from probmotion.metrics.uniformity import uniformity_p_value
 from probmotion.posteriors.problem import Problem, simulated
 from probmotion.posteriors.sampling import Interrupted
@@ -34,8 +32,8 @@ prior = cache(small_prior)
 
 def plain(how="occluded"):
     drawn = prior().sample(np.random.default_rng(0), 1)[0]
-    evidence = observe(Motion(drawn, prior().skeleton, 30.0), how, 0.3, 0)
-    return Problem("toy", "a toy", MotionPosterior(prior(), evidence), drawn)
+    likelihood = observe(Motion(drawn, prior().skeleton, 30.0), how, 0.3, 0)
+    return Problem("toy", "a toy", MotionPosterior(prior(), likelihood), drawn)
 
 
 def toy(how="occluded"):
@@ -44,23 +42,23 @@ def toy(how="occluded"):
 
 @dataclass(frozen=True)
 class Batch:
-    """Exact draws, all from one stream: quicker than one stream each. Notes its runs in a file."""
+    """Exact draws from one random stream; appends its seeds to a log file."""
 
     name: ClassVar[str] = "batch"
     requires: ClassVar[tuple[type, ...]] = ()
-    blind: bool = False
-    diary: str = ""
+    prior_only: bool = False
+    log: str = ""
     fails_above: float = math.inf
     thin: int = 1
 
     def sample(self, posterior, *, draws=1000, chains=1, seed=0, initial=None, progress=True):
-        if self.diary:
-            with open(self.diary, "a") as file:
+        if self.log:
+            with open(self.log, "a") as file:
                 file.write(f"{seed}\n")
         rng = seeds.generator(seed, "batch")
         if rng.random() > self.fails_above:
             raise RuntimeError("the floor gave way")
-        likelihood = None if self.blind else posterior.likelihood
+        likelihood = None if self.prior_only else posterior.likelihood
         x = posterior.prior.exact_posterior(likelihood).sample(rng, draws * chains)
         return MotionDraws.of(
             posterior,
@@ -78,39 +76,40 @@ class Batch:
 
 @dataclass(frozen=True)
 class Paid(Batch):
-    """Notes how it was thinned."""
+    """Records its thinning."""
 
     effort: ClassVar[tuple[str, ...]] = ("thin",)
 
-    def sample(self, posterior, **asked):
-        Path(self.diary).parent.joinpath(f"thin-{self.thin}").touch()
-        return super().sample(posterior, **asked)
+    def sample(self, posterior, **options):
+        Path(self.log).parent.joinpath(f"thin-{self.thin}").touch()
+        return super().sample(posterior, **options)
 
 
 @dataclass(frozen=True)
 class Unfit(Batch):
     name: ClassVar[str] = "unfit"
 
-    def sample(self, posterior, **settings):
-        raise UnsupportedPosterior("unfit", "takes no evidence", "observations", ["exact"])
+    def sample(self, posterior, **options):
+        raise UnsupportedPosterior("unfit", "accepts no likelihood", "observations", ["exact"])
 
 
 SMALL = {"draws": 30, "chains": 2, "workers": 0, "progress": False}
 
 
-# Direct ranks: a Gaussian posterior N(μ, 1) of θ, draws of N(μ + shift, width²).
-
-
 def direct_ranks(seed, shift=0.0, width=1.0, n=150, draws=50):
+    """Ranks for θ ~ N(0, 1), y | θ ~ N(θ, 1), and shifted and scaled draws of the posterior."""
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=n)
-    # Given y ~ N(θ, 1): θ | y ~ N(y/2, 1/2).
     y = theta + rng.normal(size=n)
     drawn = y[:, None] / 2 + math.sqrt(0.5) * (shift + width * rng.normal(size=(n, draws)))
     return np.array([rank(t, d, rng) for t, d in zip(theta, drawn, strict=True)])
 
 
-def test_exact_draws_of_a_conjugate_gaussian_pass_with_the_stated_level():
+def nominal_coverage(width):
+    return 2 * norm.cdf(width * norm.ppf((1 + LEVELS) / 2)) - 1
+
+
+def test_exact_draws_pass_at_the_nominal_level():
     p_values = [uniformity_p_value(direct_ranks(seed)) for seed in range(40)]
     assert kstest(p_values, "uniform").pvalue > 0.01
     assert binomtest(sum(p <= 0.05 for p in p_values), 40, 0.05).pvalue > 0.01
@@ -118,54 +117,31 @@ def test_exact_draws_of_a_conjugate_gaussian_pass_with_the_stated_level():
 
 @pytest.mark.parametrize(("shift", "width"), [(0.5, 1), (-0.5, 1), (0, 0.6), (0, 1.6)])
 def test_biased_narrow_and_wide_draws_fail(shift, width):
-    for seed in range(5):
+    for seed in range(3):
         assert uniformity_p_value(direct_ranks(seed, shift, width)) < 0.01
 
 
-def test_coverage_is_what_the_widths_say():
-    for width in (0.5, 1.0, 2.0):
-        ranks = direct_ranks(0, width=width, n=4000, draws=200)
-        expected = 2 * norm.cdf(width * norm.ppf((1 + LEVELS) / 2)) - 1
-        assert np.abs(coverage_curve("direction 1", ranks) - expected).max() < 0.03
+@pytest.mark.parametrize("width", [0.5, 1.0, 2.0])
+def test_coverage_of_scaled_draws(width):
+    ranks = direct_ranks(0, width=width, n=2000, draws=200)
+    found = coverage_curve("direction 1", ranks)
+    assert np.abs(found - nominal_coverage(width)).max() < 0.04
 
 
-@pytest.mark.parametrize("width", [0.5, 1.0])
-def test_in_one_dimension_balls_about_the_middle_are_the_sets_of_highest_density(width):
+def test_balls_and_highest_density_sets_of_a_gaussian():
     rng = np.random.default_rng(4)
     truth = rng.normal(size=300)
-    draws = width * rng.normal(size=(300, 60))
+    draws = 0.5 * rng.normal(size=(300, 60))
 
-    def of(quantity, function):
+    def coverage(quantity, function):
         ties = np.random.default_rng(5)
         ranks = [rank(function(t), function(d), ties) for t, d in zip(truth, draws, strict=True)]
         return coverage_curve(quantity, np.array(ranks))
 
-    balls = of(DISTANCE, np.abs)
-    highest = of(DENSITY, lambda x: -(x**2))
-    central = of("direction 1", lambda x: x)
-    # The same ranks from the other end; U differs.
+    balls, highest = coverage(DISTANCE, np.abs), coverage(DENSITY, lambda x: -(x**2))
     np.testing.assert_allclose(balls, highest, atol=0.02)
-    expected = 2 * norm.cdf(width * norm.ppf((1 + LEVELS) / 2)) - 1
-    for found in (balls, highest, central):
-        np.testing.assert_allclose(found, expected, atol=0.1)
-
-
-def test_balls_about_random_points_cover_as_they_say_if_draws_are_exact():
-    rng = np.random.default_rng(6)
-    truth, elsewhere = 2 * rng.normal(size=(2, 2000))
-    y = truth + rng.normal(size=2000)
-    exact = 0.8 * y[:, None] + math.sqrt(0.8) * rng.normal(size=(2000, 40))
-    for draws, right in (
-        (exact, True),
-        (0.8 * y[:, None] + 0.5 * (exact - 0.8 * y[:, None]), False),
-    ):
-        ranks = np.array(
-            [
-                rank(abs(t - e), abs(d - e), rng)
-                for t, d, e in zip(truth, draws, elsewhere, strict=True)
-            ]
-        )
-        assert (uniformity_p_value(credible_level(DISTANCE, ranks)) > 0.01) == right
+    for found in (balls, highest, coverage("direction 1", lambda x: x)):
+        np.testing.assert_allclose(found, nominal_coverage(0.5), atol=0.1)
 
 
 def test_ties_are_broken_at_random():
@@ -175,7 +151,6 @@ def test_ties_are_broken_at_random():
     assert uniformity_p_value(ranks) > 0.01
     assert rank(5.0, np.arange(5.0), rng) > 5 / 6
     assert rank(-1.0, np.arange(5.0), rng) < 1 / 6
-    # None where only −∞ is: the truth may be anywhere.
     assert 0 < rank(-np.inf, np.full(9, -np.inf), rng) < 1
 
 
@@ -188,30 +163,26 @@ def autoregression(rng, n, draws, memory):
 
 
 class Run:
-    """What `independent_draws` asks of a run."""
-
     independent = False
-    dataset: ClassVar[dict] = {}
+
+    def __init__(self, times=None):
+        self.dataset = {} if times is None else {"autocorrelation_time": pd.Series(times)}
 
 
 def test_chains_are_thinned_to_about_independent_draws():
     rng = np.random.default_rng(8)
     chains = autoregression(rng, 4, 500, 0.9)
-    kept = independent_draws(chains, Run())
+    thinned = independent_draws(chains, Run())
     expected = 4 * 500 * (1 - 0.9) / (1 + 0.9)
-    assert 0.6 * expected < len(kept) < 1.5 * expected
-    assert set(kept) <= set(chains.ravel())
+    assert 0.6 * expected < len(thinned) < 1.5 * expected
+    assert set(thinned) <= set(chains.ravel())
     assert len(independent_draws(rng.normal(size=(4, 500)), Run())) > 1500
-    # What never moves is one draw.
     assert len(independent_draws(np.ones((2, 50)), Run())) == 1
-    walkers = Run()
-    walkers.dataset = {"autocorrelation_time": pd.Series([10.0, 20.0])}
-    assert len(independent_draws(chains, walkers)) == 100
-    walkers.dataset = {"autocorrelation_time": pd.Series([10.0, np.nan])}
-    assert len(independent_draws(chains, walkers)) == 1
+    assert len(independent_draws(chains, Run([10.0, 20.0]))) == 100
+    assert len(independent_draws(chains, Run([10.0, np.nan]))) == 1
 
 
-def test_a_right_chain_passes_thinned_and_would_not_unthinned():
+def test_exact_chains_pass_only_if_thinned():
     rng = np.random.default_rng(9)
     chains = autoregression(rng, 1200, 200, 0.9)
     pairs = list(zip(rng.normal(size=1200), chains, strict=True))
@@ -220,18 +191,19 @@ def test_a_right_chain_passes_thinned_and_would_not_unthinned():
     assert uniformity_p_value(np.array([rank(t, chain, rng) for t, chain in pairs])) < 1e-3
 
 
-# The whole, on a small mixture.
-
-
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory):
     samplers = {"batch": Batch(), "overconfident": Overconfident(Batch())}
-    return calibrate(toy(), samplers, simulations=100, out=tmp_path_factory.mktemp("a"), **SMALL)
+    return calibrate(toy(), samplers, simulations=60, out=tmp_path_factory.mktemp("a"), **SMALL)
 
 
 @pytest.fixture(scope="module")
 def odd():
-    samplers = {"blind": Batch(blind=True), "brittle": Batch(fails_above=0.7), "unfit": Unfit()}
+    samplers = {
+        "prior": Batch(prior_only=True),
+        "brittle": Batch(fails_above=0.7),
+        "unfit": Unfit(),
+    }
     return calibrate(toy(), samplers, simulations=30, **SMALL)
 
 
@@ -240,79 +212,70 @@ def scores(calibration, sampler):
     return table[table["sampler"] == sampler].set_index("quantity")
 
 
-def test_exact_draws_pass_and_the_negative_control_fails_at_once(calibration):
+def test_exact_draws_pass_and_the_negative_control_fails(calibration):
     right, wrong = scores(calibration, "batch"), scores(calibration, "overconfident")
     assert right.loc["all", "p_value"] > 0.05
-    assert wrong.loc["all", "p_value"] < 1e-6
+    assert wrong.loc["all", "p_value"] < 1e-4
     assert right.loc["all", "coverage_90"] == pytest.approx(0.9, abs=0.06)
     assert wrong.loc["all", "coverage_90"] < 0.75
     assert right.loc["all", "coverage_error"] < 0.05 < wrong.loc["all", "coverage_error"]
-    assert calibration.verdict("toy", "batch").startswith(
-        "batch on toy: no deviation found in 100 simulations (p = "
-    )
+    sentence = calibration.verdict("toy", "batch")
+    assert sentence.startswith("batch on toy: no deviation found in 60 simulations (p = ")
     sentence = calibration.verdict("toy", "overconfident")
-    assert sentence.startswith("overconfident on toy: too sure: 90 % intervals hold ")
-    assert sentence.endswith(" % (p < .001, 100 simulations)")
+    assert sentence.startswith("overconfident on toy: overconfident: 90 % intervals cover ")
+    assert sentence.endswith(" % (p < .001, 60 simulations)")
 
 
-def test_draws_from_the_prior_are_found_by_what_depends_on_the_evidence(odd):
-    blind = scores(odd, "blind")["p_value"]
-    assert (blind.drop(["all", "log likelihood", "log density"]) > 0.005).all()
-    assert blind["log likelihood"] < 1e-4
-    assert "no deviation" not in odd.verdict("toy", "blind")
+def test_prior_draws_are_detected_by_the_likelihood(odd):
+    p_values = scores(odd, "prior")["p_value"]
+    assert (p_values.drop(["all", "log likelihood", "log density"]) > 0.005).all()
+    assert p_values["log likelihood"] < 1e-4
+    assert "no deviation" not in odd.verdict("toy", "prior")
 
 
-def test_failures_are_counted_and_said(odd):
+def test_failures_are_counted(odd):
     brittle, unfit = scores(odd, "brittle"), scores(odd, "unfit")
     failed = int(brittle.loc["all", "failed"])
     assert 2 < failed < 20
     assert brittle.loc["all", "simulations"] == 30 - failed
     assert len(odd.ranks("toy", "brittle")["direction 1"]) == 30 - failed
-    said = f"{failed} of 30 simulations failed, the first: the floor gave way"
-    assert said in odd.verdict("toy", "brittle")
+    sentence = f"{failed} of 30 simulations failed, the first: the floor gave way"
+    assert sentence in odd.verdict("toy", "brittle")
     assert list(unfit.index) == ["all"]
     assert (unfit.loc["all", "failed"], unfit.loc["all", "simulations"]) == (30, 0)
     assert math.isnan(unfit.loc["all", "p_value"])
-    assert odd.verdict("toy", "unfit").startswith("unfit on toy: not supported, unfit takes")
+    assert odd.verdict("toy", "unfit").startswith("unfit on toy: not supported, unfit accepts")
     assert f"brittle on toy: the floor gave way ({failed} of 30 simulations)" in odd.notes
-    assert (
-        "unfit on toy: unfit takes no evidence; exact would do (30 of 30 simulations)" in odd.notes
-    )
+    assert any("accepts no likelihood; try exact (30 of 30 sim" in note for note in odd.notes)
     assert len(odd.failures) == failed + 30
 
 
-def test_the_table_is_tidy_and_prints_a_line_per_sampler(odd):
+def test_the_table_prints_a_line_per_sampler(odd):
     table = odd.table()
-    assert list(table.columns) == [
-        "problem", "sampler", "quantity", "p_value", "coverage_90", "coverage_error",
-        "simulations", "failed",
-    ]  # fmt: skip
     assert not table.duplicated(["problem", "sampler", "quantity"]).any()
-    asked = [one.name for one in quantities(toy().posterior)]
-    assert list(scores(odd, "blind").index) == [
-        "all", *asked, "log likelihood", "log density", "distance",
-    ]  # fmt: skip
+    names = [quantity.name for quantity in quantities(toy().posterior)]
+    found = list(scores(odd, "prior").index)
+    assert found == ["all", *names, "log likelihood", "log density", "distance"]
     lines = str(table).splitlines()
     assert lines[0] == "toy"
     assert [line.split()[0] for line in lines[2:5]] == list(odd.plan.samplers)
     assert max(map(len, lines[:5])) <= 100
     for sampler in odd.plan.samplers:
         assert odd.verdict("toy", sampler) in lines
-    kept = pd.read_csv(odd.folder / "table.csv")
-    assert kept["p_value"].to_numpy() == pytest.approx(table["p_value"].to_numpy(), nan_ok=True)
+    stored = pd.read_csv(odd.folder / "table.csv")
+    assert list(stored.columns) == list(table.columns)
+    assert stored["p_value"].to_numpy() == pytest.approx(table["p_value"].to_numpy(), nan_ok=True)
 
 
-def test_coverage_has_an_interval_that_holds_it(calibration):
+def test_coverage_has_an_interval(calibration):
     frame = calibration.coverage("toy", "batch")
-    assert (frame["lower"] <= frame["coverage"]).all()
-    assert (frame["coverage"] <= frame["upper"]).all()
+    assert frame["coverage"].between(frame["lower"], frame["upper"]).all()
     ninety = frame[frame["level"] == 0.9].set_index("quantity")["coverage"]
     assert ninety["direction 1"] == scores(calibration, "batch").loc["direction 1", "coverage_90"]
-    inside = (frame["lower"] <= frame["level"]) & (frame["level"] <= frame["upper"])
-    assert inside.mean() > 0.8
+    assert frame["level"].between(frame["lower"], frame["upper"]).mean() > 0.8
 
 
-def test_it_is_read_again_and_plotted(calibration, monkeypatch, tmp_path):
+def test_loading_and_plotting(calibration, monkeypatch, tmp_path):
     again = Calibration.load(calibration.folder.parent)
     assert again.table().equals(calibration.table())
     drawn = {}
@@ -324,118 +287,114 @@ def test_it_is_read_again_and_plotted(calibration, monkeypatch, tmp_path):
     assert calibration.plot(tmp_path / "a.png", problem="toy") == tmp_path / "a.png"
     for blocks in drawn.values():
         assert list(blocks) == [again.verdict("toy", name) for name in ("batch", "overconfident")]
-    with pytest.raises(ValueError, match="sampler must be one of batch, over, got 'mas'"):
+    with pytest.raises(ValueError, match="sampler must be one of batch, overconfident, got 'mas'"):
         calibration.ranks("toy", "mas")
     with pytest.raises(ValueError, match="problem must be one of toy, got 'gait'"):
         calibration.plot(tmp_path / "a.png", problem="gait")
-    with pytest.raises(ValueError, match=r"which holds no comparison\.json"):
+    with pytest.raises(ValueError, match=r"comparison\.json"):
         Calibration.load(tmp_path)
 
 
-def test_a_run_goes_on_where_it_was_and_ranks_do_not_depend_on_the_order(tmp_path):
-    diary = tmp_path / "diary"
-    once = partial(calibrate, toy(), Batch(diary=str(diary)), **SMALL)
+def test_resuming_and_extending(tmp_path):
+    log = tmp_path / "log"
+    once = partial(calibrate, toy(), Batch(log=str(log)), **SMALL)
     first = once(simulations=10, out=tmp_path / "kept")
-    assert len(diary.read_text().split()) == 10
+    assert len(log.read_text().split()) == 10
     more = once(simulations=14, out=tmp_path / "kept")
-    assert len(set(diary.read_text().split())) == len(diary.read_text().split()) == 14
+    assert len(set(log.read_text().split())) == len(log.read_text().split()) == 14
     with ThreadPoolExecutor(2) as executor:
         other = once(simulations=14, executor=executor)
     for name, ranks in other.ranks("toy", "batch").items():
         np.testing.assert_array_equal(ranks, more.ranks("toy", "batch")[name])
         np.testing.assert_array_equal(ranks[:10], first.ranks("toy", "batch")[name])
-    with pytest.raises(ValueError, match="made with other settings"):
+    with pytest.raises(ValueError, match="other settings"):
         once(simulations=10, out=tmp_path / "kept", draws=20)
 
 
-def test_what_a_budget_buys_is_found_once_and_all_simulations_have_it(tmp_path):
-    paid = Paid(diary=str(tmp_path / "diary"))
-    asked = partial(calibrate, toy(), paid, out=tmp_path / "kept", **SMALL)
-    held = asked(simulations=10, budget=Budget(evaluations=350))
+def test_the_budget_is_the_same_for_all_simulations(tmp_path):
+    paid = Paid(log=str(tmp_path / "log"))
+    once = partial(calibrate, toy(), paid, out=tmp_path / "kept", **SMALL)
+    found = once(simulations=10, budget=Budget(evaluations=350))
     assert (tmp_path / "thin-50").exists()
-    pilots = len((tmp_path / "diary").read_text().split()) - 10
+    pilots = len((tmp_path / "log").read_text().split()) - 10
     assert pilots > 0
-    assert held.notes[0].startswith("every sampler had 350 evaluations")
-    assert held.notes[0].endswith("per simulation")
-    assert held.notes[1] == "used per simulation: batch 350 to 350"
-    assert not list((tmp_path / "kept").rglob("draws.nc"))
-    asked(simulations=12, budget=Budget(evaluations=350))
-    assert len((tmp_path / "diary").read_text().split()) == pilots + 12
-    plain_ranks = calibrate(toy(), replace(paid, thin=50), simulations=10, **SMALL)
-    for name, ranks in plain_ranks.ranks("toy", "batch").items():
-        np.testing.assert_array_equal(held.ranks("toy", "batch")[name], ranks)
-    with pytest.raises(ValueError, match="made with other settings"):
-        asked(simulations=12, budget=Budget(evaluations=700))
-    with pytest.raises(ValueError, match="budget must be a Budget, got 350"):
-        asked(simulations=12, budget=350)
+    assert found.notes[0].endswith("per simulation")
+    assert found.notes[1] == "used per simulation: batch 350 to 350"
+    once(simulations=12, budget=Budget(evaluations=350))
+    assert len((tmp_path / "log").read_text().split()) == pilots + 12
+    expected = calibrate(toy(), replace(paid, thin=50), simulations=10, **SMALL)
+    for name, ranks in expected.ranks("toy", "batch").items():
+        np.testing.assert_array_equal(found.ranks("toy", "batch")[name], ranks)
+    with pytest.raises(ValueError, match="other settings"):
+        once(simulations=12, budget=Budget(evaluations=700))
 
 
-def test_no_draws_are_kept_and_a_temporary_folder_goes(tmp_path):
-    held = calibrate(toy("none"), Batch(), simulations=10, **SMALL)
-    folder = Path(held.folder)
+def test_draws_are_not_stored_and_temporary_folders_are_removed():
+    found = calibrate(toy("none"), Batch(), simulations=10, **SMALL)
+    folder = Path(found.folder)
     assert not list(folder.rglob("draws.nc"))
-    assert "log likelihood" not in held.ranks("toy", "batch")
-    assert not any(name.startswith("hidden") for name in held.ranks("toy", "batch"))
-    del held
+    names = set(found.ranks("toy", "batch"))
+    assert not any(name.startswith(("log likelihood", "hidden")) for name in names)
+    del found
     assert not folder.parent.exists()
 
 
-def test_wrong_input_is_named():
-    with pytest.raises(ValueError, match="problems has 'toy', which cannot be simulated"):
-        calibrate(plain(), Batch(), simulations=10, **SMALL)
-    with pytest.raises(ValueError, match="simulations must be an integer of at least 10, got 3"):
-        calibrate(toy(), Batch(), simulations=3, **SMALL)
-    with pytest.raises(ValueError, match="draws must be a multiple of chains, 2, got 41"):
-        calibrate(toy(), Batch(), simulations=10, draws=41, chains=2)
+@pytest.mark.parametrize(
+    ("problem", "options", "message"),
+    [
+        (plain, {}, "problems must have simulate, got 'toy' without"),
+        (toy, {"simulations": 3}, "simulations must be an integer of at least 10, got 3"),
+        (toy, {"draws": 41}, "draws must be a multiple of chains, 2, got 41"),
+        (toy, {"budget": 350}, "budget must be a Budget, got 350"),
+    ],
+)
+def test_invalid_arguments(problem, options, message):
+    with pytest.raises(ValueError, match=message):
+        calibrate(problem(), Batch(), **(SMALL | {"simulations": 10} | options))
+
+
+def test_simulations_without_truth_fail():
     no_truth = replace(plain(), simulate=lambda number: replace(plain(), truth=None))
-    held = calibrate(no_truth, Batch(), simulations=10, **SMALL)
-    assert "toy simulates no truth" in held.verdict("toy", "batch")
+    found = calibrate(no_truth, Batch(), simulations=10, **SMALL)
+    assert "simulations of toy must have a truth" in found.verdict("toy", "batch")
 
 
-def test_simulations_that_differ_in_kind_are_judged_by_what_they_share():
+def test_quantities_that_only_some_simulations_have_are_skipped():
     bare = replace(plain(), posterior=MotionPosterior(prior()))
     problem = replace(toy(), simulate=lambda n: toy().simulate(n) if n % 3 else bare)
-    held = calibrate(problem, Batch(), simulations=10, **SMALL)
-    assert held.failures == []
-    assert {len(ranks) for ranks in held.ranks("toy", "batch").values()} == {10}
-    assert "log likelihood" not in held.ranks("toy", "batch")
-    (said,) = (note for note in held.notes if "left out" in note)
-    assert said == ("batch on toy: log likelihood is left out, which not all simulations have")
-    assert held.ranked
+    found = calibrate(problem, Batch(), simulations=10, **SMALL)
+    assert found.failures == []
+    assert {len(ranks) for ranks in found.ranks("toy", "batch").values()} == {10}
+    assert "log likelihood" not in found.ranks("toy", "batch")
+    assert "batch on toy: log likelihood skipped, not in all simulations" in found.notes
+    assert found.ranked
 
 
-# The negative control.
+@dataclass(frozen=True)
+class Stopped(Batch):
+    def sample(self, posterior, **options):
+        raise Interrupted(super().sample(posterior, **options))
 
 
-def test_overconfident_draws_keep_their_mean_and_lose_the_rest():
+def test_the_negative_control_shrinks_draws_towards_their_mean():
     posterior = plain().posterior
-    right = Batch().sample(posterior, draws=30, chains=2, seed=3)
-    wrong = Overconfident(Batch(), 0.25).sample(posterior, draws=30, chains=2, seed=3)
+    options = {"draws": 30, "chains": 2, "seed": 3}
+    right = Batch().sample(posterior, **options)
+    wrong = Overconfident(Batch(), 0.25).sample(posterior, **options)
     np.testing.assert_allclose(wrong.flat().mean(axis=0), right.flat().mean(axis=0))
     np.testing.assert_allclose(wrong.flat().std(axis=0), 0.25 * right.flat().std(axis=0))
     assert wrong.dataset.attrs["sampler"] == "overconfident"
     assert wrong.counts == {"density": 7}
     assert wrong.independent
     assert (wrong.dataset["acceptance"] == 0.25).all()
-    assert "log_density" not in wrong.dataset
-    assert "theta" not in wrong.dataset
-
-
-@pytest.mark.parametrize("factor", [0, 1, 2.0, math.nan])
-def test_a_factor_that_does_not_shrink_is_refused(factor):
-    with pytest.raises(ValueError, match="factor is"):
-        Overconfident(Batch(), factor)
-
-
-@dataclass(frozen=True)
-class Stopped(Batch):
-    def sample(self, posterior, **settings):
-        raise Interrupted(super().sample(posterior, **settings))
-
-
-def test_what_an_interrupted_sampler_had_finished_is_pulled_too():
-    settings = {"draws": 10, "chains": 2, "seed": 1}
-    expected = Overconfident(Batch()).sample(plain().posterior, **settings)
+    assert not {"log_density", "theta"} & set(wrong.dataset)
+    # So are the draws of an interrupted run.
     with pytest.raises(Interrupted) as stop:
-        Overconfident(Stopped()).sample(plain().posterior, **settings)
-    np.testing.assert_array_equal(stop.value.draws.flat(), expected.flat())
+        Overconfident(Stopped(), 0.25).sample(posterior, **options)
+    np.testing.assert_array_equal(stop.value.draws.flat(), wrong.flat())
+
+
+@pytest.mark.parametrize("factor", [0, 1, math.nan])
+def test_factors_that_do_not_shrink_are_rejected(factor):
+    with pytest.raises(ValueError, match="factor must be"):
+        Overconfident(Batch(), factor)

@@ -1,10 +1,8 @@
-"""Bias budgets against closed forms: a Gaussian prior, on which every part is known.
+"""Error decomposition against closed forms for a Gaussian prior.
 
-On it a step of a sampler is linear, so that the covariance after T steps is a product of small
-matrices, and for T → ∞ the design's items 1 to 6 say what it is.
+A sampler step is then linear, and the covariance after T steps a product of small matrices; items
+refer to the design.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
@@ -15,7 +13,7 @@ import pytest
 
 from probmotion import Keypoints2D, Motion, MotionPosterior, NoiseSchedule, UnsupportedPosterior
 from probmotion.calibration.error_decomposition import decompose_error
-from probmotion.calibration.error_measures import BiasMeasures
+from probmotion.calibration.error_measures import ErrorMeasures
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.problem import Problem
@@ -23,12 +21,12 @@ from probmotion.problems import load_problem
 from probmotion.samplers.diffusion.guidance import WeightedTriangulation
 
 JOINTS = 60
-budget_of = partial(decompose_error, progress=False)
+decompose = partial(decompose_error, progress=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Joints that are independent, each N(mean_j, covariance), metres; one frame."""
+    """Independent joints N(mean_j, covariance), metres, in one frame."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -100,12 +98,12 @@ def problem_of(prior, likelihood=None):
 
 
 def covariance_after(S, T, views=None, shared_noise=True):
-    """A joint's covariance after T steps: of `ancestral3d`, or with views of `mas`."""
+    """Covariance of a joint after T steps of `ancestral3d`, or with views of `mas`."""
     schedule = NoiseSchedule.cosine(T)
     axes = np.eye(3)[None] if views is None else views
     inverse = np.linalg.inv(np.einsum("vcx,vcy->xy", axes, axes))
     rows = np.concatenate(list(axes))
-    # The state is X, or all views side by side; `embed` makes the state of a motion.
+    # The state is X, or all views side by side; `embed` maps a motion to it.
     embed = np.eye(3) if shared_noise else rows
 
     def estimate(alpha_bar):
@@ -134,33 +132,31 @@ def log_trace(covariance, S):
     return math.log(np.trace(covariance) / np.trace(S))
 
 
-def means(budget, measure):
-    table = budget.table()
+def means(decomposition, measure):
+    table = decomposition.table()
     return table[table["measure"] == measure].set_index("part")["mean"]
 
 
-def test_isotropic_the_steps_alone_shrink_and_views_change_nothing():
-    """Items 1, 5 and 6: .955 at T = 100, .995 at 1000; independent noise leaves M⁻¹."""
-    S = np.eye(3)
-    found = budget_of(problem_of(centred(1, 1, 1)), steps=100, seeds=2, draws=100)
+def test_isotropic_prior_shrinks_by_discretisation_alone():
+    """Items 1, 5 and 6: .955 at T = 100, .995 at 1000; limit M⁻¹ for independent noise."""
+    S, T = np.eye(3), 30
+    assert log_trace(covariance_after(S, 100), S) == pytest.approx(math.log(0.955), abs=1e-3)
+    assert log_trace(covariance_after(S, 1000), S) == pytest.approx(math.log(0.995), abs=1e-3)
+    found = decompose(problem_of(centred(1, 1, 1)), steps=T, seeds=2, draws=100)
     spread = means(found, "spread")
-    error = math.sqrt(2 / (100 * 2 * JOINTS * 3))
-    assert spread["remainder"] == pytest.approx(math.log(0.995), abs=4 * math.sqrt(2) * error)
-    discretisation = spread["remainder"] + spread["discretisation"]
-    assert discretisation == pytest.approx(math.log(0.955), abs=4 * math.sqrt(2) * error)
-    # The views' denoiser is then the 3D one, and noise and all are shared.
+    error = 4 * math.sqrt(2) * math.sqrt(2 / (100 * 2 * JOINTS * 3))
+    many, few = (log_trace(covariance_after(S, steps), S) for steps in (10 * T, T))
+    assert spread["remainder"] == pytest.approx(many, abs=error)
+    assert spread["remainder"] + spread["discretisation"] == pytest.approx(few, abs=error)
+    # The view denoisers then agree with the 3D one.
     assert spread["single view"] == pytest.approx(0, abs=1e-10)
     views = ring(5, math.pi / 16)
-    coarse, here, fine = (
-        covariance_after(S, T, views, shared_noise=False) for T in (200, 100, 400)
-    )
+    coarse, here, fine = (covariance_after(S, T, views, shared_noise=False) for T in (200, T, 400))
     limit = np.linalg.inv(np.einsum("vcx,vcy->xy", views, views))
     np.testing.assert_allclose(2 * fine - coarse, limit, atol=3e-3)
-    # At T = 100 the steps take a little more from it than from the motion.
-    sharing = log_trace(here, covariance_after(S, 100))
-    assert spread["noise sharing"] == pytest.approx(sharing, abs=4 * math.sqrt(2) * error)
-    expected = log_trace(here, S)
-    assert spread["whole"] == pytest.approx(expected, abs=4 * math.sqrt(2) * error)
+    sharing = log_trace(here, covariance_after(S, T))
+    assert spread["noise sharing"] == pytest.approx(sharing, abs=error)
+    assert spread["whole"] == pytest.approx(log_trace(here, S), abs=error)
     assert means(found, "mean").abs().max() < 0.01
 
 
@@ -169,26 +165,26 @@ def test_isotropic_the_steps_alone_shrink_and_views_change_nothing():
     [
         # Item 2: elevation mixes vertical and horizontal.
         ((1, 0.05, 1), math.radians(15), (0.835, 0.114, 0.835)),
-        # Item 3: what is large shrinks, what is small inflates; level views, but for no warning.
+        # Item 3: large directions shrink, small ones inflate; nearly level views.
         ((0.01, 0.01, 1), 1e-9, (0.055, 0.01, 0.675)),
     ],
 )
-def test_conditioning_on_single_views_shrinks_large_directions_and_inflates_small(
+def test_single_view_conditioning_shrinks_large_and_inflates_small_directions(
     true, elevation, drawn
 ):
     prior = centred(*true)
-    S, T = prior.covariance, 40
-    found = budget_of(
+    S, T = prior.covariance, 15
+    exact = log_trace(covariance_after(S, 60, ring(5, elevation)), covariance_after(S, 60))
+    assert exact == pytest.approx(log_trace(np.diag(drawn), S), abs=0.02)
+    found = decompose(
         problem_of(prior), steps=T, seeds=2, draws=100, settings={"elevation": elevation}
     )
     after = covariance_after(S, T, ring(5, elevation))
     before = covariance_after(S, T)
     spread = means(found, "spread")
     assert spread["single view"] == pytest.approx(log_trace(after, before), abs=0.01)
-    # Steps enter only as far as they do so alone.
-    assert log_trace(after, before) == pytest.approx(log_trace(np.diag(drawn), S), abs=0.02)
-    # Small directions mix what is alike: joints, and axes of one variance.
-    small = BiasMeasures(problem_of(prior)).small.reshape(JOINTS, 3, -1)
+    # Small directions mix joints, and axes of equal variance.
+    small = ErrorMeasures(problem_of(prior)).small.reshape(JOINTS, 3, -1)
     inflated, right = (
         np.einsum("jxd,xy,jyd->d", small, covariance, small) for covariance in (after, before)
     )
@@ -198,7 +194,7 @@ def test_conditioning_on_single_views_shrinks_large_directions_and_inflates_smal
 
 
 def test_parts_add_up_exactly_seed_by_seed():
-    found = budget_of(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
+    found = decompose(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
     assert found.parts == ["remainder", "discretisation", "single view", "noise sharing"]
     table = found.table()
     assert list(table.columns) == ["setting", "measure", "part", "mean", "low", "high"]
@@ -210,22 +206,21 @@ def test_parts_add_up_exactly_seed_by_seed():
         rows = table[table["measure"] == measure].set_index("part")
         np.testing.assert_allclose(rows.loc[found.parts, "mean"].sum(), rows.loc["whole", "mean"])
         assert (rows["low"] < rows["high"]).all()
-    # Five steps shrink, and are said to; the mean is nobody's fault.
-    said = {words.partition(":")[0]: words for words in found.findings}
-    assert "discretisation -" in said["spread"]
-    assert said["mean"].startswith("mean: in all not told from exact draws; not told from chance")
+    sentences = {words.partition(":")[0]: words for words in found.findings}
+    assert "discretisation -" in sentences["spread"]
+    assert sentences["mean"].startswith("mean: not significant in all; not significant: ")
 
 
-def test_measures_of_draws_that_are_moved_and_stretched():
+def test_measures_of_shifted_and_scaled_draws():
     problem = problem_of(centred(1, 0.3, 0.1))
-    measures = BiasMeasures(problem)
+    measures = ErrorMeasures(problem)
     exact = problem.reference(11, 400)
     total = 1.4 * JOINTS
     floor = measures.of(exact, seed=2)
     shift = np.random.default_rng(0).normal(size=exact.shape[1:])
     moved = measures.of(exact + shift, seed=2)
     apart = float((shift**2).sum()) / total
-    # W₂² of a shift is its square along a direction: on average ‖shift‖² / D.
+    # W₂² of a shift along a direction is its square, ‖shift‖² / D on average.
     for measure in ("mean", "distance"):
         assert moved[measure] - floor[measure] == pytest.approx(apart, rel=0.15)
     for measure in ("spread", "small"):
@@ -236,15 +231,15 @@ def test_measures_of_draws_that_are_moved_and_stretched():
     # Of Gaussians: (1.5 σ − σ)² along every direction.
     assert stretched["distance"] - floor["distance"] == pytest.approx(0.25, rel=0.1)
     assert abs(stretched["mean"]) < 0.005
-    # The last 5 % of the variance, all of it of the axis of variance .1.
+    # The small directions hold the last 5 % of the variance, on the axis of variance .1.
     assert 0.048 * total < measures.small_variances.sum() < 0.051 * total
     small = measures.small.reshape(JOINTS, 3, -1)
     assert (small[:, 2] ** 2).sum() > 0.98 * small.shape[-1]
 
 
-def test_a_denoiser_that_is_right_adds_nothing_and_a_wrong_one_does():
+def test_the_network_part_is_zero_for_an_exact_denoiser_only():
     prior = centred(1, 0.3, 0.1)
-    run = partial(budget_of, problem_of(prior), steps=10, seeds=2, draws=30)
+    run = partial(decompose, problem_of(prior), steps=10, seeds=2, draws=30)
     right, wrong = run(learnt=prior), run(learnt=replace(prior, fault=0.8))
     for measure in right.values:
         np.testing.assert_array_equal(right.differences(measure)["network"], 0)
@@ -256,26 +251,25 @@ def test_a_denoiser_that_is_right_adds_nothing_and_a_wrong_one_does():
     assert run(shared_noise=True).parts == ["remainder", "discretisation", "single view"]
 
 
-def evidence(prior, noise):
+def observed(prior, noise):
     drawn = prior.sample(np.random.default_rng(1), 1)[0]
     motion = Motion(drawn, prior.skeleton, prior.fps)
     return Keypoints2D.observe(motion, Cameras.ring(1, elevation=0.3), noise, seed=0)
 
 
-def test_guidance_is_what_guiding_costs_beside_denoisers_given_the_evidence():
+def test_guidance():
     prior = centred(1, 0.3, 0.1)
-    run = partial(budget_of, steps=10, seeds=2, draws=30)
-    idle = run(problem_of(prior, evidence(prior, 1e5)), learnt=prior)
+    run = partial(decompose, steps=10, seeds=2, draws=30)
+    idle = run(problem_of(prior, observed(prior, 1e5)), learnt=prior)
     assert idle.parts == ["remainder", "discretisation", "single view", "guidance", "network"]
     for measure in idle.values:
         np.testing.assert_allclose(idle.differences(measure)["guidance"], 0, atol=1e-6)
         np.testing.assert_array_equal(idle.differences(measure)["network"], 0)
-    sharp = problem_of(prior, evidence(prior, 0.05))
+    sharp = problem_of(prior, observed(prior, 0.05))
     found = run(sharp)
-    # The mean of exact draws given y is not told from that of the reference.
     assert abs(means(found, "mean")["floor"]) < 0.02
     assert any("no learnt denoiser" in note for note in found.notes)
-    # Evidence as one more view is the design's example of what fails.
+    # Treating the observation as one more view is biased.
     naive = run(sharp, settings={"guidance": WeightedTriangulation()})
     row = naive.table().set_index(["measure", "part"]).loc[("mean", "guidance")]
     assert row["low"] > 10 * means(found, "mean")["guidance"] > 0
@@ -285,13 +279,13 @@ def test_guidance_is_what_guiding_costs_beside_denoisers_given_the_evidence():
         )
 
 
-def test_what_is_stopped_goes_on(tmp_path):
+def test_interrupted_runs_resume(tmp_path):
     prior = centred(1, 0.3, 0.1)
-    run = partial(budget_of, problem_of(prior), steps=4, seeds=2, draws=12)
+    run = partial(decompose, problem_of(prior), steps=4, seeds=2, draws=12)
     whole = run(out=tmp_path / "whole")
 
     calls = []
-    of = BiasMeasures.of
+    of = ErrorMeasures.of
 
     def stop_at_the_sixth(self, positions, seed):
         calls.append(seed)
@@ -300,7 +294,7 @@ def test_what_is_stopped_goes_on(tmp_path):
         return of(self, positions, seed)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(BiasMeasures, "of", stop_at_the_sixth)
+        patched.setattr(ErrorMeasures, "of", stop_at_the_sixth)
         with pytest.raises(KeyboardInterrupt):
             run(out=tmp_path / "parts")
         again = run(out=tmp_path / "parts")
@@ -308,19 +302,13 @@ def test_what_is_stopped_goes_on(tmp_path):
     assert again.table().equals(whole.table())
     csv = [(tmp_path / name / "decompose_error.csv").read_text() for name in ("whole", "parts")]
     assert csv[0] == csv[1]
-    with pytest.raises(ValueError, match="holds another budget, expected a new folder"):
-        budget_of(problem_of(prior), steps=5, seeds=2, draws=12, out=tmp_path / "parts")
+    with pytest.raises(ValueError, match="out must be a new folder"):
+        decompose(problem_of(prior), steps=5, seeds=2, draws=12, out=tmp_path / "parts")
 
 
-def test_the_batch_changes_nothing():
-    run = partial(budget_of, problem_of(centred(1, 0.3, 0.1)), steps=4, seeds=2, draws=12)
-    one, other = (run(settings={"batch": batch}).table() for batch in (5, 256))
-    np.testing.assert_allclose(one["mean"], other["mean"], atol=1e-9)
-
-
-def test_gaits_have_a_manifold_and_a_picture(tmp_path):
+def test_gaits_have_a_manifold_measure_and_a_plot(tmp_path):
     problem = load_problem("gait", frames=4, components=3)
-    found = budget_of(problem, steps=8, seeds=2, draws=40)
+    found = decompose(problem, steps=6, seeds=2, draws=30)
     assert list(found.values) == ["spread", "small", "off", "mean", "distance"]
     off = found.table().set_index(["measure", "part"]).loc["off"]
     assert abs(off.loc["floor", "mean"]) < 0.1
@@ -330,42 +318,42 @@ def test_gaits_have_a_manifold_and_a_picture(tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_gaits_given_evidence_have_exact_denoisers():
+def test_conditional_gaits():
     problem = load_problem("gait-monocular", frames=4, components=3)
-    found = budget_of(problem, steps=20, seeds=2, draws=60)
+    found = decompose(problem, steps=8, seeds=2, draws=40)
     spread = means(found, "spread")
-    # At 200 steps the 3D sampler given y draws from the posterior, but for what steps leave.
     assert abs(spread["remainder"]) < 0.4
     assert abs(means(found, "mean")["remainder"]) < 0.1
     assert found.parts == ["remainder", "discretisation", "single view", "guidance"]
 
 
-def test_what_does_not_fit_is_refused_in_a_sentence():
-    problem = problem_of(centred(1, 1, 1))
-    for wrong, words in (
-        ({"seeds": 1}, "seeds must be an integer of at least 2, got 1"),
-        ({"draws": 3}, "draws must be an integer of at least 10, got 3"),
-        ({"settings": {"perspective": True}}, "settings has 'perspective', expected some of n_vie"),
-        ({"learnt": Points(np.zeros((3, 3)), np.eye(3))}, "learnt is of 1 frames of 3 joints"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            budget_of(problem, **wrong)
-
-    with pytest.raises(ValueError, match="problem is 'points', which nobody knows exactly"):
-        budget_of(problem_of(Flat()))
-    seen = problem_of(centred(1, 1, 1), evidence(centred(1, 1, 1), 0.1))
-    with pytest.raises(ValueError, match="shared_noise must be True where there is, got False"):
-        budget_of(seen, shared_noise=False)
+def test_invalid_arguments():
+    prior = centred(1, 1, 1)
+    problem = problem_of(prior)
 
     class Blind(Flat):
         skeleton, frames = problem.posterior.skeleton, 1
 
-    with pytest.raises(UnsupportedPosterior, match="mas needs a prior with Denoises2D, which Bli"):
-        budget_of(problem, learnt=Blind())
+    for of, options, message in (
+        (problem, {"seeds": 1}, "seeds must be an integer of at least 2, got 1"),
+        (problem, {"draws": 3}, "draws must be an integer of at least 10, got 3"),
+        (problem, {"settings": {"perspective": True}}, "settings must be among .*, got 'perspec"),
+        (problem, {"learnt": replace(prior, mean=np.zeros((3, 3)))}, "got 1 frames and 3 joints"),
+        (problem_of(Flat()), {}, "problem must have an exact posterior, got 'points'"),
+        (
+            problem_of(prior, observed(prior, 0.1)),
+            {"shared_noise": False},
+            "shared_noise must be T",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            decompose(of, **options)
+    with pytest.raises(UnsupportedPosterior, match="mas needs a prior with Denoises2D, got Blind"):
+        decompose(problem, learnt=Blind())
 
 
 class Flat:
-    """A prior of which nothing is known."""
+    """A prior without density or denoiser."""
 
     skeleton = Skeleton(["point"], [-1])
     frames, fps, dim = 1, 20.0, 3

@@ -1,17 +1,16 @@
-"""A package of somebody else's, made on the fly, takes part by its entry point."""
+"""Samplers of another package take part through its entry points."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import subprocess
-import sys
 
 import pytest
+from toy_samplers import finish, start
 
-SAMPLER = '''
-"""A sampler of another package's."""
+PACKAGE = '''
+"""Samplers of another package."""
 import time
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 
 from probmotion import MotionDraws, seeds
-from probmotion.priors import HasLogDensity
+from probmotion.posteriors.protocols import HasLogDensity
 
 
 @dataclass(frozen=True)
@@ -48,52 +47,22 @@ class Importance:
             seconds=time.perf_counter() - start, theta=theta,
             counts={"density": chains * self.candidates},
         )
+
+
+class Needy(Importance):
+    def __init__(self, model):
+        self.model = model
 '''
 
-RUN = """
-import json, sys
+SCRIPT = """
+import json, sys, warnings
 import numpy as np
 import probmotion as pm
 from probmotion.comparison import Budget, compare
+from probmotion.comparison.results.naming import named_samplers
 from probmotion.models import GaussianMixtureMotion
-from probmotion.sampling import load_sampler, sampler_names, suited
-
-if __name__ == "__main__":
-    rng = np.random.default_rng(0)
-    prior = GaussianMixtureMotion(
-        skeleton=pm.Skeleton(["root", "a", "b"], [-1, 0, 1]), fps=30.0,
-        means=rng.normal(size=(1, 4, 3, 3)), factors=0.4 * rng.normal(size=(1, 2, 4, 3, 3)),
-        noise=0.1, weights=np.ones(1), azimuths=1,
-    )
-    truth = pm.Motion(prior.sample(rng, 1)[0], prior.skeleton, 30.0)
-    seen = pm.Keypoints2D.observe(truth, pm.Cameras.ring(1, elevation=0.2), noise=0.5, seed=0)
-    posterior = pm.MotionPosterior(prior, seen)
-    found = compare(
-        {"mine": posterior}, ["importance", "exact"], draws=40, chains=2, workers=2,
-        budget=Budget(evaluations=3000), out=sys.argv[1], progress=False,
-    )
-    table = found.table()
-    print(json.dumps({
-        "listed": "importance" in sampler_names(),
-        "module": load_sampler("importance").__module__,
-        "words": table.attrs["words"],
-        "failures": [result.failure.message for result in found.failures],
-        "swd_ratio": dict(table[table["metric"] == "swd_ratio"].set_index("sampler")["value"]),
-        "settings": {r.sampler: r.budget["settings"] for r in found.results},
-        "suited": suited(posterior),
-    }))
-"""
-
-BROKEN = """
-import json
-import warnings
-import numpy as np
-import probmotion as pm
-from probmotion.comparison import compare
-from probmotion.comparison.naming import named_samplers
-from probmotion.models import GaussianMixtureMotion
+from probmotion.posteriors.sampling import load_sampler, sampler_names, suited
 from probmotion.samplers import ExactSampler
-from probmotion.sampling import load_sampler, sampler_names, suited
 
 class Bare:
     skeleton, frames, fps, dim = pm.Skeleton(["a"], [-1]), 1, 30.0, 3
@@ -101,156 +70,121 @@ class Bare:
     def motion(self, theta):
         return theta.reshape(*theta.shape[:-1], 1, 1, 3)
 
+def message(call):
+    try:
+        call()
+    except Exception as error:
+        return [type(error).__name__, str(error)]
+
 rng = np.random.default_rng(0)
 prior = GaussianMixtureMotion(
     skeleton=pm.Skeleton(["root", "a", "b"], [-1, 0, 1]), fps=30.0,
     means=rng.normal(size=(1, 4, 3, 3)), factors=0.4 * rng.normal(size=(1, 2, 4, 3, 3)),
     noise=0.1, weights=np.ones(1), azimuths=1,
 )
-
-def said(call):
-    try:
-        call()
-    except Exception as error:
-        return [type(error).__name__, str(error)]
-
-exact = ExactSampler()
+truth = pm.Motion(prior.sample(rng, 1)[0], prior.skeleton, 30.0)
+seen = pm.Keypoints2D.observe(truth, pm.Cameras.ring(1, elevation=0.2), noise=0.5, seed=0)
+posterior = pm.MotionPosterior(prior, seen)
+found = compare(
+    {"mine": posterior}, ["importance", "exact"], draws=40, chains=2, workers=1,
+    budget=Budget(evaluations=3000), out=sys.argv[1], progress=False,
+)
+table = found.table()
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     names = list(named_samplers(None))
 print(json.dumps({
     "listed": sampler_names(),
-    "suited": suited(pm.MotionPosterior(prior)),
-    "unsupported": said(lambda: exact.sample(pm.MotionPosterior(Bare()), draws=1)),
-    "loaded": {name: said(lambda: load_sampler(name)) for name in ("gone", "bare", "wild")},
+    "module": load_sampler("importance").__module__,
+    "failures": [result.failure.message for result in found.failures],
+    "swd_ratio": dict(table[table["metric"] == "swd_ratio"].set_index("sampler")["value"]),
+    "settings": {r.sampler: r.budget["settings"] for r in found.results},
+    "suited": suited(posterior),
+    "loaded": {name: message(lambda: load_sampler(name)) for name in ("gone", "bare", "wild")},
     "all": [names, [str(warning.message) for warning in caught]],
-    "other": said(lambda: compare("gait", "exact", draws=10, chains=1, workers=0, progress=False)),
+    "unsupported": message(lambda: ExactSampler().sample(pm.MotionPosterior(Bare()), draws=1)),
 }))
 """
 
 
 @pytest.fixture
-def package(tmp_path):
-    """A package as pip would leave it in a folder on the path."""
+def package(tmp_path, monkeypatch):
+    """Return a function that installs a package with entry points in a folder on the path."""
     site = tmp_path / "site"
-    (site / "walkers_of_ours").mkdir(parents=True)
-    (site / "walkers_of_ours" / "__init__.py").write_text(SAMPLER)
     information = site / "walkers_of_ours-0.3.dist-info"
-    information.mkdir()
+    information.mkdir(parents=True)
+    (site / "walkers_of_ours.py").write_text(PACKAGE)
+    (site / "wild.py").write_text("raise RuntimeError('two\\nlines')")
     (information / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: walkers-of-ours\nVersion: 0.3\n"
     )
-    (information / "entry_points.txt").write_text(
-        "[probmotion.samplers]\nimportance = walkers_of_ours:Importance\n"
-    )
-    return site
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.getenv("PYTHONPATH", "")]))
+
+    def install(entries):
+        lines = [f"{name} = {value}" for name, value in entries.items()]
+        (information / "entry_points.txt").write_text(
+            "\n".join(["[probmotion.samplers]", *lines, ""])
+        )
+
+    return install
 
 
-def test_its_sampler_runs_beside_ours_on_a_posterior_of_one_s_own(package, tmp_path):
-    (tmp_path / "run.py").write_text(RUN)
-    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
-    run = subprocess.run(
-        [sys.executable, "-W", "error", str(tmp_path / "run.py"), str(tmp_path / "out")],
-        env={**os.environ, "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
-    assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout)
-    assert found["listed"]
+def test_samplers_of_another_package_run_and_broken_ones_are_skipped(package, tmp_path):
+    broken = {
+        "gone": ("gone_for_good:Sampler", "ModuleNotFoundError: No module named 'gone_for_good'"),
+        "bare": (
+            "walkers_of_ours:Nobody",
+            "AttributeError: module 'walkers_of_ours' has no attribute 'Nobody'",
+        ),
+        "wild": ("wild:Sampler", "RuntimeError: two lines"),
+    }
+    entries = {name: value for name, (value, _) in broken.items()}
+    package({"importance": "walkers_of_ours:Importance"} | entries)
+    (tmp_path / "run.py").write_text(SCRIPT)
+    output, _ = finish(start("-W", "error", tmp_path / "run.py", tmp_path / "out"))
+    found = json.loads(output)
+    assert {"importance", "exact", *broken} <= set(found["listed"])
     assert found["module"] == "walkers_of_ours"
     assert found["failures"] == []
     assert set(found["swd_ratio"]) == {"importance", "exact"}
     assert found["swd_ratio"]["importance"] < 3
-    # Its effort is spent like that of our own samplers.
+    # Its budget is spent like that of registered samplers.
     assert found["settings"] == {"importance": {"candidates": 1500}, "exact": {}}
-    assert "importance" in found["suited"]
-
-
-NEEDY = """
-
-class Needy(Importance):
-    def __init__(self, model):
-        self.model = model
-"""
-
-
-def test_whatever_they_are_called_and_whatever_they_need_they_stop_no_others(package, tmp_path):
-    (package / "walkers_of_ours" / "__init__.py").write_text(SAMPLER + NEEDY)
-    names = ["my.good", "1st", "lambda", "my good", "my-good", "plain"]
-    entries = [*(f"{name} = walkers_of_ours:Importance" for name in names)]
-    entries += ["needy = walkers_of_ours:Needy", "mh = walkers_of_ours:Importance"]
-    (package / "walkers_of_ours-0.3.dist-info" / "entry_points.txt").write_text(
-        "\n".join(["[probmotion.samplers]", *entries])
-    )
-    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
-
-    def said(*samplers):
-        words = ["compare", "gait-monocular(frames=4)", "--samplers", *samplers, "--draws", "10"]
-        words += ["--workers", "0", "--out", str(tmp_path / "out")]
-        command = "import sys; from probmotion.cli import main; sys.exit(main())"
-        run = subprocess.run(
-            [sys.executable, "-c", command, *words],
-            env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        return run.returncode, run.stdout, run.stderr
-
-    status, table, notes = said("exact", "my.good", "1st", "lambda", "my good")
-    assert status == 0, notes
-    for name in ("exact", "my.good", "1st", "lambda", "my good"):
-        assert re.search(rf"^{re.escape(name)} .* [0-9.]+", table, re.MULTILINE)
-    assert "sampler 'mh' of the package walkers-of-ours is left out" in notes
-    assert "'needy', which cannot be made without settings (TypeError" in notes
-    assert "it is left out" in notes
-    status, _, notes = said("needy")
-    assert status == 2
-    assert notes.splitlines()[-1].startswith("probmotion: sampler is 'needy', which cannot be made")
-    assert "Traceback" not in notes
-
-
-def test_those_that_cannot_be_imported_are_named_and_stop_no_others(package, tmp_path):
-    (package / "wild.py").write_text("raise RuntimeError('two\\nlines')")
-    (package / "walkers_of_ours-0.3.dist-info" / "entry_points.txt").write_text(
-        "[probmotion.samplers]\n"
-        "gone = gone_for_good:Sampler\nbare = walkers_of_ours:Nobody\nwild = wild:Sampler\n"
-    )
-    (tmp_path / "run.py").write_text(BROKEN)
-    paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
-    run = subprocess.run(
-        [sys.executable, "-W", "error", str(tmp_path / "run.py")],
-        env={**os.environ, "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
-    assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout)
-    assert {"gone", "bare", "wild", "exact"} <= set(found["listed"])
-    assert "exact" in found["suited"]
-    assert not {"gone", "bare", "wild"} & set(found["suited"])
-    kind, sentence = found["unsupported"]
-    assert kind == "UnsupportedPosterior"
-    assert sentence.startswith("exact needs a prior with ")
-    for name, value, reason in [
-        ("gone", "gone_for_good:Sampler", "ModuleNotFoundError: No module named 'gone_for_good'"),
-        (
-            "bare",
-            "walkers_of_ours:Nobody",
-            "AttributeError: module 'walkers_of_ours' has no attribute 'Nobody'",
-        ),
-        ("wild", "wild:Sampler", "RuntimeError: two lines"),
-    ]:
+    assert {"importance", "exact"} <= set(found["suited"])
+    assert not set(broken) & set(found["suited"])
+    for name, (value, reason) in broken.items():
         assert found["loaded"][name] == [
             "ValueError",
-            f"sampler is {name!r}, which the package walkers-of-ours registers as {value!r}, "
-            f"expected one that can be imported ({reason})",
+            f"sampler {name!r} of the package walkers-of-ours must be importable from {value!r}, "
+            f"got {reason}",
         ]
-    # Who asks for all gets all others, and is told.
-    names, told = found["all"]
-    assert set(names) == set(found["listed"]) - {"gone", "bare", "wild"}
-    assert sorted(told) == sorted(f"{said}; it is left out" for _, said in found["loaded"].values())
-    assert found["other"] is None
+    names, warnings = found["all"]
+    assert set(names) == set(found["listed"]) - set(broken)
+    assert sorted(warnings) == sorted(f"{m}; sampler skipped" for _, m in found["loaded"].values())
+    kind, message = found["unsupported"]
+    assert kind == "UnsupportedPosterior"
+    assert message.startswith("exact needs a prior with ")
+
+
+def test_unusual_names_and_samplers_without_defaults_do_not_stop_others(package, tmp_path):
+    names = ["my.good", "1st", "lambda", "my good", "my-good", "plain", "mh"]
+    package(
+        {name: "walkers_of_ours:Importance" for name in names} | {"needy": "walkers_of_ours:Needy"}
+    )
+    command = "import sys; from probmotion.cli.main import main; sys.exit(main())"
+
+    def run(*samplers, returncode):
+        words = ["compare", "gait-monocular(frames=4)", "--samplers", *samplers, "--draws", "10"]
+        words += ["--workers", "0", "--out", tmp_path / "out"]
+        return finish(start("-c", command, *words), returncode)
+
+    table, notes = run("exact", "my.good", "1st", "lambda", "my good", returncode=0)
+    for name in ("exact", "my.good", "1st", "lambda", "my good"):
+        assert re.search(rf"^{re.escape(name)} .* [0-9.]+", table, re.MULTILINE)
+    assert "sampler 'mh' of the package walkers-of-ours is skipped" in notes
+    assert "sampler 'needy' must have default settings, got TypeError" in notes
+    assert "sampler skipped" in notes
+    _, notes = run("needy", returncode=2)
+    expected = "probmotion: sampler 'needy' must have default settings"
+    assert notes.splitlines()[-1].startswith(expected)
+    assert "Traceback" not in notes

@@ -1,15 +1,18 @@
-"""Small samplers and problems for the tests of the comparison, importable by its workers."""
+"""Small samplers, problems and helpers for the tests of comparison, importable by workers."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import pandas as pd
 
 from probmotion import Motion, MotionDraws, MotionPosterior, Skeleton, UnsupportedPosterior, seeds
 from probmotion.models import GaussianMixtureMotion
@@ -17,17 +20,50 @@ from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import Samplable
 from probmotion.problems.observations import observe
 
+SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
+
+
+def numbers(table) -> str:
+    """Return all values of a table that do not depend on the machine."""
+    table = pd.DataFrame(table)
+    return table[~table["metric"].isin(["seconds", "peak_memory_mib"])].to_csv(index=False)
+
+
+def count(diary: Path) -> int:
+    """Return how many runs a diary records."""
+    return len(diary.read_text().split()) if diary.exists() else 0
+
+
+def start(*words, **settings) -> subprocess.Popen:
+    """Start Python with these samplers importable."""
+    paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, *map(str, words)],
+        env={**os.environ, "PYTHONPATH": paths},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **settings,
+    )
+
+
+def finish(process: subprocess.Popen, returncode: int = 0) -> tuple[str, str]:
+    """Return what a process printed, after checking its return code."""
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == returncode, errors
+    return output, errors
+
 
 @dataclass(frozen=True)
 class Holder:
-    """A value, and a cache that does not count."""
+    """Value with a cache that does not count."""
 
     value: object
     cache: dict = field(init=False, default_factory=dict)
 
 
 class Plain:
-    """An object that is no dataclass."""
+    """Object that is no dataclass."""
 
     def __init__(self, value):
         self.value = value
@@ -48,19 +84,19 @@ def small_prior() -> GaussianMixtureMotion:
 
 
 def generation() -> Problem:
-    return Problem("generation", "no evidence", MotionPosterior(small_prior()))
+    return Problem("generation", "no observations", MotionPosterior(small_prior()))
 
 
 def monocular() -> Problem:
     prior = small_prior()
     truth = Motion(prior.sample(np.random.default_rng(1), 1)[0], prior.skeleton, 30.0)
-    evidence = observe(truth, "monocular", 0.05, 0)
-    return Problem("monocular", "one camera", MotionPosterior(prior, evidence), truth.positions)
+    likelihood = observe(truth, "monocular", 0.05, 0)
+    return Problem("monocular", "one camera", MotionPosterior(prior, likelihood), truth.positions)
 
 
 @dataclass(frozen=True)
 class PriorDraws:
-    """Draws from the prior, stretched; takes no evidence. Notes every run in a file."""
+    """Stretched draws from the prior, without observations; records every run in a diary."""
 
     name: ClassVar[str] = "prior-draws"
     requires: ClassVar[tuple[type, ...]] = (Samplable,)
@@ -75,7 +111,9 @@ class PriorDraws:
             with open(self.diary, "a") as file:
                 file.write(f"{seed}\n")
         if posterior.likelihood is not None:
-            raise UnsupportedPosterior(self.name, "takes no evidence", "observations", ["exact"])
+            raise UnsupportedPosterior(
+                self.name, "takes no observations", "observations", ["exact"]
+            )
         time.sleep(self.nap)
         rng = seeds.generator(seed, "toy")
         x = self.spread * posterior.prior.sample(rng, draws * chains)
@@ -97,7 +135,7 @@ SEEN = []
 
 @dataclass(frozen=True)
 class Counting(PriorDraws):
-    """Notes how many posteriors this process has met."""
+    """Records how many posteriors this process has seen."""
 
     name: ClassVar[str] = "counting"
 
@@ -110,151 +148,74 @@ class Counting(PriorDraws):
 
 
 @dataclass(frozen=True)
-class Unwritable(PriorDraws):
-    """Its draws hold what no file can."""
+class Failing(PriorDraws):
+    """Fails in the given way."""
 
-    name: ClassVar[str] = "unwritable"
-
-    def sample(self, posterior, **settings):
-        found = super().sample(posterior, **settings)
-        found.dataset.attrs["odd"] = {"a": 1}
-        return found
-
-
-@dataclass(frozen=True)
-class Crashing(PriorDraws):
-    name: ClassVar[str] = "crashing"
+    name: ClassVar[str] = "failing"
+    how: str = "raise"
+    file: str = ""
 
     def sample(self, posterior, **settings):
-        super().sample(posterior, **settings)
-        raise RuntimeError("the floor gave\nway")
-
-
-@dataclass(frozen=True)
-class CrashingOnce(PriorDraws):
-    """Fails until a file exists."""
-
-    name: ClassVar[str] = "crashing-once"
-    mended: str = ""
-
-    def sample(self, posterior, **settings):
-        if not Path(self.mended).exists():
-            raise RuntimeError("not yet")
-        return super().sample(posterior, **settings)
-
-
-@dataclass(frozen=True)
-class Dying(PriorDraws):
-    """Takes its process with it."""
-
-    name: ClassVar[str] = "dying"
-
-    def sample(self, posterior, **settings):
-        os._exit(9)
-
-
-@dataclass(frozen=True)
-class TooFew(PriorDraws):
-    name: ClassVar[str] = "too-few"
-
-    def sample(self, posterior, *, draws=1000, **settings):
-        return super().sample(posterior, draws=draws - 1, **settings)
-
-
-@dataclass(frozen=True)
-class Interrupting(PriorDraws):
-    """Ctrl-C arrives in the middle of its second cell."""
-
-    name: ClassVar[str] = "interrupting"
-
-    def sample(self, posterior, **settings):
+        match self.how:
+            case "raise":
+                raise RuntimeError("the floor gave\nway")
+            case "until the file exists":
+                if not Path(self.file).exists():
+                    raise RuntimeError("not yet")
+            case "exit":
+                raise SystemExit(3)
+            case "memory":
+                raise MemoryError
+            case "KeyboardInterrupt":
+                raise KeyboardInterrupt("of its own")
+            case "die":
+                os._exit(9)
+            case "hang" | "hang without signals":
+                if self.how != "hang":  # as compiled code
+                    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+                while True:
+                    try:
+                        time.sleep(30)
+                    except Exception:  # as libraries that wrap errors of callbacks
+                        continue
+            case "too few":
+                return super().sample(posterior, **settings | {"draws": settings["draws"] - 1})
+            case "one chain":
+                n = settings["draws"] * settings["chains"]
+                return super().sample(posterior, **settings | {"draws": n, "chains": 1})
+            case "infinite":
+                shape = (posterior.frames, posterior.skeleton.n_joints, 3)
+                x = np.full((settings["chains"], settings["draws"], *shape), np.inf)
+                return MotionDraws.of(posterior, self, x, seed=0, seconds=0.0)
         draws = super().sample(posterior, **settings)
-        if len(Path(self.diary).read_text().split()) == 2:
-            raise KeyboardInterrupt
+        positions = draws.dataset["positions"].values
+        match self.how:
+            case "interrupt the second run":
+                if count(Path(self.diary)) == 2:
+                    raise KeyboardInterrupt
+            case "unwritable":
+                draws.dataset.attrs["odd"] = {"a": 1}
+            case "nan":
+                positions[0, 0, 0, 0, 0] = np.nan
+            case "diverged":
+                positions[0, 0] *= 1e200
+            case "none":
+                return None
+            case "array":
+                return positions
+            case "no time":
+                return replace(draws, dataset=draws.dataset.assign_attrs(seconds=np.nan))
+            case "other skeleton":
+                names = [f"{name} of another" for name in draws.skeleton.joint_names]
+                skeleton = Skeleton(names, draws.skeleton.parents)
+                other = MotionPosterior(replace(posterior.prior, skeleton=skeleton))
+                return super().sample(other, **settings)
         return draws
 
 
 @dataclass(frozen=True)
-class NotANumber(PriorDraws):
-    """Hands over draws that were spoilt after they were checked."""
-
-    name: ClassVar[str] = "not-a-number"
-
-    def sample(self, posterior, **settings):
-        found = super().sample(posterior, **settings)
-        found.dataset["positions"].values[0, 0, 0, 0, 0] = np.nan
-        return found
-
-
-@dataclass(frozen=True)
-class Unchecked(PriorDraws):
-    """Leaves it to MotionDraws to find out that a draw is infinite."""
-
-    name: ClassVar[str] = "unchecked"
-
-    def sample(self, posterior, *, draws=1000, chains=1, **settings):
-        x = np.full((chains, draws, posterior.frames, posterior.skeleton.n_joints, 3), np.inf)
-        return MotionDraws.of(posterior, self, x, seed=0, seconds=0.0)
-
-
-@dataclass(frozen=True)
-class Diverged(PriorDraws):
-    """Its draws are numbers, but of what measures make of them squares are not."""
-
-    name: ClassVar[str] = "diverged"
-
-    def sample(self, posterior, **settings):
-        found = super().sample(posterior, **settings)
-        found.dataset["positions"].values[0, 0] *= 1e200
-        return found
-
-
-@dataclass(frozen=True)
-class Interrupted(PriorDraws):
-    """Asks to be stopped where nobody pressed a key."""
-
-    name: ClassVar[str] = "interrupted"
-
-    def sample(self, posterior, **settings):
-        raise KeyboardInterrupt("of its own")
-
-
-@dataclass(frozen=True)
-class Hungry(PriorDraws):
-    name: ClassVar[str] = "hungry"
-
-    def sample(self, posterior, **settings):
-        raise MemoryError
-
-
-@dataclass(frozen=True)
-class Quitting(PriorDraws):
-    name: ClassVar[str] = "quitting"
-
-    def sample(self, posterior, **settings):
-        raise SystemExit(3)
-
-
-@dataclass(frozen=True)
-class Endless(PriorDraws):
-    """Never returns; calls itself compiled code where it does not even hear alarms."""
-
-    name: ClassVar[str] = "endless"
-    deaf: bool = False
-
-    def sample(self, posterior, **settings):
-        if self.deaf:
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
-        while True:
-            try:
-                time.sleep(30)
-            except Exception:  # as libraries do that wrap what they call
-                continue
-
-
-@dataclass(frozen=True)
 class Walking(PriorDraws):
-    """Its cost is a straight line in ``stride``, and nothing else comes of it."""
+    """Its reported cost is linear in ``stride``, which has no other effect."""
 
     name: ClassVar[str] = "walking"
     effort: ClassVar[tuple[str, ...]] = ("stride", "start")
@@ -281,7 +242,7 @@ class Walking(PriorDraws):
 
 @dataclass(frozen=True)
 class Napping(PriorDraws):
-    """Takes a hundredth of a second per unit of effort."""
+    """Reports a hundredth of a second per unit of effort."""
 
     name: ClassVar[str] = "napping"
     effort: ClassVar[tuple[str, ...]] = ("rounds",)
@@ -290,5 +251,4 @@ class Napping(PriorDraws):
 
     def sample(self, posterior, **settings):
         found = super().sample(posterior, **settings)
-        time.sleep(0.01 * self.rounds)
         return MotionDraws(found.dataset.assign_attrs(seconds=0.01 * self.rounds))

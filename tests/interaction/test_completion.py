@@ -1,4 +1,4 @@
-"""Completion: exact where the truth is among the draws, and better than one annotation."""
+"""Retrieval of draws for 2D pairs, and completion of occluded joints."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from probmotion import Skeleton
 from probmotion.data.synthetic.dances import synthetic_dances
+from probmotion.interaction import retrieval
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.completion import (
     blend,
@@ -16,18 +17,25 @@ from probmotion.interaction.completion import (
     nearest_annotation_completion,
     occluded_joint_error,
 )
-from probmotion.interaction.retrieval import view_grid
+from probmotion.interaction.geometry.coordinates import interaction_distance
+from probmotion.interaction.retrieval import view_grid, views_around
 
 PAIR = Skeleton.preset("pair17")
-DRAWS = np.concatenate([dance.positions[::5] for dance in synthetic_dances(8)])
-TRUTH = synthetic_dances(9)[8].positions[40]
+DANCES = synthetic_dances(9)
+DRAWS = np.concatenate([dance.positions[::5] for dance in DANCES[:8]])
+FEW = np.concatenate([dance.positions[::9] for dance in DANCES[:4]])
+TRUTH = DANCES[8].positions[40]
 VIEWS = view_grid(6, 1)
 HIDDEN = np.isin(np.arange(34), [6, 7, 12, 13, 26, 27])
 
 
-def without(pose, hidden=HIDDEN):
-    """Return a pose whose hidden joints are NaN: nobody may read them."""
+def masked(pose, hidden=HIDDEN):
+    """Set the occluded joints to NaN."""
     return np.where(hidden[:, None], np.nan, pose)
+
+
+def completed(draws=DRAWS, pose=TRUTH, visible=~HIDDEN, **options):
+    return complete(masked(pose, ~visible), visible, draws, PAIR, **{"n_nearest": 10} | options)
 
 
 def turned(poses, seed=0):
@@ -36,112 +44,184 @@ def turned(poses, seed=0):
     return poses @ np.swapaxes(matrices, 1, 2) + rng.normal(size=(len(poses), 1, 3))
 
 
-def test_a_truth_that_was_drawn_often_is_found_exactly():
+def test_true_pose_among_the_draws_is_recovered():
     draws = np.concatenate([turned(DRAWS[:60]), turned(np.repeat(TRUTH[None], 20, axis=0), 1)])
-    done = complete(without(TRUTH), ~HIDDEN, draws, PAIR, n_nearest=20)
-    np.testing.assert_allclose(done.positions, TRUTH, atol=1e-9)
-    assert sorted(done.indices) == list(range(60, 80))
+    result = completed(draws, n_nearest=20)
+    np.testing.assert_allclose(result.positions, TRUTH, atol=1e-9)
+    assert sorted(result.indices) == list(range(60, 80))
 
 
-def test_visible_joints_stay_exactly_as_they_were():
-    done = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=10)
-    np.testing.assert_array_equal(done.positions[~HIDDEN], TRUTH[~HIDDEN])
-    assert np.isfinite(done.positions).all()
-    assert len(done.indices) == 10
+def test_completion_is_invariant_to_rigid_motion_and_better_than_the_mean_pose():
+    result, moved = completed(), completed(turned(DRAWS))
+    np.testing.assert_array_equal(result.positions[~HIDDEN], TRUTH[~HIDDEN])
+    np.testing.assert_array_equal(moved.indices, result.indices)
+    np.testing.assert_allclose(moved.positions, result.positions, atol=1e-9)
+    error = occluded_joint_error(TRUTH, result.positions, HIDDEN)
+    mean_pose = completed(n_nearest=len(DRAWS)).positions
+    assert error < 0.8 * occluded_joint_error(TRUTH, mean_pose, HIDDEN)
 
 
-def test_where_and_how_the_draws_stand_is_no_matter():
-    plain = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=10)
-    moved = complete(without(TRUTH), ~HIDDEN, turned(DRAWS), PAIR, n_nearest=10)
-    np.testing.assert_array_equal(moved.indices, plain.indices)
-    np.testing.assert_allclose(moved.positions, plain.positions, atol=1e-9)
+def test_median_is_robust_to_an_outlier():
+    draws = TRUTH + np.random.default_rng(0).normal(scale=0.005, size=(9, 34, 3))
+    draws[0, HIDDEN] += 5.0
+    result = completed(draws, n_nearest=9)
+    assert occluded_joint_error(TRUTH, result.positions, HIDDEN) < 0.02
 
 
-def test_one_wild_draw_does_not_move_the_median():
-    """A median forgives what a mean would not."""
-    near = TRUTH + np.random.default_rng(0).normal(scale=0.005, size=(9, 34, 3))
-    wild = near[0].copy()
-    wild[HIDDEN] += 5.0
-    done = complete(without(TRUTH), ~HIDDEN, np.stack([*near[1:], wild]), PAIR, n_nearest=9)
-    assert occluded_joint_error(TRUTH, done.positions, HIDDEN) < 0.02
-
-
-def test_dances_of_the_same_kind_tell_hidden_joints_better_than_the_mean_pose():
-    done = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=10)
-    error = occluded_joint_error(TRUTH, done.positions, HIDDEN)
-    everything = complete(without(TRUTH), ~HIDDEN, DRAWS, PAIR, n_nearest=len(DRAWS))
-    assert error < 0.8 * occluded_joint_error(TRUTH, everything.positions, HIDDEN)
-
-
-def test_blending_moves_hidden_joints_by_the_gaussian_weighted_mean():
+def test_blend_moves_occluded_joints_by_the_gaussian_weighted_mean():
     median = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.0]])
     target = np.array([[0.0, 0.4], [1.0, -0.2], [np.nan, np.nan]])
-    visible = np.array([True, True, False])
-    blended = blend(median, target, visible, bandwidth=0.5)
+    blended = blend(median, target, np.array([True, True, False]), bandwidth=0.5)
     w0, w1 = np.exp(-(0.25**2) / 0.5), np.exp(-(0.75**2) / 0.5)
-    wanted = (0.4 * w0 - 0.2 * w1) / (w0 + w1)
-    np.testing.assert_allclose(blended, [[0.0, 0.4], [1.0, -0.2], [0.25, wanted]])
+    expected = (0.4 * w0 - 0.2 * w1) / (w0 + w1)
+    np.testing.assert_allclose(blended, [[0.0, 0.4], [1.0, -0.2], [0.25, expected]])
 
 
-def test_blending_a_shift_shifts_and_a_far_joint_follows_its_nearest():
+def test_blend_reproduces_a_shift_and_distant_joints_follow_the_nearest():
     shift = np.array([0.3, -0.1, 0.2])
-    np.testing.assert_allclose(blend(TRUTH, without(TRUTH + shift), ~HIDDEN, 0.3), TRUTH + shift)
+    np.testing.assert_allclose(blend(TRUTH, masked(TRUTH + shift), ~HIDDEN, 0.3), TRUTH + shift)
     median = np.array([[0.0, 0, 0], [1.0, 0, 0], [500.0, 0, 0]])
     target = np.array([[0.0, 1, 0], [1.0, 2, 0], [np.nan] * 3])
     assert blend(median, target, np.array([True, True, False]), 0.1)[2, 1] == pytest.approx(2)
 
 
-def test_a_picture_of_a_draw_is_completed_exactly():
-    picture = project_to_views(DRAWS[[7]], VIEWS[[2]], PAIR)[0, 0]
-    done = complete_keypoints(without(picture), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=1)
-    np.testing.assert_allclose(done.positions, picture, atol=1e-9)
-    assert done.indices.tolist() == [7]
+def test_projection_of_a_draw_is_recovered():
+    projection = project_to_views(DRAWS[[7]], VIEWS[[2]], PAIR)[0, 0]
+    result = complete_keypoints(
+        masked(projection), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=1
+    )
+    np.testing.assert_allclose(result.positions, projection, atol=1e-9)
+    assert result.indices.tolist() == [7]
 
 
-def test_visible_keypoints_stay_exactly_as_they_were():
-    picture = project_to_views(TRUTH[None], VIEWS[[3]], PAIR)[0, 0]
-    done = complete_keypoints(without(picture), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=5)
-    np.testing.assert_array_equal(done.positions[~HIDDEN], picture[~HIDDEN])
-    assert occluded_joint_error(picture, done.positions, HIDDEN) < 0.3
+def test_visible_keypoints_are_unchanged():
+    projection = project_to_views(TRUTH[None], VIEWS[[3]], PAIR)[0, 0]
+    result = complete_keypoints(
+        masked(projection), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=5
+    )
+    np.testing.assert_array_equal(result.positions[~HIDDEN], projection[~HIDDEN])
+    assert occluded_joint_error(projection, result.positions, HIDDEN) < 0.3
 
 
-def test_the_nearest_annotation_lends_its_hidden_joints():
-    pictures = project_to_views(DRAWS[:30], VIEWS[[1]], PAIR)[:, 0]
+def test_nearest_annotation_completes_occluded_joints():
+    annotated = project_to_views(DRAWS[:30], VIEWS[[1]], PAIR)[:, 0]
     c, s = np.cos(0.4), np.sin(0.4)
-    query = pictures[12] @ np.array([[c, s], [-s, c]]) + 1.0
-    done = nearest_annotation_completion(without(query), ~HIDDEN, pictures, PAIR)
-    np.testing.assert_allclose(done.positions, query, atol=1e-9)
-    assert done.indices.tolist() == [12]
-    # One that lacks a hidden joint cannot lend it.
+    query = annotated[12] @ np.array([[c, s], [-s, c]]) + 1.0
+    given = masked(query), ~HIDDEN, annotated, PAIR
+    result = nearest_annotation_completion(*given)
+    np.testing.assert_allclose(result.positions, query, atol=1e-9)
+    assert result.indices.tolist() == [12]
     known = np.ones((30, 34), dtype=bool)
     known[12, 6] = False
-    other = nearest_annotation_completion(without(query), ~HIDDEN, pictures, PAIR, known)
+    other = nearest_annotation_completion(*given, known)
     assert other.indices.tolist() != [12]
     np.testing.assert_array_equal(other.positions[~HIDDEN], query[~HIDDEN])
     known[:, 26] = False
-    with pytest.raises(ValueError, match="annotated has no pair with every hidden joint"):
-        nearest_annotation_completion(without(query), ~HIDDEN, pictures, PAIR, known)
+    with pytest.raises(ValueError, match="annotated must contain a pair with every occluded joint"):
+        nearest_annotation_completion(*given, known)
 
 
-def test_the_error_is_the_mean_distance_of_hidden_joints():
+def test_error_is_the_mean_distance_of_occluded_joints():
     estimate = TRUTH.copy()
     estimate[6] += [0.3, 0.0, 0.4]
     estimate[0] += 9.0
     assert occluded_joint_error(TRUTH, estimate, HIDDEN) == pytest.approx(0.5 / 6)
-    with pytest.raises(ValueError, match="hidden has no joint, expected at least one"):
+    with pytest.raises(ValueError, match="hidden must mark at least one joint, got none"):
         occluded_joint_error(TRUTH, estimate, ~HIDDEN & HIDDEN)
 
 
-def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(ValueError, match="visible has 3 joints, expected at least 4"):
-        complete(TRUTH, np.arange(34) < 3, DRAWS, PAIR)
-    with pytest.raises(ValueError, match="n_nearest must be at most 20, the draws, got 100"):
-        complete(TRUTH, ~HIDDEN, DRAWS[:20], PAIR)
-    with pytest.raises(
-        ValueError, match="pose must be finite, got 3 values that are NaN or infinite"
-    ):
-        complete(without(TRUTH, np.arange(34) == 0), ~HIDDEN, DRAWS, PAIR)
-    with pytest.raises(ValueError, match=r"draws must have shape \(S, 34, 3\), got \(144, 17, 3\)"):
-        complete(TRUTH, ~HIDDEN, DRAWS[:, :17], PAIR)
-    with pytest.raises(ValueError, match=r"bandwidth must be a finite number above 0, got 0\.0"):
-        complete(TRUTH, ~HIDDEN, DRAWS, PAIR, bandwidth=0.0)
+def test_invalid_arguments_are_rejected():
+    with pytest.raises(ValueError, match="visible must mark at least 4 joints, got 3"):
+        completed(visible=np.arange(34) < 3)
+    with pytest.raises(ValueError, match=r"n_nearest must be at most 20, .*, got 100"):
+        completed(DRAWS[:20], n_nearest=100)
+    with pytest.raises(ValueError, match="pose must be finite, got 3 values"):
+        completed(pose=masked(TRUTH, np.arange(34) == 0))
+
+
+# Retrieval.
+
+
+def retrieve(keypoints, draws=FEW, **options):
+    return retrieval.retrieve(keypoints, draws, PAIR, **{"views": VIEWS} | options)
+
+
+def projection(draw, view, turn=0.0, shift=(0.0, 0.0)):
+    """Project a draw, then rotate and shift it in the image."""
+    seen = project_to_views(FEW[draw][None], VIEWS[view][None], PAIR)[0, 0]
+    c, s = np.cos(turn), np.sin(turn)
+    return seen @ np.array([[c, s], [-s, c]]) + np.array(shift)
+
+
+@pytest.mark.parametrize(("draw", "view"), [(0, 0), (13, 4), (39, 5)])
+def test_projection_retrieves_its_draw_and_view(draw, view):
+    result = retrieve(projection(draw, view, 0.3, (2.0, -1.0)), n=3)
+    assert result.indices.shape == result.distances.shape == (3,)
+    assert result.indices[0] == draw
+    np.testing.assert_array_equal(result.views[0], VIEWS[view])
+    assert result.distances[0] < 1e-9 < 0.01 < result.distances[1] <= result.distances[2]
+
+
+def test_distances_are_minima_over_views():
+    query = projection(5, 2) + np.random.default_rng(0).normal(scale=0.05, size=(34, 2))
+    result = retrieve(query, FEW[:4], n=4)
+    expected = interaction_distance(query, project_to_views(FEW[:4], VIEWS, PAIR))
+    np.testing.assert_array_equal(result.indices, expected.min(axis=1).argsort())
+    np.testing.assert_allclose(result.distances, np.sort(expected.min(axis=1)), atol=1e-9)
+    np.testing.assert_array_equal(result.views, VIEWS[expected.argmin(axis=1)[result.indices]])
+
+
+def test_occluded_joints_are_ignored():
+    visible = ~np.isin(np.arange(34), [6, 7, 20])
+    results = [
+        retrieve(np.where(visible[:, None], projection(8, 1), value), visible=visible)
+        for value in (np.nan, 7.0)
+    ]
+    assert results[0].indices[0] == 8
+    assert results[0].distances[0] < 1e-9
+    assert results[0].distances == results[1].distances
+
+
+def test_batches_and_blocks_do_not_change_the_result(monkeypatch):
+    queries = np.stack([[projection(1, 0), projection(2, 1), projection(30, 5)]])
+    together = retrieve(queries, n=2)
+    assert together.indices.shape == (1, 3, 2)
+    assert together.views.shape == (1, 3, 2, 2)
+    monkeypatch.setattr(retrieval, "_BLOCK", 13)
+    for place in range(3):
+        alone = retrieve(queries[0, place], n=2)
+        for many, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(many[0, place], one)
+
+
+def test_repeated_poses_count_once_by_their_first_index():
+    repeated = FEW[[4, 4, 9, 4, 9, 2]]
+    result = retrieve(projection(9, 3), repeated, n=3)
+    assert result.indices[0] == 2
+    assert sorted(result.indices) == [0, 2, 5]
+    with pytest.raises(ValueError, match="n must be at most 3, the number of distinct draws"):
+        retrieve(projection(9, 3), repeated, n=4)
+
+
+def test_default_views_surround_the_pair():
+    views = view_grid()
+    assert np.unique(views, axis=0).shape == (48, 2)
+    assert np.degrees(views[:, 1]).min() == pytest.approx(50)
+    assert np.degrees(views[:, 1]).max() == pytest.approx(100)
+    # The view is between two grid points.
+    between = project_to_views(FEW[11][None], views[[20]] + 0.15, PAIR)[0, 0]
+    assert retrieve(between, views=None).indices[0] in (10, 11, 12)
+
+
+def test_views_around_an_estimate_contain_it():
+    views = views_around(np.array([0.3, 1.2]))
+    assert views.shape == (15, 2)
+    assert np.abs(views - [0.3, 1.2]).sum(axis=1).min() < 1e-12
+    assert np.degrees(np.abs(views - [0.3, 1.2]).max(axis=0)) == pytest.approx([30, 15])
+
+
+def test_invalid_queries_are_rejected():
+    with pytest.raises(ValueError, match="views must contain at least one view, got none"):
+        retrieve(projection(0, 0), views=np.empty((0, 2)))
+    with pytest.raises(ValueError, match="visible must share an edge with at least 1 draws"):
+        retrieve(projection(0, 0), visible=np.arange(34) == 3)

@@ -1,9 +1,4 @@
-"""ASF and AMC files: positions worked out by hand, a real recording, damaged files."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
+"""ASF and AMC reading: positions by hand, a real recording and damaged files."""
 
 import numpy as np
 import pytest
@@ -11,7 +6,7 @@ import pytest
 from probmotion.io.amc import read_amc
 from probmotion.io.asf import read_asf
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import load_motion, read_motion
+from probmotion.io.files import load
 
 ASF = """# a leg and a head
 :version 1.10
@@ -21,7 +16,7 @@ ASF = """# a leg and a head
   length 0.254
   angle deg
 :documentation
-   begin with nothing that means something here
+   begin of ignored text
 :root
    order TX TY TZ RX RY RZ
    axis XYZ
@@ -69,25 +64,25 @@ ASF = """# a leg and a head
   end
 """
 
-# The values of root, thigh, shin and toe, and where the ends of the bones are (decimetres): thigh,
-# head, shin, toe. The root is at (10, 20, 30).
+# Channel values of root, thigh, shin and toe, and the ends of thigh, head, shin and toe in
+# decimetres. The root is at (10, 20, 30).
 FRAMES: dict[tuple[float, ...], list[tuple[int, ...]]] = {
-    # The rest pose: down, down, forwards; up.
+    # Rest pose.
     (0, 0, 0, 0, 0, 0, 0, 0): [(10, 16, 30), (10, 22, 30), (10, 13, 30), (10, 13, 31)],
     # The shin's own x axis is the world's y axis: z turns to x.
     (0, 0, 0, 0, 0, 90, 0, 0): [(10, 16, 30), (10, 22, 30), (10, 13, 30), (11, 13, 30)],
-    # The toe's own z axis is x and its y axis is z: first z turns to -y, and then that to x.
+    # The toe's z axis is x and its y axis is z: z turns to -y, then to x.
     (0, 0, 0, 0, 0, 0, 90, 90): [(10, 16, 30), (10, 22, 30), (10, 13, 30), (11, 13, 30)],
     # The root turns about x (y to z, z to -y), then about y (z to x).
     (90, 90, 0, 0, 0, 0, 0, 0): [(6, 20, 30), (12, 20, 30), (3, 20, 30), (3, 19, 30)],
-    # The thigh turns -y to -z, and with it the shin's axis y to z; the head stays.
+    # The thigh turns -y to -z, and the shin's axis from y to z.
     (0, 0, 0, 90, 0, 90, 0, 0): [(10, 20, 26), (10, 22, 30), (10, 20, 23), (11, 20, 23)],
-    # The thigh turns about x, -y to -z, then about z, which leaves that; the toe's -y turns to x.
+    # The thigh turns about x, -y to -z, then about z; the toe's -y turns to x.
     (0, 0, 0, 90, 90, 0, 0, 0): [(10, 20, 26), (10, 22, 30), (10, 20, 23), (11, 20, 23)],
 }
 
 
-def amc(frames: list[tuple[float, ...]], first: int = 1) -> str:
+def amc(frames, first=1):
     lines = ["#!OML:ASF made.asf", ":FULLY-SPECIFIED", ":DEGREES"]
     for number, (x, y, z, *thigh, shin, z_toe, y_toe) in enumerate(frames, start=first):
         lines += [
@@ -103,14 +98,14 @@ def amc(frames: list[tuple[float, ...]], first: int = 1) -> str:
 AMC = amc(list(FRAMES))
 
 
-def put(folder: Path, asf: str = ASF, motion: str = AMC, name: str = "made") -> Path:
-    """Write both files; return the path of the motion."""
+def put(folder, asf=ASF, motion=AMC, name="made"):
+    """Write both files and return the path of the motion."""
     (folder / "made.asf").write_bytes(asf.encode())
     (folder / f"{name}.amc").write_bytes(motion.encode())
     return folder / f"{name}.amc"
 
 
-def test_positions_worked_out_by_hand(tmp_path: Path) -> None:
+def test_positions_by_hand(tmp_path):
     motion = read_amc(put(tmp_path))
     assert motion.skeleton.joint_names == ("root", "thigh", "head", "shin", "toe")
     assert motion.skeleton.parents == (-1, 0, 0, 1, 3)
@@ -120,7 +115,7 @@ def test_positions_worked_out_by_hand(tmp_path: Path) -> None:
     assert motion.rotations is None
 
 
-def test_a_skeleton_alone_is_its_rest_pose(tmp_path: Path) -> None:
+def test_asf_rest_pose_and_channels(tmp_path):
     put(tmp_path)
     body = read_asf(tmp_path / "made.asf")
     assert body.channels[1:] == (("RX", "RZ"), (), ("RX",), ("RZ", "RY"))
@@ -128,17 +123,17 @@ def test_a_skeleton_alone_is_its_rest_pose(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         body.offsets[1:], [[0.0, -0.4, 0], [0, 0.2, 0], [0, -0.3, 0], [0, 0, 0.1]], atol=1e-15
     )
-    # The toe's axes: its x is y, its y is z, its z is x.
+    # The toe's axes x, y, z are the world's y, z, x.
     np.testing.assert_allclose(body.axes[4], np.eye(3)[[2, 0, 1]], atol=1e-15)
 
 
-def test_the_unit_of_length_is_an_inch_over_what_the_file_says(tmp_path: Path) -> None:
+def test_length_unit_is_an_inch_over_the_declared_length(tmp_path):
     whole = read_amc(put(tmp_path)).positions
     cmu = read_amc(put(tmp_path, ASF.replace("length 0.254", "length 0.45"))).positions
     np.testing.assert_allclose(cmu, whole * 0.254 / 0.45, rtol=1e-15)
 
 
-def test_line_ends_comments_cases_and_first_numbers_do_not_matter(tmp_path: Path) -> None:
+def test_line_ends_comments_case_and_first_frame_number(tmp_path):
     wanted = read_amc(put(tmp_path)).positions
     other = AMC.replace("shin", "# nothing\n\nshin").replace("DEGREES", "degrees")
     for end in ("\n", "\r\n", "\r"):
@@ -149,7 +144,7 @@ def test_line_ends_comments_cases_and_first_numbers_do_not_matter(tmp_path: Path
     np.testing.assert_array_equal(read_amc(path).positions, wanted)
 
 
-def test_the_order_of_a_root_is_the_file_s(tmp_path: Path) -> None:
+def test_root_channels_follow_the_declared_order(tmp_path):
     turned = AMC.replace("root 10 20 3.0e+001 90 90 0", "root 0 90 90 10 20 30")
     turned = turned.replace("root 10 20 3.0e+001 0 0 0", "root 0 0 0 10 20 30")
     path = put(tmp_path, ASF.replace("TX TY TZ RX RY RZ", "RZ RX RY TX TY TZ"), turned)
@@ -158,7 +153,7 @@ def test_the_order_of_a_root_is_the_file_s(tmp_path: Path) -> None:
     )
 
 
-def test_the_skeleton_is_beside_the_motion_or_given(tmp_path: Path) -> None:
+def test_skeleton_file_is_found_or_given(tmp_path):
     subject = put(tmp_path, name="made_01")
     assert read_amc(subject).name == "made_01"
     (tmp_path / "other").mkdir()
@@ -173,58 +168,58 @@ def test_the_skeleton_is_beside_the_motion_or_given(tmp_path: Path) -> None:
         read_amc(tmp_path / "none.amc")
 
 
-def test_the_rate_is_given_or_assumed_aloud(tmp_path: Path) -> None:
+def test_frame_rate_is_given_or_assumed_with_a_warning(tmp_path):
     path = put(tmp_path)
     assert read_amc(path, fps=60.0).fps == 60.0
     with pytest.raises(ValueError, match="fps must be a finite number above 0, got 0"):
         read_amc(path, fps=0)
-    for read in (read_motion, load_motion):
-        with pytest.warns(MotionFileWarning, match=r"made\.amc is taken to have 120 frames per"):
-            assert read(path).fps == 120.0
+    with pytest.warns(MotionFileWarning, match=r"made\.amc: assuming 120 frames per second"):
+        assert load(path).fps == 120.0
     path = put(tmp_path, motion=":SAMPLES-PER-SECOND 60\n" + AMC)
     assert read_amc(path, fps=60.0).fps == 60.0
-    with pytest.raises(MotionFileError, match="line 1: :SAMPLES-PER-SECOND must be 120 as, got 60"):
+    with pytest.raises(MotionFileError, match="line 1: :SAMPLES-PER-SECOND: expected fps=120, got"):
         read_amc(path)
 
 
 WRONG_SKELETONS = {
-    "": "nothing came, expected a line that begins with ':'",
-    "HIERARCHY\nROOT Hips": "line 1: 'HIERARCHY' came, expected :version, :name or :units",
-    ASF.partition(":hierarchy")[0]: "line 48: the file ends without :hierarchy, expected all",
-    ASF.partition("name shin")[0]: "the file ends without :hierarchy",
-    ASF.rpartition("end")[0]: "line 53: end did not come, expected it around the hierarchy",
-    ASF + ":root\n": "line 55: ':root' came again, expected it once",
+    "": "expected a line that begins with ':', got nothing",
+    "HIERARCHY\nROOT Hips": "line 1: expected :version, :name or :units, got 'HIERARCHY'",
+    ASF.partition(":hierarchy")[0]: "line 48: expected :hierarchy, got the end of the file",
+    ASF.rpartition("end")[0]: "line 53: expected end around the hierarchy",
+    ASF + ":root\n": "line 55: expected ':root' once, got it again",
     ASF.replace("angle deg", "angle rad"): "line 7: angle must be deg, got 'rad'",
-    ASF.replace("length 0.254", ""): "line 7: :units has no length, expected one",
+    ASF.replace("length 0.254", ""): "line 7: expected length in :units",
     ASF.replace("length 0.254", "length 0"): "line 6: length must be between 0.001 and 1000, got 0",
-    ASF.replace("length 0.254", "length 1 2"): "line 6: length has 2 values, expected 1",
-    ASF.replace("order", "other"): ":root has no order, expected one",
-    ASF.replace("TX TY", "TX L"): "line 11: channel 'L' came, expected each of TX, TY, TZ, RX, RY",
-    ASF.replace("position 0 0", "position 0 1"): "line 13: position is 0 1 0, expected 0 0 0",
-    ASF.replace("rx rz", "rx rx"): "line 22: channel 'rx' came, expected each of RX, RY, RZ once",
-    ASF.replace("dof RX", "dof TX"): "channel 'TX' came, expected each of RX, RY, RZ once at most",
-    ASF.replace("name toe", "name thigh"): "line 28: name must be a new one, got 'thigh'",
-    ASF.replace("name toe", "name root"): "line 28: name must be a new one, got 'root'",
-    ASF.replace("name toe\n", "\n"): "line 33: the bone of line 26 has no name, expected one",
-    ASF.replace("direction 0 0 1", "direction 0 0 2"): "direction is 0 0 2, expected a vector of",
-    ASF.replace("direction 0 0 1", "direction 0 0"): "line 29: direction has 2 values, expected 3",
+    ASF.replace("length 0.254", "length 1 2"): "line 6: length: expected 1 values, got 2",
+    ASF.replace("order", "other"): "expected order in :root",
+    ASF.replace("TX TY", "TX L"): "line 11: expected channels TX, TY, TZ, RX, RY, RZ, each at most",
+    ASF.replace("position 0 0", "position 0 1"): "line 13: position must be 0 0 0, got 0 1 0",
+    ASF.replace("rx rz", "rx rx"): "line 22: expected channels RX, RY, RZ, each at most once, got",
+    ASF.replace("dof RX", "dof TX"): "each at most once, got 'TX'",
+    ASF.replace("name toe", "name thigh"): "line 28: name must be unique, got 'thigh'",
+    ASF.replace("name toe\n", "\n"): "line 33: expected name in the bone of line 26",
+    ASF.replace("direction 0 0 1", "direction 0 0 2"): "direction must be a unit vector, got 0 0 2",
+    ASF.replace("direction 0 0 1", "direction 0 0"): "line 29: direction: expected 3 values, got 2",
     ASF.replace("length 4", "length -4"): "line 20: length must be 0 or more, got -4",
-    ASF.replace("length 4", "length nan"): "line 20: length has 'nan', expected a number between",
-    ASF.replace("length 4", "length 4_0"): "line 20: length has '4_0', expected a number between",
-    ASF.replace("90 0 90 XYZ", "90 0 90 ZYX"): "axis is '90 0 90 ZYX', expected three angles and",
-    ASF.replace("90 0 90 XYZ", "90 0 90"): "axis is '90 0 90', expected three angles and XYZ",
-    ASF.replace("id 2", "length 3"): "length came again in the bone of line 26, expected it once",
-    ASF.replace("id 2", "eggs 2"): "line 27: 'eggs' came, expected id, name, direction",
-    ASF.replace("  end\n:hier", "\n:hier"): "ends inside the bone of line 42, expected its end",
-    ASF.replace("shin toe\n", "shin\n"): "line 26: bone 'toe' has no parent in the hierarchy",
-    ASF.replace("shin toe", "shin nose"): "line 53: 'nose' came, expected a bone of :bonedata",
-    ASF.replace("shin toe", "shin toe head"): "line 53: 'head' has a second parent, expected one",
-    ASF.replace("root thigh head", "root head\nshin thigh"): "parents form a cycle",
+    ASF.replace("length 4", "length nan"): "line 20: length: expected a number between",
+    ASF.replace(
+        "90 0 90 XYZ", "90 0 90 ZYX"
+    ): "axis must be three angles and XYZ, got '90 0 90 ZYX",
+    ASF.replace("90 0 90 XYZ", "90 0 90"): "axis must be three angles and XYZ, got '90 0 90'",
+    ASF.replace("id 2", "length 3"): "expected length once in the bone of line 26",
+    ASF.replace("id 2", "eggs 2"): "line 27: expected id, name, direction",
+    ASF.replace("  end\n:hier", "\n:hier"): "expected end of the bone of line 42",
+    ASF.replace("shin toe\n", "shin\n"): "line 26: expected a parent of 'toe' in the hierarchy",
+    ASF.replace("shin toe", "shin nose"): "line 53: expected a bone of :bonedata, got 'nose'",
+    ASF.replace(
+        "shin toe", "shin toe head"
+    ): "line 53: expected one parent of 'head', got a second",
+    ASF.replace("root thigh head", "root head\nshin thigh"): "parents must form trees, got a cycle",
 }
 
 
 @pytest.mark.parametrize("asf", WRONG_SKELETONS, ids=list(WRONG_SKELETONS.values()))
-def test_what_is_wrong_with_a_skeleton_is_one_sentence(asf: str, tmp_path: Path) -> None:
+def test_skeleton_defects_are_reported(asf, tmp_path):
     path = put(tmp_path, asf)
     with pytest.raises(MotionFileError) as error:
         read_amc(path)
@@ -233,25 +228,27 @@ def test_what_is_wrong_with_a_skeleton_is_one_sentence(asf: str, tmp_path: Path)
 
 
 WRONG_MOTIONS = {
-    "": "nothing came, expected a line that begins with ':'",
-    "HIERARCHY\nROOT Hips": "line 1: 'HIERARCHY' came, expected :FULLY-SPECIFIED before it",
-    AMC.replace(":DEGREES", ":RADIANS"): "line 4: '1' came, expected :DEGREES before it",
-    AMC.partition("1\n")[0]: "line 3: the file ends before its first frame, expected one at least",
-    AMC.replace("\n1\n", "\n"): "line 4: 'root' came, expected the number of a frame",
-    AMC.replace("\n3\n", "\n4\n"): "line 14: frame 4 came after 2, expected 3",
-    AMC.replace("\n3\n", "\n"): "line 14: 'root' came, expected a bone that moves, once in a frame",
-    AMC.replace("shin 90\n", "\n", 1): "line 14: frame 2 ends without 'shin', expected all bones",
-    AMC.rpartition("toe")[0]: "line 32: frame 6 ends without 'toe', expected all bones that move",
-    AMC.replace("shin 90", "head 90"): "line 11: 'head' came, expected a bone that moves, once in",
-    AMC.replace("shin 90", "shin"): "line 11: 'shin' has 0 values, expected 1",
-    AMC.replace("shin 90", "shin 90 1"): "line 11: 'shin' has 2 values, expected 1",
-    AMC.replace("shin 90", "shin inf"): "line 11: 'shin' has 'inf', expected a number between -1e9",
-    AMC.replace("shin 90", "shin 1e10"): "line 11: 'shin' has '1e10', expected a number between",
+    "": "expected a line that begins with ':', got nothing",
+    "HIERARCHY\nROOT Hips": "line 1: expected :FULLY-SPECIFIED first, got 'HIERARCHY'",
+    AMC.replace(":DEGREES", ":RADIANS"): "line 4: expected :DEGREES first, got '1'",
+    AMC.partition("1\n")[0]: "line 3: expected at least one frame, got the end of the file",
+    AMC.replace("\n1\n", "\n"): "line 4: expected the number of a frame, got 'root'",
+    AMC.replace("\n3\n", "\n4\n"): "line 14: expected frame 3, got 4",
+    AMC.replace("\n3\n", "\n"): "line 14: expected each moving bone once in a frame, got 'root'",
+    AMC.replace("shin 90\n", "\n", 1): "line 14: expected all moving bones in frame 2, got no 'shi",
+    AMC.rpartition("toe")[0]: "line 32: expected all moving bones in frame 6, got no 'toe'",
+    AMC.replace("shin 90", "head 90"): "line 11: expected each moving bone once in a frame, got",
+    AMC.replace("shin 90", "shin"): "line 11: 'shin': expected 1 values, got 0",
+    AMC.replace("shin 90", "shin 90 1"): "line 11: 'shin': expected 1 values, got 2",
+    AMC.replace(
+        "shin 90", "shin inf"
+    ): "line 11: 'shin': expected a number between -1e9 and 1e9, g",
+    AMC.replace("shin 90", "shin 1e10"): "line 11: 'shin': expected a number between",
 }
 
 
 @pytest.mark.parametrize("motion", WRONG_MOTIONS, ids=list(WRONG_MOTIONS.values()))
-def test_what_is_wrong_with_a_motion_is_one_sentence(motion: str, tmp_path: Path) -> None:
+def test_motion_defects_are_reported(motion, tmp_path):
     path = put(tmp_path, motion=motion)
     with pytest.raises(MotionFileError) as error:
         read_amc(path)
@@ -259,48 +256,45 @@ def test_what_is_wrong_with_a_motion_is_one_sentence(motion: str, tmp_path: Path
     assert WRONG_MOTIONS[motion] in str(error.value)
 
 
-def outcomes(path: Path, damaged: list[str], put_one: Callable[[str], object]) -> list[bool]:
-    """Return which of the damaged texts were read; the others are refused in one sentence."""
+def outcomes(path, damaged, put_one):
+    """Return which of the damaged texts are read; the others raise MotionFileError."""
     read = []
     for text in damaged:
         put_one(text)
         try:
             read.append(bool(np.isfinite(read_amc(path).positions).all()))
         except MotionFileError as error:
-            refused = str(error)
+            assert "must" in str(error) or "expected" in str(error), text  # noqa: PT017
+            assert str(error).isprintable()  # noqa: PT017
             read.append(False)
-        else:
-            refused = "as expected"
-        assert "expected" in refused, text
-        assert refused.isprintable()
     return read
 
 
-def test_a_file_that_is_cut_or_garbled_anywhere_is_read_or_refused(tmp_path: Path) -> None:
+def test_truncated_and_garbled_files_are_read_or_refused(tmp_path):
     short = amc(list(FRAMES)[-2:])
     path = put(tmp_path, ASF, short)
-    garbled = ["", "1", "1e300", "-9" * 30, "begin", "end", ":units", "root", "é\x00", "("]
+    put_asf = (tmp_path / "made.asf").write_text
+    garbled = ["", "1e300", "begin", ":units", "é\x00"]
 
-    def damages(text: str) -> list[str]:
+    def damages(text):
         words = text.split(" ")
-        swaps = [(place, other) for place in range(0, len(words), 3) for other in garbled[::2]]
-        return [text[:stop] for stop in range(0, len(text), 3)] + [
-            " ".join([*words[:place], other, *words[place + 1 :]]) for place, other in swaps
+        cut = [text[:stop] for stop in range(0, len(text), 9)]
+        return cut + [
+            " ".join([*words[:place], other, *words[place + 1 :]])
+            for place in range(0, len(words), 5)
+            for other in garbled
         ]
 
-    cut = outcomes(path, damages(short), path.write_text)
-    assert True in cut
-    assert False in cut
-    # A motion that is cut is whole only after a frame, or within its last number.
+    assert True in outcomes(path, damages(short), path.write_text)
+    # A truncated motion is valid only after a frame, or within its last number.
     assert sum(outcomes(path, [short[:stop] for stop in range(len(short))], path.write_text)) <= 4
     path.write_text(short)
-    assert False in outcomes(path, damages(ASF), (tmp_path / "made.asf").write_text)
+    assert False in outcomes(path, damages(ASF), put_asf)
     whole = ASF.rstrip()
-    parts = [whole[:stop] for stop in range(0, len(whole), 5)]
-    assert not any(outcomes(path, parts, (tmp_path / "made.asf").write_text))
+    assert not any(outcomes(path, [whole[:stop] for stop in range(0, len(whole), 9)], put_asf))
 
 
-def test_a_real_recording_agrees_with_its_conversion(real_data: Path) -> None:
+def test_real_recording_agrees_with_its_conversion(real_data):
     path = real_data / "originals" / "02_01.amc"
     motion = read_amc(path)
     with np.load(real_data / "cmu_single" / "cmu_02_01.npz") as known:

@@ -1,23 +1,15 @@
-"""BVH reading: kinematics against pybvh and by hand, every defect named by its line."""
-
-from __future__ import annotations
+"""BVH reading: kinematics against pybvh and by hand, and defects by line."""
 
 import itertools
 import re
-import time
 import warnings
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import read_motion
-
-DATA = Path(__file__).parents[3] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data beside the checkout")
+from probmotion.io.files import load
 
 MINIMAL = """HIERARCHY
 ROOT Hips
@@ -42,14 +34,14 @@ Frame Time: 0.0333333
 """
 
 
-def written(folder: Path, text: str | bytes, name: str = "clip.bvh") -> Path:
+def written(folder, text, name="clip.bvh"):
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 
 
-def chain(order: str, rng: np.random.Generator, frames: int = 5) -> str:
-    """A root and two joints with one rotation order, random offsets and angles."""
+def chain(order, rng, frames=5):
+    """Root and two joints of one rotation order with random offsets and angles."""
     channels = " ".join(f"{axis}rotation" for axis in order)
     offsets = rng.normal(size=(3, 3))
     lines = ["HIERARCHY"]
@@ -65,51 +57,45 @@ def chain(order: str, rng: np.random.Generator, frames: int = 5) -> str:
     return "\n".join(lines) + "\n"
 
 
-def pybvh_positions(path: Path) -> np.ndarray:
+def pybvh_positions(path):
     import pybvh
 
     return pybvh.read_bvh_file(path, world_up="+y").node_positions()
 
 
-# --- kinematics --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
-def test_positions_agree_with_pybvh_in_every_rotation_order(tmp_path: Path, order: str) -> None:
+def test_positions_agree_with_pybvh(tmp_path, order):
     path = written(tmp_path, chain(order, np.random.default_rng(7)))
     positions = read_bvh(path, scale=1.0, end_sites=True).positions
     np.testing.assert_allclose(positions, pybvh_positions(path), atol=1e-9)
 
 
-@needs_data
-@pytest.mark.parametrize("name", ["60_10_scaled", "61_10_scaled", "131_01"])
-def test_positions_of_real_files_agree_with_pybvh(name: str) -> None:
-    path = DATA / "originals" / f"{name}.bvh"
+@pytest.mark.parametrize("name", ["60_10_scaled", "131_01"])
+def test_positions_of_real_files_agree_with_pybvh(name, real_data):
+    path = real_data / "originals" / f"{name}.bvh"
     positions = read_bvh(path, scale=1.0, end_sites=True).positions
     np.testing.assert_allclose(positions, pybvh_positions(path), atol=1e-8)
 
 
-@needs_data
-def test_cmu_clip_agrees_with_its_independent_conversion_in_metres() -> None:
-    archive = np.load(DATA / "cmu_single" / "cmu_131_01.npz")
+def test_cmu_clip_agrees_with_its_conversion(real_data):
+    archive = np.load(real_data / "cmu_single" / "cmu_131_01.npz")
     with pytest.warns(MotionFileWarning, match=r"1/0\.45 inch"):
-        motion = read_bvh(DATA / "originals" / "131_01.bvh", end_sites=True)
+        motion = read_bvh(real_data / "originals" / "131_01.bvh", end_sites=True)
     assert motion.skeleton.joint_names == tuple(archive["joint_names"])
     assert motion.skeleton.parents == tuple(archive["parents"])
     assert motion.fps == 120
     np.testing.assert_allclose(motion.positions[1::4], archive["positions"], atol=1e-6)
 
 
-def test_a_quarter_turn_by_hand(tmp_path: Path) -> None:
+def test_quarter_turns_by_hand(tmp_path):
     motion = read_bvh(written(tmp_path, MINIMAL), scale=1.0, end_sites=True)
     assert motion.skeleton.joint_names == ("Hips", "Knee", "Knee_end")
-    # Frame 1: the hip turns (0, -1, 0) about z by 90° to (1, 0, 0); the shank, first turned
-    # about the knee's x axis from -y to -z, stays along -z.
+    # Frame 1: the hip rotates (0, -1, 0) about z to (1, 0, 0); the shank points along -z.
     expected = [[0, 1, 0], [1, 1, 0], [1, 1, -0.5]]
     np.testing.assert_allclose(motion.positions[1], expected, atol=1e-12)
 
 
-def test_rotations_and_rest_offsets_reproduce_the_positions(tmp_path: Path) -> None:
+def test_rotations_and_rest_offsets_reproduce_positions(tmp_path):
     motion = read_bvh(written(tmp_path, chain("YXZ", np.random.default_rng(2))), scale=0.01)
     world = motion.rotations[:, 0]
     knee = motion.positions[:, 0] + world @ motion.rest_offsets[1]
@@ -118,7 +104,7 @@ def test_rotations_and_rest_offsets_reproduce_the_positions(tmp_path: Path) -> N
     np.testing.assert_allclose(motion.positions[:, 2], foot, atol=1e-12)
 
 
-def test_position_channels_replace_offsets_axis_by_axis(tmp_path: Path) -> None:
+def test_position_channels_replace_offsets_axis_by_axis(tmp_path):
     text = MINIMAL.replace(
         "CHANNELS 3 Zrotation Yrotation Xrotation", "CHANNELS 3 Zposition Xrotation Xposition"
     ).replace("0 0 0\n0 1 0 90 0 0 0 0 90", "3 0 2\n0 1 0 90 0 0 0 0 0")
@@ -128,7 +114,7 @@ def test_position_channels_replace_offsets_axis_by_axis(tmp_path: Path) -> None:
     assert motion.rotations is None, "rotations alone would not reproduce these positions"
 
 
-def test_joints_may_have_any_channels_or_none(tmp_path: Path) -> None:
+def test_joints_with_arbitrary_channels(tmp_path):
     text = (
         MINIMAL.replace("CHANNELS 6 X", "CHANNELS 5 X")
         .replace("Zrotation Yrotation Xrotation\n    JOINT", "Yrotation Zrotation\n    JOINT")
@@ -140,17 +126,17 @@ def test_joints_may_have_any_channels_or_none(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.positions[1, 2], [0, 1, -1.5], atol=1e-12)
 
 
-def test_several_roots_make_one_skeleton(tmp_path: Path) -> None:
+def test_several_roots_form_one_skeleton(tmp_path):
     ball = "ROOT Ball\n{\nOFFSET 5 0 0\nCHANNELS 1 Yposition\n}\nMOTION"
     text = MINIMAL.replace("MOTION", ball).replace("0 0 90\n", "0 0 90 4\n")
     text = text.replace("0 1 0 0 0 0 0 0 0\n", "0 1 0 0 0 0 0 0 0 3\n")
     motion = read_bvh(written(tmp_path, text), scale=1.0)
     assert motion.skeleton.roots == (0, 2)
     np.testing.assert_allclose(motion.positions[:, 2], [[5, 3, 0], [5, 4, 0]])
-    assert motion.rotations is not None, "a root may move without losing the rotations"
+    assert motion.rotations is not None, "roots may translate"
 
 
-def test_end_sites_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+def test_end_sites_are_optional(tmp_path):
     two = MINIMAL.replace(
         "        End Site", "        End Site\n{\nOFFSET 0 0 2\n}\n        End Site named", 1
     )
@@ -161,10 +147,7 @@ def test_end_sites_are_left_out_unless_asked_for(tmp_path: Path) -> None:
     assert named.parents == (-1, 0, 1, 1)
 
 
-# --- text --------------------------------------------------------------------------------------
-
-
-def test_line_ends_blanks_case_and_byte_order_mark_do_not_matter(tmp_path: Path) -> None:
+def test_line_ends_blanks_case_and_byte_order_mark(tmp_path):
     expected = read_bvh(written(tmp_path, MINIMAL)).positions
     lines = MINIMAL.split("\n")
     ends = itertools.cycle(["\r\n", "\n", "\r", "\n\n\t \r\n"])
@@ -185,7 +168,7 @@ def test_line_ends_blanks_case_and_byte_order_mark_do_not_matter(tmp_path: Path)
         np.testing.assert_array_equal(motion.positions, expected)
 
 
-def test_names_keep_blanks_and_letters_of_any_script(tmp_path: Path) -> None:
+def test_names_with_blanks_and_any_script(tmp_path):
     for name, encoding in (("Bip01 L Thigh", "utf-8"), ("膝", "utf-8"), ("Hüfte", "latin-1")):
         text = MINIMAL.replace("Knee", name).encode(encoding)
         assert read_bvh(written(tmp_path, text)).skeleton.joint_names[1] == name
@@ -197,7 +180,6 @@ def test_names_keep_blanks_and_letters_of_any_script(tmp_path: Path) -> None:
         ("0.0333333", 30),
         (".0083333", 120),
         ("0.00833", 120),
-        ("0.016667", 60),
         ("0.041708", 1 / 0.041708),  # 23.976 frames per second, not 24
         ("0.0333667", 1 / 0.0333667),  # 29.97, not 30
         ("0.03", 1 / 0.03),
@@ -206,14 +188,9 @@ def test_names_keep_blanks_and_letters_of_any_script(tmp_path: Path) -> None:
         ("0.0001", 10_000),
     ],
 )
-def test_frame_time_becomes_the_integer_rate_it_rounds(
-    tmp_path: Path, frame_time: str, fps: float
-) -> None:
+def test_rounded_frame_times_become_integer_rates(tmp_path, frame_time, fps):
     text = MINIMAL.replace("0.0333333", frame_time)
     assert read_bvh(written(tmp_path, text)).fps == pytest.approx(fps, rel=1e-14)
-
-
-# --- units -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -225,131 +202,108 @@ def test_frame_time_becomes_the_integer_rate_it_rounds(
         (130.0, "centimetres", 0.01),
     ],
 )
-def test_unit_is_inferred_from_the_longest_chain_and_announced(
-    tmp_path: Path, reach: float, unit: str, factor: float
-) -> None:
+def test_unit_is_inferred_with_a_warning(tmp_path, reach, unit, factor):
     text = MINIMAL.replace("OFFSET 0 -1 0", f"OFFSET 0 -{reach} 0")
     with pytest.warns(MotionFileWarning, match=unit) as caught:
-        motion = read_motion(written(tmp_path, text))
+        motion = load(written(tmp_path, text))
     assert len(caught) == 1
-    assert "\n" not in str(caught[0].message)
     assert "clip.bvh" in str(caught[0].message)
     np.testing.assert_allclose(motion.positions[0, 0], [0, factor, 0])
     np.testing.assert_allclose(motion.rest_offsets[1], [0, -reach * factor, 0])
 
 
-def test_metres_are_read_as_they_are_without_a_word(tmp_path: Path) -> None:
+def test_metres_are_read_without_a_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for reach in (0.0, 0.3, 1.0, 2.4, 5.0):
             text = MINIMAL.replace("OFFSET 0 -1 0", f"OFFSET 0 -{reach} 0")
-            assert read_motion(written(tmp_path, text)).positions[0, 0, 1] == 1
+            assert load(written(tmp_path, text)).positions[0, 0, 1] == 1
 
 
-def test_a_given_scale_is_used_silently(tmp_path: Path) -> None:
+def test_scale_overrides_the_inferred_unit(tmp_path):
     text = MINIMAL.replace("OFFSET 0 -1 0", "OFFSET 0 -240 0")
     assert read_bvh(written(tmp_path, text), scale=0.5).positions[0, 1, 1] == -119.5
-    with pytest.raises(ValueError, match="scale is 0"):
+    with pytest.raises(ValueError, match="scale must be a finite number above 0, got 0"):
         read_bvh(written(tmp_path, text), scale=0)
 
 
-# --- defects -----------------------------------------------------------------------------------
-
-
-def defect(old: str, new: str, message: str, line: int) -> Any:
+def defect(old, new, message, line):
     assert old in MINIMAL
     return pytest.param(MINIMAL.replace(old, new, 1), message, line, id=message[:40])
 
 
+NUMBER, ROW = "expected a number between", "0 1 0 90 0 0 0 0 90"
 DEFECTS = [
-    defect("Frames: 2", "Frames: 3", "after 2 lines of values, expected 3, the Frames of line", 20),
-    defect("Frames: 2", "Frames: 1", "after 2 lines of values, expected 1", 20),
+    defect("Frames: 2", "Frames: 3", "expected 3 lines of values as in line 17, got 2", 20),
+    defect("Frames: 2", "Frames: 1", "expected 1 lines of values as in line 17, got 2", 20),
     defect("Frames: 2", "Frames: 0", "Frames must be an integer of at least 1, got '0'", 17),
-    defect("Frames: 2", "Frames: -2", "Frames is '-2'", 17),
-    defect("Frames: 2\n", "", "came, expected 'Frames: …'", 17),
-    defect("Frame Time: 0.0333333\n", "", "came, expected 'Frame Time: …'", 18),
-    defect("0.0333333", "0", "Frame Time is 0 s, expected between 0.0001 and 1 seconds", 18),
-    defect("0.0333333", "-0.03", "Frame Time is -0.03 s", 18),
-    defect("0.0333333", "33.3", "Frame Time is 33.3 s", 18),
-    defect("0.0333333", "nan", "'nan' came, expected a number", 18),
-    defect("0 1 0 90 0 0 0 0 90", "0 1 0 90 0 0 0 0", "8 values came, expected 9", 20),
-    defect("0 1 0 90 0 0 0 0 90", "0 1 0 90 0 0 0 0 90 1", "10 values came, expected 9", 20),
-    defect("0 1 0 90", "0 nan 0 90", "'nan' came, expected a number", 20),
-    defect("0 1 0 90", "0 inf 0 90", "'inf' came, expected a number", 20),
-    defect("0 1 0 90", "0 1e300 0 90", "'1e300' came, expected a number between", 20),
-    defect("0 1 0 90", "0 1_0 0 90", "'1_0' came", 20),
-    defect("0 1 0 90", "0 ١ 0 90", "'١' came", 20),
-    defect("0 1 0 90", "0 1,5 0 90", "'1,5' came", 20),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1", "OFFSET has 2 values, expected 3", 8),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1 zero", "'zero' came, expected a number", 8),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1 nan", "'nan' came, expected a number", 8),
-    defect("        OFFSET 0 -1 0\n", "", "'Knee' closes without OFFSET", 13),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1 0\nOFFSET 0 -1 0", "has a second OFFSET", 9),
-    defect("CHANNELS 3 Z", "CHANNELS 2 Z", "announces '2' channels and names 3", 9),
-    defect("CHANNELS 3 Z", "CHANNELS Z", "CHANNELS announces 'Zrotation'", 9),
-    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation", "channel 'Wrotation' came", 9),
-    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Xrotation", "channel 'Xrotation' came", 9),
-    defect("            OFFSET 0 -0.5 0\n", "", "'Knee_end' closes without OFFSET", 12),
-    defect("OFFSET 0 -0.5 0", "CHANNELS 0", "CHANNELS came inside an End Site", 12),
-    defect("OFFSET 0 -0.5 0", "JOINT x", "JOINT came inside an End Site", 12),
-    defect("End Site", "End", "'End' came, expected End Site", 10),
-    defect("JOINT Knee", "ROOT Knee", "ROOT came inside 'Hips'", 6),
-    defect("JOINT Knee", "JOINT", "JOINT has no name", 6),
-    defect("JOINT Knee", "JOINT Hips", "joint 'Hips' came before at line 2", 6),
-    defect("JOINT Knee", "LIMB Knee", "'LIMB' came, expected ROOT", 6),
-    defect("ROOT Hips", "JOINT Hips", "JOINT Hips came outside a joint", 2),
-    defect("ROOT Hips\n{", "ROOT Hips", "'OFFSET' came, expected '{'", 3),
-    defect("}\nMOTION", "MOTION", "the hierarchy ends inside 'Hips' of line 2", 15),
-    defect("}\nMOTION", "}\n}\nMOTION", "'}' came without an open brace", 16),
-    defect("HIERARCHY\n", "", "'ROOT Hips' came, expected HIERARCHY", 1),
-    defect("MOTION\n", "", "'Frames:' came, expected ROOT", 16),
+    defect("Frames: 2", "Frames: -2", "at least 1, got '-2'", 17),
+    defect("Frames: 2\n", "", "expected 'Frames: …', got", 17),
+    defect("Frame Time: 0.0333333\n", "", "expected 'Frame Time: …', got", 18),
+    defect("0.0333333", "0", "Frame Time must be 0.0001 to 1 seconds, got 0", 18),
+    defect("0.0333333", "33.3", "seconds, got 33.3", 18),
+    defect("0.0333333", "nan", NUMBER, 18),
+    defect(ROW, ROW[:-3], "expected 9 values, one per channel, got 8", 20),
+    defect(ROW, ROW + " 1", "expected 9 values, one per channel, got 10", 20),
+    defect("0 1 0 90", "0 nan 0 90", f"{NUMBER} -1e9 and 1e9, got 'nan'", 20),
+    defect("0 1 0 90", "0 1e300 0 90", NUMBER, 20),
+    defect("0 1 0 90", "0 1_0 0 90", NUMBER, 20),
+    defect("0 1 0 90", "0 ١ 0 90", NUMBER, 20),
+    defect("0 1 0 90", "0 1,5 0 90", NUMBER, 20),
+    defect("OFFSET 0 -1 0", "OFFSET 0 -1", "expected 3 values of OFFSET, got 2", 8),
+    defect("OFFSET 0 -1 0", "OFFSET 0 -1 zero", f"{NUMBER} -1e9 and 1e9, got 'zero'", 8),
+    defect("        OFFSET 0 -1 0\n", "", "expected OFFSET in 'Knee', got '}'", 13),
+    defect("OFFSET 0 -1 0", "OFFSET 0 -1 0\nOFFSET 0 -1 0", "one OFFSET of 'Knee', got a", 9),
+    defect("CHANNELS 3 Z", "CHANNELS 2 Z", "expected '2' channels as declared, got 3", 9),
+    defect("CHANNELS 3 Z", "CHANNELS Z", "expected 'Zrotation' channels as declared", 9),
+    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation", "at most once, got 'Wrotation'", 9),
+    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Xrotation", "at most once, got 'Xrotation'", 9),
+    defect("            OFFSET 0 -0.5 0\n", "", "expected OFFSET in 'Knee_end'", 12),
+    defect("OFFSET 0 -0.5 0", "CHANNELS 0", "inside an End Site, got CHANNELS", 12),
+    defect("OFFSET 0 -0.5 0", "JOINT x", "inside an End Site, got JOINT", 12),
+    defect("End Site", "End", "expected End Site, got 'End'", 10),
+    defect("JOINT Knee", "ROOT Knee", "expected ROOT outside braces, got it inside 'Hips'", 6),
+    defect("JOINT Knee", "JOINT", "expected a name after JOINT", 6),
+    defect("JOINT Knee", "JOINT Hips", "expected unique names, got 'Hips' as in line 2", 6),
+    defect("JOINT Knee", "LIMB Knee", "a brace or MOTION, got 'LIMB'", 6),
+    defect("ROOT Hips", "JOINT Hips", "expected ROOT, got JOINT Hips outside a joint", 2),
+    defect("ROOT Hips\n{", "ROOT Hips", "expected '{', got 'OFFSET'", 3),
+    defect("}\nMOTION", "MOTION", "expected the closing brace of 'Hips', line 2", 15),
+    defect("}\nMOTION", "}\n}\nMOTION", "got '}' without an open brace", 16),
+    defect("HIERARCHY\n", "", "expected HIERARCHY, got 'ROOT Hips'", 1),
+    defect("MOTION\n", "", "a brace or MOTION, got 'Frames:'", 16),
 ]
 
 
 @pytest.mark.parametrize(("text", "message", "line"), DEFECTS)
-def test_a_defect_is_one_sentence_with_its_line(
-    tmp_path: Path, text: str, message: str, line: int
-) -> None:
+def test_defects_are_reported_with_their_line(tmp_path, text, message, line):
     path = written(tmp_path, text)
     with pytest.raises(MotionFileError) as caught:
-        read_motion(path)
-    said = str(caught.value)
-    assert message in said
-    assert said.startswith(f"{path}, line {line}: ")
-    assert "expected" in said
-    assert "\n" not in said
+        load(path)
+    assert str(caught.value).startswith(f"{path}, line {line}: ")
+    assert message in str(caught.value)
 
 
-def test_motion_before_hierarchy_is_an_error(tmp_path: Path) -> None:
+def test_motion_before_hierarchy_is_refused(tmp_path):
     hierarchy, motion = MINIMAL.split("MOTION\n")
-    with pytest.raises(MotionFileError, match="line 1: MOTION came, expected HIERARCHY"):
+    with pytest.raises(MotionFileError, match="line 1: expected HIERARCHY"):
         read_bvh(written(tmp_path, "MOTION\n" + motion + hierarchy))
 
 
-def test_every_truncation_is_an_error_until_the_last_number(tmp_path: Path) -> None:
+def test_truncated_files_are_refused(tmp_path):
     for length in range(len(MINIMAL) - len(" 90\n") + 1):
         with pytest.raises(MotionFileError, match=r"line \d+"):
             read_bvh(written(tmp_path, MINIMAL[:length]))
 
 
-def test_empty_missing_and_foreign_files(tmp_path: Path) -> None:
-    with pytest.raises(MotionFileError, match="nothing came, expected HIERARCHY"):
-        read_motion(written(tmp_path, ""))
-    with pytest.raises(FileNotFoundError):
-        read_motion(tmp_path / "none.bvh")
-    with pytest.raises(FileNotFoundError):
-        read_motion(tmp_path / "none.txt")
-    with pytest.raises(MotionFileError, match=r"ends in '\.txt'"):
-        read_motion(written(tmp_path, MINIMAL, "clip.txt"))
+def test_empty_missing_and_foreign_files(tmp_path):
     (tmp_path / "folder.bvh").mkdir()
-    with pytest.raises(MotionFileError, match="cannot be read"):
-        read_motion(tmp_path / "folder.bvh")
-
-
-def test_ten_thousand_frames_read_in_seconds(tmp_path: Path) -> None:
-    rows = "0 1 0 12.345678 -98.765432 1 0 0 90\n" * 10_000
-    head = MINIMAL[: MINIMAL.index("0 1 0 0 0")].replace("Frames: 2", "Frames: 10000")
-    path = written(tmp_path, head + rows)
-    begun = time.perf_counter()
-    assert read_bvh(path).frames == 10_000
-    assert time.perf_counter() - begun < 5
+    for path, error, message in (
+        (written(tmp_path, ""), MotionFileError, "expected HIERARCHY"),
+        (tmp_path / "none.bvh", FileNotFoundError, "none.bvh"),
+        (tmp_path / "none.txt", FileNotFoundError, "none.txt"),
+        (written(tmp_path, MINIMAL, "clip.txt"), MotionFileError, r"got '\.txt'"),
+        (tmp_path / "folder.bvh", MotionFileError, "cannot be read"),
+    ):
+        with pytest.raises(error, match=message):
+            load(path)

@@ -1,16 +1,10 @@
-"""Damaged and foreign files: the readers return something or raise MotionFileError, nothing else.
-
-Warnings are errors in these tests, so that a reader that divides by zero or overflows fails too.
-"""
-
-from __future__ import annotations
+"""Damaged and foreign files are read or raise MotionFileError. Warnings are errors."""
 
 import io
 import json
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import read_keypoints, read_motion
+from probmotion.io.files import load, read_keypoints
 from probmotion.motion.motion import KeypointTrack, Motion
 
 BVH = b"""HIERARCHY
@@ -51,7 +45,7 @@ Frame Time: 0.0333333
 """
 
 
-def npz(**more: object) -> bytes:
+def npz(**more):
     file = io.BytesIO()
     np.savez(
         file,
@@ -82,6 +76,13 @@ JSONS = [
     for content in (COCO, RESULTS, OPENPOSE, ALPHAPOSE, [OPENPOSE, OPENPOSE])
     for indent in (None, 1)
 ]
+TABLE = b"""scorer,net,net,net,net,net
+individuals,mouse,mouse,mouse,single,single
+bodyparts,snout,snout,snout,corner,corner
+coords,x,y,likelihood,x,y
+7,1,2,0.5,0,9
+8,nan,,,0,9
+"""
 ARCHIVES = [npz(), npz(keypoints=np.zeros((4, 2, 2)), confidence=np.ones((4, 2)))]
 SNIPPETS = [
     *(b"\r", b"\n", b"\r\n", b"\t", b"\x00", b"\xff", b"\xef\xbb\xbf", b"{", b"}", b"[", b"]"),
@@ -93,7 +94,7 @@ SNIPPETS = [
 
 
 @st.composite
-def damaged(draw: st.DrawFn, originals: list[bytes]) -> bytes:
+def damaged(draw, originals):
     """One of ``originals`` after one to four mutations."""
     content = draw(st.sampled_from(originals))
     for _ in range(draw(st.integers(1, 4))):
@@ -128,10 +129,8 @@ def damaged(draw: st.DrawFn, originals: list[bytes]) -> bytes:
     return content
 
 
-def read_damaged(
-    content: bytes, ending: str, read: Callable[[Path], Motion | list[KeypointTrack]]
-) -> None:
-    """Read ``content`` from a file; any exception but MotionFileError escapes."""
+def read_damaged(content, ending, read):
+    """Read ``content`` from a file; other exceptions than MotionFileError propagate."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", MotionFileWarning)
@@ -141,8 +140,8 @@ def read_damaged(
             result = read(path)
         except MotionFileError as error:
             said = str(error)
-            assert "expected" in said, said
-            assert said.isprintable(), "one line, which any terminal can show"
+            assert "expected" in said or "must" in said, said
+            assert said.isprintable()
             assert len(said.replace(str(path), "")) < 600, said
             return
     if isinstance(result, Motion):
@@ -152,54 +151,58 @@ def read_damaged(
         assert all(isinstance(track, KeypointTrack) for track in result)
 
 
-def read_tracks(path: Path) -> list[KeypointTrack]:
+def read_tracks(path):
     return read_keypoints(path, fps=30)
 
 
-def read_with_end_sites(path: Path) -> Motion:
+def read_with_end_sites(path):
     return read_bvh(path, end_sites=True)
 
 
 @pytest.mark.parametrize(
     ("content", "ending", "read"),
     [
-        (BVH, ".bvh", read_motion),
-        *((archive, ".npz", read_motion) for archive in ARCHIVES),
+        (BVH, ".bvh", load),
+        *((archive, ".npz", load) for archive in ARCHIVES),
         (ARCHIVES[1], ".npz", read_tracks),
         *((content, ".json", read_tracks) for content in JSONS if b"bodies" not in content),
     ],
 )
-def test_the_undamaged_files_read(
-    content: bytes, ending: str, read: Callable, tmp_path: Path
-) -> None:
+def test_undamaged_files_are_read(content, ending, read, tmp_path):
     path = tmp_path / f"clip{ending}"
     path.write_bytes(content)
     assert read(path)
 
 
-@settings(derandomize=True, max_examples=400)
+@settings(derandomize=True, max_examples=250)
 @given(damaged([BVH]))
-def test_damaged_bvh(content: bytes) -> None:
+def test_damaged_bvh(content):
     read_damaged(content, ".bvh", read_with_end_sites)
 
 
 @settings(derandomize=True, max_examples=150)
 @given(damaged(ARCHIVES))
-def test_damaged_npz(content: bytes) -> None:
-    read_damaged(content, ".npz", read_motion)
+def test_damaged_npz(content):
+    read_damaged(content, ".npz", load)
     read_damaged(content, ".npz", read_tracks)
 
 
-@settings(derandomize=True, max_examples=300)
+@settings(derandomize=True, max_examples=150)
 @given(damaged(JSONS))
-def test_damaged_json(content: bytes) -> None:
+def test_damaged_json(content):
     read_damaged(content, ".json", read_tracks)
+
+
+@settings(derandomize=True, max_examples=150)
+@given(damaged([TABLE]))
+def test_damaged_tables(content):
+    read_damaged(content, ".csv", read_tracks)
 
 
 @settings(derandomize=True, max_examples=200)
 @given(st.binary(max_size=200), st.binary(max_size=300))
-def test_damaged_arrays_in_a_whole_archive(head: bytes, body: bytes) -> None:
-    """The zip's checksums hold here, so that the damage reaches the array's own header."""
+def test_damaged_arrays_in_valid_archives(head, body):
+    """The zip's checksums are valid, so that the array's own header is damaged."""
     file = io.BytesIO()
     valid = zipfile.ZipFile(io.BytesIO(ARCHIVES[0]))
     with zipfile.ZipFile(file, "w") as archive:
@@ -208,7 +211,7 @@ def test_damaged_arrays_in_a_whole_archive(head: bytes, body: bytes) -> None:
             if name == "positions.npy":
                 member = member[: 10 + len(head) % 90] + head + body
             archive.writestr(name, member)
-    read_damaged(file.getvalue(), ".npz", read_motion)
+    read_damaged(file.getvalue(), ".npz", load)
 
 
 NUMBERS = st.one_of(st.integers(), st.floats(), st.just(10**400), st.just(1e308))
@@ -222,7 +225,7 @@ KEYS = st.sampled_from(
 )
 
 
-@settings(derandomize=True, max_examples=200)
+@settings(derandomize=True, max_examples=80)
 @given(
     st.recursive(
         st.one_of(SCALARS, st.lists(st.floats(0, 9), min_size=51, max_size=51)),
@@ -232,23 +235,14 @@ KEYS = st.sampled_from(
         max_leaves=20,
     )
 )
-def test_any_json(content: object) -> None:
+def test_any_json(content):
     read_damaged(json.dumps(content).encode(), ".json", read_tracks)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(st.binary(max_size=300), st.sampled_from((b"", b"HIERARCHY\n", b"PK\x03\x04", b"[")))
-def test_random_bytes(tail: bytes, head: bytes) -> None:
-    for ending in (".bvh", ".npz"):
-        read_damaged(head + tail, ending, read_motion)
-    for ending in (".json", ".npz"):
-        read_damaged(head + tail, ending, read_tracks)
-
-
-def test_files_of_another_kind() -> None:
+def test_files_of_other_formats():
     foreign = [BVH, *ARCHIVES, *JSONS, b"", BVH.decode().encode("utf-16")]
     for content in foreign:
         for ending in (".bvh", ".npz"):
-            read_damaged(content, ending, read_motion)
+            read_damaged(content, ending, load)
         for ending in (".json", ".npz"):
             read_damaged(content, ending, read_tracks)

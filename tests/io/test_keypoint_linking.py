@@ -1,6 +1,4 @@
-"""People without track ids are followed through a video."""
-
-from __future__ import annotations
+"""Tracking of people without track ids."""
 
 import json
 
@@ -15,17 +13,17 @@ RNG = np.random.default_rng(0)
 BODY = RNG.random((17, 2)) * 40
 
 
-def person_at(x: float, confidence: float = 0.9) -> np.ndarray:
+def person_at(x, confidence=0.9):
     return np.column_stack([BODY + np.array([x, 50.0]), np.full(17, confidence)])
 
 
-def shuffled(*people: np.ndarray, frame: int) -> list[Detection]:
+def shuffled(*people, frame):
     order = np.random.default_rng(frame).permutation(len(people))
     return [Detection("", frame, None, people[k], f"frame {frame}") for k in order]
 
 
-def test_two_people_who_pass_each_other_keep_their_names():
-    """Where they cross, each comes nearer to the place of the other than to their own."""
+def test_crossing_people_keep_their_ids():
+    """At the crossing, each is closer to the other's last position than to their own."""
     detections = []
     for frame in range(12):
         left, right = person_at(100 + 25 * frame), person_at(412 - 25 * frame)
@@ -38,23 +36,16 @@ def test_two_people_who_pass_each_other_keep_their_names():
     assert len(linked) == 24
 
 
-def test_the_video_begins_with_the_first_full_image_and_bystanders_are_left_out():
+def test_tracking_starts_at_the_first_full_image_without_bystanders():
     detections = shuffled(person_at(300), frame=0)
     detections += shuffled(person_at(100), person_at(300), person_at(900, 0.2), frame=1)
     detections += shuffled(person_at(110), person_at(905, 0.99), person_at(290), frame=2)
     detections += shuffled(person_at(280), frame=3)
-    linked = link_people(detections, 2)
-    assert [(found.frame, found.person) for found in linked] == [
-        (0, "1"),
-        (1, "0"),
-        (1, "1"),
-        (2, "0"),
-        (2, "1"),
-        (3, "1"),
-    ]
+    linked = [(found.frame, found.person) for found in link_people(detections, 2)]
+    assert linked == [(0, "1"), (1, "0"), (1, "1"), (2, "0"), (2, "1"), (3, "1")]
 
 
-def test_a_file_without_ids_is_read_when_told_how_many(tmp_path):
+def test_people_are_followed_in_files_without_ids(tmp_path):
     frames = [
         {"people": [{"pose_keypoints_2d": found.values.ravel().tolist()} for found in one]}
         for one in (shuffled(person_at(100 + k), person_at(300 - k), frame=k) for k in range(5))
@@ -64,9 +55,10 @@ def test_a_file_without_ids_is_read_when_told_how_many(tmp_path):
     first, second = read_keypoints(path, 30.0, people=2)
     assert np.allclose(np.diff(first.keypoints[:, 0, 0]), 1)
     assert np.allclose(np.diff(second.keypoints[:, 0, 0]), -1)
-    with pytest.raises(ValueError, match="two people without a track id"):
-        read_keypoints(path, 30.0)
-    with pytest.raises(ValueError, match="people must be at most the 2 of one image, got 3"):
-        read_keypoints(path, 30.0, people=3)
-    with pytest.raises(ValueError, match="people is 0"):
-        read_keypoints(path, 30.0, people=0)
+    for people, message in (
+        (None, "two people without track ids in frame 0"),
+        (3, "people must be at most 2, as in one image, got 3"),
+        (0, "people must be an integer of at least 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_keypoints(path, 30.0, people=people)

@@ -19,7 +19,7 @@ def rng():
 
 
 def turned(motions, yaw):
-    """Motions (N, L, J, 3) turned about the vertical, by one yaw each or all."""
+    """Motions (N, L, J, 3) rotated about the vertical by one yaw each or all."""
     c, s = np.cos(yaw), np.sin(yaw)
     zero, one = np.zeros_like(c), np.ones_like(c)
     rows = [[c, zero, s], [zero, one, zero], [-s, zero, c]]
@@ -32,59 +32,51 @@ def gaits(style, numbers, frames=20):
 
 
 def distance_at(a, b, yaw):
-    """Root mean square distance of joints of two motions, (L, J, 3), after one turn."""
+    """Root mean square joint distance of two motions, (L, J, 3), after one rotation."""
     a, b = (motion - motion[:, :1] for motion in (a, b))
-    apart = turned(a[None], np.atleast_1d(yaw)) - b
-    return np.sqrt((apart**2).sum(axis=-1).mean(axis=(1, 2)))
+    difference = turned(a[None], np.atleast_1d(yaw)) - b
+    return np.sqrt((difference**2).sum(axis=-1).mean(axis=(1, 2)))
 
 
-def test_copies_that_are_turned_and_walk_elsewhere_are_at_no_distance(rng):
-    motions = rng.normal(size=(5, 6, 4, 3))
-    path = rng.normal(size=(5, 6, 1, 3))
-    moved = turned(motions, rng.uniform(0, 7, 5)) + path
+def test_distance_is_a_metric_invariant_to_heading_and_path(rng):
+    motions = rng.normal(size=(12, 3, 4, 3))
+    moved = turned(motions, rng.uniform(0, 7, 12)) + rng.normal(size=(12, 3, 1, 3))
     distances = yaw_aligned_distances(motions, moved)
     assert np.diag(distances).max() < 1e-7
-    assert distances[~np.eye(5, dtype=bool)].min() > 0.5
-
-
-def test_the_distance_is_the_least_over_all_turns(rng):
-    a, b = rng.normal(size=(3, 5, 4, 3)), rng.normal(size=(4, 5, 4, 3))
-    yaws = np.linspace(0, 2 * np.pi, 3601)
-    expected = [[distance_at(one, other, yaws).min() for other in b] for one in a]
-    # The grid misses the minimum by 1/7200 of a turn, which costs its square.
-    np.testing.assert_allclose(yaw_aligned_distances(a, b), expected, atol=1e-6)
-
-
-def test_a_joint_that_is_raised_by_a_known_amount(rng):
-    motion = rng.normal(size=(1, 6, 4, 3))
-    raised = motion.copy()
-    raised[:, :, 2, 1] += 0.3
-    # One of four joints is 0.3 m away in every frame, and no turn about the vertical helps.
-    assert yaw_aligned_distances(motion, raised) == pytest.approx(0.3 / 2)
-    # With the root raised instead, every other joint is 0.3 m away from it.
-    raised = motion.copy()
-    raised[:, :, 0, 1] += 0.3
-    assert yaw_aligned_distances(motion, raised) == pytest.approx(0.3 * np.sqrt(3 / 4))
-    # About another joint, that one is at the origin and the first one is 0.3 m away.
-    assert yaw_aligned_distances(motion, raised, root=1) == pytest.approx(0.3 / 2)
-
-
-def test_the_distance_is_a_metric_between_orbits(rng):
-    motions = rng.normal(size=(12, 3, 4, 3))
-    distances = yaw_aligned_distances(motions, motions)
+    assert distances[~np.eye(12, dtype=bool)].min() > 0.5
     np.testing.assert_allclose(distances, distances.T, atol=1e-7)
     through = (distances[:, :, None] + distances[None]).min(axis=1)
     assert (distances <= through + 1e-7).all()
 
 
-def test_a_mirror_image_is_another_motion_until_it_is_mirrored_back(rng):
+def test_distance_is_the_minimum_over_yaw(rng):
+    a, b = rng.normal(size=(3, 5, 4, 3)), rng.normal(size=(4, 5, 4, 3))
+    yaws = np.linspace(0, 2 * np.pi, 3601)
+    expected = [[distance_at(one, other, yaws).min() for other in b] for one in a]
+    np.testing.assert_allclose(yaw_aligned_distances(a, b), expected, atol=1e-6)
+
+
+def test_distance_of_a_raised_joint_by_hand(rng):
+    motion = rng.normal(size=(1, 6, 4, 3))
+    raised = motion.copy()
+    raised[:, :, 2, 1] += 0.3
+    # One of four joints is 0.3 m away in every frame.
+    assert yaw_aligned_distances(motion, raised) == pytest.approx(0.3 / 2)
+    # With the root raised, the three others are 0.3 m away.
+    raised = motion.copy()
+    raised[:, :, 0, 1] += 0.3
+    assert yaw_aligned_distances(motion, raised) == pytest.approx(0.3 * np.sqrt(3 / 4))
+    assert yaw_aligned_distances(motion, raised, root=1) == pytest.approx(0.3 / 2)
+
+
+def test_depth_mirrored_motions_differ_unless_mirrored_back(rng):
     motions = gaits("walk", range(3))
     images = turned(motions * IN_DEPTH, rng.uniform(0, 7, 3))
     assert np.diag(yaw_aligned_distances(motions, images)).min() > 0.05
     assert np.diag(yaw_aligned_distances(motions, images, mirrored=True)).max() < 1e-7
 
 
-def test_no_distance_depends_on_the_other_motions(rng, monkeypatch):
+def test_distances_are_independent_of_the_other_motions(rng, monkeypatch):
     a, b = rng.normal(size=(300, 3, 4, 3)), rng.normal(size=(270, 3, 4, 3))
     whole = yaw_aligned_distances(a, b)
     np.testing.assert_array_equal(whole[250:260, 3:4], yaw_aligned_distances(a[250:260], b[3:4]))
@@ -95,19 +87,16 @@ def test_no_distance_depends_on_the_other_motions(rng, monkeypatch):
     np.testing.assert_allclose(whole, yaw_aligned_distances(a, b), rtol=1e-12)
 
 
-def test_draws_may_be_near_and_cover_little(rng):
+def test_nearest_distances_separate_fidelity_and_coverage():
     real = np.concatenate([gaits("walk", range(10)), gaits("run", range(10))])
     half = nearest_distances(real[:10], real)
     assert half.of_draws < 1e-7
     assert half.of_real == pytest.approx(
         yaw_aligned_distances(real[:10], real[10:]).min(axis=0).mean() / 2, abs=1e-7
     )
-    far = nearest_distances(real[:10], real[10:])
-    within = nearest_distances(gaits("run", range(10, 20)), real[10:])
-    assert within.of_draws < 0.6 * far.of_draws
 
 
-def test_draws_with_exchanged_depth_are_found(rng):
+def test_mirrored_fraction_counts_depth_mirrored_draws(rng):
     real = gaits("walk", range(40))
     draws = turned(gaits("walk", range(40, 60)), rng.uniform(0, 7, 20))
     assert mirrored_fraction(draws, real) < 0.1
@@ -118,9 +107,9 @@ def test_draws_with_exchanged_depth_are_found(rng):
     )
 
 
-def test_flat_motions_are_their_own_mirror_images(rng):
-    flat = rng.normal(size=(6, 4, 5, 3)) * [1, 1, 0]
-    assert mirrored_fraction(flat, rng.normal(size=(6, 4, 5, 3)) * [1, 1, 0]) == 0
+def test_mirrored_fraction_of_planar_motions_is_zero(rng):
+    flat, other = rng.normal(size=(2, 6, 4, 5, 3)) * [1, 1, 0]
+    assert mirrored_fraction(flat, other) == 0
 
 
 def test_windows_of_a_clip():
@@ -128,21 +117,21 @@ def test_windows_of_a_clip():
     found = windows(clip, 3)
     assert found[:, :, 0, 0].tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]
     assert windows(clip, 2, stride=3)[:, :, 1, 2].tolist() == [[0, 1], [3, 4]]
-    with pytest.raises(ValueError, match="positions has 5 frames, expected at least frames=6"):
+    with pytest.raises(ValueError, match="positions must have at least frames=6 frames, got 5"):
         windows(clip, 6)
 
 
-def test_bad_input():
-    motions = np.zeros((2, 3, 4, 3))
-    with pytest.raises(ValueError, match=r"b has motions of shape \(2, 4, 3\), expected \(3, 4"):
-        yaw_aligned_distances(motions, np.zeros((2, 2, 4, 3)))
-    with pytest.raises(ValueError, match=r"real has motions of shape \(3, 5, 3\), expected"):
-        nearest_distances(motions, np.zeros((2, 3, 5, 3)))
-    with pytest.raises(ValueError, match=r"a must have shape \(N, L, J, 3\), got \(3, 4, 3\)"):
-        yaw_aligned_distances(motions[0], motions)
-    broken = motions.copy()
-    broken[1, 0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="draws must be finite, got 1 values that are NaN"):
-        mirrored_fraction(broken, motions)
-    with pytest.raises(ValueError, match=r"real must have shape at least one, got \(0, 3, 4, 3\)"):
-        nearest_distances(motions, motions[:0])
+@pytest.mark.parametrize(
+    ("function", "first", "second", "message"),
+    [
+        (yaw_aligned_distances, (2, 3, 4, 3), (2, 2, 4, 3), r"b must have .* like a, got \(2, 4"),
+        (nearest_distances, (2, 3, 4, 3), (2, 3, 5, 3), r"real must have .* like draws, got \(3"),
+        (yaw_aligned_distances, (3, 4, 3), (2, 3, 4, 3), r"a must have shape \(N, L, J, 3\), got"),
+        (nearest_distances, (2, 3, 4, 3), (0, 3, 4, 3), "real must contain at least one motion"),
+    ],
+)
+def test_invalid_motions_are_refused(function, first, second, message):
+    with pytest.raises(ValueError, match=message):
+        function(np.zeros(first), np.zeros(second))
+    with pytest.raises(ValueError, match="draws must be finite, got 36 values"):
+        mirrored_fraction(np.full((1, 3, 4, 3), np.nan), np.zeros((1, 3, 4, 3)))

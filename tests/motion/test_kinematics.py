@@ -1,9 +1,4 @@
-"""Forward kinematics and its inverse."""
-
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
+"""Forward kinematics and fitting of rotations."""
 
 import numpy as np
 import pytest
@@ -12,13 +7,11 @@ from scipy.spatial.transform import Rotation
 from probmotion import Skeleton
 from probmotion.motion.kinematics import fit_rotations, forward_kinematics
 
-# Two trees whose parents come after some of their children.
+# Two trees with some parents after their children.
 TANGLED = Skeleton(["c", "b", "a", "e", "d", "f"], [1, 2, -1, 4, -1, 2])
 
 
-def random_pose(
-    skeleton: Skeleton, batch: tuple[int, ...], seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_pose(skeleton, batch, seed):
     rng = np.random.default_rng(seed)
     shape = (*batch, skeleton.n_joints)
     rotations = Rotation.random(int(np.prod(shape)), rng=rng).as_matrix().reshape(*shape, 3, 3)
@@ -26,10 +19,8 @@ def random_pose(
     return rotations, rng.standard_normal((*batch, len(skeleton.roots), 3)), offsets
 
 
-def by_hand(
-    skeleton: Skeleton, rotations: np.ndarray, translations: np.ndarray, offsets: np.ndarray
-) -> np.ndarray:
-    """Each joint's 4 × 4 transforms multiplied from its root down, one frame."""
+def by_matrix_products(skeleton, rotations, translations, offsets):
+    """Positions of one frame by products of 4 × 4 transforms from the root."""
     positions = np.zeros((skeleton.n_joints, 3))
     for joint in range(skeleton.n_joints):
         total = np.eye(4)
@@ -44,13 +35,13 @@ def by_hand(
 
 
 @pytest.mark.parametrize("skeleton", [TANGLED, Skeleton.preset("pair17")], ids=["tangled", "pair"])
-def test_positions_are_the_products_of_the_transforms(library: Any, skeleton: Skeleton) -> None:
+def test_positions_agree_with_matrix_products(library, skeleton):
     pose = random_pose(skeleton, (2, 3), seed=1)
     arrays = [library.array(part) for part in pose]
     run = library.compiled(lambda *parts: forward_kinematics(skeleton, *parts))
     positions, turns = run(*arrays)
     wanted = [
-        [by_hand(skeleton, pose[0][b, f], pose[1][b, f], pose[2]) for f in range(3)]
+        [by_matrix_products(skeleton, pose[0][b, f], pose[1][b, f], pose[2]) for f in range(3)]
         for b in range(2)
     ]
     library.assert_close(positions, np.array(wanted))
@@ -67,60 +58,35 @@ def test_positions_are_the_products_of_the_transforms(library: Any, skeleton: Sk
     )
 
 
-def test_empty_batches_and_no_frames(library: Any) -> None:
-    rotations, translations, offsets = random_pose(TANGLED, (0, 4), seed=1)
-    positions, turns = forward_kinematics(
-        TANGLED, library.array(rotations), library.array(translations), library.array(offsets)
-    )
-    assert positions.shape == (0, 4, 6, 3)
-    assert turns.shape == (0, 4, 6, 3, 3)
+def test_empty_batches_stay_empty():
+    positions, turns = forward_kinematics(TANGLED, *random_pose(TANGLED, (0, 4), seed=1))
+    assert (positions.shape, turns.shape) == ((0, 4, 6, 3), (0, 4, 6, 3, 3))
 
 
-def test_the_gradient_reaches_every_offset(differentiable: Any) -> None:
-    rotations, translations, offsets = random_pose(TANGLED, (2,), seed=4)
-
-    def height(values: Any) -> Any:
-        moving = (differentiable.array(rotations), differentiable.array(translations))
-        return forward_kinematics(TANGLED, *moving, values)[0][..., 1].sum()
-
-    gradient = differentiable.gradient(height, offsets)
-    step = 1e-6
-    for joint, axis in np.ndindex(offsets.shape):
-        moved = offsets.copy()
-        moved[joint, axis] += step
-        change = sum(
-            by_hand(TANGLED, r, t, moved)[:, 1].sum() - by_hand(TANGLED, r, t, offsets)[:, 1].sum()
-            for r, t in zip(rotations, translations, strict=True)
-        )
-        assert gradient[joint, axis] == pytest.approx(change / step, abs=1e-7)
-
-
-def test_wrong_shapes_are_refused() -> None:
+def test_invalid_input_is_refused():
     rotations, translations, offsets = random_pose(TANGLED, (2,), seed=1)
-    with pytest.raises(ValueError, match=r"rotations has shape .*expected \(…, L, 6, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"rotations must have shape \(…, L, 6, 3, 3\), got"):
         forward_kinematics(TANGLED, rotations[:, :5], translations, offsets)
-    with pytest.raises(ValueError, match=r"root_translations has shape .*expected \(…, L, 2, 3\)"):
+    with pytest.raises(ValueError, match=r"root_translations must have shape \(…, L, 2, 3\), got"):
         forward_kinematics(TANGLED, rotations, translations[:, :1], offsets)
-    with pytest.raises(ValueError, match=r"rest_offsets has shape .*expected \(…, 6, 3\)"):
+    with pytest.raises(ValueError, match=r"rest_offsets must have shape \(…, 6, 3\), got"):
         forward_kinematics(TANGLED, rotations, translations, offsets[:5])
-    with pytest.raises(ValueError, match=r"positions has shape .*expected \(L, 6, 3\)"):
+    with pytest.raises(ValueError, match=r"positions must have shape \(L, 6, 3\), got"):
         fit_rotations(TANGLED, np.zeros((2, 5, 3)))
-    with pytest.raises(ValueError, match="positions has no frame, expected at least one"):
+    with pytest.raises(ValueError, match="positions must contain at least one frame, got none"):
         fit_rotations(TANGLED, np.zeros((0, 6, 3)))
-    with pytest.raises(
-        ValueError, match="positions must be finite, got 1 values that are NaN or infinite"
-    ):
-        fit_rotations(TANGLED, np.pad([[[np.nan]]], ((0, 0), (0, 5), (0, 2))))
+    with pytest.raises(ValueError, match="positions must be finite, got 18 values"):
+        fit_rotations(TANGLED, np.full((1, 6, 3), np.nan))
 
 
-def assert_rotations(rotations: np.ndarray) -> None:
+def assert_rotations(rotations):
     identity = rotations @ np.swapaxes(rotations, -1, -2)
     np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), identity.shape), atol=1e-12)
     assert (np.linalg.det(rotations) > 0).all()
 
 
-def errors_of(skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
-    """Distances between positions and what the fitted rotations give, (L, J)."""
+def errors_of(skeleton, positions):
+    """Distances between positions and the reconstruction from fitted rotations, (L, J)."""
     rotations, offsets = fit_rotations(skeleton, positions)
     assert_rotations(rotations)
     back, _ = forward_kinematics(skeleton, rotations, positions[:, list(skeleton.roots)], offsets)
@@ -128,7 +94,7 @@ def errors_of(skeleton: Skeleton, positions: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("skeleton", [TANGLED, Skeleton.preset("pair17")], ids=["tangled", "pair"])
-def test_rigid_motion_comes_back_exactly(skeleton: Skeleton) -> None:
+def test_rigid_motion_is_reconstructed_exactly(skeleton):
     rotations, translations, offsets = random_pose(skeleton, (7,), seed=2)
     positions, _ = forward_kinematics(skeleton, rotations, translations, offsets)
     assert errors_of(skeleton, positions).max() < 1e-9
@@ -138,12 +104,11 @@ def test_rigid_motion_comes_back_exactly(skeleton: Skeleton) -> None:
         np.linalg.norm(offsets, axis=-1)[[j for j, _ in skeleton.bones]],
         atol=1e-12,
     )
-    # The rest pose is the first frame: nothing is turned there.
+    # The rest pose is the first frame.
     np.testing.assert_allclose(fitted[0], np.tile(np.eye(3), (skeleton.n_joints, 1, 1)), atol=1e-9)
 
 
-def test_a_joint_with_several_children_is_turned_as_it_was() -> None:
-    """Three children that are not in a plane leave nothing open: the turns are known."""
+def test_rotation_of_noncoplanar_children_is_recovered():
     hub = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
     rotations, translations, offsets = random_pose(hub, (5,), seed=3)
     rotations[0, 0] = np.eye(3)
@@ -153,33 +118,32 @@ def test_a_joint_with_several_children_is_turned_as_it_was() -> None:
     np.testing.assert_allclose(fitted[:, 0], rotations[:, 0], atol=1e-9)
 
 
-def test_a_chain_is_not_twisted() -> None:
+def test_chains_are_fitted_without_twist():
     chain = Skeleton(["a", "b", "c"], [-1, 0, 1])
     rng = np.random.default_rng(5)
     positions = np.cumsum(rng.standard_normal((9, 3, 3)), axis=1)
     positions[1, 1] = positions[0, 1]
-    positions[1] = 2 * positions[1, :1] - positions[1]  # every bone the other way round
+    positions[1] = 2 * positions[1, :1] - positions[1]  # every bone reversed
     positions[2] = positions[0] + [[0, 0, 0], [1e-9, 0, 0], [0, 1e-9, 0]]
     rotations, offsets = fit_rotations(chain, positions)
     assert_rotations(rotations)
-    # The axis of the least turn is square to the bone that it turns.
+    # The axis of a minimal rotation is orthogonal to the bone.
     axis = Rotation.from_matrix(rotations[:, 0]).as_rotvec()
     np.testing.assert_allclose(axis @ offsets[1], 0, atol=1e-9)
     axis = Rotation.from_matrix(rotations[:, 1]).as_rotvec()
     np.testing.assert_allclose(axis @ offsets[2], 0, atol=1e-9)
 
 
-def test_half_a_turn_is_found() -> None:
+def test_half_turns_are_fitted():
     bone = Skeleton(["a", "b"], [-1, 0])
     start, aside = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0][:2]
-    for gap in (0.0, 1e-13, 1e-9, 1e-7, 1e-4):
-        end = -start + gap * aside
-        end /= np.linalg.norm(end)
+    for gap in (0.0, 1e-13, 1e-7):
+        end = (gap * aside - start) / np.linalg.norm(gap * aside - start)
         positions = np.array([[np.zeros(3), start], [np.zeros(3), end]])
         assert errors_of(bone, positions).max() < 1e-12
 
 
-def test_bones_of_no_length_turn_with_their_parents() -> None:
+def test_zero_length_bones_follow_their_parents():
     skeleton = Skeleton(["a", "b", "c"], [-1, 0, 1])
     positions = np.zeros((4, 3, 3))
     positions[:, 2] = np.random.default_rng(6).standard_normal((4, 3))
@@ -190,7 +154,7 @@ def test_bones_of_no_length_turn_with_their_parents() -> None:
     assert errors_of(skeleton, np.zeros((2, 3, 3))).max() == 0
 
 
-def test_a_bone_that_changes_its_length_keeps_its_direction_and_mean() -> None:
+def test_varying_bones_keep_direction_and_mean_length():
     bone = Skeleton(["a", "b"], [-1, 0])
     lengths = np.array([0.9, 1.0, 1.2])
     directions = Rotation.random(3, rng=1).as_matrix()[:, 0]
@@ -200,8 +164,7 @@ def test_a_bone_that_changes_its_length_keeps_its_direction_and_mean() -> None:
     )
 
 
-def test_an_error_is_not_passed_on() -> None:
-    """A bone that is 0.1 too long ends off; the next one, at a right angle, still meets its end."""
+def test_errors_do_not_accumulate_along_a_chain():
     chain = Skeleton(["a", "b", "c"], [-1, 0, 1])
     positions = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1.2, 0, 0], [1.2, 1, 0]]])
     errors = errors_of(chain, positions)
@@ -209,8 +172,7 @@ def test_an_error_is_not_passed_on() -> None:
     np.testing.assert_allclose(errors[:, 2], np.sqrt(1 + 0.1**2) - 1, atol=1e-12)
 
 
-def test_children_in_line_are_not_twisted() -> None:
-    """Two children on one line leave the turn about it open: the least one is taken."""
+def test_collinear_children_are_fitted_without_twist():
     skeleton = Skeleton(["a", "b", "c"], [-1, 0, 0])
     ends = Rotation.random(20, rng=4).as_matrix()[:, 0]
     positions = np.stack([np.zeros((20, 3)), ends, -0.5 * ends], axis=1)
@@ -220,7 +182,7 @@ def test_children_in_line_are_not_twisted() -> None:
     np.testing.assert_allclose(axis @ offsets[1], 0, atol=1e-2)
 
 
-def test_the_rest_pose_serves_all_frames_not_the_first_alone() -> None:
+def test_rest_pose_is_fitted_to_all_frames():
     hub = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
     rng = np.random.default_rng(7)
     bones = rng.standard_normal((1, 3, 3)) + 0.2 * rng.standard_normal((30, 3, 3))
@@ -233,14 +195,14 @@ def test_the_rest_pose_serves_all_frames_not_the_first_alone() -> None:
     assert fitted < 0.8 * first
 
 
-def test_siblings_that_move_against_each_other_lose_no_more_than_they_must() -> None:
-    """Kabsch: no rotation of the same rest pose is nearer, by random search around the fit."""
+def test_rotation_of_moving_siblings_is_least_squares():
+    """Kabsch: no rotation of the rest pose is closer, by random search around the fit."""
     skeleton = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
     rng = np.random.default_rng(7)
     positions = np.concatenate([np.zeros((5, 1, 3)), rng.standard_normal((5, 3, 3))], axis=1)
     rotations, offsets = fit_rotations(skeleton, positions)
 
-    def loss(turns: np.ndarray) -> np.ndarray:
+    def loss(turns):
         residual = np.einsum("...lij,cj->...lci", turns, offsets[1:]) - positions[:, 1:]
         return (residual**2).sum(axis=(-1, -2))
 
@@ -248,16 +210,3 @@ def test_siblings_that_move_against_each_other_lose_no_more_than_they_must() -> 
     for size in (1e-3, 1e-1, 1.0):
         nearby = Rotation.from_rotvec(size * rng.standard_normal((200 * 5, 3))).as_matrix()
         assert (loss(nearby.reshape(200, 5, 3, 3) @ rotations[:, 0]) > best - 1e-12).all()
-
-
-def test_real_clips_come_back(real_data: Path) -> None:
-    """Where siblings are rigid, to the file's single precision; CMU's ASF bones slip by cm."""
-    for file, worst in (
-        ("cmu_single/cmu_131_01", 1e-6),
-        ("deepmimic_human/humanoid3d_backflip", 1e-6),
-        ("deepmimic_dog/dog3d_canter", 1e-6),
-        ("cmu_single/cmu_01_01", 0.06),
-    ):
-        archive = np.load(real_data / f"{file}.npz")
-        skeleton = Skeleton(archive["joint_names"].tolist(), archive["parents"].tolist())
-        assert errors_of(skeleton, archive["positions"]).max() < worst, file

@@ -1,6 +1,4 @@
-"""Joints with holes on another skeleton and at another rate: as motions are, but for the holes."""
-
-from __future__ import annotations
+"""Retargeting and resampling with occluded joints, against motions without occlusion."""
 
 import numpy as np
 import pytest
@@ -12,12 +10,12 @@ from probmotion.motion.occlusion import joints_at_rate, joints_on_skeleton
 PERSON = Skeleton.preset("person14")
 
 
-def walk(frames: int = 20, fps: float = 30.0) -> Motion:
+def walk(frames=20, fps=30.0):
     return make_gait("walk", frames=frames, fps=fps)
 
 
 @pytest.mark.parametrize("preset", ["h36m17", "smpl22", "person17", "cmu31"])
-def test_joints_are_those_that_a_motion_is_retargeted_to(preset: str) -> None:
+def test_joints_agree_with_motion_retarget(preset):
     source = Skeleton.preset(preset)
     rng = seeds.generator(0, preset)
     places = rng.normal(size=(3, source.n_joints, 3))
@@ -27,7 +25,7 @@ def test_joints_are_those_that_a_motion_is_retargeted_to(preset: str) -> None:
     np.testing.assert_array_equal(confidence, 1.0)
 
 
-def test_the_same_skeleton_changes_nothing_but_what_is_hidden() -> None:
+def test_same_skeleton_only_masks_occluded_joints():
     places = walk().retarget(PERSON).positions
     confidence = np.full((20, 14), 0.5)
     confidence[3, 4] = 0.0
@@ -37,7 +35,7 @@ def test_the_same_skeleton_changes_nothing_but_what_is_hidden() -> None:
     assert np.isnan(joints).sum() == 3
 
 
-def test_pelvis_and_neck_are_midway() -> None:
+def test_missing_pelvis_and_neck_are_midpoints():
     names = ["LHip", "RHip", "LShoulder", "RShoulder", "Nose", *(
         f"{side}{part}" for side in "LR" for part in ("Elbow", "Wrist", "Knee", "Ankle")
     )]  # fmt: skip
@@ -52,37 +50,36 @@ def test_pelvis_and_neck_are_midway() -> None:
     assert np.isnan(joints[7, 0]).all()
     assert shown[7, 0] == 0
     assert shown[7, 1] > 0
-    # The mean of two joints with variances 1/w has a quarter of their sum.
+    # The variance of the mean is a quarter of the sum of the variances 1/w.
     variance = (1 / confidence[:, 2] + 1 / confidence[:, 3]) / 4
     np.testing.assert_allclose(shown[:, 1], 1 / variance)
 
 
-def test_every_joint_that_is_missing_is_named() -> None:
+def test_missing_and_ambiguous_joints_are_named():
     source = Skeleton(["LHip", "LShoulder", "Nose"], [-1, 0, 1])
-    with pytest.raises(ValueError, match="lacks pelvis, neck, left_elbow, left_wrist, right_sh"):
+    with pytest.raises(ValueError, match="got no pelvis, neck, left_elbow, left_wrist, right_sh"):
         joints_on_skeleton(np.zeros((2, 3, 3)), np.ones((2, 3)), source, PERSON)
     twice = Skeleton(["lfemur", "lhipjoint", "left_hip"], [1, -1, 1])
-    with pytest.raises(ValueError, match="several joints that are the prior's 'lHip'"):
+    with pytest.raises(ValueError, match="one counterpart of 'lHip', got several"):
         joints_on_skeleton(np.zeros((2, 3, 3)), np.ones((2, 3)), twice, Skeleton(["lHip"], [-1]))
 
 
-@pytest.mark.parametrize(("fps", "new_fps"), [(60, 30), (25, 30), (30, 25), (30, 60), (50, 30)])
-def test_rates_are_brought_as_motions_are(fps: float, new_fps: float) -> None:
+@pytest.mark.parametrize(("fps", "new_fps"), [(60, 30), (25, 30), (30, 25), (50, 30)])
+def test_rates_agree_with_motion_resample(fps, new_fps):
     motion = walk(31, fps)
     joints, shown = joints_at_rate(motion.positions, np.ones((31, 17)), fps, new_fps)
-    wanted = motion.resample(new_fps)
-    np.testing.assert_allclose(joints, wanted.positions, atol=1e-12)
+    np.testing.assert_allclose(joints, motion.resample(new_fps).positions, atol=1e-12)
     assert shown.shape == joints.shape[:2]
     assert shown.min() >= 1 - 1e-12
 
 
-def test_a_joint_is_hidden_where_a_neighbour_is() -> None:
+def test_joints_are_occluded_next_to_occluded_frames():
     motion = walk(21, 20.0)
     confidence = np.ones((21, 17))
     confidence[6, 3] = 0.0
     places = np.where(confidence[..., None] > 0, motion.positions, np.nan)
     joints, shown = joints_at_rate(places, confidence, 20.0, 30.0)
-    # At 30 a second frame t is at 2 t / 3 of the old ones: 8 is at 5⅓, 9 at 6, 10 at 6⅔.
+    # At 30 fps, frame t is at 2 t / 3 of the old frames: 8 is at 5⅓, 9 at 6, 10 at 6⅔.
     assert np.flatnonzero(shown[:, 3] == 0).tolist() == [8, 9, 10]
     np.testing.assert_array_equal(np.isnan(joints).any(axis=-1), shown == 0)
     wanted = motion.resample(30.0).positions
@@ -90,19 +87,19 @@ def test_a_joint_is_hidden_where_a_neighbour_is() -> None:
     np.testing.assert_allclose(joints[seen], wanted[seen], atol=1e-12)
 
 
-def test_frames_that_stay_have_no_neighbour() -> None:
+def test_coinciding_frames_ignore_their_neighbours():
     confidence = np.ones((9, 1))
-    confidence[1::2] = 0.0  # every second frame is hidden, and half the rate asks for the others
+    confidence[1::2] = 0.0  # half the rate selects only the other frames
     places = np.where(confidence[..., None] > 0, np.arange(9.0)[:, None, None], np.nan)
     joints, shown = joints_at_rate(np.broadcast_to(places, (9, 1, 3)), confidence, 60.0, 30.0)
     np.testing.assert_array_equal(shown, 1.0)
     np.testing.assert_allclose(joints[:, 0, 0], [0, 2, 4, 6, 8])
 
 
-def test_confidence_is_the_precision_of_what_is_interpolated() -> None:
+def test_confidence_is_the_precision_after_interpolation():
     rng = seeds.generator(0, "precision")
     confidence = np.array([[4.0], [0.25], [1.0]])
-    noise = rng.normal(size=(20_000, 3, 1, 3)) / np.sqrt(confidence)[..., None]
-    found = [joints_at_rate(each, confidence, 20.0, 30.0)[0] for each in noise[:4000]]
+    noise = rng.normal(size=(4000, 3, 1, 3)) / np.sqrt(confidence)[..., None]
+    found = [joints_at_rate(each, confidence, 20.0, 30.0)[0] for each in noise]
     _, shown = joints_at_rate(noise[0], confidence, 20.0, 30.0)
     np.testing.assert_allclose(np.var(found, axis=(0, 3)), 1 / shown, rtol=0.06)

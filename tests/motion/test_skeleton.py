@@ -1,50 +1,48 @@
-"""Skeletons: trees of named joints."""
+"""Skeletons and their presets."""
 
-from __future__ import annotations
-
+import numpy as np
 import pytest
 
 from probmotion import Skeleton
 from probmotion.motion.presets import PRESETS
 
 
-def test_a_cycle_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"parents form a cycle \(b → c\), expected a tree"):
-        Skeleton(["a", "b", "c", "d"], [-1, 2, 1, 1])
-    with pytest.raises(ValueError, match=r"cycle \(a\)"):
-        Skeleton(["a"], [0])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([], []), "joint_names must contain at least one joint, got none"),
+        ((["hip", "a", "hip"], [-1, 0, 0]), r"joint_names must be unique, got \['hip'\]"),
+        ((["hip", "knee"], [-1]), "parents must have one entry per joint, 2, got 1"),
+        ((["hip", "knee"], [-1, 2]), r"parents\[1\] must be -1 or a joint's index below 2, got 2"),
+        ((["hip", "knee"], [-2, 0]), r"parents\[0\] must be an integer of at least -1, got -2"),
+        ((["hip", "knee"], [-1, 0.0]), r"parents\[1\] must be an integer of at least -1, got 0.0"),
+        ((["hip", "knee"], [-1, 0], [0.1]), "radii must have one entry per joint, 2, got 1"),
+        ((["hip"], [-1], [0.0]), r"radii\[0\] must be a finite number above 0, got 0.0"),
+        ((["a", "b", "c", "d"], [-1, 2, 1, 1]), r"parents must form trees, got a cycle \(b → c\)"),
+        ((["a"], [0]), r"got a cycle \(a\)"),
+    ],
+)
+def test_invalid_skeletons_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Skeleton(*arguments)
 
 
-def test_bad_input_is_refused_in_one_sentence() -> None:
-    with pytest.raises(ValueError, match="joint_names must contain at least one joint, got none"):
-        Skeleton([], [])
-    with pytest.raises(ValueError, match=r"joint_names repeats \['hip'\], expected every name onc"):
-        Skeleton(["hip", "knee", "hip"], [-1, 0, 0])
-    with pytest.raises(ValueError, match="parents has 1 entries, expected 2, one per joint"):
-        Skeleton(["hip", "knee"], [-1])
-    with pytest.raises(ValueError, match=r"parents\[1\] \(knee\) is 2, expected -1 \(a root\)"):
-        Skeleton(["hip", "knee"], [-1, 2])
-    with pytest.raises(ValueError, match=r"parents\[0\] \(hip\) is -2"):
-        Skeleton(["hip", "knee"], [-2, 0])
-    with pytest.raises(ValueError, match="radii has 1 entries, expected 2"):
-        Skeleton(["hip", "knee"], [-1, 0], [0.1])
-
-
-def test_unknown_presets_and_joints_list_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"name must be one of .*coco17.*h36m17, got 'h36m'"):
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(ValueError, match=r"name must be one of .*coco17.*h36m17.*, got 'h36m'"):
         Skeleton.preset("h36m")
-    walker = Skeleton.preset("h36m17")
-    with pytest.raises(ValueError, match=r"'paw', which names no joint of this skeleton.*pelvis"):
-        walker.index("paw")
+    with pytest.raises(ValueError, match=r"pelvis.*, got 'paw', which names no joint"):
+        Skeleton.preset("h36m17").index("paw")
+    with pytest.raises(ValueError, match="joints must be 0 to 16, got 17"):
+        Skeleton.preset("h36m17").subset([17])
 
 
-def test_joints_are_found_by_own_and_canonical_names() -> None:
+def test_index_accepts_own_and_canonical_names():
     skeleton = Skeleton.preset("cmu31")
     assert skeleton.index("lfemur") == skeleton.index("left_knee") == 4
     assert skeleton.canonical_names[skeleton.index("root")] == "pelvis"
 
 
-def test_parents_may_come_after_their_children() -> None:
+def test_topology_with_parents_after_children():
     skeleton = Skeleton(["ankle", "knee", "hip", "ball"], [1, 2, -1, -1])
     assert skeleton.roots == (2, 3)
     assert skeleton.bones == ((0, 1), (1, 2))
@@ -53,13 +51,13 @@ def test_parents_may_come_after_their_children() -> None:
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_presets_are_trees_in_a_fixed_order(preset: str) -> None:
+def test_presets_are_symmetric_trees_of_their_size(preset):
     skeleton = Skeleton.preset(preset)
     order = skeleton.topological_order
     assert sorted(order) == list(range(skeleton.n_joints))
     for joint, parent in skeleton.bones:
         assert order.index(parent) < order.index(joint)
-    # Mirrored joints hang from mirrored parents.
+    # Mirrored joints have mirrored parents.
     mirror = dict(skeleton.mirrored_pairs) | {b: a for a, b in skeleton.mirrored_pairs}
     assert len(mirror) == 2 * len(skeleton.mirrored_pairs)
     for joint, other in mirror.items():
@@ -71,7 +69,7 @@ def test_presets_are_trees_in_a_fixed_order(preset: str) -> None:
     assert skeleton.n_joints == expected
 
 
-def test_preset_joints_that_other_rooms_rely_on() -> None:
+def test_canonical_names_of_presets():
     sides = ("left", "right")
     person = {"pelvis", "spine", "neck", "nose", "head"} | {
         f"{side}_{part}"
@@ -94,20 +92,18 @@ def test_preset_joints_that_other_rooms_rely_on() -> None:
     assert len(Skeleton.preset("gymnast-ball").roots) == 2
 
 
-def test_presets_are_those_of_the_real_data(real_data: object) -> None:
-    import numpy as np
-
+def test_presets_agree_with_real_data(real_data):
     for preset, file in (
         ("cmu31", "cmu_single/cmu_01_01.npz"),
         ("body25b", "pose2sim_multiview/S00_P00_T01_BalancingTrial_cam_01.npz"),
     ):
-        archive = np.load(real_data / file)  # type: ignore[operator]
+        archive = np.load(real_data / file)
         found = Skeleton(archive["joint_names"].tolist(), archive["parents"].tolist())
         assert found.canonical_names == Skeleton.preset(preset).canonical_names
         assert found.parents == Skeleton.preset(preset).parents
 
 
-def test_a_subset_bridges_the_joints_left_out() -> None:
+def test_subset_bridges_missing_joints():
     chain = Skeleton(["a", "b", "c", "d"], [-1, 0, 1, 2], [0.1, 0.2, 0.3, 0.4])
     part = chain.subset([3, 0, 2])
     assert part.joint_names == ("d", "a", "c")
@@ -116,7 +112,7 @@ def test_a_subset_bridges_the_joints_left_out() -> None:
     assert chain.subset([3, 1]).parents == (1, -1)
 
 
-def test_equal_skeletons_are_interchangeable() -> None:
+def test_equality_and_hash_ignore_radii():
     assert Skeleton.preset("coco17") == Skeleton.preset("coco17")
     assert len({Skeleton.preset("coco17"), Skeleton.preset("coco17")}) == 1
     assert Skeleton(["a"], [-1], [0.1]) == Skeleton(["a"], [-1])

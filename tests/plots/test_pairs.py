@@ -1,4 +1,4 @@
-"""Pictures of pose-pairs: who is drawn where and in which colour."""
+"""Stick figures of pose-pairs: positions and colours."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from matplotlib.colors import to_hex
 
 from probmotion import Skeleton
 from probmotion.data.synthetic.dances import synthetic_dances
-from probmotion.plots.colours import LEFT, RIGHT
 from probmotion.plots.pairs import draw_pairs
+from probmotion.plots.style import LEFT, RIGHT
 
 PAIR = Skeleton.preset("pair17")
 POSES = synthetic_dances(1)[0].positions[::20]
 
 
-def bones(figure, colour, picture=0):
-    """Return the bones of a colour in a picture, (n, 2, 2), metres."""
+def bones(figure, colour, panel=0):
+    """Return the bones of a colour in a panel, (n, 2, 2), metres."""
     found = [
         np.array(lines.get_segments())
-        for lines in figure.axes[picture].collections
+        for lines in figure.axes[panel].collections
         if to_hex(lines.get_color()[0]).upper() == colour
     ]
     return np.concatenate(found)
 
 
-def test_each_character_has_its_colour_and_all_its_bones():
+def test_characters_have_their_colour_and_all_bones():
     figure = draw_pairs({"real": POSES}, PAIR)
     assert len(figure.axes) == len(POSES)
-    for picture, pose in enumerate(POSES):
+    for panel, pose in enumerate(POSES):
         for colour, person in ((LEFT, 0), (RIGHT, 1)):
-            drawn = bones(figure, colour, picture)
+            drawn = bones(figure, colour, panel)
             assert len(drawn) == 16
-            # From +Z the picture's axes are the world's x and y, shifted.
+            # Seen from +Z, the axes are the world's x and y, shifted.
             lengths = np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=1)
             ends = [bone for bone in PAIR.bones if bone[0] // 17 == person]
             wanted = [np.linalg.norm(pose[j, :2] - pose[parent, :2]) for j, parent in ends]
             np.testing.assert_allclose(sorted(lengths), sorted(wanted), atol=1e-12)
 
 
-def test_characters_keep_their_places_to_each_other_and_stand_on_the_ground():
+def test_characters_keep_their_relative_position_and_stand_on_the_ground():
     figure = draw_pairs({"real": POSES[:1] + np.array([0.0, 3.0, 0.0])}, PAIR)
     first, second = bones(figure, LEFT), bones(figure, RIGHT)
     wanted = POSES[0, 17:34, 0].max() - POSES[0, :17, 0].max()
@@ -47,7 +47,7 @@ def test_characters_keep_their_places_to_each_other_and_stand_on_the_ground():
     assert min(first[..., 1].min(), second[..., 1].min()) == pytest.approx(0, abs=1e-12)
 
 
-def test_all_pictures_share_one_scale():
+def test_all_panels_have_the_same_scale():
     rows = {"real": POSES, "half": 0.5 * POSES[:2], "annotated": 0.7 * POSES[:3, :, :2]}
     figure = draw_pairs(rows, PAIR, columns=3)
     assert len(figure.axes) == 3 + 2 + 3
@@ -56,7 +56,7 @@ def test_all_pictures_share_one_scale():
     np.testing.assert_allclose(scales, np.full((8, 2), scales[0][0]), rtol=1e-9)
 
 
-def test_annotations_are_dashed_and_lack_hidden_joints():
+def test_annotations_are_dashed_without_occluded_joints():
     annotation = POSES[:1, :, :2].copy()
     annotation[0, 7] = np.nan  # a wrist: one bone
     annotation[0, 6] = np.nan  # its elbow: one more
@@ -68,23 +68,5 @@ def test_annotations_are_dashed_and_lack_hidden_joints():
     )
     assert all(style is None for style in solid)
     assert all(style is not None for style in dashed)
-    # Only what is in space stands on a ground line.
+    # Only 3D poses have a ground line.
     assert [len(axes.lines) for axes in figure.axes] == [1, 0]
-
-
-def test_a_picture_is_written(tmp_path):
-    draw_pairs({"real": POSES}, PAIR, tmp_path / "pairs.png", title="dance", azimuth=0.5)
-    assert (tmp_path / "pairs.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(ValueError, match="rows must contain at least one label, got none"):
-        draw_pairs({}, PAIR)
-    with pytest.raises(ValueError, match=r"rows\['a'\] has shape \(5, 17, 3\), expected"):
-        draw_pairs({"a": POSES[:, :17]}, PAIR)
-    with pytest.raises(ValueError, match=r"rows\['a'\] is empty, expected at least one pose-pair"):
-        draw_pairs({"a": POSES[:0]}, PAIR)
-    with pytest.raises(ValueError, match=r"rows\['a'\] has 15 values that are NaN"):
-        draw_pairs({"a": np.where(np.arange(34)[:, None] == 2, np.nan, POSES)}, PAIR)
-    with pytest.raises(ValueError, match=r"rows\['a'\]\[0\] has no joint to draw"):
-        draw_pairs({"a": np.full((1, 34, 2), np.nan)}, PAIR)

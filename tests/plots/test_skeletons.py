@@ -1,4 +1,4 @@
-"""Filmstrips: what is drawn where, in which colour and at which scale."""
+"""Filmstrips: positions, colours and scale."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from matplotlib.colors import to_hex
 
 from probmotion import Skeleton
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.plots.colours import GREY, LEFT, RIGHT
 from probmotion.plots.skeletons import draw_skeletons
+from probmotion.plots.style import GREY, LEFT, RIGHT
 
 WALK = make_gait("walk", frames=20).centred()
 
 
 def bones(figure, colour, strip=0):
-    """Return the bones of a colour in a strip, (n, 2, 2), metres on the picture."""
+    """Return the bones of a colour in a strip, (n, 2, 2), metres."""
     found = [
         np.array(lines.get_segments())
         for lines in figure.axes[strip].collections
@@ -26,10 +26,10 @@ def bones(figure, colour, strip=0):
     return np.concatenate(found)
 
 
-def test_a_bone_is_as_long_as_it_looks_from_the_camera():
+def test_bones_have_their_projected_length():
     figure = draw_skeletons({"walk": WALK.positions[None]}, WALK.skeleton, moments=1, draws=1)
     left_shin = WALK.positions[0, [WALK.skeleton.index("left_ankle"), 5]]
-    # From +Z the picture's axes are the world's x and y.
+    # Seen from +Z, the axes are the world's x and y.
     drawn = bones(figure, LEFT)
     lengths = np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=-1)
     wanted = np.linalg.norm((left_shin[0] - left_shin[1])[:2])
@@ -39,11 +39,11 @@ def test_a_bone_is_as_long_as_it_looks_from_the_camera():
     np.testing.assert_allclose(sorted(wrists), sorted(heights))
 
 
-def test_left_and_right_have_their_own_colours():
+def test_left_and_right_have_different_colours():
     figure = draw_skeletons({"walk": WALK.positions[None]}, WALK.skeleton, moments=1, draws=1)
     left, right = bones(figure, LEFT), bones(figure, RIGHT)
     assert len(left) == len(right) == len(WALK.skeleton.mirrored_pairs)
-    # The body faces the camera on +Z, so its left is on the picture's right.
+    # The body faces the camera at +Z, so its left is on the right.
     assert left[:, 0, 0].mean() > right[:, 0, 0].mean() + 0.1
 
 
@@ -57,7 +57,7 @@ def test_heading_undoes_any_yaw():
     assert np.abs(bones(plain, LEFT, 1) - bones(plain, LEFT, 0)).max() > 0.1
 
 
-def test_all_strips_share_one_scale_in_both_directions():
+def test_all_strips_have_the_same_scale():
     rows = {"walk": WALK.positions[None], "half": 0.5 * WALK.positions[None]}
     figure = draw_skeletons(rows, WALK.skeleton)
     figure.draw_without_rendering()
@@ -67,7 +67,7 @@ def test_all_strips_share_one_scale_in_both_directions():
     assert heights[0] == pytest.approx(2 * heights[1])
 
 
-def test_truth_stands_behind_at_its_own_place():
+def test_truth_is_drawn_at_its_relative_position():
     moved = WALK.positions + np.array([0.25, 0.0, 0.0])
     figure = draw_skeletons(
         {"moved": moved[None]}, WALK.skeleton, truth=WALK.positions, moments=1, draws=1
@@ -80,7 +80,7 @@ def test_truth_stands_behind_at_its_own_place():
     assert apart == pytest.approx(0.25)
 
 
-def test_nothing_global_is_changed(tmp_path):
+def test_global_settings_of_matplotlib_are_unchanged(tmp_path):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
@@ -92,32 +92,10 @@ def test_nothing_global_is_changed(tmp_path):
     )
 
 
-def test_a_skeleton_without_sides_is_drawn():
+def test_skeletons_without_sides_are_drawn_without_heading():
     skeleton = Skeleton(["hub", "rim"], [-1, 0])
     motions = np.random.default_rng(0).normal(size=(2, 5, 2, 3))
     figure = draw_skeletons({"wheel": motions}, skeleton)
     assert len(figure.axes) == 2
-    with pytest.raises(ValueError, match="no left-right pairs"):
+    with pytest.raises(ValueError, match="heading must be None"):
         draw_skeletons({"wheel": motions}, skeleton, heading=0.0)
-
-
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
-        ({}, "rows is empty"),
-        ({"a": np.zeros((2, 5, 3, 3))}, r"rows\['a'\] has shape"),
-        ({"a": np.full((1, 2, 17, 3), np.nan)}, r"rows\['a'\] has 102 values that are NaN"),
-    ],
-)
-def test_wrong_rows_are_refused(rows, said):
-    with pytest.raises(ValueError, match=said):
-        draw_skeletons(rows, WALK.skeleton)
-
-
-def test_a_failed_write_leaves_nothing(tmp_path):
-    rows = {"walk": WALK.positions[None]}
-    with pytest.raises(OSError, match="cannot write"):
-        draw_skeletons(rows, WALK.skeleton, tmp_path / "missing" / "walk.png")
-    with pytest.raises(ValueError, match=r"ends in \.png"):
-        draw_skeletons(rows, WALK.skeleton, tmp_path / "walk.jpg")
-    assert list(tmp_path.iterdir()) == []

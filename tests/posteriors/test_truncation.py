@@ -1,4 +1,4 @@
-"""The truncated density: eq. 11 by hand, what is not asked, and what a run is told."""
+"""Truncated density: eq. 11, skipped likelihood evaluations and statistics of runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probmotion.samplers.mcmc.proposals import Isotropic
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """log f = −θ₀²/2 relative to a measure of log density −|θ₁|."""
+    """log f = −θ₀²/2 relative to a base measure of log density −|θ₁|."""
 
     skeleton = Skeleton(["point"], [-1])
     frames = 1
@@ -38,13 +38,13 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """log L = min(0, x − 4): 0 at most."""
+    """log L = min(0, x − 4) ≤ 0, recording where it is evaluated."""
 
-    asked: list = field(default_factory=list)
+    calls: list = field(default_factory=list)
     log_bound = 0.0
 
     def log_density(self, positions):
-        self.asked.extend(np.ravel(positions[..., 0, 0, 0]).tolist())
+        self.calls.extend(np.ravel(positions[..., 0, 0, 0]).tolist())
         return np.minimum(0.0, positions[..., 0, 0, 0] - 4)
 
     def simulate(self, rng, positions):
@@ -54,47 +54,42 @@ class Slope:
 THETA = np.array([[0.0, 0.5], [1.0, 2.0], [4.0, 0.0], [-1.0, 1.0], [2.0, -3.0], [0.5, 10.0]])
 
 
-def test_the_density_is_equation_11():
+def test_the_density_follows_eq_11():
     posterior = TruncatedPosterior(Line(), Slope(), seed=np.array([1.0, 0.3]), limit=math.e)
     seed = -0.5 - 3.0
     level = -0.5 * THETA[:, 0] ** 2 + np.minimum(0, THETA[:, 0] - 4)
     expected = np.where(level < seed - 1, -np.inf, np.minimum(level, seed + 1))
     measure = Line().log_measure(THETA)
     assert posterior.log_seed == pytest.approx(seed)
-    found = posterior.log_density(THETA)
-    assert np.allclose(found, expected + measure)
-    assert np.isneginf(found).tolist() == [False, False, True, True, False, True]
-    assert found[4] == pytest.approx(seed + 0 - 3 - 0.5)  # level −4, below the cap
+    log_density = posterior.log_density(THETA)
+    assert np.allclose(log_density, expected + measure)
+    assert np.isneginf(log_density).tolist() == [False, False, True, True, False, True]
+    assert log_density[4] == pytest.approx(seed + 0 - 3 - 0.5)  # level −4, below the cap
 
 
-def test_the_cap_levels_the_density():
+def test_the_density_is_constant_above_the_cap():
     posterior = TruncatedPosterior(Line(), seed=np.array([3.0, 0.0]), limit=2.0)
     near, far = posterior.log_density(np.array([[0.0, 0.0], [1.0, 0.0]]))
     assert near == far == pytest.approx(-4.5 + math.log(2))
 
 
-def test_infinity_leaves_the_density_as_it_is():
+def test_an_infinite_limit_does_not_truncate():
     whole = TruncatedPosterior(Line(), Slope())
     expected = Line().log_density(THETA) + np.minimum(0, THETA[:, 0] - 4)
     assert np.allclose(whole.log_density(THETA), expected)
     assert all(not flags.any() for flags in whole.draw_statistics(THETA, expected).values())
 
 
-def test_evidence_is_asked_only_where_it_could_save_the_point():
-    evidence = Slope()
-    posterior = TruncatedPosterior(Line(), evidence, limit=math.e)
-    evidence.asked.clear()
-    # The seed is at −4, the floor at −5: a prior below −5 is lost, and so is what is outside.
+def test_the_likelihood_is_only_evaluated_where_needed():
+    likelihood = Slope()
+    posterior = TruncatedPosterior(Line(), likelihood, limit=math.e)
+    likelihood.calls.clear()
+    # The floor is at −5: priors below it are skipped, as are points outside the support.
     posterior.log_density(np.array([[3.0, 0.0], [3.3, 0.0], [-3.1, 0.0], [1.0, 10.0]]))
-    assert evidence.asked == [3.0, -3.1]
+    assert likelihood.calls == [3.0, -3.1]
 
 
-def test_a_single_point_is_a_batch_of_no_axes():
-    posterior = TruncatedPosterior(Line(), Slope(), limit=100.0)
-    assert posterior.log_density(THETA[0]) == posterior.log_density(THETA)[0]
-
-
-def test_shares_are_of_the_cap_and_of_a_nat_above_the_floor():
+def test_flags_at_the_cap_and_near_the_floor():
     posterior = TruncatedPosterior(Line(), seed=np.array([3.0, 0.0]), limit=math.exp(2))
     theta = np.array([[0.0, 1.0], [2.0, 0.0], [np.sqrt(2 * 5.7), 0.0], [np.sqrt(2 * 5.4), 0.0]])
     flags = posterior.draw_statistics(theta, posterior.log_density(theta))
@@ -102,7 +97,7 @@ def test_shares_are_of_the_cap_and_of_a_nat_above_the_floor():
     assert flags["near_floor"].tolist() == [0, 0, 1, 0]
 
 
-def test_every_run_keeps_where_its_draws_are_cut():
+def test_runs_store_the_flags():
     posterior = TruncatedPosterior(Line(), limit=2.0)
     sampler = MetropolisHastings(Isotropic(1.0, None), warmup=0, thin=1)
     start = np.zeros((1, 2))
@@ -112,7 +107,7 @@ def test_every_run_keeps_where_its_draws_are_cut():
     assert not draws.dataset["at_cap"].any()
 
 
-def test_the_limit_for_a_dimension_keeps_a_gaussians_draws():
+def test_the_limit_for_a_dimension_keeps_the_typical_set():
     dim = 108
     rng = np.random.default_rng(0)
     below = 0.5 * (rng.standard_normal((20_000, dim)) ** 2).sum(axis=1)
@@ -121,10 +116,10 @@ def test_the_limit_for_a_dimension_keeps_a_gaussians_draws():
     assert (below > math.log(100)).mean() > 0.999
 
 
-def test_wrong_input_is_named():
-    with pytest.raises(ValueError, match="limit is 1"):
+def test_invalid_arguments():
+    with pytest.raises(ValueError, match="limit must be above 1, got 1"):
         TruncatedPosterior(Line(), limit=1.0)
-    with pytest.raises(ValueError, match="seed has log density -inf"):
+    with pytest.raises(ValueError, match="seed must have positive density, got log density -inf"):
         TruncatedPosterior(Line(), seed=np.array([0.0, 10.0]))
-    with pytest.raises(ValueError, match="seed has shape"):
+    with pytest.raises(ValueError, match="seed must have shape"):
         TruncatedPosterior(Line(), seed=np.zeros(3))

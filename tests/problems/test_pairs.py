@@ -1,4 +1,4 @@
-"""Problems on pose-pairs: held out whole, drawn from, measured by coverage."""
+"""Pose-pair problems: held-out clips, coverage and comparison."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from probmotion.data.pair_sets import SALSA_HELD_OUT
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.metrics.coverage import coverage
 from probmotion.metrics.measures import measure
-from probmotion.models.pose_pairs.pair_posterior import PairSettings
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem, pairs_problem, problem_descriptions, problem_names
@@ -24,19 +23,16 @@ def problem() -> Problem:
     return load_problem("dance-pairs")
 
 
-def test_they_are_listed_without_being_made():
+def test_problems_are_listed_with_descriptions(problem):
     assert {"dance-pairs", "salsa-pairs", "salsa-pairs-paper"} <= set(problem_names())
-    assert "5599 annotated 2D pairs" in problem_descriptions()["salsa-pairs"]
-    assert set(problem_descriptions()) == set(problem_names())
+    descriptions = problem_descriptions()
+    assert set(descriptions) == set(problem_names())
+    for made in (problem, load_problem("gait")):
+        assert made.description == descriptions[made.name]
 
 
-def test_a_description_is_that_of_the_problem(problem):
-    assert problem.description == problem_descriptions()["dance-pairs"]
-    assert load_problem("gait").description == problem_descriptions()["gait"]
-
-
-def test_clips_are_held_out_whole(problem):
-    """No annotation, and not the seed, is of a clip that is to be covered."""
+def test_clips_are_held_out_completely(problem):
+    """Neither annotations nor seed come from clips to be covered."""
     shown = np.concatenate([dance.positions for dance in synthetic_dances(6)])
     hidden = np.concatenate([dance.positions for dance in synthetic_dances(8)[6:]])
     assert problem.held_out.shape == (60, 1, 34, 3)
@@ -49,7 +45,7 @@ def test_clips_are_held_out_whole(problem):
     assert sources <= {f"dance-{number}" for number in range(6)}
 
 
-def test_runs_are_measured_by_coverage_and_wherever_pairs_stand(problem):
+def test_metrics_include_coverage_and_are_invariant_to_translation(problem):
     sampler = MetropolisHastings(Isotropic(0.02), warmup=300, thin=2)
     draws = sampler.sample(problem.posterior, draws=30, chains=2, progress=False)
     found = measure(problem, draws, seed=0)
@@ -68,8 +64,8 @@ def test_runs_are_measured_by_coverage_and_wherever_pairs_stand(problem):
 
 
 @pytest.mark.slow
-def test_draws_cover_better_than_the_seed_and_than_the_prior(problem):
-    """What the whole is for, on made data; on real data it is measured by the ablations."""
+def test_posterior_draws_cover_better_than_seed_and_prior(problem):
+    """On synthetic data; the ablations measure real data."""
     sampler = MetropolisHastings(Isotropic(0.02), warmup=1000, thin=4)
     truth = problem.held_out[:, 0]
     found = {}
@@ -84,7 +80,7 @@ def test_draws_cover_better_than_the_seed_and_than_the_prior(problem):
     assert found["posterior"] < 0.8 * found["prior"]
 
 
-def test_the_published_numbers_are_a_problem_of_their_own(real_data, monkeypatch):
+def test_published_settings(real_data, monkeypatch):
     monkeypatch.setenv("PROBMOTION_DATA", str(real_data))
     settings = load_problem("salsa-pairs-paper").posterior
     assert settings.limit == 100
@@ -92,7 +88,7 @@ def test_the_published_numbers_are_a_problem_of_their_own(real_data, monkeypatch
     assert load_problem("salsa-pairs").posterior.limit == np.inf
 
 
-def test_compare_says_who_can_and_why_others_cannot(problem, tmp_path):
+def test_compare_reports_unsupported_samplers(problem, tmp_path):
     samplers = {"mh": MetropolisHastings(Isotropic(0.02), warmup=200, thin=2)}
     comparison = pm.compare(
         problem,
@@ -107,33 +103,33 @@ def test_compare_says_who_can_and_why_others_cannot(problem, tmp_path):
     assert "held-out poses" in text
     for words in ("D_IC", "near floor", "Denoises2D", "gradient", "dimension"):
         assert words in text
-    assert "needs a density with a gradient, which PosePairPrior has not; mh would do" in text
+    assert "needs a differentiable density, which PosePairPrior does not have; try mh" in text
 
 
-def test_wrong_input_is_named():
+def test_invalid_inputs_are_rejected():
     dances = synthetic_dances(2)
     with pytest.raises(ValueError, match="dance-9"):
         pairs_problem(dances, ["dance-9"])
-    with pytest.raises(ValueError, match="held_out has shape"):
+    with pytest.raises(ValueError, match="held_out must have shape"):
         Problem("p", "", load_problem("gait").posterior, held_out=np.zeros((3, 1, 34, 3)))
 
 
-def test_salsa_is_the_published_experiment(real_data, monkeypatch):
+def test_salsa_problem_matches_the_paper(real_data, monkeypatch):
     monkeypatch.setenv("PROBMOTION_DATA", str(real_data))
     problem = load_problem("salsa-pairs")
-    evidence = problem.posterior.likelihood
-    assert len(evidence.annotations) == 5599
-    assert not set(evidence.annotations.sources) & set(SALSA_HELD_OUT)
+    likelihood = problem.posterior.likelihood
+    assert len(likelihood.annotations) == 5599
+    assert not set(likelihood.annotations.sources) & set(SALSA_HELD_OUT)
     assert problem.held_out.shape == (300, 1, 34, 3)
     assert problem.posterior.dim == 108
-    # The annotations' views had to be estimated; the seed is within the prior's support.
+    # Views of the annotations are estimated; the seed must be within the prior's support.
     assert np.isfinite(problem.posterior.log_seed)
     log_f = problem.posterior.prior.log_plausibility(problem.held_out)
     assert np.median(log_f) > -2
     assert np.quantile(log_f, 0.1) > -20
 
 
-def test_salsa_without_data_says_how_to_get_it(monkeypatch, tmp_path):
+def test_missing_salsa_clips_error_explains_the_download(monkeypatch, tmp_path):
     from probmotion.data import downloads
     from probmotion.problems import pairs
 
@@ -143,19 +139,5 @@ def test_salsa_without_data_says_how_to_get_it(monkeypatch, tmp_path):
         return look(tmp_path / "nothing")
 
     monkeypatch.setattr(downloads, "salsa_pairs", nowhere)
-    with pytest.raises(
-        FileNotFoundError, match=r"the ten salsa clips are not in .*nothing; .*down"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"salsa clips are not in .*nothing.*down"):
         pairs.PAIR_PROBLEMS["salsa-pairs"][1]()
-
-
-def test_a_small_problem_of_ones_own():
-    problem = pairs_problem(
-        synthetic_dances(3),
-        ["dance-2"],
-        n_annotations=20,
-        n_held_out=5,
-        settings=PairSettings(n_views=4, n_near=4, measure="cartesian"),
-    )
-    assert problem.held_out.shape == (5, 1, 34, 3)
-    assert problem.posterior.likelihood.measure == "cartesian"

@@ -1,20 +1,26 @@
-"""The registered problems are what their names say."""
+"""Gait problems: references, observations, parameters and simulated truths."""
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
 
 from probmotion import MotionPosterior
+from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.comparison.results.naming import _NAME
 from probmotion.posteriors.problem import Problem
-from probmotion.problems import load_problem
+from probmotion.problems import load_problem, problem_names
 from probmotion.problems.gait import GAIT_PROBLEMS
 
-WITH_EVIDENCE = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]
+OBSERVED = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]
 
 
 @pytest.mark.parametrize("name", GAIT_PROBLEMS)
-def test_reference_draws_are_the_posteriors_and_seeded(name):
+def test_reference_draws_are_seeded(name):
     problem = load_problem(name)
     assert problem.name == name
     assert load_problem(name) is problem
@@ -25,12 +31,7 @@ def test_reference_draws_are_the_posteriors_and_seeded(name):
     assert (draws != problem.reference(4, 4)).any()
 
 
-def test_an_unknown_problem_is_told_the_known_ones():
-    with pytest.raises(ValueError, match="problem must be one of gait, gait-mono, got 'gate'"):
-        load_problem("gate")
-
-
-def test_the_gait_prior_is_the_designs():
+def test_gait_prior_parameters():
     prior = load_problem("gait").posterior.prior
     assert (prior.frames, prior.rank, prior.azimuths) == (30, 10, 36)
     weights = dict(zip(prior.styles, prior.weights, strict=True))
@@ -39,24 +40,24 @@ def test_the_gait_prior_is_the_designs():
     assert load_problem("gait-monocular").posterior.prior is prior
 
 
-@pytest.mark.parametrize("name", WITH_EVIDENCE)
-def test_the_truth_is_a_typical_draw_of_its_posterior(name):
+@pytest.mark.parametrize("name", OBSERVED)
+def test_truth_is_typical_of_the_posterior(name):
     problem = load_problem(name)
     exact = problem.posterior.prior.exact_posterior(problem.posterior.likelihood)
     at_draws = exact.log_density(problem.reference(0, 500))
     assert abs(exact.log_density(problem.truth) - at_draws.mean()) < 4 * at_draws.std()
 
 
-@pytest.mark.parametrize("name", WITH_EVIDENCE)
-def test_the_keypoints_are_of_the_truth_with_the_stated_noise(name):
+@pytest.mark.parametrize("name", OBSERVED)
+def test_keypoint_noise_has_the_stated_scale(name):
     problem = load_problem(name)
-    evidence = problem.posterior.likelihood
-    residual = evidence.keypoints - evidence.cameras.project(problem.truth)
-    seen = residual[evidence.entries.visible] / evidence.noise
+    likelihood = problem.posterior.likelihood
+    residual = likelihood.keypoints - likelihood.cameras.project(problem.truth)
+    seen = residual[likelihood.entries.visible] / likelihood.noise
     assert abs(seen.var() - 1) < 4 * np.sqrt(2 / seen.size)
 
 
-def test_the_occluded_limb_is_a_leg_for_half_of_the_frames():
+def test_a_leg_is_occluded_for_half_of_the_frames():
     problem = load_problem("gait-occluded")
     hidden = ~problem.posterior.likelihood.entries.visible[0]
     names = np.array(problem.posterior.skeleton.joint_names)
@@ -64,7 +65,7 @@ def test_the_occluded_limb_is_a_leg_for_half_of_the_frames():
     assert (hidden[:, hidden.any(axis=0)].sum(axis=0) == 15).all()
 
 
-def test_sparse_evidence_leaves_many_modes_and_every_style():
+def test_sparse_observations_leave_many_modes_and_every_style():
     problem = load_problem("gait-sparse")
     assert problem.posterior.likelihood.entries.visible.sum() == 6
     exact = problem.posterior.prior.exact_posterior(problem.posterior.likelihood)
@@ -77,13 +78,7 @@ def test_sparse_evidence_leaves_many_modes_and_every_style():
     assert one.component_probabilities.max() > 0.99
 
 
-def test_a_truth_of_another_shape_is_refused():
-    posterior = load_problem("gait").posterior
-    with pytest.raises(ValueError, match=r"truth must have shape \(30, 17, 3\), got \(29, 17, 3\)"):
-        Problem("bad", "", posterior, np.zeros((29, 17, 3)))
-
-
-def test_a_prior_without_closed_form_has_no_reference():
+def test_non_conjugate_problems_have_no_reference():
     gait = load_problem("gait").posterior.prior
 
     class Plain:
@@ -94,14 +89,127 @@ def test_a_prior_without_closed_form_has_no_reference():
 
     problem = Problem("plain", "", MotionPosterior(Plain()))
     assert not problem.has_reference
-    with pytest.raises(ValueError, match="problem plain has no reference: Plain has no exact"):
+    with pytest.raises(ValueError, match="problem plain must have reference draws"):
         problem.reference(0, 5)
+    observed = load_problem("gait-monocular").posterior
+    heavy = replace(observed.likelihood, degrees_of_freedom=4.0)
+    assert not Problem("heavy", "", MotionPosterior(observed.prior, heavy)).has_reference
+    with pytest.raises(ValueError, match=r"truth must have shape \(30, 17, 3\), got \(29, 17, 3\)"):
+        Problem("bad", "", observed, np.zeros((29, 17, 3)))
 
 
-def test_student_t_noise_has_no_reference():
-    from dataclasses import replace
+def seen(problem):
+    return problem.posterior.likelihood.entries.visible
 
-    problem = load_problem("gait-monocular")
-    evidence = replace(problem.posterior.likelihood, degrees_of_freedom=4.0)
-    heavy = Problem("heavy", "", MotionPosterior(problem.posterior.prior, evidence))
-    assert not heavy.has_reference
+
+def test_parameters_change_the_problem():
+    problem = load_problem(
+        "gait-occluded", frames=8, joints=12, noise=0.05, hidden=0.25, components=6, seed=3
+    )
+    prior = problem.posterior.prior
+    assert (prior.frames, len(prior.styles), prior.azimuths) == (8, 3, 2)
+    assert problem.posterior.likelihood.noise == 0.05
+    assert seen(problem).any(axis=(0, 1)).sum() == 12
+    limb = {(~seen(load_problem("gait-occluded", frames=8, hidden=h)))[0].any(-1).sum()
+            for h in (0.0, 0.25, 0.5, 1.0)}  # fmt: skip
+    assert limb == {0, 2, 4, 8}
+    other = load_problem("gait-occluded", frames=8, seed=4)
+    assert (other.truth != load_problem("gait-occluded", frames=8).truth).any()
+
+
+def test_few_components_are_styles_without_azimuths():
+    prior = load_problem("gait", frames=4, components=2).posterior.prior
+    assert (len(prior.styles), prior.azimuths) == (2, 1)
+    assert prior.weights.sum() == pytest.approx(1)
+    whole = load_problem("gait", frames=4).posterior.prior
+    np.testing.assert_array_equal(prior.means, whole.means[:2])
+
+
+def test_problem_is_cached_under_a_canonical_name():
+    problem = load_problem("gait-monocular", noise=0.05, frames=4)
+    assert problem.name == "gait-monocular(frames=4, noise=0.05)"
+    assert _NAME.fullmatch(problem.name)
+    assert load_problem(problem.name) is problem
+    assert load_problem("gait-monocular", frames=4, noise=0.05, seed=0) is problem
+    assert load_problem("gait-monocular(noise=0.02)") is load_problem("gait-monocular")
+
+
+def test_pickled_problem_has_the_same_fingerprint():
+    problem = load_problem("gait-monocular", frames=4)
+    assert fingerprint(pickle.loads(pickle.dumps(problem))) == fingerprint(problem)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "sentence"),
+    [
+        ("gait-sparse", {"hidden": 0.5}, "must be one of frames, components, .* got 'hidden'"),
+        ("walk2d", {"frames": 5}, "parameters of walk2d must not be set, got 'frames'"),
+        ("gait", {"frames": 1}, "frames must be an integer of at least 2, got 1"),
+        ("gait", {"components": 100}, "components must be at most 3, .* or a multiple .* got 100"),
+        ("gait-monocular", {"frames": 4, "joints": 18}, "joints must be at most 17, got 18"),
+        ("gait-monocular", {"frames": 4, "noise": -1.0}, "noise must be a finite number above 0"),
+        ("gait-monocular", {"frames": 4, "hidden": 1.5}, "hidden must be between 0 and 1, got 1.5"),
+        ("gait(frames=[5])", {}, r"frames must be a number such as 30, got \[5\]"),
+        ("gait(frames 5)", {}, r"parameters must be given as in .* got \(frames 5\)"),
+        ("gate(frames=5)", {}, "problem must be one of gait, .* got 'gate'"),
+    ],
+)
+def test_invalid_parameters_are_rejected(name, scale, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        load_problem(name, **scale)
+
+
+def test_noisy_joints_have_student_t_noise():
+    problem = load_problem("gait-noisy3d")
+    assert "gait-noisy3d" in problem_names()
+    likelihood = problem.posterior.likelihood
+    residual = (likelihood.joints - problem.truth).ravel() / 0.03
+    assert stats.kstest(residual, stats.t(3).cdf).pvalue > 0.001
+    assert stats.kstest(residual, stats.norm(0, residual.std()).cdf).pvalue < 0.001
+
+
+def test_simulated_problem_has_its_own_observations():
+    problem = load_problem("gait-occluded", frames=6)
+    first, second = problem.simulate(1), problem.simulate(2)
+    assert (first.truth != second.truth).any()
+    np.testing.assert_array_equal(first.truth, problem.simulate(1).truth)
+    np.testing.assert_array_equal(first.truth, second.simulate(1).truth)
+    np.testing.assert_array_equal(seen(first), seen(problem))
+    for again in (first, second):
+        likelihood = again.posterior.likelihood
+        residual = (likelihood.keypoints - likelihood.cameras.project(again.truth))[seen(again)]
+        assert abs((residual / likelihood.noise).var() - 1) < 4 * np.sqrt(2 / residual.size)
+    assert load_problem("gait", frames=6).simulate(0).posterior.likelihood is None
+
+
+def test_ranks_of_simulated_truths_are_uniform():
+    """Simulation-based calibration (Talts et al. 2018) of exact draws, on a height and a depth."""
+    problem = load_problem("gait-sparse", frames=2, components=6, noise=0.2)
+    ranks = []
+    for k in range(200):
+        again = problem.simulate(k)
+        draws = again.reference(k, 9)
+        ranks.append([(draws[:, 0, 3, axis] < again.truth[0, 3, axis]).sum() for axis in (1, 2)])
+    for scalar in np.transpose(ranks):
+        counts = np.bincount(scalar, minlength=10)
+        assert stats.chisquare(counts).pvalue > 0.001
+
+
+def test_observations_of_another_truth_are_not_calibrated():
+    """Negative control of the test above."""
+    problem = load_problem("gait-monocular", frames=2, components=6)
+    ranks = [
+        (problem.reference(k, 9)[:, 0, 3, 2] < problem.simulate(k).truth[0, 3, 2]).sum()
+        for k in range(100)
+    ]
+    assert stats.chisquare(np.bincount(ranks, minlength=10)).pvalue < 1e-6
+
+
+def test_learnt_prior_can_be_simulated():
+    problem = load_problem("walk-vae-monocular")
+    again = problem.simulate(1)
+    assert again.truth.shape == problem.truth.shape
+    assert (again.truth != problem.truth).any()
+    likelihood = again.posterior.likelihood
+    residual = likelihood.keypoints - likelihood.cameras.project(again.truth)
+    assert abs(residual.std() / likelihood.noise - 1) < 0.1

@@ -58,7 +58,7 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     assert (tmp_path / "take3.bvh").exists()
 
     table = Comparison.load(tmp_path / "comparison").table()
-    assert "swd_ratio" in printed
+    assert "swd ratio" in printed
     wide = table.pivot_table(index="sampler", columns="metric", values="value")
     assert set(wide.index) == {"exact", "ancestral3d", "mas", "mvpc", "mh"}
     assert wide.loc["ancestral3d", "off_manifold_ratio"] < 0.6
@@ -73,13 +73,13 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_pose_pairs(tmp_path, monkeypatch):
-    from probmotion.io.files import load_motion
+    from probmotion.io.files import load
 
     printed = run("02_pose_pairs.py", tmp_path, 5, monkeypatch)
-    assert "90 of 90 frames are the dance" in printed
+    assert "90 of 90 frames are dance" in printed
     assert "108 dimensions" in printed
     assert "200 annotations" in printed
-    walk = load_motion(tmp_path / "walk.bvh")
+    walk = load(tmp_path / "walk.bvh")
     assert walk.frames == 150
     assert len(walk.skeleton.roots) == 2
     accepted = float(printed.split("accepted: ")[1].split()[0])
@@ -115,11 +115,11 @@ def test_motion_from_2d(tmp_path, monkeypatch):
         detected, cleaned = numbers(kind)
         assert cleaned < 0.6 * detected
     # A draw may be caught in something else, as the prose says; the others answer.
-    misses = np.array(numbers("misses what was seen by, mm: "))
+    misses = np.array(numbers("error against observations, mm: "))
     caught = misses > 80
     assert caught.sum() <= 3
-    wrong = np.array(numbers("misses the truth by, mm: "))
-    assert wrong[~caught].max() < 0.5 * numbers("without evidence: ")[0]
+    wrong = np.array(numbers("error against truth, mm: "))
+    assert wrong[~caught].max() < 0.5 * numbers("without observations: ")[0]
 
 
 @pytest.mark.slow
@@ -185,4 +185,4 @@ def test_compare_and_calibrate(tmp_path, monkeypatch):
     assert str(advise("gait-monocular")) in printed
     right, wrong = (line for line in printed.splitlines() if " on gait-monocular(" in line)
     assert "no deviation found" in right
-    assert "too sure: 90 % intervals hold" in wrong
+    assert "overconfident: 90 % intervals" in wrong

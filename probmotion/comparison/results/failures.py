@@ -1,4 +1,4 @@
-"""Why a cell has no draws: one word for the table, one sentence, and where it happened."""
+"""Failures of runs: the word shown in the table, the message and the traceback."""
 
 from __future__ import annotations
 
@@ -7,72 +7,57 @@ from dataclasses import dataclass
 
 from probmotion.posteriors.sampling import UnsupportedPosterior
 
-__all__ = ["CellNotKept", "Failure", "NotFinite", "TimeIsUp", "WorkerDied"]
+__all__ = ["Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied"]
 
-# What libraries say where memory ends, if they do not raise a MemoryError.
+# How libraries report exhausted memory other than by MemoryError.
 _MEMORY_KINDS = ("OutOfMemoryError",)
 _MEMORY_SIGNS = ("RESOURCE_EXHAUSTED", "can't allocate memory", "Unable to allocate")
 _NAN_SIGN = "NaN or infinite"
 
 
-class CellNotKept(OSError):  # noqa: N818 (it says what happened)
-    """A finished cell could not be written; what was finished before it is there."""
+class ResultNotWritten(OSError):  # noqa: N818
+    """The result of a run or pilot could not be written."""
 
 
-class NotFinite(ValueError):  # noqa: N818
-    """Draws are NaN or infinite."""
+class NonFiniteDraws(ValueError):  # noqa: N818
+    """Draws are NaN, infinite or too large for the metrics."""
 
 
-class TimeIsUp(RuntimeError):  # noqa: N818
-    """A cell took longer than its limit.
-
-    Parameters
-    ----------
-    seconds : float
-        The limit.
-    """
+class TimeLimitExceeded(RuntimeError):  # noqa: N818
+    """A run took longer than ``seconds``."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__(f"took longer than time_limit, {seconds:g} seconds")
         self.seconds = seconds
 
-    def __reduce__(self) -> tuple[type[TimeIsUp], tuple[float]]:
-        return TimeIsUp, (self.seconds,)
+    def __reduce__(self) -> tuple[type[TimeLimitExceeded], tuple[float]]:
+        return TimeLimitExceeded, (self.seconds,)
 
 
 class WorkerDied(RuntimeError):  # noqa: N818
-    """The process that ran a cell ended; ``killed`` says whether from outside, as when memory ends.
-
-    Parameters
-    ----------
-    killed : bool
-        Whether by the signal that cannot be refused.
-    """
+    """The worker process of a run ended; ``killed`` if by SIGKILL, as when memory runs out."""
 
     def __init__(self, killed: bool) -> None:
-        super().__init__(
-            "a worker process died while this cell ran, perhaps for want of memory; "
-            "expected it to finish"
-        )
+        super().__init__("a worker process died during this run, possibly out of memory")
         self.killed = killed
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What a cell holds in place of draws.
+    """Reason why a run has no draws.
 
     Parameters
     ----------
     word : str
-        ``memory``, ``time``, ``nan``, ``died``; what an
-        :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` says, ``budget`` among them;
-        else the error's class.
+        ``memory``, ``time``, ``nan``, ``died``, the word of an
+        :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` such as ``budget``, or the
+        class of the error.
     message : str
         One sentence.
     unsupported : bool
-        Whether it would be the same another time; an accident is tried again by the next run.
+        Whether the sampler does not support the problem. Other failures are retried.
     traceback : str
-        Where it happened.
+        Traceback of the error.
     """
 
     word: str
@@ -85,7 +70,7 @@ class Failure:
 
     @classmethod
     def of(cls, error: BaseException) -> Failure:
-        """Return what an error amounts to."""
+        """Return the failure that an error caused."""
         message = " ".join(str(error).split()) or type(error).__name__
         trace = "".join(traceback.format_exception(error))
         unsupported = isinstance(error, UnsupportedPosterior)
@@ -95,22 +80,21 @@ class Failure:
 def _word(error: BaseException, message: str) -> str:
     if isinstance(error, UnsupportedPosterior):
         return error.word
-    if isinstance(error, TimeIsUp):
+    if isinstance(error, TimeLimitExceeded):
         return "time"
-    if _for_want_of_memory(error, message):
+    if _is_out_of_memory(error, message):
         return "memory"
     if isinstance(error, WorkerDied):
         return "died"
-    if isinstance(error, NotFinite | FloatingPointError):
+    if isinstance(error, NonFiniteDraws | FloatingPointError):
         return "nan"
-    # What MotionDraws, densities and gradients say of a sampler's numbers.
+    # Raised by MotionDraws, densities and gradients.
     if isinstance(error, ValueError) and _NAN_SIGN in message:
         return "nan"
     return type(error).__name__
 
 
-def _for_want_of_memory(error: BaseException, message: str) -> bool:
+def _is_out_of_memory(error: BaseException, message: str) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, WorkerDied) and error.killed):
         return True
-    kind = type(error).__name__
-    return kind in _MEMORY_KINDS or any(sign in message for sign in _MEMORY_SIGNS)
+    return type(error).__name__ in _MEMORY_KINDS or any(sign in message for sign in _MEMORY_SIGNS)

@@ -1,4 +1,4 @@
-"""A digest of what was asked for, so that a finished cell is reused only for the same question."""
+"""Fingerprint of a run's inputs, so that a finished run is reused only for identical inputs."""
 
 from __future__ import annotations
 
@@ -17,44 +17,50 @@ import numpy as np
 from array_api_compat import is_array_api_obj
 
 from probmotion.arrays import to_numpy
-from probmotion.comparison.results.script_code import SIMPLE, class_content, is_of_a_script, reached
+from probmotion.comparison.results.script_code import (
+    SIMPLE,
+    class_content,
+    globals_read,
+    is_user_code,
+)
 from probmotion.posteriors.draws import library_versions
 
 __all__ = ["fingerprint"]
 
 _RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
-_TOLD_ANYWAY = {"sklearn", *(name.replace("-", "_") for name in library_versions())}
-"""Packages whose versions stand beside every fingerprint."""
+_RECORDED_PACKAGES = {"sklearn", *(name.replace("-", "_") for name in library_versions())}
+"""Packages whose versions are recorded beside every fingerprint."""
 
-_NUMPYS_OWN_RANDOMNESS = getattr(np.random.random, "__self__", None)
+_NUMPY_GLOBAL_RANDOM = getattr(np.random.random, "__self__", None)
 
 _CODE = (
     *("code", "consts", "names", "varnames", "freevars", "cellvars", "exceptiontable"),
     *("argcount", "posonlyargcount", "kwonlyargcount", "flags"),
 )
-"""What code does, of its attributes: not the file and the lines that it stands in."""
+"""Attributes of compiled code other than its file and line numbers."""
 
 
 def fingerprint(value: Any) -> str:
-    """Return a hexadecimal digest of what ``value`` holds.
+    """Return a hexadecimal digest of ``value``.
 
-    Numbers, strings, arrays, lists, mappings, dataclasses (by the fields they are made with, so
-    that caches do not count), classes, modules and functions written in C (by name), functions of
-    Python (by name, compiled code, defaults and what they close over), bound methods (by what
-    they are bound to as well), networks (by layers and weights), other objects by their
-    attributes, and what has none by what it is pickled as. Of an object whose class is in no
-    installed package, but in a script or notebook, the methods count as functions do, and with a
-    script's functions what they read of their module: other functions, classes, numbers, strings
-    and arrays, but not lists and mappings, which may be filled as it runs. What is of an installed
-    package counts by its name and the package's version.
+    - Numbers, strings, arrays, lists, mappings: their contents.
+    - Dataclasses: their ``init`` fields, so that caches do not count.
+    - Classes, modules and C functions: their names.
+    - Python functions: name, compiled code, defaults and closure; bound methods also their object.
+    - Networks: layers and weights.
+    - Other objects: their attributes, or their pickled state if they have none.
+    - Classes and functions of a script or notebook: also the code of their methods and the
+      functions, classes, numbers, strings and arrays of the module that they read. Lists and
+      mappings are left out, since functions may fill them.
+    - Anything of an installed package: also the version of the package.
 
-    Another version of Python compiles other code, so that it has other fingerprints of functions.
+    Fingerprints of functions depend on the Python version, which compiles them.
 
     Raises
     ------
     ValueError
-        If an object has nothing of that kind to tell it by; the message says where it is held.
+        If an object has no content to identify it by.
     """
     digest = hashlib.sha256()
     _add(digest, value, ())
@@ -63,7 +69,7 @@ def fingerprint(value: Any) -> str:
 
 def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
     kind = type(value)
-    digest.update(f"<{kind.__module__}.{kind.__qualname__}{_edition(kind.__module__)}>".encode())
+    digest.update(f"<{kind.__module__}.{kind.__qualname__}{_version_of(kind.__module__)}>".encode())
     parts: list[Any] = []
     if id(value) in above:
         digest.update(f"the object {above.index(id(value))} levels down".encode())
@@ -76,14 +82,14 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         parts += value
     elif isinstance(value, set | frozenset):
         parts += sorted(value, key=repr)
-    elif _has_a_name(value):
+    elif _is_named(value):
         module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
-        digest.update(f"{module}.{name}{_edition(module)}".encode())
-        parts += _behind_the_name(value)
+        digest.update(f"{module}.{name}{_version_of(module)}".encode())
+        parts += _named_content(value)
     elif isinstance(value, CodeType):
         parts += [getattr(value, f"co_{name}") for name in _CODE]
-    elif value is _NUMPYS_OWN_RANDOMNESS:
-        pass  # There is one; SciPy's distributions hold it, whose density does not ask it.
+    elif value is _NUMPY_GLOBAL_RANDOM:
+        pass  # SciPy's distributions refer to it, but their densities do not use it.
     elif isinstance(value, slice):
         parts += [value.start, value.stop, value.step]
     elif is_array_api_obj(value):
@@ -94,7 +100,7 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
         else:
             digest.update(array.tobytes())
     elif callable(getattr(value, "state_dict", None)):
-        # A network: its layers and its weights, not what hangs on them while it runs.
+        # A network; its other attributes, such as hooks, may change while it runs.
         parts += [repr(value), dict(value.state_dict())]
     elif isinstance(value, PurePath):
         digest.update(str(value).encode())
@@ -105,86 +111,85 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
             if field.init:
                 parts += [field.name, getattr(value, field.name)]
     elif getattr(value, "__dict__", None):
-        held = vars(value).items()
-        # What was computed from the rest, once asked for, says nothing new.
-        parts.append({name: part for name, part in held if not _computed(kind, name)})
-    elif not _plain(kind):
+        attributes = vars(value).items()
+        # Cached properties follow from the other attributes.
+        parts.append({name: part for name, part in attributes if not _is_cached(kind, name)})
+    elif not _is_stateless(kind):
         parts += _as_pickled(value)
-    if is_of_a_script(kind.__module__):
+    if is_user_code(kind.__module__):
         parts.append(class_content(kind))
     for part in parts:
         _add(digest, part, (*above, id(value)))
     digest.update(b"</>")
 
 
-def _has_a_name(value: Any) -> bool:
+def _is_named(value: Any) -> bool:
     if isinstance(value, type | ModuleType | FunctionType | MethodType):
         return True
-    # An object of a class of Python may be called, and have taken over a function's name, but its
-    # attributes say what it does.
+    # Callable objects of Python classes may carry a function's name, but are identified by their
+    # attributes.
     if not callable(value) or isinstance(type(value).__call__, FunctionType):
         return False
     return hasattr(value, "__qualname__")
 
 
-def _behind_the_name(value: Any) -> list[Any]:
-    """Return what tells a function or method from another of the same name."""
+def _named_content(value: Any) -> list[Any]:
+    """Return the content that distinguishes objects of the same name."""
     if isinstance(value, type):
-        return [class_content(value)] if is_of_a_script(value.__module__) else []
+        return [class_content(value)] if is_user_code(value.__module__) else []
     if isinstance(value, ModuleType):
         return [value.__name__]
     if isinstance(value, MethodType):
         return [value.__func__, value.__self__]
     if isinstance(value, FunctionType):
-        defaults = [_or_marker(each) for each in value.__defaults__ or ()]
-        named = {name: _or_marker(each) for name, each in (value.__kwdefaults__ or {}).items()}
-        cells = [_held(cell) for cell in value.__closure__ or ()]
-        return [value.__code__, defaults, named, cells, vars(value), reached(value)]
-    # Written in C: a method of an object, or the compiled or caching form of a function.
+        defaults = [_without_marker(each) for each in value.__defaults__ or ()]
+        named = {name: _without_marker(each) for name, each in (value.__kwdefaults__ or {}).items()}
+        cells = [_closure_value(cell) for cell in value.__closure__ or ()]
+        return [value.__code__, defaults, named, cells, vars(value), globals_read(value)]
+    # Written in C: a bound method, or a compiled or cached function.
     return [getattr(value, "__self__", None), getattr(value, "__wrapped__", None)]
 
 
-def _held(cell: CellType) -> list[Any]:
-    """Return what a function closes over; nothing where that is not assigned yet."""
+def _closure_value(cell: CellType) -> list[Any]:
+    """Return the value of a closure variable; empty if it is not assigned yet."""
     try:
-        return [_or_marker(cell.cell_contents)]
+        return [_without_marker(cell.cell_contents)]
     except ValueError:
         return []
 
 
-def _or_marker(value: Any) -> Any:
-    """Return the value, or for a bare object, which libraries use for "not given", its class."""
+def _without_marker(value: Any) -> Any:
+    """Return the value, or the class of a bare object, a common marker for "not given"."""
     return object if type(value) is object else value
 
 
 def _as_pickled(value: Any) -> list[Any]:
-    """Return what an object without attributes is made anew from, where it can be."""
+    """Return the pickled state of an object without attributes."""
     try:
-        # What draws is another after every draw, and a bare object stands for itself.
-        told = type(value) is not object and not isinstance(value, _RANDOM)
-        made: Any = value.__reduce_ex__(2) if told else None
+        # Random generators change with every draw, and a bare object has no state.
+        has_state = type(value) is not object and not isinstance(value, _RANDOM)
+        reduced: Any = value.__reduce_ex__(2) if has_state else None
     except TypeError:
-        made = None
-    if isinstance(made, str):
-        return [made]  # The name of what there is one of.
-    if made is None:
-        name = type(value).__name__
+        reduced = None
+    if isinstance(reduced, str):
+        return [reduced]  # the name of a singleton
+    if reduced is None:
         raise ValueError(
-            f"value holds a {name}, which cannot be told from another, expected numbers, strings, "
-            "arrays, dataclasses, objects with attributes or what can be pickled, and randomness "
-            "that comes from seeds"
+            "value must contain only numbers, strings, arrays, dataclasses, objects with "
+            f"attributes or objects that can be pickled, got a {type(value).__name__}; derive "
+            "random numbers from seeds instead of storing a generator"
         )
-    made_by, given, *rest = made
-    # What follows the state are iterators, over the items of lists and mappings.
+    factory, arguments, *rest = reduced
+    # Iterators over the items of lists and mappings follow the state.
     state, items, pairs = (*rest, None, None, None)[:3]
-    return [made_by, given, state, list(items or ()), list(pairs or ())]
+    return [factory, arguments, state, list(items or ()), list(pairs or ())]
 
 
-def _edition(module: str | None) -> str:
-    """Return which version of its package a module is of, where results do not say so anyway."""
+def _version_of(module: str | None) -> str:
+    """Return the version of a module's package unless results record it anyway."""
     package = (module or "").partition(".")[0]
-    told = package in sys.stdlib_module_names or package in _TOLD_ANYWAY
-    return "" if told or is_of_a_script(module) else _installed_version(package)
+    recorded = package in sys.stdlib_module_names or package in _RECORDED_PACKAGES
+    return "" if recorded or is_user_code(module) else _installed_version(package)
 
 
 @cache
@@ -193,10 +198,10 @@ def _installed_version(package: str) -> str:
     return "".join(f" {name} {version(name)}" for name in names)
 
 
-def _computed(kind: type, name: str) -> bool:
+def _is_cached(kind: type, name: str) -> bool:
     return isinstance(getattr(kind, name, None), cached_property)
 
 
-def _plain(kind: type) -> bool:
-    """Whether objects of a class written in Python hold nothing: then its name says all."""
+def _is_stateless(kind: type) -> bool:
+    """Whether a Python class has objects without state, which its name identifies."""
     return kind.__module__ != "builtins" and hasattr(kind, "__dict__") and bool(kind.__dictoffset__)

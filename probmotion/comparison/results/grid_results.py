@@ -1,4 +1,4 @@
-"""`GridResults`: the stored results of an experiment grid."""
+"""Stored results of a grid: table, draws and failures."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from probmotion.comparison.results.cell_results import (
-    CellResult,
+from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.results.run_results import (
+    RunResult,
     read_draws,
     read_result,
     used_of_budget,
 )
-from probmotion.comparison.results.plan import Plan
 from probmotion.files import written_whole
 from probmotion.posteriors.draws import MotionDraws
 
@@ -25,111 +25,110 @@ if TYPE_CHECKING:
 __all__ = ["GridResults"]
 
 _TABLE, _FAILURES = "table.csv", "failures.json"
-_PROBLEMS, _PILOTS = "problems", "pilots"
 
 
 class GridResults:
-    """What every sampler drew on every problem, and what was measured of it.
+    """Draws and metrics of every sampler on every problem.
 
     Parameters
     ----------
     folder : Path
-        Where the cells are.
+        Folder of the grid.
     plan : Plan
-        The grid; cells that are not finished are left out.
+        The grid; unfinished runs are left out.
     temporary : bool
-        Remove the folder with this object.
+        Remove the folder together with this object.
     """
 
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
         self.folder = folder
         self.plan = plan
-        found = [read_result(plan.cell_folder(folder, *address)) for address in plan.cells()]
-        self.results: list[CellResult] = [result for result in found if result is not None]
+        found = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
+        self.results: list[RunResult] = [result for result in found if result is not None]
         if temporary:
             weakref.finalize(self, shutil.rmtree, folder, True)
 
     @classmethod
-    def load(cls, folder: str | Path, temporary: bool = False) -> Self:
-        """Return the comparison in a folder, as far as it is finished.
+    def load(cls, folder: str | Path) -> Self:
+        """Return the results in a folder; the grid may be unfinished.
 
         Raises
         ------
         ValueError
-            If the folder is none that :func:`~probmotion.comparison.compare` wrote.
+            If :func:`~probmotion.comparison.compare` did not write the folder.
         """
-        return cls(Path(folder), Plan.load(Path(folder)), temporary)
+        return cls(Path(folder), Plan.load(Path(folder)))
 
     @property
-    def failures(self) -> list[CellResult]:
-        """The cells without draws: samplers that do not fit a problem, or that failed on it."""
+    def failures(self) -> list[RunResult]:
+        """Runs without draws, because the sampler failed or does not support the problem."""
         return [result for result in self.results if result.failure is not None]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences to read with the table: budget, long runs, settings not defaults, failures."""
+        """Notes to the table: budget, long reference runs, changed settings, failures."""
         notes = [*self.plan.notes, *self.plan.references]
         if used := used_of_budget(self.results):
             notes.append(
-                f"used per cell (budget_used; set_…: settings that it bought): {', '.join(used)}"
+                "used per run (budget_used; set_…: settings chosen for the budget): "
+                + ", ".join(used)
             )
-        bought = {
+        chosen = {
             (result.sampler, name)
             for result in self.results
             for name in (result.budget or {}).get("settings") or {}
         }
         for sampler, given in self.plan.samplers.items():
-            # What a budget has bought stands in the table.
-            settings = {
-                name: value for name, value in given.items() if (sampler, name) not in bought
-            }
+            settings = [
+                f"{name}={value}" for name, value in given.items() if (sampler, name) not in chosen
+            ]
             if settings:
-                listed = ", ".join(f"{name}={value}" for name, value in settings.items())
-                notes.append(f"{sampler} ran with {listed}; its other settings are its defaults")
+                notes.append(f"{sampler} ran with {', '.join(settings)} and defaults otherwise")
         seeds: dict[str, list[int]] = {}
         for result in self.failures:
             assert result.failure is not None
             where = f"{result.sampler} on {result.problem}"
             seeds.setdefault(f"{where}: {result.failure.message}", []).append(result.seed)
         for sentence, failed in seeds.items():
-            # Where some seeds worked, the table shows a mean of fewer than it seems.
+            # The table then averages over fewer seeds.
             some = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
             notes.append(sentence + (some if len(failed) < self.plan.seeds else ""))
         return notes
 
     def table(self) -> ComparisonTable:
-        """Return the tidy data frame: columns problem, sampler, seed, metric, value.
+        """Return the tidy data frame with columns problem, sampler, seed, metric, value.
 
-        It prints as mean ± standard deviation over seeds, a block per problem. A cell without
-        draws has the one metric ``unsupported`` or ``failed``, 1.
+        A run without draws has a single metric, ``unsupported`` or ``failed``, equal to 1.
+        Printing shows mean ± standard deviation over seeds in a block per problem.
         """
         from probmotion.comparison.results.table import ComparisonTable
 
         rows: list[tuple[str, str, int, str, float]] = []
-        words: dict[tuple[str, str], str] = {}
+        words: dict[str, str] = {}
         for result in self.results:
             metrics = result.metrics
             if result.failure is not None:
-                words[result.problem, result.sampler] = result.failure.word
+                words[f"{result.problem}/{result.sampler}"] = result.failure.word
                 metrics = {"unsupported" if result.failure.unsupported else "failed": 1.0}
             address = (result.problem, result.sampler, result.seed)
             rows += [(*address, name, float(value)) for name, value in metrics.items()]
         table = ComparisonTable(rows, columns=["problem", "sampler", "seed", "metric", "value"])
         table.attrs = {
             "problems": self.plan.problems,
-            "words": {f"{problem}/{sampler}": word for (problem, sampler), word in words.items()},
+            "samplers": list(self.plan.samplers),
+            "words": words,
             "notes": self.notes,
             "draws": self.plan.draws,
         }
         return table
 
     def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
-        """Return the draws of one cell.
+        """Return the draws of one run.
 
         Raises
         ------
         ValueError
-            If there is no such cell, or it failed; the message says which there are, or why.
+            If there is no such run or it failed.
         """
         for result in self.results:
             if (result.problem, result.sampler, result.seed) == (problem, sampler, seed):
@@ -137,29 +136,28 @@ class GridResults:
                     raise ValueError(
                         f"{sampler} has no draws of {problem}: {result.failure.message}"
                     )
-                return read_draws(self.plan.cell_folder(self.folder, problem, sampler, seed))
+                return read_draws(self.plan.run_folder(self.folder, problem, sampler, seed))
         raise ValueError(
-            f"there is no cell of problem {problem!r}, sampler {sampler!r}, seed {seed!r}; "
-            f"expected one of {', '.join(self.plan.problems)}, of "
-            f"{', '.join(self.plan.samplers)}, and a seed below {self.plan.seeds}"
+            f"there is no run of problem {problem!r}, sampler {sampler!r}, seed {seed!r}; "
+            f"problem must be one of {', '.join(self.plan.problems)}, sampler one of "
+            f"{', '.join(self.plan.samplers)}, and seed below {self.plan.seeds}"
         )
 
     def write(self, folder: str | Path) -> None:
-        """Write ``table.csv`` and ``failures.json``; into another folder, the cells as well."""
+        """Write ``table.csv`` and ``failures.json``; copy the runs if ``folder`` is another one."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if folder.resolve() != self.folder.resolve():
-            for result in self.results:
-                address = (result.problem, result.sampler, result.seed)
-                shutil.copytree(
-                    self.plan.cell_folder(self.folder, *address),
-                    self.plan.cell_folder(folder, *address),
-                    dirs_exist_ok=True,
-                )
-            for problem in self.plan.problems:
-                for kept in (Path(_PROBLEMS) / problem, Path(_PILOTS) / problem):
-                    if (self.folder / kept).exists():
-                        shutil.copytree(self.folder / kept, folder / kept, dirs_exist_ok=True)
+            copied = [
+                self.plan.run_folder(Path(), result.problem, result.sampler, result.seed)
+                for result in self.results
+            ]
+            copied += [
+                Path(kind) / name for kind in ("problems", "pilots") for name in self.plan.problems
+            ]
+            for part in copied:
+                if (self.folder / part).exists():
+                    shutil.copytree(self.folder / part, folder / part, dirs_exist_ok=True)
             self.plan.save(folder)
         with written_whole(folder / _TABLE) as unfinished:
             self.table().to_csv(unfinished, index=False)

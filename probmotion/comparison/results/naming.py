@@ -1,4 +1,4 @@
-"""What a caller calls problems and samplers: names, objects, or a mapping of either."""
+"""Names of the problems and samplers of a grid, given as names, objects or mappings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probmotion.problems.catalogue import load_problem, problem_names
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
 
 _NAME = re.compile(r"\w[\w.,=+() -]*")
-# Bytes of a folder's name, and what stands around it while it is written.
+# Longest name of a folder in bytes, less the affixes of its temporary name.
 _LONGEST = 200
 
 AnyProblem = str | Problem | MotionPosterior
@@ -22,7 +22,7 @@ AnySampler = str | Sampler
 
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
-    """Return the problems by what the table calls them; a registered one by its name in full."""
+    """Return problems by their names in the table; registered ones by their full names."""
     found: dict[str, str | Problem] = {}
     for label, given in _labelled(problems, AnyProblem):
         if isinstance(given, str):
@@ -31,11 +31,11 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
             _add("problems", found, label or given.name, _registered_name(given) or given)
         elif isinstance(given, MotionPosterior):
             name = label or "posterior"
-            _add("problems", found, name, Problem(name, "a posterior of the caller's", given))
+            _add("problems", found, name, Problem(name, "a user-supplied posterior", given))
         else:
             raise ValueError(
-                f"problems has a {type(given).__name__}, expected names, Problem or "
-                "MotionPosterior objects"
+                "problems must be names, Problem or MotionPosterior objects, got "
+                f"{type(given).__name__}"
             )
     if not found:
         raise ValueError("problems must contain at least one, got none")
@@ -43,19 +43,19 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
 
 
 def _registered_name(problem: Problem) -> str | None:
-    """A registered problem travels by its name: a process then makes it once for all cells."""
+    """Return the name of a registered problem, which each worker process then makes once."""
     name = problem.name
     if name.partition("(")[0] not in problem_names():
         return None
     try:
         return name if load_problem(name) is problem else None
     except (ValueError, FileNotFoundError):
-        # What cannot be made by that name is the caller's own, such as "gait(mine)".
+        # A user's problem with a similar name, such as "gait(mine)".
         return None
 
 
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
-    """Return the samplers by what the table calls them; all registered ones for None."""
+    """Return samplers by their names in the table; all registered ones for None."""
     found: dict[str, Sampler] = {}
     for label, given in _labelled(
         list(importable_samplers()) if samplers is None else samplers, AnySampler
@@ -65,9 +65,9 @@ def named_samplers(samplers: Any) -> dict[str, Sampler]:
         elif isinstance(given, Sampler) and not isinstance(given, type):
             _add("samplers", found, label or given.name, given)
         else:
-            what = given.__name__ if isinstance(given, type) else type(given).__name__
+            kind = f"the class {given.__name__}" if isinstance(given, type) else f"{given!r}"
             raise ValueError(
-                f"samplers has {what}, expected names or objects with name, requires and sample()"
+                f"samplers must be names or objects with name, requires and sample(), got {kind}"
             )
     if not found:
         raise ValueError("samplers must contain at least one, got none")
@@ -85,17 +85,15 @@ def _labelled(given: Any, one: Any) -> list[tuple[str | None, Any]]:
 def _add(argument: str, found: dict[str, Any], name: str, value: Any) -> None:
     if name in found:
         raise ValueError(
-            f"{argument} has two called {name!r}, expected different names; give a mapping, such "
-            f"as {{'{name}-a': …, '{name}-b': …}}"
+            f"{argument} must have different names, got {name!r} twice; pass a mapping, such as "
+            f"{{'{name}-a': …, '{name}-b': …}}"
         )
     if not _NAME.fullmatch(name):
         raise ValueError(
-            f"{argument} has the name {name!r}, expected letters, digits and . , = + ( ) - _ that "
-            "make a folder's name"
+            f"names of {argument} must consist of letters, digits and . , = + ( ) - _, got {name!r}"
         )
-    if (long := len(name.encode())) > _LONGEST:
+    if (length := len(name.encode())) > _LONGEST:
         raise ValueError(
-            f"{argument} has a name of {long} bytes, {name[:20]}…, expected at most {_LONGEST}, "
-            "which a folder's name may have"
+            f"names of {argument} must have at most {_LONGEST} bytes, got {length}: {name[:20]}…"
         )
     found[name] = value

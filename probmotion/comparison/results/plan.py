@@ -1,4 +1,4 @@
-"""`Plan`: the grid that was asked for, as its folder holds it."""
+"""Plan of a grid: its problems, samplers and sizes, stored in its folder."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from probmotion.problems.catalogue import load_problem
 __all__ = ["Plan"]
 
 _PLAN = "comparison.json"
-# A folder of another format is not touched.
-_FORMAT = 1
+# Folders of format 1 stored runs in cells/<problem>/<sampler>/<seed>/cell.json.
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The grid that was asked for.
+    """Plan of a grid.
 
     Parameters
     ----------
     problems : dict of str
         Descriptions by name.
     samplers : dict of dict
-        By name: settings that differ from the class's defaults.
+        By name, the settings that differ from the defaults.
     draws, chains, seeds : int
         As given to :func:`~probmotion.comparison.compare`.
     notes : tuple of str
-        Sentences to read with the table: the budget, if there was one.
+        Notes on the budget.
     references : tuple of str
-        Sentences on problems whose exact draws are those of long runs.
+        Notes on problems whose reference draws come from long runs.
     """
 
     problems: dict[str, str]
@@ -57,9 +57,9 @@ class Plan:
         chains: int,
         seeds: int,
         budget: Budget | None = None,
-        per: str = "cell",
+        per: str = "run",
     ) -> Plan:
-        """Return the plan of a grid of these objects; ``per`` says what a budget is for."""
+        """Return the plan of a grid; ``per`` names the unit that the budget applies to."""
         loaded = {
             name: load_problem(source) if isinstance(source, str) else source
             for name, source in problems.items()
@@ -74,77 +74,76 @@ class Plan:
             references=tuple(_reference_notes(loaded)),
         )
 
-    def cells(self) -> Iterator[tuple[str, str, int]]:
-        """Yield (problem, sampler, seed): all samplers of one problem and seed in a row."""
+    def runs(self) -> Iterator[tuple[str, str, int]]:
+        """Yield (problem, sampler, seed), all samplers of one problem and seed in a row."""
         for problem in self.problems:
             for seed in range(self.seeds):
                 for sampler in self.samplers:
                     yield problem, sampler, seed
 
     @staticmethod
-    def cell_folder(folder: Path, problem: str, sampler: str, seed: int) -> Path:
-        """Return where a cell is kept below ``folder``."""
-        return folder / "cells" / problem / sampler / str(seed)
+    def run_folder(folder: Path, problem: str, sampler: str, seed: int) -> Path:
+        """Return the folder of a run."""
+        return folder / "runs" / problem / sampler / str(seed)
 
     def save(self, folder: Path) -> None:
         """Write the plan into ``folder``."""
         with written_whole(folder / _PLAN) as unfinished:
-            held = {"format": _FORMAT, **asdict(self)}
-            unfinished.write_text(json.dumps(held, indent=1), encoding="utf-8")
+            stored = {"format": _FORMAT, **asdict(self)}
+            unfinished.write_text(json.dumps(stored, indent=1), encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path) -> Plan:
         """Read the plan in ``folder``."""
         path = folder / _PLAN
         try:
-            held = json.loads(path.read_text(encoding="utf-8"))
-            _check_format(folder, held)
-            sentences = {name: tuple(held.get(name, ())) for name in ("notes", "references")}
-            return cls(**held | sentences)
+            stored = json.loads(path.read_text(encoding="utf-8"))
+            _check_format(folder, stored)
+            return cls(**stored | {name: tuple(stored[name]) for name in ("notes", "references")})
         except OSError as error:
             raise ValueError(
-                f"folder is {str(folder)!r}, which holds no {_PLAN}, expected one that compare() "
-                "wrote"
+                f"folder must be one that compare() wrote, got {str(folder)!r} without {_PLAN}"
             ) from error
         except _OtherVersionError:
             raise
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
     @staticmethod
     def check_folder(folder: Path) -> None:
-        """Raise ``ValueError`` if another version of this package keeps its cells in ``folder``."""
+        """Raise ``ValueError`` if another version of this package wrote runs into ``folder``."""
         try:
-            held = json.loads((folder / _PLAN).read_text(encoding="utf-8"))
+            stored = json.loads((folder / _PLAN).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return
-        _check_format(folder, held)
+        _check_format(folder, stored)
 
 
 class _OtherVersionError(ValueError):
-    """The folder is of another version."""
+    """Another version of this package wrote the folder."""
 
 
-def _check_format(folder: Path, held: Any) -> None:
-    """Take the format out of what a plan's file holds; the first ones had none written."""
-    found = held.pop("format", _FORMAT) if isinstance(held, dict) else _FORMAT
+def _check_format(folder: Path, stored: Any) -> None:
+    """Remove the format from a stored plan and check it."""
+    found = stored.pop("format", 1) if isinstance(stored, dict) else _FORMAT
     if found != _FORMAT:
         raise _OtherVersionError(
-            f"out is {folder}, which another version of probmotion wrote (format {found}, expected "
-            f"{_FORMAT}); expected a folder of its own for this one"
+            f"out is {folder}, which another version of probmotion wrote (format {found}, not "
+            f"{_FORMAT}); use another folder"
         )
 
 
 def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:
-    """Yield what stands for exact draws where there are none."""
+    """Yield a note for each problem whose reference draws come from long runs."""
     for name, problem in problems.items():
-        if problem.kept is not None and problem.most_reference is not None:
-            told = problem.kept.certificate
-            anywhere = "" if problem.aligned_to is None else ", wherever motions stand"
-            mixed = "" if told.get("rhat") is None else f", R-hat {told['rhat']:.3f}"
+        if problem.stored is not None and problem.max_references is not None:
+            certificate = problem.stored.certificate
+            aligned = "" if problem.aligned_to is None else ", up to a rigid motion"
+            rhat = certificate.get("rhat")
+            mixed = "" if rhat is None else f" (R-hat {rhat:.3f})"
             yield (
-                f"what stands for exact draws of {name} are {problem.kept.n} draws of long runs of "
-                f"{told['sampler']}{mixed}{anywhere}"
+                f"reference draws of {name} are {problem.stored.n} draws from long runs of "
+                f"{certificate['sampler']}{mixed}{aligned}"
             )
 
 
@@ -152,12 +151,12 @@ def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler], per: str) -> 
     notes = [f"every sampler had {budget} per {per}"]
     if free := [name for name, sampler in samplers.items() if not effort_of(sampler)]:
         verb = "has" if len(free) == 1 else "have"
-        notes.append(f"{', '.join(free)} {verb} no setting of effort and ran as given")
+        notes.append(f"{', '.join(free)} {verb} no effort setting and ran with the given settings")
     return tuple(notes)
 
 
 def _changed_settings(sampler: Any) -> dict[str, str]:
-    """The settings of a dataclass that differ from its class's defaults, as text."""
+    """Return the settings of a dataclass that differ from the defaults, as text."""
     if not is_dataclass(sampler):
         return {}
     kind: Any = type(sampler)
@@ -168,12 +167,12 @@ def _changed_settings(sampler: Any) -> dict[str, str]:
     return {
         field.name: repr(getattr(sampler, field.name))
         for field in fields(sampler)
-        if usual is None or not _same(getattr(sampler, field.name), getattr(usual, field.name))
+        if usual is None or not _equal(getattr(sampler, field.name), getattr(usual, field.name))
     }
 
 
-def _same(value: Any, usual: Any) -> bool:
-    """Whether two settings are equal; those with arrays, which say it by element, by contents."""
+def _equal(value: Any, usual: Any) -> bool:
+    """Whether two settings are equal; arrays, which compare elementwise, by their fingerprint."""
     try:
         return bool(value == usual)
     except (ValueError, RuntimeError):

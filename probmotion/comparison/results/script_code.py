@@ -1,4 +1,4 @@
-"""What scripts and notebooks define: code that may change between two runs of one version."""
+"""Code of scripts and notebooks, which may change between runs of the same package version."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from array_api_compat import is_array_api_obj
 
-__all__ = ["SIMPLE", "class_content", "is_of_a_script", "reached"]
+__all__ = ["SIMPLE", "class_content", "globals_read", "is_user_code"]
 
 SIMPLE = bool | int | float | complex | str | bytes | EllipsisType | np.generic
-"""Kinds of values that their ``repr`` tells."""
+"""Types whose ``repr`` identifies the value."""
 
 _INSTALLED = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
-"""Folders of packages, whose code changes with their versions alone."""
+"""Folders of installed packages, whose code is identified by their versions."""
 
 
-def is_of_a_script(module: str | None) -> bool:
-    """Return whether what stands in a module is in no installed package or library."""
+def is_user_code(module: str | None) -> bool:
+    """Return whether a module belongs to a script or notebook rather than an installed package."""
     package = (module or "").partition(".")[0]
     if package in (*sys.builtin_module_names, __name__.partition(".")[0]):
         return False
@@ -32,14 +32,13 @@ def is_of_a_script(module: str | None) -> bool:
 
 
 def class_content(kind: type) -> dict[str, Any]:
-    """Return methods and plain numbers and strings of a class and of those that it inherits from.
+    """Return methods and simple attributes of a user's class and its user-defined bases.
 
-    Of classes in scripts alone. Fields of a dataclass, and methods that it writes, are left out:
-    objects tell them.
+    Fields and generated methods of dataclasses are left out; instances hold the fields.
     """
     found: dict[str, Any] = {}
     for each in reversed(kind.__mro__):
-        if each is object or not is_of_a_script(each.__module__):
+        if each is object or not is_user_code(each.__module__):
             continue
         fields = getattr(each, "__dataclass_fields__", {})
         for name, value in vars(each).items():
@@ -52,37 +51,33 @@ def class_content(kind: type) -> dict[str, Any]:
     return found
 
 
-def reached(function: FunctionType) -> dict[str, Any]:
-    """Return what a script's function reads by its name, by that name, and what that reads in turn.
+def globals_read(function: FunctionType) -> dict[str, Any]:
+    """Return the global variables that a user's function reads, directly or through others.
 
-    Functions and classes of scripts, numbers, strings, arrays, and tuples of them. Not lists and
-    mappings, which functions fill as they run, nor other objects.
-
-    Returns
-    -------
-    dict
-        Of functions the code, defaults and named defaults; of classes the same of each method.
+    Contains user functions and classes (their code and simple defaults), numbers, strings, arrays
+    and tuples of them by qualified name. Lists and mappings, which functions may fill, and other
+    objects are left out.
     """
     found: dict[str, Any] = {}
-    waiting = [function] if is_of_a_script(function.__module__) else []
+    waiting = [function] if is_user_code(function.__module__) else []
     while waiting:
         each = waiting.pop()
         for name in sorted(set(_global_names(each.__code__))):
             value = each.__globals__.get(name)
-            # What is compiled, or keeps results, has the function that it was made of.
+            # Compiled or cached functions wrap the original one.
             value = getattr(value, "__wrapped__", value)
             key = f"{each.__module__}.{name}"
             if key in found or value is function:
                 continue
-            if isinstance(value, FunctionType) and is_of_a_script(value.__module__):
-                found[key] = _written(value)
+            if isinstance(value, FunctionType) and is_user_code(value.__module__):
+                found[key] = _code_and_defaults(value)
                 waiting.append(value)
-            elif isinstance(value, type) and is_of_a_script(value.__module__):
+            elif isinstance(value, type) and is_user_code(value.__module__):
                 content = class_content(value)
                 methods = [part for part in content.values() if isinstance(part, FunctionType)]
                 found[key] = {
-                    part: _written(held) if isinstance(held, FunctionType) else held
-                    for part, held in content.items()
+                    part: _code_and_defaults(value) if isinstance(value, FunctionType) else value
+                    for part, value in content.items()
                 }
                 waiting += methods
             elif _is_plain(value):
@@ -90,8 +85,7 @@ def reached(function: FunctionType) -> dict[str, Any]:
     return found
 
 
-def _written(function: FunctionType) -> list[Any]:
-    """Return what stands in a function's text."""
+def _code_and_defaults(function: FunctionType) -> list[Any]:
     defaults = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
     return [function.__code__, [value for value in defaults if _is_plain(value)]]
 
@@ -103,7 +97,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _global_names(code: CodeType) -> Iterator[str]:
-    """Yield the names of what is neither local nor closed over, of inner functions as well."""
+    """Yield the names of global variables, including those of inner functions."""
     for step in dis.get_instructions(code):
         if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
             yield step.argval

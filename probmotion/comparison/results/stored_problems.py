@@ -1,8 +1,4 @@
-"""What is kept of a comparison's problems, so that its page can be made without making them anew.
-
-A user's own problem is nowhere but in the memory of the run; its truth, evidence and a few
-reference draws are what a picture needs of it.
-"""
+"""Truth, observations and reference draws of a problem, stored for the report."""
 
 from __future__ import annotations
 
@@ -28,28 +24,28 @@ _CAMERA = ("rotation", "translation", "focal", "centre", "orthographic")
 
 @dataclass(frozen=True, eq=False)
 class StoredProblem:
-    """What there is to be seen of a problem.
+    """The parts of a problem that figures and the report show.
 
     Parameters
     ----------
     skeleton : Skeleton
-        Of its motions.
+        Skeleton of the motions.
     fps : float
         Frames per second.
     has_observations : bool
-        Whether its posterior has any, of whatever kind.
+        Whether the posterior has observations of any kind.
     truth : ndarray, (L, J, 3), optional
-        Metres.
+        True motion, metres.
     reference : ndarray, (n, L, J, 3), optional
         Reference draws, metres.
     held_out : ndarray, (n, L, J, 3), optional
-        Real motions that were held out, metres.
+        Held-out real motions, metres.
     camera : Cameras, optional
-        The first camera of its evidence, a batch of one.
+        First camera, a batch of one.
     keypoints : ndarray, (L, J, 2), optional
-        What that camera shows, image units; NaN where hidden.
+        Keypoints of that camera in image units; NaN where occluded.
     joints : ndarray, (L, J, 3), optional
-        Noisy 3D joints, metres; NaN where hidden.
+        Noisy 3D joints, metres; NaN where occluded.
     """
 
     skeleton: Skeleton
@@ -64,7 +60,7 @@ class StoredProblem:
 
     @classmethod
     def of(cls, problem: Problem, draws: int = 8, seed: int = 0) -> StoredProblem:
-        """Return what is to be seen of a problem, with so many reference draws where it has any."""
+        """Return the stored form of a problem with at most ``draws`` reference draws."""
         check_count("draws", draws)
         posterior, likelihood = problem.posterior, problem.posterior.likelihood
         camera = keypoints = joints = held_out = None
@@ -90,27 +86,27 @@ class StoredProblem:
 
 
 def store_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: int = 0) -> None:
-    """Write what is to be seen of a problem into ``folder``, which is made where it is missing.
+    """Write the stored form of a problem into ``folder``, creating it if necessary.
 
-    ``seed`` is that of the reference draws.
+    ``seed`` selects the reference draws.
 
     Raises
     ------
     OSError
         If the folder cannot be written to.
     """
-    kept = StoredProblem.of(problem, draws, seed)
+    stored = StoredProblem.of(problem, draws, seed)
     arrays: dict[str, np.ndarray] = {
-        "joint_names": np.array(kept.skeleton.joint_names),
-        "parents": np.array(kept.skeleton.parents),
-        "fps": np.array(kept.fps),
-        "has_observations": np.array(kept.has_observations),
+        "joint_names": np.array(stored.skeleton.joint_names),
+        "parents": np.array(stored.skeleton.parents),
+        "fps": np.array(stored.fps),
+        "has_observations": np.array(stored.has_observations),
     }
     for name in _ARRAYS:
-        if (held := getattr(kept, name)) is not None:
-            arrays[name] = np.asarray(held, dtype=np.float32)
-    if kept.camera is not None:
-        arrays |= {f"camera_{name}": np.asarray(getattr(kept.camera, name)) for name in _CAMERA}
+        if (array := getattr(stored, name)) is not None:
+            arrays[name] = np.asarray(array, dtype=np.float32)
+    if stored.camera is not None:
+        arrays |= {f"camera_{name}": np.asarray(getattr(stored.camera, name)) for name in _CAMERA}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(folder / _FILE) as unfinished, open(unfinished, "wb") as file:
@@ -118,7 +114,7 @@ def store_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: in
 
 
 def read_stored(folder: str | Path) -> StoredProblem | None:
-    """Return what :func:`store_problem` wrote into ``folder``, or None where it wrote nothing.
+    """Return the problem that :func:`store_problem` wrote into ``folder``, or None.
 
     Raises
     ------
@@ -129,8 +125,8 @@ def read_stored(folder: str | Path) -> StoredProblem | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as held:
-            arrays = {name: held[name] for name in held.files}
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
         camera = None
         if "camera_rotation" in arrays:
             numbers = {name: arrays[f"camera_{name}"] for name in _CAMERA}
@@ -144,6 +140,4 @@ def read_stored(folder: str | Path) -> StoredProblem | None:
             **{name: arrays[name].astype(np.float64) for name in _ARRAYS if name in arrays},
         )
     except (OSError, BadZipFile, KeyError, ValueError, EOFError) as error:
-        raise ValueError(
-            f"{path} is damaged ({error}), expected a file that store_problem() wrote"
-        ) from error
+        raise ValueError(f"{path} is damaged: {error}") from error

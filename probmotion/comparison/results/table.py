@@ -1,140 +1,128 @@
-"""The table of a comparison: a tidy data frame that prints as mean ± standard deviation."""
+"""Table of a grid: a tidy data frame that prints as mean ± standard deviation."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import pandas as pd
 
-from probmotion.comparison.results.qualities import best_of
+from probmotion.comparison.results.headline_metrics import best_of
 
-__all__ = ["ComparisonTable"]
+__all__ = ["BLOCKS", "ComparisonTable", "mean_and_sd"]
 
-_BLOCKS: tuple[tuple[str, dict[str, str]], ...] = (
-    (
-        "against references",
-        {
-            "seconds": "seconds",
-            "swd_ratio": "swd_ratio",
-            "variance_ratio": "variance_ratio",
-            "mean_error_sd": "mean",
-            "off_manifold_ratio": "off_manifold_ratio",
-            "log_density_gap": "log p",
-            "mode_proportions_tv": "shares",
-            "precision": "P",
-            "recall": "R",
+BLOCKS: Mapping[str, Mapping[str, str]] = {
+    title: {"seconds": "seconds", **columns}
+    for title, columns in {
+        "against references": {
+            "swd_ratio": "swd ratio",
+            "variance_ratio": "variance ratio",
+            "mean_error_sd": "mean error (sd)",
+            "off_manifold_ratio": "off-manifold ratio",
+            "log_density_gap": "log-density gap",
+            "mode_proportions_tv": "mode proportions TV",
+            "precision": "precision",
+            "recall": "recall",
         },
-    ),
-    (
-        "tests of being alike",
-        {"seconds": "seconds", "c2st": "C2ST", "mmd": "MMD²", "ksd": "KSD²"},
-    ),
-    (
-        "against the truth, mm",
-        {
-            "seconds": "seconds",
+        "two-sample tests": {"c2st": "C2ST", "mmd": "MMD²", "ksd": "KSD²"},
+        "against the truth, mm": {
             "mpjpe_mm": "MPJPE",
-            "mpjpe_mean_mm": "of mean",
-            "mpjpe_best_mm": "of best",
-            "mpjpe_visible_mm": "visible",
-            "mpjpe_occluded_mm": "hidden",
+            "mpjpe_mean_mm": "MPJPE of mean",
+            "mpjpe_best_mm": "best MPJPE",
+            "mpjpe_visible_mm": "MPJPE visible",
+            "mpjpe_occluded_mm": "MPJPE occluded",
             "g_mpjpe_mm": "G-MPJPE",
             "pa_mpjpe_mm": "PA-MPJPE",
         },
-    ),
-    (
-        "in the world, mm",
-        {
-            "seconds": "seconds",
-            "g_mpjpe_visible_mm": "visible",
-            "g_mpjpe_occluded_mm": "hidden",
-            "g_mpjpe_mean_mm": "of mean",
-            "g_mpjpe_mean_visible_mm": "its visible",
-            "g_mpjpe_mean_occluded_mm": "its hidden",
-            "acceleration_ratio": "acceleration",
+        "world coordinates, mm": {
+            "g_mpjpe_visible_mm": "G-MPJPE visible",
+            "g_mpjpe_occluded_mm": "G-MPJPE occluded",
+            "g_mpjpe_mean_mm": "G-MPJPE of mean",
+            "g_mpjpe_mean_visible_mm": "of mean, visible",
+            "g_mpjpe_mean_occluded_mm": "of mean, occluded",
+            "acceleration_ratio": "acceleration ratio",
         },
-    ),
-    (
-        "held-out poses",
-        {
-            "seconds": "seconds",
+        "held-out poses": {
             "coverage_interaction": "D_IC",
             "coverage_cartesian": "D_C",
             "coverage_shape-context": "D_S",
             "at_cap": "at cap",
             "near_floor": "near floor",
         },
-    ),
-    (
-        "filmed, against real",
-        {
-            "seconds": "seconds",
+        "2D views against real": {
             "fid": "FID",
-            "diversity_ratio": "diversity",
-            "view_precision": "P",
-            "view_recall": "R",
+            "diversity_ratio": "diversity ratio",
+            "view_precision": "precision",
+            "view_recall": "recall",
             "fid_side": "FID side",
-            "view_recall_side": "R side",
-            "fid_learnt": "FID learnt",
-            "view_recall_learnt": "R learnt",
+            "view_recall_side": "recall side",
+            "fid_learnt": "FID training",
+            "view_recall_learnt": "recall training",
             "mcd_cm2": "MCD",
         },
-    ),
-    (
-        "the run",
-        {
-            "seconds": "seconds",
-            "denoiser_evaluations": "denoiser",
-            "density_evaluations": "density",
-            "gradient_evaluations": "gradient",
-            "acceptance": "accepted",
+        "cost and convergence": {
+            "denoiser_evaluations": "denoiser evaluations",
+            "density_evaluations": "density evaluations",
+            "gradient_evaluations": "gradient evaluations",
+            "acceptance": "acceptance",
             "divergent": "divergent",
             "rhat": "R-hat",
-            "ess_bulk": "ESS",
-            "ess_tail": "ESS tail",
+            "ess_bulk": "bulk ESS",
+            "ess_tail": "tail ESS",
         },
-    ),
-)
-_LEGEND = """\
-swd: sliced Wasserstein distance / that of two exact sets (1 is right); tr: trace of covariance /
-exact (1; below: over-confident); mean: error of the mean / √tr (0); off: variance off the prior's
-manifold / exact (1); log p: mean log density less exact, nats (0); shares: total variation of the
-styles' shares from exact (0); P, R: precision and recall; denoiser, density, gradient: evaluations.
-The frame and table.csv hold more measures."""
+    }.items()
+}
+"""Column headings by metric, for each block of the table."""
+
+_REFERENCES_LEGEND = """\
+swd ratio: sliced Wasserstein distance to the references, divided by that between two reference
+sets (ideal: 1); variance ratio: trace of the covariance, divided by the references' (ideal: 1,
+overconfident below); mean error (sd): error of the mean in posterior standard deviations √tr
+(ideal: 0); off-manifold ratio: variance off the prior's manifold, divided by the references'
+(ideal: 1); log-density gap: mean log density minus the references', nats (ideal: 0); mode
+proportions TV: total variation distance of the mode proportions from the references' (ideal: 0).
+The data frame and table.csv hold further metrics."""
 _SEEDS_LEGEND = """\
-±: standard deviation over seeds; *: best of its column, of those with draws at every seed; °: not
-to be told from it (intervals of 95 % of paired differences over seeds, Student's at Holm's levels,
-hold 0)."""
+±: standard deviation over seeds; *: best of the column among samplers with draws at every seed;
+°: statistically tied with the best (95 % Student intervals of the paired differences over seeds,
+at Holm's levels, contain 0)."""
 _TESTS_LEGEND = """\
-C2ST: how often a classifier tells a draw from an exact one (0.5: it guesses); MMD²: squared maximum
-mean discrepancy from exact draws (0); KSD²: squared kernel Stein discrepancy from density (0)."""
+C2ST: accuracy of a classifier that separates draws from references (ideal: 0.5); MMD²: squared
+maximum mean discrepancy from the references (ideal: 0); KSD²: squared kernel Stein discrepancy from
+the density (ideal: 0)."""
 _WORLD_LEGEND = """\
-in the world: G-MPJPE, without alignment, of the draws and of their mean; acceleration: mean size of
-a joint's acceleration over the truth's (0.5 to 2 is plausible)."""
+world coordinates: G-MPJPE (without alignment) of the draws and of their mean; acceleration ratio:
+mean joint acceleration divided by the truth's (0.5 to 2 is plausible)."""
 _TRUTH_LEGEND = """\
-against the truth: where references show how far right draws are, single draws are not marked as the
-nearest, for those that vary too little are nearer; their mean is."""
+against the truth: where there are references, distances of single draws to the truth are not
+highlighted, because overconfident draws are closer; those of their mean are."""
 _COVERAGE_LEGEND = """\
 D_IC, D_C, D_S: mean distance of a held-out pose to its nearest draw in interaction coordinates (m),
-joints (root mean square, m) and shape contexts; at cap, near floor: shares of draws where the
-density is cut."""
-
+joint positions (root mean square, m) and shape contexts; at cap, near floor: proportions of draws
+at which the density is clipped."""
 _GENERATION_LEGEND = """\
-FID: Fréchet distance of the features of random views and of held-out real ones; it falls with the
-number of draws; diversity: mean distance of two motions / real motions' (1 is right); P, R:
-precision and recall; side: from π/4 to 3π/4 beside the first view; learnt: against the clips that
-were learnt from, which few held-out clips need not be like; MCD: Motion Chamfer Distance to
-held-out views, of windows of 10 frames (cm²), where a problem has them; it falls with the number of
-draws as well."""
+FID: Fréchet distance between features of random views and held-out real views; it decreases with
+the number of draws; diversity ratio: mean distance of two motions, divided by that of real motions
+(ideal: 1); side: from π/4 to 3π/4 beside the first view; training: against the training clips,
+which a few held-out clips need not resemble; MCD: Motion Chamfer Distance to held-out views in
+windows of 10 frames (cm²); it also decreases with the number of draws."""
+_LEGENDS = (
+    ({"swd_ratio"}, _REFERENCES_LEGEND),
+    ({"c2st", "ksd"}, _TESTS_LEGEND),
+    ({"g_mpjpe_mean_mm"}, _WORLD_LEGEND),
+    ({"coverage_cartesian"}, _COVERAGE_LEGEND),
+    ({"fid"}, _GENERATION_LEGEND),
+)
+_NARROWEST = 10
+"""Width in letters to which column headings are wrapped at least."""
 
 
 class ComparisonTable(pd.DataFrame):
-    """Columns problem, sampler, seed, metric, value; ``print`` shows mean ± sd over seeds.
+    """Data frame with columns problem, sampler, seed, metric, value; prints mean ± sd over seeds.
 
-    ``attrs`` hold the problems' descriptions, the words for cells without draws, and notes.
-    Whatever is cut from it is a plain data frame.
+    ``attrs`` hold the descriptions of the problems, the words for runs without draws, and notes.
+    Slices are plain data frames.
     """
 
     @property
@@ -151,7 +139,7 @@ class ComparisonTable(pd.DataFrame):
         return None
 
     def summary(self) -> str:
-        """Return the table as text, a block per problem."""
+        """Return the table as text with a block per problem."""
         problems = list(dict.fromkeys(self["problem"]))
         parts = [self._problem(problem) for problem in problems]
         if self.groupby("problem")["seed"].nunique().gt(1).any():
@@ -159,76 +147,66 @@ class ComparisonTable(pd.DataFrame):
         parts += self.legends()
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
-        return "\n\n".join(parts) if parts else "no cell is finished"
+        return "\n\n".join(parts) if parts else "no run is finished"
 
     def legends(self) -> list[str]:
-        """Return how to read the measures that it has, a paragraph per kind."""
-        return [
-            legend
-            for metric, legend in (
-                ("swd_ratio", _LEGEND),
-                ("c2st|ksd", _TESTS_LEGEND),
-                ("g_mpjpe_mean_mm", _WORLD_LEGEND),
-                ("coverage_cartesian", _COVERAGE_LEGEND),
-                ("fid", _GENERATION_LEGEND),
-            )
-            if self["metric"].isin(metric.split("|")).any()
-        ] + [_TRUTH_LEGEND] * self._leaves_nearness_unmarked()
-
-    def _leaves_nearness_unmarked(self) -> bool:
-        """Whether some problem has references beside a truth, and seeds enough for marks."""
-        return self["seed"].nunique() > 1 and any(
+        """Return explanations of the metrics in the table."""
+        measured = set(self["metric"])
+        legends = [legend for metrics, legend in _LEGENDS if metrics & measured]
+        unmarked = self["seed"].nunique() > 1 and any(
             {"swd_ratio", "mpjpe_mm"} <= set(rows) for _, rows in self.groupby("problem")["metric"]
         )
+        return [*legends, _TRUTH_LEGEND] if unmarked else legends
 
     def _problem(self, problem: str) -> str:
-        """The blocks of one problem, each a measure per column and a sampler per row."""
+        """Return the blocks of one problem, with a column per metric and a row per sampler."""
         rows = pd.DataFrame(self[self["problem"] == problem])
         samplers = list(dict.fromkeys(rows["sampler"]))
         seeds = sorted(set(rows["seed"]))
         words = self.attrs.get("words", {})
         values: dict[tuple[str, str], pd.Series] = {
-            (str(sampler), str(metric)): cells.set_index("seed")["value"]
-            for (sampler, metric), cells in rows.groupby(["sampler", "metric"])
+            (str(sampler), str(metric)): group.set_index("seed")["value"]
+            for (sampler, metric), group in rows.groupby(["sampler", "metric"])
         }
         lines = [f"{problem}: {self.attrs.get('problems', {}).get(problem, '')}"]
-        for title, columns in _BLOCKS:
+        for title, columns in BLOCKS.items():
             shown = {key: head for key, head in columns.items() if key in set(rows["metric"])}
             if not set(shown) - {"seconds"}:
                 continue
             body = []
-            marks = {metric: self._marks(metric, values, samplers, seeds) for metric in shown}
+            symbols = {metric: self._symbols(metric, values, samplers, seeds) for metric in shown}
             for sampler in samplers:
-                cells = [
-                    _mean_and_sd(values.get((sampler, metric))) + marks[metric].get(sampler, "")
+                entries = [
+                    mean_and_sd(values.get((sampler, metric))) + symbols[metric].get(sampler, "")
                     for metric in shown
                 ]
-                if not any(cells) and (sampler, "seconds") not in values:
-                    cells[0] = words.get(f"{problem}/{sampler}", "")
-                body.append([sampler, *cells])
+                if not any(entries) and (sampler, "seconds") not in values:
+                    entries[0] = words.get(f"{problem}/{sampler}", "")
+                body.append([sampler, *entries])
             lines.append(_aligned([title, *shown.values()], body))
         if len(lines) == 1:
             failed = [[sampler, words.get(f"{problem}/{sampler}", "")] for sampler in samplers]
             lines.append(_aligned(["no draws", ""], failed))
         return "\n".join(lines)
 
-    def _marks(
+    def _symbols(
         self,
         metric: str,
         values: Mapping[tuple[str, str], pd.Series],
         samplers: Sequence[str],
         seeds: Sequence[int],
     ) -> dict[str, str]:
-        """Return what stands behind each sampler's number; nothing where none is the best."""
-        found = {name: values[name, metric] for name in samplers if (name, metric) in values}
+        """Return the symbol after each sampler's number; empty if the metric has no best value."""
+        own = {name: values[name, metric] for name in samplers if (name, metric) in values}
         measured = {other for _, other in values}
-        best, tied = best_of(metric, found, seeds, measured, self.attrs.get("draws"))
+        best, tied = best_of(metric, own, seeds, measured, self.attrs.get("draws"))
         if best is None:
             return {}
-        return {name: "*" if name == best else "°" if name in tied else " " for name in found}
+        return {name: "*" if name == best else "°" if name in tied else " " for name in own}
 
 
-def _mean_and_sd(values: Any) -> str:
+def mean_and_sd(values: pd.Series | None) -> str:
+    """Return mean ± standard deviation of values with significant digits; empty for None."""
     if values is None:
         return ""
     mean, sd = float(values.mean()), float(values.std())
@@ -251,19 +229,25 @@ def _unit(value: float) -> tuple[float, str]:
 
 
 def _decimals(value: float, digits: int) -> int:
-    """Places after the point that show so many digits of a value, at most three."""
+    """Return the decimal places that show the given number of digits, at most three."""
     if value == 0 or (float(value).is_integer() and abs(value) >= 100):
         return 0
     return min(3, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
-def _aligned(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    rows = [heads, *body]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(heads))]
+def _aligned(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Return aligned columns; headings but the first are wrapped to the width of their column."""
+    headings = [[header[0]]]
+    for heading, *column in zip(header[1:], *(row[1:] for row in body), strict=True):
+        width = max(_NARROWEST, *map(len, column))
+        headings.append(textwrap.wrap(heading, width, break_on_hyphens=False) or [""])
+    height = max(map(len, headings))
+    rows = [*zip(*([""] * (height - len(h)) + h for h in headings), strict=True), *body]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+            entry.ljust(width) if column == 0 else entry.rjust(width)
+            for column, (entry, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in rows
     )

@@ -1,4 +1,4 @@
-"""One run at a time per problem and folder."""
+"""Locks that allow one grid at a time per problem and folder."""
 
 from __future__ import annotations
 
@@ -8,41 +8,38 @@ from pathlib import Path
 
 __all__ = ["locked"]
 
-_LOCK = ".lock"
-
 
 @contextmanager
 def locked(folder: Path, problems: Iterable[str]) -> Iterator[None]:
-    """Keep other runs from these problems' cells below ``folder`` during the block.
+    """Lock the problems of a folder during the block.
 
-    Runs of different problems may share a folder, as the tasks of an array job do. The locks are
-    the operating system's, on files: they go with the process that holds them, however it ends.
+    Grids of different problems may share a folder, as the jobs of an array do. The operating
+    system releases the locks when the process ends, even if it is killed.
 
     Raises
     ------
     ValueError
-        If another run is at one of the problems.
+        If another process has locked one of the problems.
     OSError
-        If the folder's file system has no locks.
+        If the file system does not support locks.
     """
     from filelock import FileLock, Timeout
 
-    with ExitStack() as held:
+    with ExitStack() as stack:
         for problem in problems:
-            place = folder / "cells" / problem
+            place = folder / "runs" / problem
             place.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(place / _LOCK, blocking=False, fallback_to_soft=False)
+            lock = FileLock(place / ".lock", blocking=False, fallback_to_soft=False)
             try:
-                held.enter_context(lock)
+                stack.enter_context(lock)
             except Timeout as error:
                 raise ValueError(
-                    f"out is {folder}, where another run is at work on {problem}; expected it to "
-                    "end first, or another folder"
+                    f"out is {folder}, where another process is running {problem}; wait for it to "
+                    "end or use another folder"
                 ) from error
             except OSError as error:
-                reason = error.strerror or str(error)
                 raise OSError(
-                    f"out is {str(folder)!r}, whose files cannot be locked, {reason}; expected a "
-                    "folder on another file system"
+                    f"out is {str(folder)!r}, where files cannot be locked: "
+                    f"{error.strerror or error}; use a folder on another file system"
                 ) from error
         yield

@@ -1,7 +1,7 @@
-"""Processes of our own that run tasks: what one of them dies of fails no other's task.
+"""Worker processes, whose crashes fail only their own task.
 
-They are spawned, and do not import the script or notebook that asks for them: what is defined
-there travels by value, so a script needs no ``if __name__ == "__main__"``.
+They are spawned without importing the caller's script or notebook. Its classes and functions are
+sent by value, so that a script needs no ``if __name__ == "__main__"``.
 """
 
 from __future__ import annotations
@@ -20,69 +20,46 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import cloudpickle
 
-from probmotion.comparison.results.failures import TimeIsUp, WorkerDied
+from probmotion.comparison.results.failures import TimeLimitExceeded, WorkerDied
+from probmotion.comparison.run.grid_tasks import GridTask
 from probmotion.posteriors.problem import Problem
 from probmotion.threads import one_thread
 
-__all__ = ["Done", "Task", "run_in_processes"]
-
-
-class Task(Protocol):
-    """What a worker is given, pickled; it keeps its own result."""
-
-    @property
-    def limit(self) -> float | None:
-        """Seconds that :meth:`run` may take."""
-
-    def prepare(self) -> None:
-        """Load what the task needs, which the limit does not count."""
-
-    def run(self, progress: bool) -> None:
-        """Run and keep the result or the failure."""
-
-    def fail(self, error: BaseException) -> None:
-        """Keep an error as the result."""
-
-    def answered(self) -> bool:
-        """Whether the result, or the failure, is there."""
+__all__ = ["Done", "run_in_processes"]
 
 
 Done = Callable[[Any, BaseException | None], None]
-"""Told of every task that ended, with the error that it could not keep itself."""
+"""Called for every task that ended, with the error if it could not store it itself."""
 
-# What a process is born with is set for all threads of this one.
-_ONE_STARTS = threading.Lock()
-_READY, _BEGUN = b"ready", b"begun"
-# A task ends itself at its limit, but for compiled code that does not return: then it is killed.
+# Processes are started with settings that affect all threads of this one.
+_START_LOCK = threading.Lock()
+_READY, _STARTED = b"ready", b"started"
+# Factor and seconds beyond the limit after which a task in compiled code is killed.
 _GRACE = 1.2, 1.0
 
 
 class _Worker:
-    """One process, and the task that it has."""
+    """Worker process and its current task."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=False)
-        with _ONE_STARTS, _born_deaf(), _without_main():
+        with _START_LOCK, _ignoring_ctrl_c(), _without_main():
             self.process.start()
         theirs.close()
         self.ready = False
         self.known: set[int] = set()
-        self.task: Task | None = None
+        self.task: GridTask | None = None
         self.until: float | None = None
 
-    def give(self, task: Task) -> None:
-        """Hand over a task; raises what keeps it from travelling.
-
-        A problem travels once: what is compiled or kept of it serves all of its tasks.
-        """
-        # multiprocessing's own pickler would share the memory of torch's tensors, and know classes
-        # of a notebook by name alone.
+    def give(self, task: GridTask) -> None:
+        """Send a task; each problem is sent once, so that its caches serve all of its tasks."""
+        # multiprocessing's pickler would share the memory of tensors and send classes by name.
         packed = io.BytesIO()
         pickler = _TaskPickler(packed, known=self.known)
         pickler.dump(task)
@@ -90,36 +67,36 @@ class _Worker:
         self.known |= pickler.new.keys()
         self.task = task
 
-    def heard(self) -> bytes | None:
-        """Return what the process says, or None if it is dead."""
+    def message(self) -> bytes | None:
+        """Return the next message of the process, or None if it has died."""
         try:
             return self.connection.recv_bytes()
         except (EOFError, OSError):
             self.process.join()
             return None
 
-    def begin_clock(self) -> None:
-        """Start to count the task's time."""
+    def start_clock(self) -> None:
+        """Start the clock of the task."""
         assert self.task is not None
         if self.task.limit is not None:
             factor, more = _GRACE
             self.until = time.monotonic() + factor * self.task.limit + more
 
-    def rest(self) -> Task:
-        """Return the task, which is over."""
+    def take_task(self) -> GridTask:
+        """Remove and return the finished task."""
         task, self.task, self.until = self.task, None, None
         assert task is not None
         return task
 
     def kill(self) -> None:
-        """End the process whatever it does."""
+        """Kill the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
 
 
 class _TaskPickler(cloudpickle.Pickler):
-    """Leaves problems out; those that the other side does not know yet are in ``new``, packed."""
+    """Replaces problems by numbers; ``new`` holds those that the worker does not know yet."""
 
     def __init__(self, file: io.BytesIO, known: set[int]) -> None:
         super().__init__(file)
@@ -127,7 +104,7 @@ class _TaskPickler(cloudpickle.Pickler):
         self.new: dict[int, bytes] = {}
 
     def persistent_id(self, value: Any) -> int | None:
-        """Return the number of a problem; the tasks keep it alive, and so the number its own."""
+        """Return the id of a problem, which stays unique while tasks refer to it."""
         if not isinstance(value, Problem):
             return None
         if id(value) not in self.known:
@@ -136,38 +113,38 @@ class _TaskPickler(cloudpickle.Pickler):
 
 
 class _TaskUnpickler(pickle.Unpickler):
-    """Puts problems in, each unpacked for the first task that is of it."""
+    """Replaces numbers by problems, each unpickled once."""
 
     def __init__(self, packed: bytes, problems: dict[int, bytes | Problem]) -> None:
         super().__init__(io.BytesIO(packed))
         self.problems = problems
 
     def persistent_load(self, number: Any) -> Problem:
-        """Return the problem of a number."""
-        held = self.problems[number]
-        if isinstance(held, bytes):
-            held = self.problems[number] = pickle.loads(held)
-        return held
+        """Return the problem with a number."""
+        problem = self.problems[number]
+        if isinstance(problem, bytes):
+            problem = self.problems[number] = pickle.loads(problem)
+        return problem
 
 
-def run_in_processes(tasks: Sequence[Task], workers: int, done: Done) -> None:
+def run_in_processes(tasks: Sequence[GridTask], workers: int, done: Done) -> None:
     """Run every task in one of ``workers`` spawned processes.
 
     Raises
     ------
     ValueError
-        If this process may have no children.
+        If this process is daemonic.
     RuntimeError
-        If processes do not start.
+        If a process does not start.
     """
     if multiprocessing.current_process().daemon:
         raise ValueError(
-            f"workers is {workers} in a daemonic process, which may have no children, expected 0"
+            f"workers must be 0 in a daemonic process, which may have no children, got {workers}"
         )
     waiting = deque(tasks)
     crew: list[_Worker] = []
     try:
-        # What a worker loads before its first task must find one thread in the environment.
+        # Libraries read the number of threads from the environment when they are loaded.
         with one_thread():
             while waiting or any(worker.task for worker in crew):
                 missing = min(workers, len(waiting) + sum(w.task is not None for w in crew))
@@ -179,65 +156,65 @@ def run_in_processes(tasks: Sequence[Task], workers: int, done: Done) -> None:
             worker.kill()
 
 
-def _hand_out(crew: list[_Worker], waiting: deque[Task], done: Done) -> None:
+def _hand_out(crew: list[_Worker], waiting: deque[GridTask], done: Done) -> None:
     for worker in crew:
         while waiting and worker.ready and worker.task is None:
             task = waiting.popleft()
             try:
                 worker.give(task)
             except OSError:
-                # It died between two tasks, which the next look at it finds.
+                # It died between two tasks; _listen removes it.
                 waiting.appendleft(task)
                 break
             except Exception as error:
                 done(
                     task,
                     TypeError(
-                        f"{task} cannot be sent to a process, {error}; expected what can be "
-                        "pickled, or workers=0"
+                        f"{task} cannot be sent to a worker process: {error}; make it "
+                        "picklable or use workers=0"
                     ),
                 )
 
 
 def _listen(crew: list[_Worker], done: Done) -> None:
-    """Wait until a worker says something, or is to be killed, and act upon it."""
-    heard = [worker for worker in crew if worker.task is not None or not worker.ready]
-    if not heard:
+    """Wait for a message or a time limit of a worker and handle it."""
+    active = [worker for worker in crew if worker.task is not None or not worker.ready]
+    if not active:
         return
-    limits = [worker.until for worker in heard if worker.until is not None]
+    limits = [worker.until for worker in active if worker.until is not None]
     timeout = max(0.0, min(limits) - time.monotonic()) if limits else None
-    said = wait([worker.connection for worker in heard], timeout)
-    for worker in heard:
-        if worker.connection in said:
-            _act(crew, worker, done)
+    ready = wait([worker.connection for worker in active], timeout)
+    for worker in active:
+        if worker.connection in ready:
+            _handle(crew, worker, done)
         elif worker.until is not None and time.monotonic() > worker.until:
             crew.remove(worker)
             worker.kill()
-            task = worker.rest()
+            task = worker.take_task()
             assert task.limit is not None
-            done(task, TimeIsUp(task.limit))
+            done(task, TimeLimitExceeded(task.limit))
 
 
-def _act(crew: list[_Worker], worker: _Worker, done: Done) -> None:
-    said = worker.heard()
-    if said == _READY:
+def _handle(crew: list[_Worker], worker: _Worker, done: Done) -> None:
+    message = worker.message()
+    if message == _READY:
         worker.ready = True
-    elif said == _BEGUN:
-        worker.begin_clock()
-    elif said is not None:
-        done(worker.rest(), pickle.loads(said))
+    elif message == _STARTED:
+        worker.start_clock()
+    elif message is not None:
+        done(worker.take_task(), pickle.loads(message))
     elif not worker.ready:
-        raise RuntimeError("a worker process ended before it had begun, and says why above")
+        raise RuntimeError("a worker process ended before it was ready; see its error above")
     else:
         crew.remove(worker)
         worker.connection.close()
         if worker.task is not None:
             killed = worker.process.exitcode == -getattr(signal, "SIGKILL", 9)
-            done(worker.rest(), WorkerDied(killed))
+            done(worker.take_task(), WorkerDied(killed))
 
 
 def _work(connection: Connection) -> None:
-    """Run what comes, until nothing does."""
+    """Run tasks until the parent closes the connection."""
     _begin_worker()
     problems: dict[int, bytes | Problem] = {}
     connection.send_bytes(_READY)
@@ -252,11 +229,11 @@ def _work(connection: Connection) -> None:
             new, packed = pickle.loads(sent)
             problems |= new
             task = _TaskUnpickler(packed, problems).load()
-            with suppress(Exception):  # which running it meets again
+            with suppress(Exception):  # run() raises it again
                 task.prepare()
-            connection.send_bytes(_BEGUN)
+            connection.send_bytes(_STARTED)
             task.run(False)
-        # Ctrl-C is not heard here: what says so is the sampler.
+        # Workers ignore Ctrl-C, so a KeyboardInterrupt comes from the sampler.
         except (Exception, KeyboardInterrupt) as caught:
             error = caught
         connection.send_bytes(_pickled(error))
@@ -272,12 +249,12 @@ def _pickled(error: BaseException | None) -> bytes:
 
 
 @contextmanager
-def _born_deaf() -> Iterator[None]:
-    """Processes that begin in the block do not hear Ctrl-C, not even while they load."""
+def _ignoring_ctrl_c() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C even while loading."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # It unblocks Ctrl-C when it starts, so it is started first.
+    # The tracker unblocks Ctrl-C when it starts, so it is started first.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -288,7 +265,7 @@ def _born_deaf() -> Iterator[None]:
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """Processes that begin in the block do not run the caller's script."""
+    """Start processes that do not run the caller's script."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -298,7 +275,7 @@ def _without_main() -> Iterator[None]:
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone."""
+    """Ignore Ctrl-C and exit when the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

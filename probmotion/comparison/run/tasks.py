@@ -1,45 +1,54 @@
-"""`Grid`: what there is to run: cells, and before them pilots where there is a budget."""
+"""All tasks of a grid: its runs and, with a budget, the pilots before them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from probmotion.comparison.results.budgets import Budget
-from probmotion.comparison.results.failures import CellNotKept
+from probmotion.comparison.results.budgets import Budget, check_budget
+from probmotion.comparison.results.failures import ResultNotWritten
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.comparison.results.plan import Plan
-from probmotion.comparison.run.cells import Cell, forget_unfinished
+from probmotion.comparison.run.grid_runs import GridRun, forget_unfinished
+from probmotion.comparison.run.grid_tasks import GridTask
 from probmotion.comparison.run.pilots import Pilot
 from probmotion.comparison.run.workers import run_tasks
 from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.catalogue import load_problem
+from probmotion.validation import check_count, check_positive
 
-__all__ = ["Grid", "refuse_taken", "run_grid"]
+__all__ = ["Grid", "check_grid_options", "refuse_other_settings", "run_grid"]
+
+_FEWEST_DRAWS = 10
+
+
+def check_grid_options(
+    draws: int, chains: int, workers: int, budget: Budget | None, time_limit: float | None
+) -> None:
+    """Raise ``ValueError`` unless the options of a grid are in range."""
+    check_count("draws", draws, least=_FEWEST_DRAWS)
+    check_count("chains", chains)
+    check_count("workers", workers, least=0)
+    if draws % chains:
+        raise ValueError(f"draws must be a multiple of chains, {chains}, got {draws}")
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
+    check_budget(budget)
 
 
 class Grid:
-    """The tasks of a comparison.
+    """Tasks of a comparison, whose results are stored in ``folder``.
 
-    Parameters
-    ----------
-    folder : Path
-        Where their results go.
-    plan : Plan
-        The names.
-    problems, samplers : mapping
-        The objects, or the registered names of problems, by name.
-    budget : Budget, optional
-        What every sampler may spend on a cell.
-    limit : float, optional
-        Seconds that a task may take.
+    ``budget`` is that of a run, ``limit`` the time limit of a task in seconds.
     """
+
+    run_class: ClassVar[type[GridRun]] = GridRun
 
     def __init__(
         self,
@@ -56,76 +65,72 @@ class Grid:
         self.samplers = samplers
         self.budget = budget
         self.limit = limit
-        self._asked = {
-            name: _told(name, load_problem(source) if isinstance(source, str) else source)
+        self._fingerprints = {
+            name: _fingerprint(name, load_problem(source) if isinstance(source, str) else source)
             for name, source in problems.items()
         }
         for name, sampler in samplers.items():
-            _told(name, sampler)
+            _fingerprint(name, sampler)
         self._versions = library_versions()
 
     def pilots(self) -> list[Pilot]:
-        """Return the tasks that find out what a budget buys: none without one."""
+        """Return the pilots; none without a budget."""
         if self.budget is None:
             return []
         return [
-            self._pilot(problem, sampler, self.budget)
-            for problem in self.problems
-            for sampler in self.samplers
+            self._pilot(problem, sampler) for problem in self.problems for sampler in self.samplers
         ]
 
-    def cells(self) -> list[Cell]:
-        """Return the cells, with the settings that the pilots found so far, in the plan's order."""
-        return [self._cell(*address) for address in self.plan.cells()]
+    def runs(self) -> list[GridRun]:
+        """Return the runs in the plan's order, with the settings of the pilots so far."""
+        return [self._grid_run(*address) for address in self.plan.runs()]
 
-    def _pilot(self, problem: str, sampler: str, budget: Budget) -> Pilot:
+    def _pilot(self, problem: str, sampler: str) -> Pilot:
+        inputs = [
+            *(problem, self._fingerprints[problem], sampler, self.samplers[sampler]),
+            *(self.plan.draws, self.plan.chains, self._versions, self.budget),
+        ]
         return Pilot(
             path=self.folder / "pilots" / problem / f"{sampler}.json",
-            problem=problem,
-            sampler=sampler,
-            source=self.problems[problem],
             with_sampler=self.samplers[sampler],
-            draws=self.plan.draws,
-            chains=self.plan.chains,
-            budget=budget,
-            limit=self.limit,
-            fingerprint=fingerprint(
-                [
-                    *(problem, self._asked[problem], sampler, self.samplers[sampler]),
-                    *(self.plan.draws, self.plan.chains, self._versions, budget),
-                ]
-            ),
+            fingerprint=fingerprint(inputs),
+            **self._common(problem, sampler),
         )
 
-    def _cell(self, problem: str, sampler: str, seed: int) -> Cell:
+    def _grid_run(self, problem: str, sampler: str, seed: int) -> GridRun:
         with_sampler: Any = self.samplers[sampler]
-        pilot = None if self.budget is None else self._pilot(problem, sampler, self.budget)
-        found = None if pilot is None or not pilot.answered() else pilot.found()
+        pilot = None if self.budget is None else self._pilot(problem, sampler)
+        found = pilot.result() if pilot is not None and pilot.has_result() else None
         if found is not None and found.settings:
             with_sampler = replace(with_sampler, **found.settings)
-        question: list[Any] = [
-            *(problem, self._asked[problem], sampler, fingerprint(with_sampler), seed),
+        inputs: list[Any] = [
+            *(problem, self._fingerprints[problem], sampler, fingerprint(with_sampler), seed),
             *(self.plan.draws, self.plan.chains, self._versions),
         ]
-        return Cell(
-            folder=self.plan.cell_folder(self.folder, problem, sampler, seed),
-            problem=problem,
-            sampler=sampler,
+        return self.run_class(
+            path=self.plan.run_folder(self.folder, problem, sampler, seed),
             seed=seed,
-            source=self.problems[problem],
             with_sampler=with_sampler,
-            draws=self.plan.draws,
-            chains=self.plan.chains,
-            fingerprint=fingerprint(question if self.budget is None else [*question, self.budget]),
-            limit=self.limit,
-            budget=self.budget,
+            fingerprint=fingerprint(inputs if self.budget is None else [*inputs, self.budget]),
             settings=None if found is None else found.settings,
-            beforehand=None if found is None else found.failure,
+            pilot_failure=None if found is None else found.failure,
+            **self._common(problem, sampler),
         )
 
+    def _common(self, problem: str, sampler: str) -> dict[str, Any]:
+        return {
+            "problem": problem,
+            "sampler": sampler,
+            "source": self.problems[problem],
+            "draws": self.plan.draws,
+            "chains": self.plan.chains,
+            "limit": self.limit,
+            "budget": self.budget,
+        }
 
-def _told(name: str, value: Any) -> str:
-    """Return a problem's or sampler's fingerprint; an error says whose it is."""
+
+def _fingerprint(name: str, value: Any) -> str:
+    """Return the fingerprint of a problem or sampler; errors mention its name."""
     try:
         return fingerprint(value)
     except ValueError as error:
@@ -133,59 +138,52 @@ def _told(name: str, value: Any) -> str:
 
 
 def run_grid(
-    grid: Grid, workers: int, executor: Executor | None, progress: bool, label: str = "cells"
+    grid: Grid, workers: int, executor: Executor | None, progress: bool, label: str = "runs"
 ) -> None:
-    """Run what is not finished: pilots, then cells; arguments as :func:`run_tasks`'s.
+    """Run the unfinished pilots and runs; arguments as in :func:`run_tasks`.
 
     Raises
     ------
     OSError
         If a result cannot be written.
     KeyboardInterrupt
-        At Ctrl-C; the messages of both say what is finished, and that it is kept.
+        At Ctrl-C. Both messages state how many runs are finished and stored.
     """
-    cells = grid.folder / "cells"
-    forget_unfinished(cells, grid.problems)
+    forget_unfinished(grid.folder, grid.problems)
+    where = (workers, executor, progress)
     try:
-        with _finished_kept(grid):
-            where = (workers, executor, progress)
-            run_tasks(_missing(grid.pilots()), *where, label="pilots")
-            run_tasks(_missing(grid.cells()), *where, label=label)
+        with _reporting_finished(grid):
+            pilots = [pilot for pilot in grid.pilots() if not pilot.finished()]
+            run_tasks(pilots, *where, label="pilots")
+            run_tasks([run for run in grid.runs() if not run.finished()], *where, label=label)
     finally:
-        # Of workers killed while they wrote; an executor's may still be at it.
+        # Workers killed while writing; those of an executor may still be writing.
         if executor is None:
-            forget_unfinished(cells, grid.problems)
+            forget_unfinished(grid.folder, grid.problems)
 
 
-def _missing(tasks: Sequence[Any]) -> list[Any]:
-    """Return the tasks that are not finished."""
-    return [task for task in tasks if not task.finished()]
-
-
-def refuse_taken(folder: Path, tasks: Iterable[Cell | Pilot]) -> None:
-    """Raise ``ValueError`` if a folder holds results of these names, made with other settings."""
-    if taken := [task for task in tasks if task.taken()]:
-        cells = [task for task in taken if isinstance(task, Cell)]
-        what = f"{len(cells)} finished cells" if cells else f"{len(taken)} pilots of a budget"
+def refuse_other_settings(folder: Path, tasks: Iterable[GridTask]) -> None:
+    """Raise ``ValueError`` if a folder holds results of tasks made with other inputs."""
+    if conflicting := [task for task in tasks if task.conflicts()]:
+        runs = [task for task in conflicting if isinstance(task, GridRun)]
+        what = f"{len(runs)} finished runs" if runs else f"{len(conflicting)} pilots of a budget"
         raise ValueError(
-            f"out is {folder}, which holds {what} made with other settings, "
-            f"evidence or library versions, the first {(cells or taken)[0]};"
-            " expected a folder of its own for another comparison"
+            f"out is {folder}, which holds {what} made with other settings, observations or "
+            f"library versions, the first {(runs or conflicting)[0]}; use another folder"
         )
 
 
 @contextmanager
-def _finished_kept(grid: Grid) -> Iterator[None]:
-    """Say what is finished, and that it is kept, when the block is stopped."""
+def _reporting_finished(grid: Grid) -> Iterator[None]:
+    """Add the number of finished runs to the message of an interruption or a full disk."""
     try:
         yield
-    except (KeyboardInterrupt, CellNotKept) as stop:
-        cells = grid.cells()
-        finished = sum(cell.finished() for cell in cells)
-        rest = (
-            f"{finished} of {len(cells)} cells finished, which are kept in {grid.folder}; the same "
-            "command with that folder runs the others"
+    except (KeyboardInterrupt, ResultNotWritten) as stop:
+        runs = grid.runs()
+        finished = (
+            f"{sum(run.finished() for run in runs)} of {len(runs)} runs finished and stored in "
+            f"{grid.folder}; repeat the command with this folder to continue"
         )
-        if isinstance(stop, CellNotKept):
-            raise OSError(f"out cannot be written to any more, {stop}, with {rest}") from stop
-        raise KeyboardInterrupt(f"interrupted with {rest}") from None
+        if isinstance(stop, ResultNotWritten):
+            raise OSError(f"cannot write to out, {stop}, with {finished}") from stop
+        raise KeyboardInterrupt(f"interrupted with {finished}") from None

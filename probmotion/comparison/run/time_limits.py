@@ -1,4 +1,4 @@
-"""A limit on the time that a block may take."""
+"""Time limit of a block."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from probmotion.comparison.results.failures import TimeIsUp
+from probmotion.comparison.results.failures import TimeLimitExceeded
 
 __all__ = ["time_limit"]
 
 
 class _Alarm(BaseException):
-    """Passes by those who catch every ``Exception``."""
+    """Not an ``Exception``, so that samplers do not catch it."""
 
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise :class:`TimeIsUp` where the block takes longer than ``seconds``; None: no limit.
+    """Raise :class:`TimeLimitExceeded` if the block takes longer than ``seconds``.
 
-    In the main thread of a system with interval timers the block is ended then, at its next
-    step in Python; a long call of compiled code ends first. Elsewhere it is told at its end.
+    In the main thread of a system with interval timers the block is interrupted, between two
+    Python instructions; elsewhere the error is raised at its end. None means no limit.
     """
     if seconds is None:
         yield
         return
     start = time.monotonic()
-    rung = False
+    interrupted = False
     try:
         with _alarm(seconds):
             yield
     except _Alarm:
-        rung = True
+        interrupted = True
     except Exception as error:
-        # Some libraries wrap whatever is raised in what they call.
+        # Some libraries wrap errors raised in their callbacks.
         if time.monotonic() - start > seconds:
-            raise TimeIsUp(seconds) from error
+            raise TimeLimitExceeded(seconds) from error
         raise
-    if rung or time.monotonic() - start > seconds:
-        raise TimeIsUp(seconds)
+    if interrupted or time.monotonic() - start > seconds:
+        raise TimeLimitExceeded(seconds)
 
 
 @contextmanager
@@ -52,19 +52,19 @@ def _alarm(seconds: float) -> Iterator[None]:
         return
     inside = True
 
-    def ring(number: int, frame: FrameType | None) -> None:
-        # It may come when the block is just over.
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        # The signal may arrive just after the block.
         if inside:
             raise _Alarm
 
-    before = signal.signal(signal.SIGALRM, ring)
+    before = signal.signal(signal.SIGALRM, interrupt)
     remaining, interval = signal.setitimer(signal.ITIMER_REAL, seconds)
     start = time.monotonic()
     try:
         yield
     finally:
         inside = False
-        # A timer of the caller's goes on as if it had not been stopped.
+        # Resume a timer of the caller.
         left = max(remaining - (time.monotonic() - start), 1e-6) if remaining else 0.0
         signal.signal(signal.SIGALRM, before)
         signal.setitimer(signal.ITIMER_REAL, left, interval)

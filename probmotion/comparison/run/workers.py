@@ -1,4 +1,4 @@
-"""Running tasks, cells or pilots: here, in processes of our own, or on any executor."""
+"""Execution of tasks in this process, in worker processes or on an executor."""
 
 from __future__ import annotations
 
@@ -7,52 +7,39 @@ from concurrent.futures import CancelledError, Executor, Future
 from queue import SimpleQueue
 from typing import Any
 
-from probmotion.comparison.results.failures import CellNotKept
-from probmotion.comparison.run.processes import Done, Task, run_in_processes
+from probmotion.comparison.results.failures import ResultNotWritten
+from probmotion.comparison.run.grid_tasks import GridTask
+from probmotion.comparison.run.processes import Done, run_in_processes
 from probmotion.posteriors.sampling import progress_bar
 
-__all__ = ["run_task", "run_tasks"]
+__all__ = ["run_tasks"]
 
 
 def run_tasks(
-    tasks: Sequence[Task],
-    workers: int,
-    executor: Executor | None,
-    progress: bool,
-    label: str = "cells",
+    tasks: Sequence[GridTask], workers: int, executor: Executor | None, progress: bool, label: str
 ) -> None:
-    """Run every task; each keeps its own result, or its failure.
+    """Run every task, which stores its own result or failure, with a labelled progress bar.
 
-    Parameters
-    ----------
-    tasks : sequence of Task
-        What to run.
-    workers : int
-        That many processes; 0: in this one, with a bar for the draws of each cell.
-    executor : Executor, optional
-        Run there instead.
-    progress : bool
-        Show bars.
-    label : str
-        What the bar counts.
+    Tasks run on the executor if there is one, otherwise in ``workers`` processes, or with 0 in this
+    process.
 
     Raises
     ------
     KeyboardInterrupt
-        At Ctrl-C, at once; finished tasks are kept.
-    CellNotKept
-        If a result cannot be written, as on a full disk; finished tasks are kept.
+        At Ctrl-C.
+    ResultNotWritten
+        If a result cannot be written, as on a full disk.
     """
     if not tasks:
         return
     with progress_bar(len(tasks), label, progress) as bar:
 
         def done(task: Any, error: BaseException | None) -> None:
-            if isinstance(error, CellNotKept):
+            if isinstance(error, ResultNotWritten):
                 raise error
-            if error is None and not task.answered():
+            if error is None and not task.has_result():
                 error = FileNotFoundError(
-                    f"{task} ended and its result is not in out, expected workers that see out"
+                    f"{task} ended without a result in out; workers must see the folder out"
                 )
             if error is not None:
                 task.fail(error)
@@ -62,26 +49,25 @@ def run_tasks(
             _run_on(executor, tasks, done)
         elif workers == 0:
             for task in tasks:
-                run_task(task, progress)
+                _run_task(task, progress)
                 done(task, None)
         else:
             run_in_processes(tasks, workers, done)
 
 
-def run_task(task: Task, progress: bool = False) -> None:
-    """Run a task; what an executor is given."""
+def _run_task(task: GridTask, progress: bool = False) -> None:
     task.run(progress)
 
 
-def _run_on(executor: Executor, tasks: Sequence[Task], done: Done) -> None:
-    running: dict[Future[None], Task] = {}
-    # Of what an executor has cancelled when it was shut down, as_completed would never hear.
+def _run_on(executor: Executor, tasks: Sequence[GridTask], done: Done) -> None:
+    running: dict[Future[None], GridTask] = {}
+    # as_completed() misses futures that are cancelled when the executor shuts down.
     ended: SimpleQueue[Future[None]] = SimpleQueue()
     try:
         for task in tasks:
             try:
-                running[executor.submit(run_task, task)] = task
-            except Exception as error:  # as of what cannot be sent
+                running[executor.submit(_run_task, task)] = task
+            except Exception as error:  # such as a task that cannot be pickled
                 done(task, error)
         for future in running:
             future.add_done_callback(ended.put)

@@ -5,18 +5,8 @@ from .animals import (
     dog_clips as dog_clips,
     synthetic_animals as synthetic_animals,
 )
-from .choreography import (
-    HOLDS as HOLDS,
-    Dance as Dance,
-    Figure as Figure,
-    draw_dance as draw_dance,
-    level as level,
-    rise as rise,
-)
-from .cycles import repeated_cycle as repeated_cycle
 from .dances import synthetic_dances as synthetic_dances
 from .gaits import GAITS as GAITS, make_gait as make_gait, make_gaits as make_gaits
-from .limbs import bent_limb as bent_limb, rotated as rotated
 from .walks import (
     WALK_CLIPS as WALK_CLIPS,
     shared_skeleton as shared_skeleton,

@@ -1,4 +1,4 @@
-"""What two people dance: figures of eight beats, and where each partner is at any time."""
+"""Choreography of procedural couple dances: figures of eight beats and the path of each partner."""
 
 from __future__ import annotations
 
@@ -9,30 +9,29 @@ import numpy as np
 __all__ = ["HOLDS", "Dance", "Figure", "draw_dance", "level", "rise"]
 
 _FIGURE = 8  # beats
-# How far the partners' roots are from each other, metres, between the two numbers.
+# Least and greatest distance between the partners' roots, metres.
 HOLDS = {"open": (0.60, 0.78), "closed": (0.46, 0.56), "one hand": (0.62, 0.85)}
 _TURN_DISTANCE = 0.5
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Eight beats: a hold, its distance, how far the couple steps, who turns and which way."""
+    """A figure of eight beats: hold, distance (m), displacement (m) and turns."""
 
     hold: str
     distance: float
     forward: float
     aside: float
-    turns: int  # of person0 or person1; 2 where nobody turns
-    way: float
+    turns: int  # person0 or person1 turns under the arm; 2: nobody
+    way: float  # sense of rotation, -1 or 1
 
 
 @dataclass(frozen=True)
 class Dance:
-    """The style of one dance; every method is a smooth function of time (n,), seconds.
+    """Style of one dance; every method is a smooth function of time (n,), seconds.
 
-    Angles in radians; ``beat`` in seconds, ``start`` in beats, ``turning`` in radians a second;
-    ``bend`` is how high the hips stand over straight legs; ``sway`` and ``hands`` (how much higher
-    they are held) in metres.
+    Angles in radians, ``beat`` in seconds, ``start`` in beats, ``turning`` in rad/s, ``sway`` and
+    ``hands`` (raised height) in metres; ``bend`` is the hip height as a fraction of straight legs.
     """
 
     figures: tuple[Figure, ...]
@@ -49,30 +48,30 @@ class Dance:
     waves: np.ndarray  # (channels, 3, 2): sine and cosine of three slow frequencies
 
     def beats(self, time: np.ndarray) -> np.ndarray:
-        """Beats since the first figure began."""
+        """Return the beats since the first figure began."""
         return self.start + time / self.beat
 
     def wander(self, channel: int, time: np.ndarray) -> np.ndarray:
-        """A slow random function with mean square 1."""
+        """Return a slow random function with mean square 1."""
         angle = 2 * np.pi * np.multiply.outer(time, [0.11, 0.23, 0.41])
         sine, cosine = self.waves[channel].T
         return (np.sin(angle) @ sine + np.cos(angle) @ cosine) / np.sqrt(3)
 
     def weights(self, time: np.ndarray) -> np.ndarray:
-        """Share (figures, n) of each figure; from one to the next in a beat and a half."""
+        """Return the weight of each figure, (figures, n); transitions last 1.5 beats."""
         begin = _FIGURE * np.arange(len(self.figures))[:, None]
         begun = rise((self.beats(time) - begin + 0.75) / 1.5)
         return begun - np.vstack([begun[1:], np.zeros_like(begun[:1])])
 
     def raised(self, time: np.ndarray, person: int) -> np.ndarray:
-        """How far hands are raised, 0 to 1, for a turn of ``person``."""
+        """Return how far the hands are raised, 0 to 1, for a turn of ``person``."""
         return sum(
             (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in self._turns(time, person)),
             np.zeros_like(time),
         )
 
     def turned(self, time: np.ndarray, person: int) -> np.ndarray:
-        """Angle by which ``person`` has turned under the raised hands."""
+        """Return the angle by which ``person`` has turned under the raised hands."""
         ways = [figure.way for figure in self.figures if figure.turns == person]
         turns = zip(ways, self._turns(time, person), strict=True)
         return sum(
@@ -84,7 +83,7 @@ class Dance:
         return [beats - _FIGURE * k for k, f in enumerate(self.figures) if f.turns == person]
 
     def place(self, time: np.ndarray, person: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where a person's root is above the floor, (n, 3) with y = 0, and the yaw (n,)."""
+        """Return the ground position (n, 3) of a person's root, y = 0, and the yaw (n,)."""
         weights = self.weights(time)
         inside = np.clip(
             self.beats(time) - _FIGURE * np.arange(len(self.figures))[:, None], 0, _FIGURE
@@ -103,7 +102,7 @@ class Dance:
             [self.wander(1, time), np.zeros_like(time), self.wander(2, time)], axis=-1
         )
         centre += forward[:, None] * facing + aside[:, None] * level(heading + np.pi / 2)
-        # Each stands a little to the own left of the partner, and sways over the standing foot.
+        # Partners are offset to their left and sway over the standing foot.
         closed = np.array([figure.hold == "closed" for figure in self.figures]) @ weights
         left = 0.05 * closed + self.sway * np.sin(np.pi * self.beats(time))
         yaw = heading + np.pi * person
@@ -114,9 +113,9 @@ class Dance:
 
 
 def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
-    """Return a dance of random style that is longer than ``duration`` seconds.
+    """Return a random dance longer than ``duration`` seconds.
 
-    A longer one of the same generator begins with the same figures.
+    A longer dance from the same generator begins with the same figures.
     """
     beat = rng.uniform(0.44, 0.56)
     style = {
@@ -131,7 +130,7 @@ def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
     bend = rng.uniform(0.955, 0.975, size=2)
     lean = rng.normal((0.03, 0.0), 0.03)
     waves = rng.normal(size=(11, 3, 2))
-    # One figure before the clip and one after it, because feet look back and ahead.
+    # One extra figure on either side: foot placement looks back and ahead.
     figures = tuple(_draw_figure(rng) for _ in range(int(duration / beat / _FIGURE) + 4))
     return Dance(figures, beat, heights=heights, bend=bend, lean=lean, waves=waves, **style)
 
@@ -146,11 +145,11 @@ def _draw_figure(rng: np.random.Generator) -> Figure:
 
 
 def level(yaw: np.ndarray) -> np.ndarray:
-    """Level unit vectors (n, 3), from +Z towards +X."""
+    """Return horizontal unit vectors (n, 3), from +Z towards +X."""
     return np.stack([np.sin(yaw), np.zeros_like(yaw), np.cos(yaw)], axis=-1)
 
 
 def rise(x: np.ndarray) -> np.ndarray:
-    """From 0 at x = 0 to 1 at x = 1, with two continuous derivatives."""
+    """Return a C² step from 0 at x = 0 to 1 at x = 1."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)

@@ -1,4 +1,4 @@
-"""One cycle of a periodic motion, repeated for as long as wanted."""
+"""Repetition of one cycle of a periodic motion."""
 
 from __future__ import annotations
 
@@ -15,30 +15,29 @@ __all__ = ["repeated_cycle"]
 
 
 def repeated_cycle(cycle: Motion, frames: int) -> Motion:
-    """Return a cycle of a periodic motion, repeated to a number of frames.
+    """Return a periodic motion of ``frames`` frames, repeated from one cycle.
 
-    The last frame of a cycle is the first of the next, moved along and turned about the vertical
-    as the root was from the cycle's beginning to its end. What the pose misses of that is made up
-    for evenly over the cycle, every joint turning what hangs from it as one rigid piece (at the
-    root, the trunk on its own): bones keep their lengths.
+    The last frame of a cycle is the first of the next one, translated and rotated about the
+    vertical as the root moved over the cycle. The remaining mismatch of the pose is distributed
+    evenly over the cycle by rotating rigid groups of bones, so that bones keep their lengths.
 
     Parameters
     ----------
     cycle : Motion
-        At least three frames of one body.
+        At least 3 frames of one body.
     frames : int
         Frames of the result.
 
     Raises
     ------
     ValueError
-        If there are fewer than three frames, or several roots.
+        If the cycle has fewer than 3 frames or several roots.
     """
     check_count("frames", frames)
     if len(cycle.skeleton.roots) != 1:
-        raise ValueError(f"cycle has {len(cycle.skeleton.roots)} roots, expected one body")
+        raise ValueError(f"cycle must have one root, got {len(cycle.skeleton.roots)}")
     if cycle.frames < 3:
-        raise ValueError(f"cycle has {cycle.frames} frames, expected at least 3")
+        raise ValueError(f"cycle must have at least 3 frames, got {cycle.frames}")
     period = cycle.frames - 1
     root = cycle.skeleton.roots[0]
     turn = _turn_about_vertical(cycle.positions[0], cycle.positions[-1], root)
@@ -58,7 +57,7 @@ def repeated_cycle(cycle: Motion, frames: int) -> Motion:
 
 
 def _turn_about_vertical(first: np.ndarray, last: np.ndarray, root: int) -> np.ndarray:
-    """Return the rotation vector about Y that brings the first pose nearest the last, (3,)."""
+    """Return the rotation vector about Y that best aligns the first pose with the last."""
     start, end = (
         (pose[:, 2] - pose[root, 2]) + 1j * (pose[:, 0] - pose[root, 0]) for pose in (first, last)
     )
@@ -66,33 +65,33 @@ def _turn_about_vertical(first: np.ndarray, last: np.ndarray, root: int) -> np.n
 
 
 def _closed(cycle: Motion, turn: np.ndarray) -> np.ndarray:
-    """Return the joints' offsets, (L, J, 3), whose last frame is the first, turned."""
+    """Return the joint offsets (L, J, 3) such that the last equals the rotated first."""
     skeleton, positions = cycle.skeleton, cycle.positions
     parents = np.array(skeleton.parents)
     offsets = positions - positions[:, np.maximum(parents, 0)]
     elapsed = np.arange(cycle.frames)[:, None] / (cycle.frames - 1)
-    for piece in _rigid_pieces(skeleton):
-        missing = _rotation_between(offsets[-1, piece], offsets[0, piece] @ turn.T)
+    for group in _rigid_groups(skeleton):
+        missing = _rotation_between(offsets[-1, group], offsets[0, group] @ turn.T)
         even = vector_to_matrix(elapsed * missing)
-        offsets[:, piece] = np.einsum("lij,lkj->lki", even, offsets[:, piece])
+        offsets[:, group] = np.einsum("lij,lkj->lki", even, offsets[:, group])
     return offsets
 
 
-def _rigid_pieces(skeleton: Skeleton) -> list[list[int]]:
-    """Return the joints by what turns them: the parent, or the trunk where that is the root."""
+def _rigid_groups(skeleton: Skeleton) -> list[list[int]]:
+    """Return the joints grouped by parent; the trunk is apart from other children of the root."""
     root = skeleton.roots[0]
-    pieces: dict[tuple[int, bool], list[int]] = {}
+    groups: dict[tuple[int, bool], list[int]] = {}
     for joint, parent in skeleton.bones:
         central = skeleton.mirrored_order[joint] == joint
         trunk = parent == root and central and joint in skeleton.parents
-        pieces.setdefault((parent, trunk), []).append(joint)
-    return list(pieces.values())
+        groups.setdefault((parent, trunk), []).append(joint)
+    return list(groups.values())
 
 
 def _rotation_between(some: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation vector that turns vectors nearest to others, (n, 3), (n, 3) → (3,)."""
+    """Return the rotation vector (3,) that best aligns vectors (n, 3) with others (n, 3)."""
     if len(some) == 1:
-        # The shortest turn: a single bone says nothing about twist.
+        # Shortest rotation: a single bone does not determine the twist.
         axis = np.cross(some[0], others[0])
         sine = np.linalg.norm(axis)
         angle = np.arctan2(sine, some[0] @ others[0])

@@ -1,57 +1,50 @@
-"""Procedural dances: two people in hold, who step, turn under raised arms and change holds.
+"""Procedural couple dances: steps, turns under raised arms and changes of hold.
 
-They exist so that whatever is built for pose-pairs can be shown and tested on data that the project
-makes itself. A dance is a row of figures of eight beats. The couple's centre, heading and distance
-are smooth functions of time; feet are planted, beat by beat, where the hips will be; hands go
-where the hold says. Bones keep their lengths, elbows and knees bend the natural way.
+A dance is a sequence of figures of eight beats. Position, heading and distance of the couple are
+smooth functions of time; feet are planted beat by beat below the future hips; hands follow the
+hold. Bones have constant lengths, and elbows and knees bend anatomically.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from probmotion import seeds
 from probmotion.data.synthetic.choreography import HOLDS, Dance, draw_dance, level, rise
-from probmotion.data.synthetic.limbs import bent_limb, rotated
 from probmotion.geometry.rotations import euler_to_matrix
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["synthetic_dances"]
+__all__ = ["bent_limb", "synthetic_dances"]
 
-# Offsets from the parent in the body's frame (left, up, forward), shares of the height.
+# Offsets from the parent in body coordinates (left, up, forward), fractions of the body height.
 _SPINE, _CHEST, _NECK = (0.0, 0.10, 0.0), (0.0, 0.09, 0.0), (0.0, 0.10, -0.008)
 _HEAD, _SHOULDER, _HIP = (0.0, 0.055, 0.022), (0.115, 0.075, -0.005), (0.057, 0.015, 0.0)
 _ARM, _LEG, _ANKLE = (0.170, 0.146), (0.245, 0.246), 0.045
 _SIDES = {"left": 1.0, "right": -1.0}
 _UP = np.array([0.0, 1.0, 0.0])
 
-_SWING = 0.8  # beats for which a foot is in the air
+_SWING = 0.8  # duration of a step, beats
 _WRIST_TO_GRIP = 0.05
+# Limits of extension (fraction of the length) and flexion (angle).
+_STRAIGHTEST = 0.99
+_SOFTNESS = 0.01
+_FOLD = np.cos(np.deg2rad(30.0))
 Joints = dict[str, np.ndarray]
-"""Positions (L, 3) by joint, and the chest's frame (L, 3, 3) as ``frame``."""
+"""Positions (L, 3) by joint, and the orientation (L, 3, 3) of the chest as ``frame``."""
 
 
 def synthetic_dances(
     n: int = 20, *, frames: int = 90, fps: float = 30.0, seed: int = 0
 ) -> list[Motion]:
-    """Return ``n`` dances of two people on ``pair17``, named ``dance-0``, ``dance-1``, …
+    """Return ``n`` dances of ``frames`` frames at ``fps`` frames per second, on ``pair17``.
 
-    ``person0`` leads and is about 1.7 m tall, ``person1`` about 1.6 m. Everything that varies from
-    dance to dance (rhythm, figures, holds, steps, turns, posture) depends on ``seed`` and the
-    number alone: a dance is the same however many are made.
-
-    Parameters
-    ----------
-    n : int
-        Number of dances.
-    frames : int
-        Frames of each; three seconds by default.
-    fps : float
-        Frames per second.
-    seed : int
-        Seed of what varies.
+    Dances are named ``dance-0``, …; ``person0`` leads and is about 1.7 m tall, ``person1`` about
+    1.6 m. Rhythm, figures, holds, steps, turns and posture depend only on ``seed`` and the dance's
+    number.
     """
     check_count("n", n)
     check_count("frames", frames)
@@ -70,9 +63,9 @@ def synthetic_dances(
 
 
 def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
-    """Return a person's joints (L, 3) without the arms, and the chest's frame (L, 3, 3)."""
+    """Return a person's joints without arms, and the chest's orientation."""
     height, beats = dance.heights[person], dance.beats(time)
-    mirror = 1.0 - 2.0 * person  # the follower's right foot goes with the leader's left
+    mirror = 1.0 - 2.0 * person  # the follower mirrors the leader
     root, yaw = dance.place(time, person)
     roll = mirror * 2.0 * dance.sway * np.sin(np.pi * beats)
     lean = dance.lean[person] + 0.04 * dance.wander(5 + person, time)
@@ -92,30 +85,30 @@ def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
         ("neck", "chest", chest, _NECK),
         ("head", "neck", gaze, _HEAD),
     ):
-        joints[name] = joints[parent] + height * rotated(frame, offset)
+        joints[name] = joints[parent] + height * _rotated(frame, offset)
     for side, sign in _SIDES.items():
         own = (sign, 1.0, 1.0)
-        joints[f"{side}_shoulder"] = joints["chest"] + height * rotated(
+        joints[f"{side}_shoulder"] = joints["chest"] + height * _rotated(
             chest, np.multiply(own, _SHOULDER)
         )
-        hip = joints["pelvis"] + height * rotated(pelvis, np.multiply(own, _HIP))
+        hip = joints["pelvis"] + height * _rotated(pelvis, np.multiply(own, _HIP))
         ankle = _foot(dance, person, sign, time)
         lengths = (height * _LEG[0], height * _LEG[1])
-        knee, ankle = bent_limb(hip, ankle, lengths, rotated(pelvis, (0.15 * sign, 0.0, 1.0)))
+        knee, ankle = bent_limb(hip, ankle, lengths, _rotated(pelvis, (0.15 * sign, 0.0, 1.0)))
         joints |= {f"{side}_hip": hip, f"{side}_knee": knee, f"{side}_ankle": ankle}
     return joints
 
 
 def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarray:
-    """Return where a foot's ankle (L, 3) should be: planted, or on its way to the next place."""
+    """Return the target of an ankle, (L, 3): planted or swinging to the next position."""
     height = dance.heights[person]
-    odd = float((sign > 0) == (person == 0))  # every foot steps on every other beat
+    odd = float((sign > 0) == (person == 0))  # feet alternate beats
     beats = dance.beats(time)
     stepped = 2 * np.floor((beats - odd) / 2) + odd
     done = rise((beats - stepped) / _SWING)
     spots = []
     for step in (stepped - 2, stepped):
-        # Under the hip in the middle of the stance.
+        # Below the hip at mid-stance.
         middle = (step + 1 + _SWING / 2 - dance.start) * dance.beat
         root, yaw = dance.place(middle, person)
         spots.append(root + (sign * (_HIP[0] + 0.01) * height) * level(yaw + np.pi / 2))
@@ -126,32 +119,32 @@ def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarra
 
 
 def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
-    """Add elbows and wrists to both bodies: hands go where hold and turn say."""
+    """Add elbows and wrists to both bodies, with hands placed by hold and turn."""
     weights = dance.weights(time)
-    shares = {
+    weight = {
         hold: np.array([figure.hold == hold for figure in dance.figures]) @ weights
         for hold in HOLDS
     }
     raised = [dance.raised(time, person) for person in range(2)]
     lead, follow = bodies
-    sides = {(0, "left"), (1, "right")}  # the hands that stay joined: leader's left
+    sides = {(0, "left"), (1, "right")}  # hands that stay joined
     for person, body in enumerate(bodies):
         for side, sign in _SIDES.items():
             shoulder = body[f"{side}_shoulder"]
             swing = 0.05 * np.sin(np.pi * dance.beats(time))
-            free = rotated(body["frame"], (0.08 * sign, -0.34, 0.18)) + swing[:, None] * rotated(
+            free = _rotated(body["frame"], (0.08 * sign, -0.34, 0.18)) + swing[:, None] * _rotated(
                 body["frame"], (0.0, 0.3, 1.0)
             )
             free += shoulder
             joined = (person, side) in sides
             grip = _grip(lead, follow, person, side, dance.hands)
             closed = (
-                grip + 0.22 * rotated(lead["frame"], (1.0, 0.6, 0.0))
+                grip + 0.22 * _rotated(lead["frame"], (1.0, 0.6, 0.0))
                 if joined
                 else _on_partner(bodies[1 - person], person)
             )
-            target = shares["open"][:, None] * grip + shares["closed"][:, None] * closed
-            target = target + shares["one hand"][:, None] * (grip if joined else free)
+            target = weight["open"][:, None] * grip + weight["closed"][:, None] * closed
+            target = target + weight["one hand"][:, None] * (grip if joined else free)
             for turner in range(2):
                 above = _above(bodies[turner], bodies[1 - turner], dance.heights[turner])
                 goal = above if joined else free
@@ -168,34 +161,79 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
 
 
 def _grip(lead: Joints, follow: Joints, person: int, side: str, higher: float) -> np.ndarray:
-    """Where hands of an open hold meet: between the shoulders, lower."""
+    """Return where hands meet in an open hold: below the middle of the shoulders."""
     own, other = (side, "right" if side == "left" else "left")[:: 1 - 2 * person]
     between = (lead[f"{own}_shoulder"] + follow[f"{other}_shoulder"]) / 2
     return between - _UP * (0.28 - higher)
 
 
 def _on_partner(partner: Joints, person: int) -> np.ndarray:
-    """Where the other hand of a closed hold lies: her left side below the arm; his right arm."""
+    """Return where the free hand rests in a closed hold, on the partner."""
     if person == 0:
-        return partner["chest"] + rotated(partner["frame"], (0.17, -0.02, 0.0))
-    return partner["right_shoulder"] + rotated(partner["frame"], (-0.03, -0.03, 0.05))
+        return partner["chest"] + _rotated(partner["frame"], (0.17, -0.02, 0.0))
+    return partner["right_shoulder"] + _rotated(partner["frame"], (-0.03, -0.03, 0.05))
 
 
 def _above(turner: Joints, partner: Joints, height: float) -> np.ndarray:
-    """Where the raised hands meet: above the head that turns, on the partner's side."""
+    """Return where raised hands meet: above the turning head, towards the partner."""
     towards = (partner["chest"] - turner["chest"]) * [1.0, 0.0, 1.0]
     above = turner["chest"] * [1.0, 0.0, 1.0] + 0.3 * towards
     return above + _UP * 1.01 * height
 
 
 def _elbow_points(frame: np.ndarray, sign: float, way: np.ndarray) -> np.ndarray:
-    """Which way an elbow points: down, out and back; out and forward where the arm is raised."""
+    """Return the direction of an elbow: back when the arm hangs, forward when raised."""
     along = way / np.linalg.norm(way, axis=-1, keepdims=True)
     raised = rise((along * frame[..., 1]).sum(axis=-1) / 0.8)[:, None]
-    low, high = rotated(frame, (0.35 * sign, -1.0, -0.5)), rotated(frame, (0.6 * sign, -0.2, 0.8))
+    low, high = _rotated(frame, (0.35 * sign, -1.0, -0.5)), _rotated(frame, (0.6 * sign, -0.2, 0.8))
     return (1 - raised) * low + raised * high
 
 
 def _frame(yaw: np.ndarray, lean: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Frames (L, 3, 3) whose columns are a body's left, up and forward."""
+    """Return orientations (L, 3, 3) with columns left, up and forward."""
     return np.asarray(euler_to_matrix(np.stack([yaw, lean, roll], axis=-1), "YXZ"))
+
+
+def _rotated(frames: np.ndarray, offset: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Rotate an offset by body orientations, ``(…, 3, 3), (3,) → (…, 3)``."""
+    return np.asarray(frames @ np.asarray(offset))
+
+
+def bent_limb(
+    start: np.ndarray, target: np.ndarray, lengths: tuple[float, float], pole: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle joint and the end of a limb that reaches from ``start`` for ``target``.
+
+    Parameters
+    ----------
+    start, target : ndarray, (…, 3)
+        Shoulder or hip, and the desired wrist or ankle, metres.
+    lengths : tuple of float
+        Lengths of the upper and the lower bone, metres.
+    pole : ndarray, (…, 3)
+        Direction of the elbow or knee; its component along the limb is ignored.
+
+    Returns
+    -------
+    middle, end : ndarray, (…, 3)
+        Bones have exactly their lengths. The end lies on the line to the target; targets out of
+        reach are approached smoothly.
+    """
+    upper, lower = lengths
+    farthest = _STRAIGHTEST * (upper + lower)
+    nearest = np.sqrt(upper**2 + lower**2 - 2 * upper * lower * _FOLD)
+    way = target - start
+    distance = np.linalg.norm(way, axis=-1, keepdims=True)
+    along = way / np.maximum(distance, 1e-9)
+    reach = farthest - _soft_positive(farthest - distance)
+    reach = nearest + _soft_positive(reach - nearest)
+    aside = pole - (pole * along).sum(axis=-1, keepdims=True) * along
+    aside = aside / np.maximum(np.linalg.norm(aside, axis=-1, keepdims=True), 1e-9)
+    cosine = (upper**2 + reach**2 - lower**2) / (2 * upper * reach)
+    middle = start + upper * (cosine * along + np.sqrt(1 - cosine**2) * aside)
+    return middle, start + reach * along
+
+
+def _soft_positive(x: np.ndarray) -> np.ndarray:
+    """Return a smooth max(x, 0)."""
+    return _SOFTNESS * np.logaddexp(x / _SOFTNESS, 0.0)

@@ -1,8 +1,7 @@
 """Procedural gaits: people who walk, run and march; quadrupeds that walk and trot.
 
-They exist so that every feature can be shown and tested on data that the project makes itself.
-Joint angles are smooth functions of a phase; speed, stride, lean, turning and a few more vary from
-clip to clip. Bodies face +Z with their left on +X, and have constant bone lengths.
+Joint angles are smooth functions of a phase; speed, stride, lean, turning and more vary between
+clips. Bodies face +Z with their left on +X and have constant bone lengths.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ __all__ = ["GAITS", "make_gait", "make_gaits"]
 
 @dataclass(frozen=True)
 class Gait:
-    """How one style moves; pairs are (mean, standard deviation) over clips.
+    """Parameters of a style, as (mean, standard deviation) over clips.
 
-    Angles in radians, ``cadence`` in cycles per second, ``turning`` in radians per second.
+    Angles are in radians, ``cadence`` in cycles per second, ``turning`` in radians per second.
     """
 
     body: str
@@ -37,9 +36,9 @@ class Gait:
     bounce: tuple[float, float]
     turning: tuple[float, float] = (0.0, 0.25)
     wander: float = 0.09
-    """Root mean square of what every joint angle adds of its own: no two steps are alike."""
+    """Root mean square of the random variation of each joint angle, radians."""
     footfall: tuple[float, float, float, float] = (0.0, 0.5, 0.75, 0.25)
-    """Phase of left hind, right hind, left fore and right fore leg, cycles; quadrupeds only."""
+    """Phases of left hind, right hind, left fore and right fore leg, cycles (quadrupeds)."""
 
 
 GAITS: Mapping[str, Gait] = {
@@ -66,33 +65,27 @@ def make_gaits(
     fps: float = 30.0,
     seed: int = 0,
 ) -> list[Motion]:
-    """Return ``n`` clips of procedural gaits, named ``walk-0``, ``walk-1``, …
+    """Return about ``n`` clips of ``frames`` frames at ``fps`` frames per second.
 
     Parameters
     ----------
-    n : int
-        Number of clips.
+    n, frames, fps, seed
+        Number of clips, frames per clip, frames per second and random seed.
     styles : mapping of str to float, optional
-        Share of the clips per style, all of one body; walk .5, run .3, march .2 by default.
-    frames : int
-        Frames per clip.
-    fps : float
-        Frames per second.
-    seed : int
-        Seed of what varies between clips.
+        Relative frequency of each style, all of one body; walk 0.5, run 0.3, march 0.2 by default.
 
     Raises
     ------
     ValueError
-        If a style is unknown or a share is not above zero.
+        If a style is unknown or a frequency is not positive.
     """
     check_count("n", n)
-    shares = {"walk": 0.5, "run": 0.3, "march": 0.2} if styles is None else dict(styles)
-    total = sum(shares.values())
+    weights = {"walk": 0.5, "run": 0.3, "march": 0.2} if styles is None else dict(styles)
+    total = sum(weights.values())
     clips = []
-    for style, share in shares.items():
-        check_positive(f"styles[{style!r}]", share)
-        for number in range(round(n * share / total)):
+    for style, weight in weights.items():
+        check_positive(f"styles[{style!r}]", weight)
+        for number in range(round(n * weight / total)):
             clips.append(make_gait(style, number, frames=frames, fps=fps, seed=seed))
     return clips
 
@@ -100,12 +93,12 @@ def make_gaits(
 def make_gait(
     style: str, number: int = 0, *, frames: int = 30, fps: float = 30.0, seed: int = 0
 ) -> Motion:
-    """Return clip ``number`` of a style; the same whatever else is made.
+    """Return clip ``number`` of a style; it does not depend on other clips.
 
     Raises
     ------
     ValueError
-        If the style is unknown; the message lists the known ones.
+        If the style is unknown.
     """
     if style not in GAITS:
         raise ValueError(f"style must be one of {', '.join(GAITS)}, got {style!r}")
@@ -133,18 +126,18 @@ def make_gait(
 
 
 def _direction(angle: np.ndarray) -> np.ndarray:
-    """Unit vector at ``angle`` forwards of straight down, (…) → (…, 3)."""
+    """Return the unit vector at ``angle`` forwards from straight down, (…) → (…, 3)."""
     return np.stack([np.zeros_like(angle), -np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _across(yaw: np.ndarray, lean: np.ndarray) -> np.ndarray:
-    """Unit vector to the left of a body that leans, turned by ``yaw`` about its spine."""
+    """Return the unit vector to the left of a leaning body turned by ``yaw`` about its spine."""
     s = np.sin(yaw)
     return np.stack([np.cos(yaw), s * np.sin(lean), -s * np.cos(lean)], axis=-1)
 
 
 def _wander(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """A smooth random function of time with mean square 1: half a cycle to two cycles a second."""
+    """Return a smooth random function of time with mean square 1, 0.5 to 2 Hz."""
     frequency = np.array([0.5, 1.0, 1.5, 2.0])
     amplitude = rng.normal(size=(2, 4)) / 2
     angle = 2 * np.pi * np.outer(time, frequency)
@@ -152,7 +145,7 @@ def _wander(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
 
 
 def _flexion(phase: np.ndarray, peak: float) -> np.ndarray:
-    """A smooth bump in [0, 1] around ``peak``: how far a knee is bent in its swing."""
+    """Return a smooth bump in [0, 1] around ``peak``: the flexion of a swinging knee."""
     return np.exp(2.0 * (np.cos(phase - peak) - 1.0))
 
 

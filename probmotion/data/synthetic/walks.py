@@ -1,4 +1,4 @@
-"""People who walk: the real clips that the prior ``walk2d`` is about, and made ones."""
+"""Walking clips: the recorded clips behind the prior ``walk2d``, and synthetic walks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from probmotion.data.synthetic.animals import ANIMAL_SKELETON, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gait, make_gaits
-from probmotion.io.files import load_motion
+from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
@@ -28,21 +28,20 @@ WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
         "deepmimic_human/humanoid3d_stealthy_walk",
     ),
 }
-"""Clips by part, 3352 frames at 30 a second. Left out are excerpts of others (humanoid3d_walk is,
-in the median, 1 cm from humanoid3d_long_walk1, humanoid3d_zombie_walk is one of
-humanoid3d_long_zombie), what has one clip only and so cannot be held out (the zombie), and runs."""
+"""Clips by part, 3352 frames at 30 fps. Excluded are excerpts of other clips (humanoid3d_walk,
+humanoid3d_zombie_walk), styles with a single clip (zombie) and runs."""
 
 
 def walk_clips(folder: str | Path) -> dict[str, list[Motion]]:
-    """Return the clips of each part, from a folder that holds them as ``.npz``.
+    """Return the recorded walks of each part, read from ``.npz`` files below ``folder``.
 
     Raises
     ------
     FileNotFoundError
-        If one is missing.
+        If a clip is missing.
     """
     return {
-        part: [load_motion(Path(folder) / f"{name}.npz") for name in names]
+        part: [load(Path(folder) / f"{name}.npz") for name in names]
         for part, names in WALK_CLIPS.items()
     }
 
@@ -54,52 +53,38 @@ def synthetic_walks(
     seconds: float = 6.0,
     fps: float = 30.0,
 ) -> list[Motion]:
-    """Return bodies that walk, made by the project itself, for where there are no clips.
+    """Return ``n`` procedural walks of ``seconds`` s at ``fps`` frames per second.
 
-    Parameters
-    ----------
-    n : int
-        Number of clips.
-    skeleton : Skeleton, optional
-        What the clips must have the joints of: quadrupeds walk where it is one's; people by
-        default.
-    seconds, fps : float
-        Length of a clip, and its frames per second.
-
-    Raises
-    ------
-    ValueError
-        If neither people nor quadrupeds have the joints.
+    The walkers are people, or quadrupeds where people lack a joint of ``skeleton``; a
+    ``ValueError`` if both lack one.
     """
-    wanted = set() if skeleton is None else set(skeleton.canonical_names)
+    required = set() if skeleton is None else set(skeleton.canonical_names)
     for style in _STYLES:
-        if wanted <= set(make_gait(style).skeleton.canonical_names):
+        if required <= set(make_gait(style).skeleton.canonical_names):
             return make_gaits(n, styles={style: 1.0}, frames=round(seconds * fps), fps=fps)
-    if wanted <= set(ANIMAL_SKELETON.canonical_names):
+    if required <= set(ANIMAL_SKELETON.canonical_names):
         return synthetic_animals(n, round(seconds * fps), fps)
     raise ValueError(
-        f"skeleton has the joints {', '.join(sorted(wanted))}, expected those of a person or a "
-        "quadruped: bodies are made of no others"
+        f"skeleton must have joints of a person or a quadruped, got {', '.join(sorted(required))}"
     )
 
 
 def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
-    """Return the joints, by canonical names, that a body of :func:`synthetic_walks` has too.
+    """Return the sub-skeleton that a body of :func:`synthetic_walks` has as well.
 
-    Of people and quadrupeds, it is the body that has both ends of more of the skeleton's bones;
-    people where that is the same. A joint whose parent is left out becomes a root. None where no
-    bone is shared: then neither body is like the skeleton.
+    Joints are matched by canonical names with the body, person or quadruped, that shares more
+    bones. A joint whose parent is dropped becomes a root. None if no bone is shared.
     """
-    found: Skeleton | None = None
+    best: Skeleton | None = None
     for style in _STYLES:
-        part = _joints_of(make_gait(style).skeleton, skeleton)
-        if part is not None and len(part.bones) > (0 if found is None else len(found.bones)):
-            found = part
-    return found
+        part = _common_joints(make_gait(style).skeleton, skeleton)
+        if part is not None and len(part.bones) > (0 if best is None else len(best.bones)):
+            best = part
+    return best
 
 
-def _joints_of(body: Skeleton, skeleton: Skeleton) -> Skeleton | None:
-    """Return what is left of the skeleton without the joints that the body lacks."""
+def _common_joints(body: Skeleton, skeleton: Skeleton) -> Skeleton | None:
+    """Return the skeleton without the joints that the body lacks."""
     known = [name in body.canonical_names for name in skeleton.canonical_names]
     if all(known):
         return skeleton

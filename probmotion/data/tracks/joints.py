@@ -1,6 +1,6 @@
-"""Joints of 2D tracks: chosen and ordered by name, derived as midpoints, and added, as a ball is.
+"""Joints of 2D tracks: retargeting, midpoints and additional joints such as a ball.
 
-Source: *MAS*, section 6.1 (the closest ball to the athlete becomes an additional joint).
+Source: *MAS*, section 6.1 (the ball closest to the athlete becomes an additional joint).
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ def with_joint(
     confidence: np.ndarray,
     parent: str | None = None,
 ) -> KeypointTrack:
-    """Return the track with one more joint, the last.
+    """Return the track with an additional last joint.
 
     Parameters
     ----------
     track : KeypointTrack
         The track.
     name : str
-        The joint's name, such as ``"ball"``.
+        Name of the joint, such as ``"ball"``.
     keypoints : ndarray, (L, 2)
-        Where it is, in the track's unit.
+        Positions, in the track's unit; ignored where the confidence is 0.
     confidence : ndarray, (L,)
-        Its confidences; where they are 0, ``keypoints`` do not count.
+        Confidences.
     parent : str, optional
-        The name of its parent; a tree of its own by default.
+        Name of the parent; a root by default.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, the name is taken, or ``parent`` is no joint.
+        If shapes do not fit, the name exists, or ``parent`` is unknown.
     """
     points = np.asarray(keypoints, dtype=np.float64)
     weights = np.asarray(confidence, dtype=np.float64)
@@ -68,69 +68,50 @@ def with_joint(
 def with_midpoint(
     track: KeypointTrack, name: str, joints: Sequence[str], parent: str | None = None
 ) -> KeypointTrack:
-    """Return the track with one more joint amid others: at the mean of their places.
+    """Return the track with a joint ``name`` at the mean of others, with their least confidence.
 
-    Its confidence is the least of theirs, so that it is seen where all of them are.
-
-    Parameters
-    ----------
-    track : KeypointTrack
-        The track.
-    name : str
-        The joint's name, such as ``"pelvis"``.
-    joints : sequence of str
-        Names of at least two joints.
-    parent : str, optional
-        The name of its parent; a tree of its own by default.
-
-    Raises
-    ------
-    ValueError
-        If a joint is unknown, there are fewer than two, or the name is taken.
+    Raises ``ValueError`` if a joint is unknown, there are fewer than two, or the name exists.
     """
     if isinstance(joints, str) or len(joints) < 2:
-        raise ValueError(f"joints must be the names of at least two joints, got {joints!r}")
+        raise ValueError(f"joints must name at least two joints, got {joints!r}")
     places = [track.skeleton.index(joint) for joint in joints]
     middle = track.keypoints[:, places].mean(axis=1)
     return with_joint(track, name, middle, track.confidence[:, places].min(axis=1), parent)
 
 
 def retarget_track(track: KeypointTrack, skeleton: Skeleton, derive: bool = False) -> KeypointTrack:
-    """Return the track on another skeleton: its joints chosen, ordered and linked anew.
-
-    Joints are matched by their own or else their canonical names
-    (:mod:`probmotion.motion.joint_names`).
+    """Return the track on another skeleton, with joints matched by name or canonical name.
 
     Parameters
     ----------
     track : KeypointTrack
         The track.
     skeleton : Skeleton
-        The skeleton to have.
+        The target skeleton.
     derive : bool
-        Whether a ``pelvis`` that the track lacks may be made of its hips, and a ``neck`` of its
-        shoulders (:func:`with_midpoint`). No other joint is made up, and these not unasked.
+        Whether to derive a missing ``pelvis`` from the hips and a missing ``neck`` from the
+        shoulders.
 
     Raises
     ------
     ValueError
-        If a joint of ``skeleton`` has no counterpart; the message names it.
+        If a joint of ``skeleton`` has no counterpart.
     """
     if track.skeleton == skeleton:
         return track
     chosen = []
     for name, canonical in zip(skeleton.joint_names, skeleton.canonical_names, strict=True):
-        wanted = name if name in track.skeleton.joint_names else canonical
-        known = wanted in track.skeleton.joint_names or wanted in track.skeleton.canonical_names
+        target = name if name in track.skeleton.joint_names else canonical
+        known = target in track.skeleton.joint_names or target in track.skeleton.canonical_names
         if not known and derive and canonical in _MIDPOINTS:
             track = with_midpoint(track, canonical, _MIDPOINTS[canonical])
         elif not known:
-            hint = ", or derive=True" if canonical in _MIDPOINTS else ""
+            hint = "; use derive=True" if canonical in _MIDPOINTS else ""
             raise ValueError(
-                f"skeleton has the joint {name!r}, which track {track.name!r} lacks, expected one "
-                f"of {', '.join(track.skeleton.joint_names)}{hint}"
+                f"skeleton must have joints of track {track.name!r} "
+                f"({', '.join(track.skeleton.joint_names)}), got {name!r}{hint}"
             )
-        chosen.append(track.skeleton.index(wanted))
+        chosen.append(track.skeleton.index(target))
     return replace(
         track,
         keypoints=track.keypoints[:, chosen],
@@ -142,25 +123,23 @@ def retarget_track(track: KeypointTrack, skeleton: Skeleton, derive: bool = Fals
 def nearest_object(
     track: KeypointTrack, boxes: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the centre of the detected box that is nearest to the athlete, frame by frame.
+    """Return the centre of the detected box closest to the athlete in each frame.
 
-    A box is as near as its centre is to the nearest seen joint: a ball may be thrown, or rolled by
-    a foot, far from the body's centre.
+    The distance of a box is that of its centre to the closest seen joint.
 
     Parameters
     ----------
     track : KeypointTrack
         The athlete.
     boxes : sequence of ndarray, (n, 5)
-        Per frame the boxes detected in it: left, top, right, bottom, in the track's unit, and
-        confidence; any number, or an empty array.
+        Boxes detected in each frame: left, top, right, bottom, in the track's unit, and confidence.
 
     Returns
     -------
     keypoints : ndarray, (L, 2)
-        Centres; NaN in frames without a box or without a seen joint.
+        Centres; NaN in frames without a box or a seen joint.
     confidence : ndarray, (L,)
-        The boxes' confidences, 0 where there is none. See :func:`with_joint`.
+        Confidences of the boxes, 0 where there is none; see :func:`with_joint`.
 
     Raises
     ------
@@ -168,24 +147,24 @@ def nearest_object(
         If there is not one array per frame, or one has another shape or is not finite.
     """
     if len(boxes) != track.frames:
-        raise ValueError(f"boxes has {len(boxes)} entries, expected {track.frames}, one per frame")
+        raise ValueError(f"boxes must have one entry per frame, {track.frames}, got {len(boxes)}")
     keypoints = np.full((track.frames, 2), np.nan)
     confidence = np.zeros(track.frames)
-    for frame, found in enumerate(boxes):
-        found = np.asarray(found, dtype=np.float64)
+    for frame, values in enumerate(boxes):
+        detected = np.asarray(values, dtype=np.float64)
         there = seen(track)[frame]
-        if not found.size:
+        if not detected.size:
             continue
-        check_shape(f"boxes[{frame}]", found, ("n", 5))
-        if not np.isfinite(found).all():
-            raise ValueError(f"boxes[{frame}] holds NaN or infinite values, expected finite ones")
+        check_shape(f"boxes[{frame}]", detected, ("n", 5))
+        if not np.isfinite(detected).all():
+            raise ValueError(f"boxes[{frame}] must be finite")
         if not there.any():
             continue
-        centres = (found[:, :2] + found[:, 2:4]) / 2
+        centres = (detected[:, :2] + detected[:, 2:4]) / 2
         joints = track.keypoints[frame, there]
         distances = np.linalg.norm(centres[:, np.newaxis] - joints, axis=-1).min(axis=1)
         nearest = int(np.argmin(distances))
-        confidence[frame] = found[nearest, 4]
+        confidence[frame] = detected[nearest, 4]
         if confidence[frame] > 0:
             keypoints[frame] = centres[nearest]
     return keypoints, confidence

@@ -1,9 +1,10 @@
-"""Data sets of 2D tracks to learn from: where they come from, and which clips are kept out."""
+"""Training data sets of 2D tracks: projected from 3D clips or read from files, split by clip."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,7 @@ from probmotion import seeds
 from probmotion.data.projections import Centre, DetectorNoise, Filming, project_clips
 from probmotion.data.synthetic.walks import shared_skeleton, synthetic_walks
 from probmotion.data.tracks.preparation import PreparedTracks, prepare_tracks
-from probmotion.data.tracks.scale_reports import per_track_scales
-from probmotion.data.tracks.scales import bone_sizes, scale_to_bones
+from probmotion.data.tracks.scales import bone_sizes, per_track_scales, scale_to_bones
 from probmotion.io.files import files_named, read_keypoints
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
@@ -22,27 +22,20 @@ from probmotion.motion.splits import Split, clip_of, split_clips, tracks_of_clip
 
 __all__ = [
     "LearningTracks",
+    "body_sizes",
     "certain",
     "film_clips",
     "film_windows",
     "read_tracks",
+    "split_names",
     "split_tracks",
-    "synthetic_walks",
+    "unique_files",
 ]
 
 
 @dataclass(frozen=True, eq=False)
 class LearningTracks:
-    """Prepared 2D tracks, apart by clip.
-
-    Parameters
-    ----------
-    train, validation, test : list of KeypointTrack
-        Metres, centred on the root. Weights are learnt from ``train`` alone; ``test`` is not even
-        looked at.
-    split : Split
-        The clips' names.
-    """
+    """Prepared 2D tracks in metres, centred on the root and split by clip."""
 
     train: list[KeypointTrack]
     validation: list[KeypointTrack]
@@ -61,34 +54,33 @@ def film_clips(
     noise: DetectorNoise | None = None,
     shortest: float = 1.0,
 ) -> PreparedTracks:
-    """Return what cameras around 3D clips and a detector would have given, prepared.
+    """Return prepared 2D tracks of 3D clips, seen by random cameras through a noisy detector.
 
     Parameters
     ----------
     motions : sequence of Motion
-        The clips, of any skeletons that have the joints asked for.
+        Clips of any skeletons with the required joints.
     skeleton : Skeleton
-        The joints that are detected.
+        Detected joints.
     fps : float
         Frames per second of the tracks.
     views, seed, filming, noise
         See :func:`~probmotion.data.projections.project_clips`.
     shortest : float
-        Seconds of the shortest track that is kept.
+        Shortest track to keep, seconds.
     """
-    shot = Filming() if filming is None else filming
+    filming = filming or Filming()
     clips = [motion.retarget(skeleton) for motion in motions]
-    tracks = project_clips(clips, views=views, seed=seed, filming=shot, noise=noise)
-    # Cameras are alone with their clip: no other track stands in the same picture.
-    alone = [track.name for track in tracks]
-    return prepare_tracks(tracks, fps=fps, videos=alone, centre=shot.centre, shortest=shortest)
+    tracks = project_clips(clips, views=views, seed=seed, filming=filming, noise=noise)
+    videos = [track.name for track in tracks]  # one person each
+    return prepare_tracks(tracks, fps=fps, videos=videos, centre=filming.centre, shortest=shortest)
 
 
 def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
-    """Return tracks whose joints count whole or not at all: confidence 1 from the threshold on.
+    """Return tracks with confidence 1 from the threshold on and 0 below.
 
-    Of filmed tracks confidences tell which joints are lost; among those that are found the made
-    detector draws them at random, and to weigh errors by them would weigh by noise.
+    The confidences of synthetic detections tell which joints are lost but are otherwise random, so
+    that they should not weight errors.
     """
     return [
         replace(track, confidence=np.where(track.confidence >= threshold, 1.0, 0.0))
@@ -99,11 +91,10 @@ def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[Key
 def film_windows(
     motions: Sequence[Motion], skeleton: Skeleton, fps: float, frames: int, n: int, *, seed: int
 ) -> np.ndarray:
-    """Return n random windows of filmed clips, whole: ``(n, frames, J, 2)``, metres.
+    """Return n random complete windows of projected clips, ``(n, frames, J, 2)``, metres.
 
-    The detector errs but loses no joint, and windows with a hole are left out; all else is as in
-    :func:`film_clips`. Every window of every clip is as likely, from 64 sides, and as likely in a
-    mirror: what is compared with them has learnt from mirror images, too.
+    The detector has errors but loses no joint; incomplete windows are dropped. All windows of all
+    clips in 64 views are equally likely, and mirrored with probability 1/2, as in training.
 
     Raises
     ------
@@ -117,19 +108,19 @@ def film_windows(
         for track in filmed
         if track.frames >= frames
     ]
-    # Cleaning hides single entries that it takes for strays.
+    # The outlier filter may have removed single detections.
     whole = [windows[np.isfinite(windows).all(axis=(1, 2, 3))] for windows in every]
     if not sum(map(len, whole)):
         raise ValueError(
-            f"motions has clips of at most {max(track.frames for track in filmed)} frames at "
-            f"{fps:g} frames per second, expected frames={frames} without a hole in one"
+            f"motions must contain a complete window of {frames} frames at {fps:g} fps, got tracks "
+            f"of at most {max(track.frames for track in filmed)} frames"
         )
-    found = np.concatenate(whole)
+    windows = np.concatenate(whole)
     rng = seeds.generator(seed, "windows")
-    chosen = found[rng.choice(len(found), n, replace=n > len(found))]
-    turned = rng.random(n) < 0.5
-    flipped = chosen[turned][:, :, list(skeleton.mirrored_order)] * np.array([-1.0, 1.0])
-    chosen[turned] = flipped + 0.0  # a root at -0 is one at 0
+    chosen = windows[rng.choice(len(windows), n, replace=n > len(windows))]
+    mirrored = rng.random(n) < 0.5
+    flipped = chosen[mirrored][:, :, list(skeleton.mirrored_order)] * np.array([-1.0, 1.0])
+    chosen[mirrored] = flipped + 0.0  # no -0
     return chosen
 
 
@@ -146,57 +137,49 @@ def read_tracks(
     sizes: Mapping[str, float] | None = None,
     shortest: float = 1.0,
 ) -> PreparedTracks:
-    """Return the tracks of files of 2D keypoints, prepared, in metres.
+    """Read and prepare 2D tracks from files of keypoints, in metres.
 
-    Where no size of a bone is known (:func:`body_sizes` knows none, and ``sizes`` says none), the
-    unit is the body's length instead: the median over tracks of the diagonal of the body's box is
-    1 (:func:`~probmotion.data.tracks.scale_reports.per_track_scales`).
+    Without known bone sizes (neither ``sizes`` nor :func:`body_sizes`) the unit is the body length:
+    the median :func:`~probmotion.data.tracks.scales.body_extent` of the tracks is 1
+    (:func:`~probmotion.data.tracks.scales.per_track_scales`).
 
     Parameters
     ----------
     paths : iterable of str or Path
-        Files, or patterns of them, each of its own name. A track is called ``"<file>/<name>"``.
+        Files with unique names, or patterns. A track is named ``"<file>/<name>"``.
     skeleton : Skeleton, optional
-        The joints to bring tracks to; None: their own, which must be the same in all.
+        Target skeleton; None: the tracks' own, which must be the same for all.
     fps : float
         Frames per second of the data set.
     file_fps : float, optional
-        Frames per second of files that do not hold it.
+        Frames per second of files that do not contain it.
     layout, people
-        What keypoints in files are, and how many people to follow, where files do not say; see
+        Keypoint layout and number of people, for files that do not contain them; see
         :func:`~probmotion.io.read_keypoints`.
     threshold : float
-        Least confidence that counts.
+        Least confidence of a detection.
     centre : {"frame", "sequence"}
-        Where the root is at the origin.
+        Whether the root is at the origin in every frame or on average.
     sizes : mapping of str to float, optional
-        Bone sizes that pixels are brought to, of all bones or some; those of :func:`body_sizes` by
-        default.
+        Bone sizes to scale to, metres, of all bones or some; :func:`body_sizes` by default.
     shortest : float
-        Seconds of the shortest track that is kept.
+        Shortest track to keep, seconds.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file.
     ValueError
-        If two files have one name, which is that of their clip, no track shows a bone, or tracks
-        have several skeletons and none is given to bring them to.
+        If file names repeat, no track shows a bone, or tracks have several skeletons and
+        ``skeleton`` is None.
     """
     raw: list[KeypointTrack] = []
     videos: list[str] = []
-    files: dict[str, Path] = {}
-    for path in files_named(paths):
-        if path.stem in files:
-            raise ValueError(
-                f"paths has {files[path.stem]} and {path}, expected files of other names: a clip "
-                "is called as its file"
-            )
-        files[path.stem] = path
+    for path in unique_files(paths).values():
         archive = path.suffix.lower() == ".npz"
-        held = (None, None, None) if archive else (file_fps, layout, people)
-        for track in read_keypoints(path, *held):
-            # A clip's name ends at the last slash, which names of images may have too.
+        options = (None, None, None) if archive else (file_fps, layout, people)
+        for track in read_keypoints(path, *options):
+            # The clip's name ends at the last slash; image names may contain one.
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
             videos.append(name if archive else _video(path, track))
@@ -212,22 +195,33 @@ def read_tracks(
     return PreparedTracks(tuple(scaled), (*prepared.reports, report))
 
 
-def _video(path: Path, track: KeypointTrack) -> str:
-    """Return which pictures a track of a table or of JSON is from: people stand side by side.
+def unique_files(paths: Iterable[str | Path]) -> dict[str, Path]:
+    """Return the files matching paths or patterns by their stems, which name clips."""
+    files: dict[str, Path] = {}
+    for path in files_named(paths):
+        if path.stem in files:
+            raise ValueError(f"files must have unique names, got {files[path.stem]} and {path}")
+        files[path.stem] = path
+    return files
 
-    Readers call people ``"file video person"``; of several videos in a file, most differ in frames.
-    """
+
+def _video(path: Path, track: KeypointTrack) -> str:
+    """Return a name of the video of a track named ``"file video person"``."""
     return f"{path} {track.name.rpartition(' ')[0]} {track.frames}"
 
 
 def body_sizes(skeleton: Skeleton) -> dict[str, float]:
-    """Return how long a grown body's bones are in pictures, metres, by joint.
+    """Return the apparent bone sizes of an adult body, metres, by joint.
 
-    The statistic is :func:`~probmotion.data.tracks.scales.bone_sizes` of people, or quadrupeds, who
-    are made to walk, filmed from all around without errors. Where neither has all joints, it is of
-    the bones that one of them shares (:func:`~probmotion.data.synthetic.walks.shared_skeleton`):
-    COCO's limbs are a person's. There is none where no bone is shared.
+    These are the :func:`~probmotion.data.tracks.scales.bone_sizes` of projected synthetic walks,
+    for the bones shared with a person or a quadruped
+    (:func:`~probmotion.data.synthetic.walks.shared_skeleton`); empty if none is shared.
     """
+    return dict(_body_sizes(skeleton))
+
+
+@cache
+def _body_sizes(skeleton: Skeleton) -> dict[str, float]:
     shared = shared_skeleton(skeleton)
     if shared is None:
         return {}
@@ -244,41 +238,50 @@ def split_tracks(
     test: Sequence[str] = (),
     seed: int = 0,
 ) -> LearningTracks:
-    """Return tracks apart by clip: the clips that are named, or a tenth each at random.
+    """Split tracks by clip: named clips, or a random tenth each.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
         Prepared tracks.
     validation, test : sequence of str
-        Names of clips; both are given, or neither.
+        Names of clips; both or neither.
     seed : int
-        Seed of the choice where none are given.
+        Seed of the random split.
 
     Raises
     ------
     ValueError
-        If only one of the two is given, a clip is in both, has no track, or none is left to learn
-        from.
+        If only one of the two is given, a clip is in both or has no track, or none is left for
+        training.
     """
-    if bool(validation) != bool(test):
-        given, missing = ("validation", "test") if validation else ("test", "validation")
-        raise ValueError(f"{given} is given without {missing}, expected clips for both or neither")
     clips = {clip_of(track.name) for track in tracks}
-    if not validation:
-        split = split_clips(clips, seed=seed)
-    else:
-        if twice := sorted(set(validation) & set(test)):
-            raise ValueError(
-                f"test has {twice[0]!r}, which validation has too, expected other clips"
-            )
-        rest = sorted(clips - set(validation) - set(test))
-        if not rest:
-            raise ValueError("validation and test have every clip, expected some to learn from")
-        split = Split(tuple(rest), tuple(sorted(validation)), tuple(sorted(test)))
+    split = split_names(clips, validation=validation, test=test, seed=seed)
     return LearningTracks(
         tracks_of_clips(tracks, split.train),
         tracks_of_clips(tracks, split.validation),
         tracks_of_clips(tracks, split.test),
         split,
     )
+
+
+def split_names(
+    clips: Iterable[str], *, validation: Sequence[str], test: Sequence[str], seed: int
+) -> Split:
+    """Split the names of clips as :func:`split_tracks`."""
+    every = set(clips)
+    if bool(validation) != bool(test):
+        given, missing = ("validation", "test") if validation else ("test", "validation")
+        raise ValueError(f"{given} requires {missing}; name clips for both or neither")
+    if not validation:
+        return split_clips(every, seed=seed)
+    for part, names in (("validation", validation), ("test", test)):
+        if unknown := sorted(set(names) - every):
+            known = ", ".join(sorted(every))
+            raise ValueError(f"{part} must name clips among {known}, got {unknown[0]!r}")
+    if twice := sorted(set(validation) & set(test)):
+        raise ValueError(f"validation and test must be disjoint, both have {twice[0]!r}")
+    rest = sorted(every - set(validation) - set(test))
+    if not rest:
+        raise ValueError("validation and test must leave training clips, got every clip")
+    return Split(tuple(rest), tuple(sorted(validation)), tuple(sorted(test)))

@@ -1,25 +1,23 @@
-"""Raw 2D tracks → a data set: the steps of preparation in their order, each with its report.
+"""Preparation of raw 2D tracks as a data set, with a report per step.
 
-Source: *MAS*, section 6.1. The order, and why:
+Source: *MAS*, section 6.1. The steps, with the reason for their order:
 
 ============  ==================================================================================
-step          why here
+step          reason
 ============  ==================================================================================
-uncertain     first: everything after it asks only what is seen
-crowds        needs whole tracks, side by side in time, with all of their joints
-joints        before quality, which is that of the joints that will be used
-pieces        before anything is interpolated: never across a jump; before centring, which hides
-              jumps
-strays        per piece: a jump is none; before gaps are filled, which closes what it opens
-quality       per piece, and of detections alone: before gaps are filled
-gaps          before smoothing, which works on runs; before centring, which needs the root
-smooth        before resampling: decimation would fold jitter into slow movement
-resample      to the one frame rate of the data set
-short         after all that changes durations
+uncertain     first: later steps only distinguish seen from unseen
+crowds        needs whole tracks, side by side in time, with all joints
+joints        before quality, which concerns the joints used
+segments      before interpolation, which must not cross jumps
+outliers      per segment, before gaps are filled
+quality       per segment, on detections alone: before gaps are filled
+gaps          before smoothing, which needs runs, and centring, which needs the root
+smooth        before resampling, which would alias jitter
+resample      to the frame rate of the data set
+short         after everything that changes durations
 scale         to metres: one factor per track
-centre        after smoothing: the root's jitter would move every joint
-quality       again: what was hidden for want of the root may be most of a track
-mirror        last: about the root
+centre        after smoothing: jitter of the root would move every joint
+quality       again: centring drops frames without a root
 ============  ==================================================================================
 """
 
@@ -32,11 +30,11 @@ from probmotion.data.tracks.filters import (
     drop_crowds,
     drop_low_quality,
     drop_short,
-    hide_strays,
-    hide_uncertain,
+    mask_outliers,
+    mask_uncertain,
 )
 from probmotion.data.tracks.joints import retarget_track
-from probmotion.data.tracks.poses import centre_tracks, mirror_tracks
+from probmotion.data.tracks.poses import centre_tracks
 from probmotion.data.tracks.scales import scale_to_bones
 from probmotion.data.tracks.segments import split_discontinuities
 from probmotion.data.tracks.smoothing import fill_gaps, resample_tracks, smooth_tracks
@@ -50,15 +48,7 @@ __all__ = ["PreparedTracks", "prepare_tracks"]
 
 @dataclass(frozen=True, eq=False)
 class PreparedTracks:
-    """A data set of tracks with one skeleton and frame rate, and how it came about.
-
-    Attributes
-    ----------
-    tracks : tuple of KeypointTrack
-        What is left, at least one.
-    reports : tuple of StepReport
-        One per step that was taken, in order.
-    """
+    """A data set of at least one track with one skeleton and frame rate, and a report per step."""
 
     tracks: tuple[KeypointTrack, ...]
     reports: tuple[StepReport, ...]
@@ -96,12 +86,11 @@ def prepare_tracks(
     share: float = 0.6,
     jump: float = 0.5,
     unseen: float = 0.5,
-    stray: float = 0.15,
+    outlier: float = 0.15,
     longest_gap: float = 0.25,
     window: float = 0.25,
     shortest: float = 1.0,
     centre: str = "frame",
-    mirror: bool = False,
 ) -> PreparedTracks:
     """Run the steps of this module's table over raw tracks.
 
@@ -112,58 +101,52 @@ def prepare_tracks(
     fps : float
         Frames per second of the data set.
     skeleton : Skeleton, optional
-        Bring tracks to these joints, pelvis and neck derived where they lack them
-        (:func:`~probmotion.data.tracks.joints.retarget_track`); their own by default.
+        Target skeleton, with pelvis and neck derived if missing
+        (:func:`~probmotion.data.tracks.joints.retarget_track`); the tracks' own by default.
     sizes : mapping of str to float, optional
-        Scale tracks to these bones (:func:`~probmotion.data.tracks.scales.scale_to_bones`); by
-        default they keep their unit.
+        Bone sizes to scale tracks to (:func:`~probmotion.data.tracks.scales.scale_to_bones`); no
+        scaling by default.
     videos, overlap
         See :func:`~probmotion.data.tracks.filters.drop_crowds`.
     threshold : float
-        The least confidence that counts: 0.3 for people, 0.5 for horses, 0.01 with a ball.
+        Least confidence of a detection: 0.3 for people, 0.5 for horses, 0.01 with a ball.
     share : float
         See :func:`~probmotion.data.tracks.filters.drop_low_quality`.
     jump, unseen : float
         See :func:`~probmotion.data.tracks.segments.split_discontinuities`.
-    stray : float
-        See :func:`~probmotion.data.tracks.filters.hide_strays`.
+    outlier : float
+        See :func:`~probmotion.data.tracks.filters.mask_outliers`.
     longest_gap, window, shortest : float
-        Seconds: the longest gap to fill, the window of smoothing and of the search for strays, the
-        shortest track.
-    centre : str
-        ``"frame"`` or ``"sequence"``; see :func:`~probmotion.data.tracks.poses.centre_tracks`.
-    mirror : bool
-        Whether mirrored copies are added. Off by default: training mirrors at random as it goes,
-        and held-out tracks should be those that were seen.
+        Seconds: longest gap to fill, window of smoothing and outlier detection, shortest track.
+    centre : {"frame", "sequence"}
+        See :func:`~probmotion.data.tracks.poses.centre_tracks`.
 
     Raises
     ------
     ValueError
         If there is no track, tracks have several skeletons, a number is out of range, or a step
-        leaves no track; the message says which, and what it dropped.
+        leaves no track.
     """
     check_positive("fps", fps)
     left = list(tracks)
     if not left:
         raise ValueError("tracks must contain at least one, got none")
     if skeleton is None and any(track.skeleton != left[0].skeleton for track in left):
-        raise ValueError(
-            "tracks have several skeletons, expected one, or skeleton to bring them to"
-        )
+        raise ValueError("tracks must have one skeleton, got several; pass skeleton")
     reports: list[StepReport] = []
 
     def take(step: tuple[list[KeypointTrack], StepReport]) -> list[KeypointTrack]:
         reports.append(step[1])
         if not step[0]:
-            raise ValueError(f"tracks has none left, expected at least one, after {step[1]}")
+            raise ValueError(f"no track is left after step {step[1]}")
         return step[0]
 
-    left = take(hide_uncertain(left, threshold=threshold))
+    left = take(mask_uncertain(left, threshold=threshold))
     left = take(drop_crowds(left, overlap=overlap, videos=videos))
     if skeleton is not None:
         left = take(_retargeted(left, skeleton))
     left = take(split_discontinuities(left, jump=jump, unseen=unseen))
-    left = take(hide_strays(left, distance=stray, window=window))
+    left = take(mask_outliers(left, distance=outlier, window=window))
     left = take(drop_low_quality(left, threshold=threshold, share=share))
     left = take(fill_gaps(left, longest=longest_gap))
     left = take(smooth_tracks(left, window=window))
@@ -173,8 +156,6 @@ def prepare_tracks(
         left = take(scale_to_bones(left, sizes))
     left = take(centre_tracks(left, per=centre))
     left = take(drop_low_quality(left, threshold=threshold, share=share))
-    if mirror:
-        left = take(mirror_tracks(left))
     return PreparedTracks(tuple(left), tuple(reports))
 
 
@@ -186,8 +167,8 @@ def _retargeted(
     except ValueError as error:
         own = ", ".join(tracks[0].skeleton.joint_names)
         raise ValueError(
-            f"skeleton has joints that tracks of {own} do not say: {error}; expected one that fits "
-            "them, or the tracks' own (None, on the command line own)"
+            f"tracks of {own} cannot be retargeted: {error}; pass a skeleton with these joints, or "
+            "None (own on the command line)"
         ) from error
-    why = f"brought to the {skeleton.n_joints} joints {skeleton.joint_names[0]}, …"
+    why = f"retargeted to the {skeleton.n_joints} joints {skeleton.joint_names[0]}, …"
     return moved, StepReport.of("joints", tracks, moved, why)

@@ -1,4 +1,4 @@
-"""Tracks cut where they are not one motion: at jumps, and where nobody was seen for long."""
+"""Segmentation of 2D tracks at jumps and long gaps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probmotion.data.tracks.step_reports import StepReport, frames_of, seen
+from probmotion.data.tracks.step_reports import StepReport, seen
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.splits import name_within_clip
 from probmotion.validation import check_positive
@@ -16,11 +16,11 @@ __all__ = ["split_discontinuities", "track_size"]
 
 
 def track_size(track: KeypointTrack) -> float:
-    """Return a track's size: the median over frames of the diagonal of its seen joints' box."""
+    """Return the median diagonal of the bounding box of a track's seen joints."""
     there = seen(track)[..., np.newaxis]
     frames = there.any(axis=(1, 2))
     if not frames.any():
-        raise ValueError(f"track {track.name!r} has no seen joint, expected at least one")
+        raise ValueError(f"track {track.name!r} must have a seen joint, got none")
     least = np.where(there, track.keypoints, np.inf).min(axis=1)[frames]
     greatest = np.where(there, track.keypoints, -np.inf).max(axis=1)[frames]
     return float(np.median(np.linalg.norm(greatest - least, axis=-1)))
@@ -29,41 +29,41 @@ def track_size(track: KeypointTrack) -> float:
 def split_discontinuities(
     tracks: Sequence[KeypointTrack], *, jump: float = 0.5, unseen: float = 0.5
 ) -> tuple[list[KeypointTrack], StepReport]:
-    """Cut tracks at jumps, which are tracking errors, and where nothing was seen for long.
+    """Cut tracks at jumps, which are tracking errors, and at long gaps.
 
-    A track jumps between two frames, with none or only unseen ones between them, if it moves by
-    more than ``jump`` times its own size (:func:`track_size`): by the median of the distances that
-    the joints seen in both frames move, or that of the centres of all seen joints where no joint
-    is seen in both. The median, because one joint may be mistaken where the body is not.
+    A track jumps between two frames with seen joints if it moves by more than ``jump`` times its
+    size (:func:`track_size`): the median displacement of the joints seen in both frames, or else
+    the displacement of the centre of all seen joints.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
         Tracks that are not centred.
     jump : float
-        The greatest distance between frames, in units of the track's size.
+        Greatest displacement between frames, in track sizes.
     unseen : float
-        The longest time without any seen joint that a track may span, seconds.
+        Longest time without any seen joint, seconds.
 
     Returns
     -------
     tracks : list of KeypointTrack
-        The pieces, in order. Frames without a seen joint at a cut, and at the ends, belong to no
-        piece. Pieces of a track that is cut are numbered: ``"walk/left 0"``, or ``"walk/0"``
-        where the name has no ``/``, so that all belong to one clip.
+        The segments in order, without unseen frames at cuts and ends. Segments of a cut track are
+        numbered: ``"walk/left 0"``, or ``"walk/0"`` for the name ``"walk"``.
     report : StepReport
-        ``frames_dropped`` counts unseen frames; ``tracks_dropped`` tracks that were never seen.
+        What was dropped.
     """
     check_positive("jump", jump)
     check_positive("unseen", unseen)
-    pieces: list[KeypointTrack] = []
+    segments: list[KeypointTrack] = []
     jumps = gaps = never = 0
     for track in tracks:
         there = np.flatnonzero(seen(track).any(axis=1))
         if not len(there):
             never += 1
             continue
-        far = _moved(track, there) > (jump * track_size(track) or np.inf)  # one joint has no size
+        far = _moved(track, there) > (
+            jump * track_size(track) or np.inf
+        )  # a single joint has size 0
         long = np.diff(there) - 1 > unseen * track.fps
         cuts = np.flatnonzero(far | long)
         jumps += int((far & ~long).sum())
@@ -72,7 +72,7 @@ def split_discontinuities(
         stops = [*(there[cuts] + 1), there[-1] + 1]
         whole = len(starts) == 1
         for number, (start, stop) in enumerate(zip(starts, stops, strict=True)):
-            pieces.append(
+            segments.append(
                 replace(
                     track,
                     keypoints=track.keypoints[start:stop],
@@ -81,17 +81,14 @@ def split_discontinuities(
                 )
             )
     why = (
-        f"cut at {jumps} jumps of more than {jump:g} of the track's size and at {gaps} gaps of "
-        f"more than {unseen:g} s; {never} tracks were never seen"
+        f"cut at {jumps} jumps of over {jump:g} track sizes and at {gaps} gaps of over {unseen:g} "
+        f"s; {never} tracks were never seen"
     )
-    dropped = frames_of(tracks) - frames_of(pieces)
-    return pieces, StepReport.of(
-        "pieces", tracks, pieces, why, tracks_dropped=never, frames_dropped=dropped
-    )
+    return segments, StepReport.of("segments", tracks, segments, why, tracks_dropped=never)
 
 
 def _moved(track: KeypointTrack, frames: np.ndarray) -> np.ndarray:
-    """Return how far a track moves from each of ``frames`` to the next, (len(frames) - 1,)."""
+    """Return the displacement of a track from each of ``frames`` to the next."""
     there = seen(track)[frames]
     points = np.where(there[..., np.newaxis], track.keypoints[frames], 0.0)
     centres = points.sum(axis=1) / there.sum(axis=1)[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""Steps along time: gaps filled, detections smoothed, tracks brought to one frame rate."""
+"""Temporal processing of 2D tracks: gap filling, smoothing and resampling."""
 
 from __future__ import annotations
 
@@ -17,28 +17,15 @@ __all__ = ["fill_gaps", "resample_tracks", "smooth_tracks"]
 
 Step = tuple[list[KeypointTrack], StepReport]
 _HIGHEST_FPS = 10_000
-_ROUNDING = 1e-3  # as for motions: see probmotion.motion.resampling
+_ROUNDING = 1e-3  # as in probmotion.motion.resampling
 _SAME_TIME = 1e-6  # frames
 _DEGREE = 2
 
 
 def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step:
-    """Fill each joint's short gaps by monotone cubic interpolation (PCHIP), without overshoot.
+    """Fill gaps of at most ``longest`` seconds of each joint by PCHIP interpolation.
 
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks of any skeletons.
-    longest : float
-        The longest gap to fill, seconds. A joint that is unseen for longer, or before its first or
-        after its last seen frame, stays unseen: nothing is extrapolated.
-
-    Returns
-    -------
-    tracks : list of KeypointTrack
-        A filled entry has the lesser of the confidences at the two ends of its gap.
-    report : StepReport
-        ``entries_changed`` counts what was filled.
+    A filled entry has the lesser confidence of the ends of its gap. Nothing is extrapolated.
     """
     check_positive("longest", longest)
     filled = []
@@ -62,25 +49,10 @@ def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step
 
 
 def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> Step:
-    """Smooth each joint's path over its runs of seen frames (Savitzky and Golay, degree 2).
+    """Smooth each joint over its runs of seen frames (Savitzky–Golay, degree 2).
 
-    Every position becomes that of a parabola fitted to the frames around it, so that paths of
-    constant acceleration stay what they are, at their ends too.
-
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks of any skeletons.
-    window : float
-        How long a time the fit sees, seconds; an odd number of frames, at most those of the run.
-        Where that is fewer than 5, nothing changes.
-
-    Returns
-    -------
-    tracks : list of KeypointTrack
-        Confidences and what is unseen stay.
-    report : StepReport
-        ``entries_changed`` counts what was smoothed.
+    ``window``, in seconds, is rounded to an odd number of frames within the run; windows of fewer
+    than 5 frames change nothing.
     """
     check_positive("window", window)
     smoothed = []
@@ -101,26 +73,18 @@ def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> S
 
 
 def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
-    """Bring tracks to one frame rate, by linear interpolation in time.
+    """Resample tracks to ``fps`` frames per second, at most 10 000, by linear interpolation.
 
-    The first frame stays; the last is the last one of the new rate that is not after the track's
-    end. An entry between two old frames is seen where both were, with their confidences
-    interpolated; unseen stays unseen.
-
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks of any frame rates.
-    fps : float
-        Frames per second, above 0 and at most 10 000.
+    The first frame stays; no frame lies after the original end. An entry between two frames is seen
+    if both are, with interpolated confidence.
     """
     check_positive("fps", fps)
     if fps > _HIGHEST_FPS:
-        raise ValueError(f"fps must be at most {_HIGHEST_FPS} frames per second, got {fps:g}")
+        raise ValueError(f"fps must be at most {_HIGHEST_FPS}, got {fps:g}")
     resampled = [track if track.fps == fps else _resampled(track, float(fps)) for track in tracks]
     rates = sorted({f"{track.fps:g}" for track in tracks}, key=float)
-    why = f"brought {' and '.join(rates) or 'no'} fps to {fps:g}"
-    return resampled, StepReport.of("resample", tracks, resampled, why)
+    why = f"resampled {' and '.join(rates) or 'no'} fps to {fps:g}"
+    return resampled, StepReport.of("resample", tracks, resampled, why, frames_dropped=0)
 
 
 def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
@@ -128,7 +92,7 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
     frames = int(np.floor(last / track.fps * fps + _ROUNDING)) + 1
     time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
     near = np.round(time)
-    # Frames that coincide with old ones need no neighbour, which may be unseen.
+    # Frames that coincide with old ones do not depend on a neighbour, which may be unseen.
     time = np.where(np.abs(time - near) < _SAME_TIME, near, time)
     before = time.astype(int)
     after = np.ceil(time).astype(int)

@@ -1,4 +1,4 @@
-"""What a step of preparation did to a data set of 2D tracks, in numbers and words."""
+"""Reports of the preparation steps of 2D tracks."""
 
 from __future__ import annotations
 
@@ -9,30 +9,15 @@ import numpy as np
 
 from probmotion.motion.motion import KeypointTrack
 
-__all__ = ["StepReport", "entries_of", "frames_of", "seen"]
+__all__ = ["StepReport", "entries_of", "seen"]
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """One step: what came, what was dropped or changed, what left, and why.
+    """Input, output and losses of one step.
 
-    Steps that only drop keep the sums: what came is what left and what was dropped. Splitting
-    makes more tracks of the same frames, mirroring doubles both, resampling counts time anew.
-
-    Attributes
-    ----------
-    step : str
-        The step's name.
-    tracks_before, frames_before : int
-        What came.
-    tracks_after, frames_after : int
-        What left.
-    tracks_dropped, frames_dropped : int
-        Tracks that were dropped whole, and frames that were, theirs included.
-    entries_changed : int
-        Joints of single frames that were hidden, filled or moved.
-    why : str
-        What was done, and why something was dropped, in words.
+    ``entries_changed`` counts detections (joints of single frames) that were removed, filled or
+    moved; ``frames_dropped`` includes the frames of dropped tracks.
     """
 
     step: str
@@ -53,40 +38,39 @@ class StepReport:
         after: Sequence[KeypointTrack],
         why: str,
         *,
-        tracks_dropped: int = 0,
-        frames_dropped: int = 0,
+        tracks_dropped: int | None = None,
+        frames_dropped: int | None = None,
         entries_changed: int = 0,
     ) -> StepReport:
-        """Return the report of a step from the tracks that came and those that left."""
+        """Return the report of a step; what is missing from its output counts as dropped."""
+        tracks, frames = (len(before), len(after)), (frames_of(before), frames_of(after))
+        if tracks_dropped is None:
+            tracks_dropped = tracks[0] - tracks[1]
+        if frames_dropped is None:
+            frames_dropped = frames[0] - frames[1]
         return cls(
-            step, len(before), frames_of(before), len(after), frames_of(after),
-            tracks_dropped, frames_dropped, entries_changed, why,
+            step, tracks[0], frames[0], tracks[1], frames[1], tracks_dropped, frames_dropped,
+            entries_changed, why,
         )  # fmt: skip
 
     def __str__(self) -> str:
         return (
-            f"{self.step}: {_counted(self.tracks_before, 'track')} of "
-            f"{_counted(self.frames_before, 'frame')} became {self.tracks_after} of "
-            f"{self.frames_after}; {_counted(self.tracks_dropped, 'track')} and "
-            f"{_counted(self.frames_dropped, 'frame')} dropped, "
-            f"{_counted(self.entries_changed, 'joint')} changed; {self.why}"
+            f"{self.step}: tracks {self.tracks_before} → {self.tracks_after}, frames "
+            f"{self.frames_before} → {self.frames_after}, {self.entries_changed} detections "
+            f"changed; {self.why}"
         )
 
 
-def _counted(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
-
-
 def frames_of(tracks: Sequence[KeypointTrack]) -> int:
-    """Return how many frames the tracks have together."""
+    """Return the total number of frames."""
     return sum(track.frames for track in tracks)
 
 
 def seen(track: KeypointTrack) -> np.ndarray:
-    """Return which entries were seen, (L, J) bool: those with a confidence above 0."""
+    """Return which entries have a confidence above 0, (L, J) bool."""
     return track.confidence > 0
 
 
 def entries_of(tracks: Sequence[KeypointTrack]) -> int:
-    """Return how many joints of single frames were seen in the tracks together."""
+    """Return the total number of seen entries."""
     return sum(int(seen(track).sum()) for track in tracks)

@@ -1,4 +1,4 @@
-"""2D annotations of people together, and the views they were taken from."""
+"""2D annotations of several people, their views and local frames."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Annotated 2D pose-pairs: joints of several characters in single frames of videos.
+"""2D annotations of several people in video frames.
 
-Image axes are x right and y up, in metres: the scale of the characters, not of the camera.
+Image axes are x right and y up, in metres at the scale of the people.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.files import written_whole
-from probmotion.interaction.annotations.local_frames import chests, trees
+from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive, check_shape
 
@@ -23,34 +23,28 @@ __all__ = ["Annotations"]
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """n annotated frames of K characters, the joints of one skeleton with K trees.
+    """n annotated frames of K people, with the joints of one skeleton of K trees.
 
     Parameters
     ----------
     keypoints : ndarray, (n, J, 2)
-        Metres, x right, y up. Hidden joints are set to 0 and never read.
+        Metres, x right, y up. Occluded joints are set to 0 and ignored.
     visible : ndarray, (n, J), bool
-        Which joints are annotated; at least one of each character.
+        Mask of annotated joints; at least one per person.
     skeleton : Skeleton
         Names and parents of the J joints.
     neighbours : ndarray, (n, 2, J, 2)
-        The same joints in the frame before and in the frame after, in the annotation's own video
-        and axes. NaN where there is none: at a cut, at an end, where hidden.
+        The joints in the previous and next frame of the same video; NaN at cuts, ends and
+        occlusions.
     fps : float
         Frames per second of the videos.
     views : ndarray, (n, 2), optional
-        The views (φ, θ), radians, NaN for annotations whose view is unknown. By default they are
-        to be estimated, see :func:`~probmotion.interaction.annotations.backbones.annotation_views`.
+        Views (φ, θ), radians, NaN if unknown. Estimate them with
+        :func:`~probmotion.interaction.annotations.backbones.annotation_views` if None.
     sources : sequence of str, optional
         Name of the video of each annotation.
     dropped : mapping of str to int
-        What a loader left out: how many frames, by reason.
-
-    Raises
-    ------
-    ValueError
-        If there is no annotation, shapes do not fit, a visible joint is not finite, or an
-        annotation shows no joint of a character; the message names the first one.
+        Number of frames left out by a loader, by reason.
     """
 
     keypoints: np.ndarray
@@ -67,34 +61,35 @@ class Annotations:
         check_shape("keypoints", keypoints, ("n", self.skeleton.n_joints, 2))
         n = len(keypoints)
         if n == 0:
-            raise ValueError("keypoints has no annotation, expected at least one")
+            raise ValueError("keypoints must contain at least one annotation, got none")
         visible = np.asarray(self.visible)
         check_shape("visible", visible, keypoints.shape[:2])
         if visible.dtype != np.bool_:
-            raise ValueError(f"visible is of {visible.dtype}, expected bool")
+            raise ValueError(f"visible must be bool, got {visible.dtype}")
         missing = ~np.isfinite(keypoints).all(axis=-1) & visible
         if missing.any():
             index, joint = np.argwhere(missing)[0]
             raise ValueError(
-                f"keypoints is not finite in annotation {index}, joint "
-                f"{self.skeleton.joint_names[joint]}, expected it hidden there"
+                "keypoints must be finite where visible, got "
+                f"{keypoints[index, joint]} in annotation {index}, joint "
+                f"{self.skeleton.joint_names[joint]}"
             )
-        self._refuse_missing_characters(visible)
+        self._check_people(visible)
         neighbours = np.asarray(self.neighbours, dtype=np.float64)
         check_shape("neighbours", neighbours, (n, 2, self.skeleton.n_joints, 2))
         if np.isinf(neighbours).any():
-            raise ValueError("neighbours has infinite values, expected numbers, or NaN where none")
+            raise ValueError("neighbours must be finite, or NaN if missing, got infinite values")
         check_positive("fps", self.fps)
         if self.views is not None:
             views = np.asarray(self.views, dtype=np.float64)
             check_shape("views", views, (n, 2))
             if np.isinf(views).any():
-                raise ValueError("views has infinite values, expected numbers, or NaN if unknown")
+                raise ValueError("views must be finite, or NaN if unknown, got infinite values")
             object.__setattr__(self, "views", views)
         if self.sources is not None:
             sources = tuple(str(source) for source in self.sources)
             if len(sources) != n:
-                raise ValueError(f"sources has {len(sources)} names, expected {n}")
+                raise ValueError(f"sources must have {n} names, got {len(sources)}")
             object.__setattr__(self, "sources", sources)
         object.__setattr__(self, "keypoints", np.where(visible[..., np.newaxis], keypoints, 0.0))
         object.__setattr__(self, "visible", visible)
@@ -106,17 +101,16 @@ class Annotations:
         return len(self.keypoints)
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> Annotations:
-        """Return the annotations at ``indices``, in that order."""
+        """Return the annotations at ``indices`` (integers or a mask), in that order."""
         chosen = np.asarray(indices)
         if chosen.dtype == np.bool_:
             check_shape("indices", chosen, (len(self),))
             chosen = np.flatnonzero(chosen)
         elif chosen.size and not np.issubdtype(chosen.dtype, np.integer):
-            raise ValueError(f"indices is of {chosen.dtype}, expected integers or a mask")
+            raise ValueError(f"indices must be integers or a mask, got {chosen.dtype}")
         if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self)):
             raise ValueError(
-                f"indices has values from {chosen.min()} to {chosen.max()}, expected them from 0 "
-                f"to {len(self) - 1}"
+                f"indices must be from 0 to {len(self) - 1}, got {chosen.min()} to {chosen.max()}"
             )
         chosen = chosen.astype(np.int64)
         return replace(
@@ -130,14 +124,9 @@ class Annotations:
 
     @classmethod
     def joined(cls, several: Sequence[Annotations]) -> Annotations:
-        """Return the annotations of several videos as one set.
+        """Concatenate annotations of several videos with the same skeleton and frame rate.
 
-        Views are kept where all have them, names of videos where any has them.
-
-        Raises
-        ------
-        ValueError
-            If there is none, or they differ in skeleton or frame rate.
+        Views are kept if all sets have them, sources if any set has them.
         """
         if not several:
             raise ValueError("several must contain at least one set of annotations, got none")
@@ -145,9 +134,9 @@ class Annotations:
         for number, other in enumerate(several):
             if other.skeleton != first.skeleton or other.fps != first.fps:
                 raise ValueError(
-                    f"several[{number}] has {other.skeleton.n_joints} joints at {other.fps:g} "
-                    f"frames per second, expected the first one's {first.skeleton.n_joints} at "
-                    f"{first.fps:g}"
+                    f"several[{number}] must have the skeleton ({first.skeleton.n_joints} joints) "
+                    f"and frame rate ({first.fps:g}) of several[0], got "
+                    f"{other.skeleton.n_joints} joints and {other.fps:g} frames per second"
                 )
         views = [other.views for other in several if other.views is not None]
         names = [other.sources or [""] * len(other) for other in several]
@@ -164,28 +153,26 @@ class Annotations:
         )
 
     def describe(self) -> str:
-        """Return one sentence: how many annotations, hidden joints and left-out frames."""
-        hidden = int((~self.visible).sum())
+        """Return a summary: the number of annotations, occluded joints and dropped frames."""
+        occluded = int((~self.visible).sum())
         text = f"{len(self)} annotations"
-        text += f", {hidden} of {self.visible.size} joints hidden" if hidden else ""
-        left_out = [f"{count} ({why})" for why, count in self.dropped.items() if count]
-        return text + (f", frames dropped: {', '.join(left_out)}" if left_out else "")
+        text += f", {occluded} of {self.visible.size} joints occluded" if occluded else ""
+        dropped = [f"{count} ({why})" for why, count in self.dropped.items() if count]
+        return text + (f", frames dropped: {', '.join(dropped)}" if dropped else "")
 
     def local_differences(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return how much what each joint moves in the image changes per frame (eq. 12's Δp).
+        """Return the change of each bone's image direction and length per frame (eq. 12's Δp).
+
+        Half the central difference if both neighbours exist, else the one-sided difference, else
+        0. A bone of length 0 has direction 0.
 
         Returns
         -------
         turn : ndarray, (n, J)
-            Length of the change of the bone's direction, the unit vector from the parent to the
-            joint; at a root, of the direction from the root to its tree's chest.
+            Norm of the change of the unit vector from the parent to the joint (at a root: from
+            the root to the chest).
         stretch : ndarray, (n, J)
-            Change of the bone's length, metres; at a root, how far it moves.
-
-        Notes
-        -----
-        Per frame: half the central difference where both neighbours exist, else the one-sided one,
-        0 where there is none. A bone of length 0 has direction 0.
+            Change of the bone's length (at a root: its displacement), metres.
         """
         own = np.where(self.visible[..., np.newaxis], self.keypoints, np.nan)
         times = np.stack([self.neighbours[:, 0], own, self.neighbours[:, 1]])
@@ -199,7 +186,7 @@ class Annotations:
         return turn, stretch
 
     def save(self, path: str | Path) -> None:
-        """Write the annotations to an ``.npz`` archive, whole or not at all."""
+        """Write the annotations to an ``.npz`` archive, atomically."""
         arrays: dict[str, np.ndarray] = {
             "keypoints": self.keypoints,
             "visible": self.visible,
@@ -221,68 +208,59 @@ class Annotations:
 
     @classmethod
     def load(cls, path: str | Path) -> Annotations:
-        """Read what :meth:`save` wrote.
-
-        Raises
-        ------
-        ValueError
-            If the file is no such archive, or is damaged.
-        FileNotFoundError
-            If there is no such file.
-        """
+        """Read an archive written by :meth:`save`; raise ``ValueError`` if it is damaged."""
         from probmotion.io.errors import read_bytes
 
         content = read_bytes(Path(path))
         try:
             with np.load(io.BytesIO(content)) as archive:
-                held = dict(archive)
+                arrays = dict(archive)
             skeleton = Skeleton(
-                held["joint_names"].tolist(),
-                held["parents"].tolist(),
-                held["radii"].tolist() if "radii" in held else None,
+                arrays["joint_names"].tolist(),
+                arrays["parents"].tolist(),
+                arrays["radii"].tolist() if "radii" in arrays else None,
             )
-            counts = held["dropped_counts"].tolist()
+            counts = arrays["dropped_counts"].tolist()
             return cls(
-                held["keypoints"],
-                held["visible"],
+                arrays["keypoints"],
+                arrays["visible"],
                 skeleton,
-                held["neighbours"],
-                held["fps"].item(),
-                views=held.get("views"),
-                sources=held["sources"].tolist() if "sources" in held else None,
-                dropped=dict(zip(held["dropped_reasons"].tolist(), counts, strict=True)),
+                arrays["neighbours"],
+                arrays["fps"].item(),
+                views=arrays.get("views"),
+                sources=arrays["sources"].tolist() if "sources" in arrays else None,
+                dropped=dict(zip(arrays["dropped_reasons"].tolist(), counts, strict=True)),
             )
         except (ValueError, KeyError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as why:
             raise ValueError(
-                f"{path} holds no annotations ({str(why)[:120]}), expected an archive that "
-                "Annotations.save wrote"
+                f"{path} must be an archive written by Annotations.save, got an unreadable file "
+                f"({str(why)[:120]})"
             ) from why
 
     def _bones(self) -> tuple[list[int], list[int]]:
-        """Return where each joint's bone begins and ends; a root's goes up to its chest."""
+        """Return the start and end joint of each joint's bone; a root's ends at its chest."""
         base, tip = list(self.skeleton.parents), list(range(self.skeleton.n_joints))
-        for root, chest in zip(self.skeleton.roots, chests(self.skeleton), strict=True):
+        for root, chest in zip(self.skeleton.roots, chest_joints(self.skeleton), strict=True):
             base[root], tip[root] = root, chest
         return base, tip
 
-    def _refuse_missing_characters(self, visible: np.ndarray) -> None:
+    def _check_people(self, visible: np.ndarray) -> None:
         for root in self.skeleton.roots:
-            unseen = ~visible[:, np.equal(trees(self.skeleton), root)].any(axis=-1)
-            if unseen.any():
+            missing = ~visible[:, np.equal(joint_roots(self.skeleton), root)].any(axis=-1)
+            if missing.any():
                 raise ValueError(
-                    f"visible shows no joint of the character of "
-                    f"{self.skeleton.joint_names[root]} in annotation "
-                    f"{int(np.argmax(unseen))} (one person missing), expected at least one"
+                    "visible must have at least one joint per person, got none of the person of "
+                    f"{self.skeleton.joint_names[root]} in annotation {int(np.argmax(missing))}"
                 )
 
 
 def _change(values: np.ndarray) -> np.ndarray:
-    """Return the length of the change per frame of (before, own, after), ``(3, …, d) → (…)``."""
+    """Return the norm of the change per frame, ``(3, …, d) → (…)``."""
     before, own, after = values
     central, first, last = (
         np.linalg.norm(change, axis=-1)
         for change in ((after - before) / 2, own - before, after - own)
     )
-    # A difference is NaN where one of its two frames is missing.
+    # A difference is NaN if either frame is missing.
     known = np.where(np.isnan(central), np.where(np.isnan(first), last, first), central)
     return np.nan_to_num(known, nan=0.0)

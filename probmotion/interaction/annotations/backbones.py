@@ -1,20 +1,24 @@
-"""Backbones and views of annotated characters (Yin et al. 2018, section 4.2).
+"""Estimation of backbones and views from 2D annotations (Yin et al. 2018, section 4.2).
 
-Only the torso is lifted, not the pose: pelvis, spine, chest, neck, head, shoulders and hips of the
-seed, as one rigid body, turned to fit its picture
-(:mod:`probmotion.interaction.annotations.torso_fits`).
+The torso of the seed pose (pelvis, spine, chest, neck, head, shoulders and hips) is fitted to the
+annotation as a rigid body (:mod:`probmotion.interaction.annotations.torso_fits`).
 
-An orthographic picture does not say how far one character stands behind another. The seed does:
-let D be the offset between two roots in the seed. Each of the two torsos, turned by its R_k,
-carries it to R_k D, whose first two coordinates can be compared with the picture. The third is
+The depth between two people is not observable in an orthographic projection. It is estimated from
+the offset D between their roots in the seed, rotated by each torso's R_k:
 
-    Δz = Σ_k w_k (R_k D)_z,   w_k ∝ exp(−‖(R_k D)_xy − picture's offset‖² / (2 τ²)),  τ = ‖D‖/2.
+    Δz = Σ_k w_k (R_k D)_z,   w_k ∝ exp(−‖(R_k D)_xy − observed offset‖² / (2 τ²)),  τ = ‖D‖/2.
 
-On real salsa pairs in random views, the seed the medoid of a thousand, backbones were off by 3
-degrees in the median and 7 at 90 %, views by 7 and 29; keypoints with 2 cm of noise: 5 and 19, 9
-and 36; 30 % of the joints hidden: 3 and 9, 8 and 32. Over six less typical seeds the view was off
-by 7-17 and 28-60 degrees; with Δz = 0 by 30-34 and 64-72; and where |Δz| completes the seed's
-distance and the torsos choose its sign alone, by 10-19 and 41-81.
+Errors on real salsa pairs in random views, median and 90 % quantile in degrees (medoid seed):
+
+    ===================  =========  ========
+    keypoints            backbones  views
+    ===================  =========  ========
+    exact                3, 7       7, 29
+    2 cm noise           5, 19      9, 36
+    30 % occluded        3, 9       8, 32
+    ===================  =========  ========
+
+With Δz = 0 the view errors are 30-34 and 64-72 degrees.
 """
 
 from __future__ import annotations
@@ -25,11 +29,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion.interaction.annotations.local_frames import (
-    chests,
-    frames_are_sound,
+    chest_joints,
+    joint_roots,
     local_frames,
     pair_frames,
-    trees,
+    valid_frames,
 )
 from probmotion.interaction.annotations.torso_fits import fit_body
 from probmotion.interaction.annotations.views import view_angles
@@ -42,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["LEAST_JOINTS", "BackboneEstimate", "annotation_views", "lift_torsos", "torso_joints"]
 
 LEAST_JOINTS = 3
-"""Visible torso joints that a character needs: two leave a turn about their line open."""
+"""Minimum number of visible torso joints per person; two would leave a rotation undetermined."""
 
 _TORSO = {"pelvis", "spine", "chest", "neck", "head"}
 _TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
@@ -50,7 +54,7 @@ _TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("should
 
 @dataclass(frozen=True, eq=False)
 class BackboneEstimate:
-    """Lifted torsos of n annotations, K characters each, in image axes with z to the viewer.
+    """Torsos of K people in n annotations, in image axes with z towards the viewer.
 
     Attributes
     ----------
@@ -59,12 +63,12 @@ class BackboneEstimate:
     rotations : ndarray, (n, K, 3, 3)
         From the seed's axes to the image's.
     roots : ndarray, (n, K, 3)
-        Root joints, metres; z counts from the first character's.
+        Root joints, metres; z relative to the first person.
     residuals : ndarray, (n, K)
-        Root-mean-square distance of the visible torso joints from the fit, metres.
+        Root-mean-square residual of the visible torso joints, metres.
     lifted : ndarray, (n,)
-        Whether every character had :data:`LEAST_JOINTS` visible torso joints. Rows of the other
-        annotations are NaN.
+        Whether every person has at least :data:`LEAST_JOINTS` visible torso joints. The other
+        rows are NaN.
     """
 
     backbones: np.ndarray
@@ -75,42 +79,40 @@ class BackboneEstimate:
 
 
 def torso_joints(skeleton: Skeleton) -> tuple[tuple[int, ...], ...]:
-    """Return the indices of each character's torso joints, in the order of the roots."""
-    found: dict[int, list[int]] = {root: [] for root in skeleton.roots}
+    """Return the torso joints of each person, in the order of the roots."""
+    joints_by_root: dict[int, list[int]] = {root: [] for root in skeleton.roots}
     for joint, name in enumerate(skeleton.canonical_names):
         if name.rpartition(":")[2] in _TORSO:
-            found[trees(skeleton)[joint]].append(joint)
-    return tuple(tuple(joints) for joints in found.values())
+            joints_by_root[joint_roots(skeleton)[joint]].append(joint)
+    return tuple(tuple(joints) for joints in joints_by_root.values())
 
 
 def lift_torsos(
     keypoints: np.ndarray, visible: np.ndarray, seed: np.ndarray, skeleton: Skeleton
 ) -> BackboneEstimate:
-    """Return backbone, rotation and root of every character in every picture.
+    """Estimate the backbone, rotation and root of every person in every annotation.
 
     Parameters
     ----------
     keypoints : ndarray, (n, J, 2)
-        Annotated pictures, metres, x right and y up; hidden joints are not read.
+        2D annotations, metres, x right and y up; occluded joints are ignored.
     visible : ndarray, (n, J)
-        Which joints are annotated.
+        Mask of annotated joints.
     seed : ndarray, (J, 3)
-        A pose-pair, metres, whose torsos are the rigid bodies.
+        Pose-pair with the torsos to fit, metres; its local frame must not be degenerate.
     skeleton : Skeleton
-        The characters' skeleton.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, the seed is not finite, its roots coincide or its backbones cancel.
+        Skeleton of the J joints.
     """
     keypoints, visible, seed = np.asarray(keypoints), np.asarray(visible), np.asarray(seed)
     check_shape("keypoints", keypoints, ("n", skeleton.n_joints, 2))
     check_shape("visible", visible, keypoints.shape[:2])
     check_shape("seed", seed, (skeleton.n_joints, 3))
     check_finite("seed", seed)
-    if not frames_are_sound(pair_frames(seed, skeleton)):
-        raise ValueError("seed must be roots apart and backbones not along them, got degenerate")
+    if not valid_frames(pair_frames(seed, skeleton)):
+        raise ValueError(
+            "seed must have distinct roots and backbones not parallel to their line, got a "
+            "degenerate pair"
+        )
     torsos = [list(joints) for joints in torso_joints(skeleton)]
     seen = np.stack([visible[:, joints].sum(axis=-1) for joints in torsos])
     lifted = np.asarray((seen >= LEAST_JOINTS).all(axis=0))
@@ -122,15 +124,15 @@ def lift_torsos(
         residuals=np.full(shape, np.nan),
         lifted=lifted,
     )
-    heads = zip(skeleton.roots, chests(skeleton), torsos, strict=True)
-    for character, (root, chest, joints) in enumerate(heads):
+    people = zip(skeleton.roots, chest_joints(skeleton), torsos, strict=True)
+    for person, (root, chest, joints) in enumerate(people):
         points, shown = keypoints[lifted][:, joints], visible[lifted][:, joints]
         fit = fit_body(points, shown, seed[joints] - seed[root])
-        estimate.rotations[lifted, character] = fit.rotations
-        estimate.backbones[lifted, character] = fit.rotations @ (seed[chest] - seed[root])
-        estimate.residuals[lifted, character] = fit.residuals
+        estimate.rotations[lifted, person] = fit.rotations
+        estimate.backbones[lifted, person] = fit.rotations @ (seed[chest] - seed[root])
+        estimate.residuals[lifted, person] = fit.residuals
         known = visible[lifted, root]
-        estimate.roots[lifted, character, :2] = np.where(
+        estimate.roots[lifted, person, :2] = np.where(
             known[:, np.newaxis], keypoints[lifted, root], fit.translations
         )
     offsets = seed[list(skeleton.roots)] - seed[skeleton.roots[0]]
@@ -141,42 +143,38 @@ def lift_torsos(
 
 
 def annotation_views(annotations: Annotations, seed: np.ndarray) -> np.ndarray:
-    """Return the view (φ, θ) of each annotation, estimated from its lifted torsos.
+    """Estimate the view (φ, θ) of each annotation from its torsos.
 
     Parameters
     ----------
     annotations : Annotations
-        n annotated pictures.
+        n annotations.
     seed : ndarray, (J, 3)
-        A pose-pair, metres.
+        Pose-pair with the torsos to fit, metres.
 
     Returns
     -------
     views : ndarray, (n, 2)
-        φ in [−π, π] and θ in [0, π], radians; NaN for annotations that cannot be lifted
-        (too few torso joints seen) or whose frame is degenerate.
+        φ in [−π, π] and θ in [0, π], radians; NaN if too few torso joints are visible or the
+        local frame is degenerate.
     """
     estimate = lift_torsos(annotations.keypoints, annotations.visible, seed, annotations.skeleton)
     frames = local_frames(estimate.roots, estimate.backbones)
     views = np.full((len(frames), 2), np.nan)
-    sound = frames_are_sound(frames)
-    views[sound] = view_angles(frames[sound], np.array([0.0, 0.0, 1.0]))
+    valid = valid_frames(frames)
+    views[valid] = view_angles(frames[valid], np.array([0.0, 0.0, 1.0]))
     return views
 
 
 def _depths(roots: np.ndarray, rotations: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return how much nearer to the viewer each root is than the first: ``(n, K)``.
-
-    ``roots`` (n, K, 2) are the pictures', ``rotations`` (n, K, 3, 3) the torsos', ``offsets``
-    (K, 3) the seed's from its first root.
-    """
+    """Return Δz of each root relative to the first, (n, K); ``offsets`` (K, 3) are the seed's."""
     depths = np.zeros(rotations.shape[:2])
     for other in range(1, len(offsets)):
-        # What the first torso and this one make of the seed's offset between them.
-        carried = rotations[:, [0, other]] @ offsets[other]
-        gap = carried[..., :2] - (roots[:, other] - roots[:, 0])[:, np.newaxis]
+        # The seed's offset rotated by the first torso and by the other one.
+        rotated = rotations[:, [0, other]] @ offsets[other]
+        gap = rotated[..., :2] - (roots[:, other] - roots[:, 0])[:, np.newaxis]
         spread = offsets[other] @ offsets[other] / 4
         exponent = -np.einsum("nka,nka->nk", gap, gap) / (2 * spread)
         weights = np.exp(exponent - exponent.max(axis=-1, keepdims=True))
-        depths[:, other] = (weights * carried[..., 2]).sum(axis=-1) / weights.sum(axis=-1)
+        depths[:, other] = (weights * rotated[..., 2]).sum(axis=-1) / weights.sum(axis=-1)
     return depths

@@ -1,4 +1,4 @@
-"""Annotations drawn from 3D motions: the pictures that a study with known truth is made of."""
+"""Simulated 2D annotations of 3D motions, with known ground truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.interaction.annotations.annotations import Annotations
-from probmotion.interaction.annotations.local_frames import frames_are_sound, pair_frames, trees
+from probmotion.interaction.annotations.local_frames import joint_roots, pair_frames, valid_frames
 from probmotion.interaction.annotations.views import view_angles
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -18,25 +18,25 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["ELEVATIONS", "DrawnAnnotations", "draw_annotations", "world_axes"]
 
 ELEVATIONS = (np.radians(-10.0), np.radians(40.0))
-"""Least and greatest elevation of a random camera, radians above the horizon."""
+"""Range of random camera elevations, radians above the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnAnnotations:
-    """Annotations, and the truth behind them.
+    """Simulated annotations and their ground truth.
 
     Attributes
     ----------
     annotations : Annotations
-        The pictures of n frames.
+        Annotations of n frames.
     views : ndarray, (n, 2)
-        Their true views (φ, θ) in the pairs' own frames, radians.
+        True views (φ, θ) in the local frames, radians.
     world_views : ndarray, (n, 2)
         Azimuth and elevation of the cameras, radians.
     clips, frames : ndarray, (n,), int
-        Which motion, and which of its frames.
+        Index of the motion and of its frame.
     positions : ndarray, (n, J, 3)
-        The pose-pairs, metres.
+        Pose-pairs, metres.
     """
 
     annotations: Annotations
@@ -58,7 +58,7 @@ def draw_annotations(
     noise: float = 0.0,
     hidden: float = 0.0,
 ) -> DrawnAnnotations:
-    """Return pictures of n different frames, drawn at random from all frames of all motions.
+    """Simulate annotations of n distinct frames, drawn uniformly from all motions.
 
     Parameters
     ----------
@@ -67,26 +67,19 @@ def draw_annotations(
     n : int
         Number of annotations, at most the number of frames.
     seed : int
-        Of the frames, the views, the noise and the hidden joints.
+        Seed of the frames, views, noise and occlusions.
     frames : sequence of ndarray, (L,) bool, optional
-        Which frames of each clip may be drawn; all by default. Their neighbours need not be.
+        Mask of the frames to draw from, per clip; all by default.
     world_views : ndarray, (n, 2), optional
-        Azimuth (0 looks at the scene from +Z, a quarter turn from +X) and elevation of each
-        camera, radians. By default the azimuth is uniform on the circle and the elevation
-        uniform between -10 and 40 degrees (:data:`ELEVATIONS`).
+        Azimuth (0: camera on the +Z side, π/2: +X side) and elevation of each camera, radians. By
+        default uniform on the circle and on :data:`ELEVATIONS`.
     known_views : bool
-        Whether the annotations carry their true views.
+        Whether the annotations include their true views.
     noise : float
-        Standard deviation of independent noise on every coordinate, neighbours too, metres.
+        Standard deviation of the noise of every coordinate, including neighbours, metres.
     hidden : float
-        Share of the joints of each character, below 1, that are hidden, drawn anew for each
-        annotation; in its neighbours the same joints are hidden.
-
-    Raises
-    ------
-    ValueError
-        If there are too few frames, clips differ in skeleton or rate, or the frame of a drawn
-        pair is degenerate (which clip and frame).
+        Fraction of each person's joints that are occluded, below 1, drawn for each annotation and
+        shared by its neighbours.
     """
     skeleton, fps = _common(motions)
     check_count("n", n)
@@ -96,9 +89,9 @@ def draw_annotations(
     }
     clips, numbers = _drawn_frames(motions, n, frames, rng["frames"])
     if world_views is None:
-        share = rng["views"].random((n, 2))
+        uniform = rng["views"].random((n, 2))
         low = np.array([-np.pi, ELEVATIONS[0]])
-        world_views = low + share * (np.array([np.pi, ELEVATIONS[1]]) - low)
+        world_views = low + uniform * (np.array([np.pi, ELEVATIONS[1]]) - low)
     world_views = np.asarray(world_views, dtype=np.float64)
     check_shape("world_views", world_views, (n, 2))
     check_finite("world_views", world_views)
@@ -106,22 +99,22 @@ def draw_annotations(
     axes = world_axes(world_views)
     poses = _with_neighbours(motions, clips, numbers)
     local = pair_frames(poses[:, 1], skeleton)
-    sound = frames_are_sound(local)
-    if not sound.all():
-        first = int(np.argmin(sound))
+    valid = valid_frames(local)
+    if not valid.all():
+        first = int(np.argmin(valid))
         raise ValueError(
-            f"motions has a degenerate pair in frame {numbers[first]} of clip {clips[first]}, "
-            "expected roots apart and backbones not along them"
+            "motions must have distinct roots and backbones not parallel to their line, got a "
+            f"degenerate pair in frame {numbers[first]} of clip {clips[first]}"
         )
     views = view_angles(local, axes[:, 2])
     visible = _visible(n, skeleton, hidden, rng["hidden"])
-    pictures = _pictures(poses, axes, noise, rng["noise"])
-    pictures = np.where(visible[:, np.newaxis, :, np.newaxis], pictures, np.nan)
+    projections = _projections(poses, axes, noise, rng["noise"])
+    projections = np.where(visible[:, np.newaxis, :, np.newaxis], projections, np.nan)
     annotations = Annotations(
-        pictures[:, 1],
+        projections[:, 1],
         visible,
         skeleton,
-        pictures[:, [0, 2]],
+        projections[:, [0, 2]],
         fps,
         views=views if known_views else None,
         sources=[motions[clip].name for clip in clips],
@@ -130,7 +123,7 @@ def draw_annotations(
 
 
 def world_axes(world_views: np.ndarray) -> np.ndarray:
-    """Return image axes right, up and towards the viewer, as rows: ``(n, 2) → (n, 3, 3)``."""
+    """Return the camera axes right, up and towards the viewer as rows: ``(n, 2) → (n, 3, 3)``."""
     azimuth, elevation = np.asarray(world_views, dtype=np.float64).T
     sin_a, cos_a, sin_e, cos_e = (
         np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
@@ -146,13 +139,11 @@ def _common(motions: Sequence[Motion]) -> tuple[Skeleton, float]:
     skeleton, fps = motions[0].skeleton, motions[0].fps
     for number, motion in enumerate(motions):
         if motion.skeleton != skeleton:
-            raise ValueError(
-                f"motions[{number}] has other joints than the first, expected the same"
-            )
+            raise ValueError(f"motions[{number}] must have the skeleton of motions[0]")
         if motion.fps != fps:
             raise ValueError(
-                f"motions[{number}] has {motion.fps:g} frames per second and the first {fps:g}, "
-                "expected the same: resample it"
+                f"motions[{number}] must have the frame rate of motions[0], {fps:g}, got "
+                f"{motion.fps:g}: resample it"
             )
     return skeleton, fps
 
@@ -163,37 +154,37 @@ def _drawn_frames(
     frames: Sequence[np.ndarray] | None,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return clip and frame number of n frames, each at most once."""
+    """Return the clip and frame indices of n distinct frames."""
     if frames is None:
         frames = [np.ones(motion.frames, dtype=bool) for motion in motions]
     if len(frames) != len(motions):
-        raise ValueError(f"frames has {len(frames)} entries, expected {len(motions)}, one per clip")
+        raise ValueError(f"frames must have {len(motions)} masks, one per clip, got {len(frames)}")
     for number, (motion, chosen) in enumerate(zip(motions, frames, strict=True)):
         check_shape(f"frames[{number}]", chosen, (motion.frames,))
         if chosen.dtype != np.bool_:
-            raise ValueError(f"frames[{number}] is of {chosen.dtype}, expected bool")
+            raise ValueError(f"frames[{number}] must be bool, got {chosen.dtype}")
     clips = np.repeat(np.arange(len(frames)), [int(chosen.sum()) for chosen in frames])
     numbers = np.concatenate([np.flatnonzero(chosen) for chosen in frames])
     if n > len(clips):
-        raise ValueError(f"n must be at most the {len(clips)} frames to draw from, got {n}")
+        raise ValueError(f"n must be at most {len(clips)}, the number of frames, got {n}")
     drawn = rng.permutation(len(clips))[:n]
     return clips[drawn], numbers[drawn]
 
 
-def _pictures(
+def _projections(
     poses: np.ndarray, axes: np.ndarray, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return what cameras see of poses, with noise: ``(n, 3, J, 3) → (n, 3, J, 2)``."""
+    """Return noisy orthographic projections: ``(n, 3, J, 3) → (n, 3, J, 2)``."""
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}")
-    pictures = np.einsum("nai,ntji->ntja", axes[:, :2], poses)
-    return pictures + noise * rng.standard_normal(pictures.shape)
+    projections = np.einsum("nai,ntji->ntja", axes[:, :2], poses)
+    return projections + noise * rng.standard_normal(projections.shape)
 
 
 def _with_neighbours(
     motions: Sequence[Motion], clips: np.ndarray, frames: np.ndarray
 ) -> np.ndarray:
-    """Return positions before, at and after each frame, NaN beyond the ends: ``(n, 3, J, 3)``."""
+    """Return positions before, at and after each frame, (n, 3, J, 3); NaN beyond the ends."""
     first = motions[0].positions
     poses = np.full((len(clips), 3, *first.shape[1:]), np.nan)
     for number, motion in enumerate(motions):
@@ -206,13 +197,13 @@ def _with_neighbours(
 
 
 def _visible(n: int, skeleton: Skeleton, hidden: float, rng: np.random.Generator) -> np.ndarray:
-    """Return which joints are seen, the same number hidden of each character: ``(n, J)``."""
+    """Return a visibility mask with the same number of occluded joints per person: ``(n, J)``."""
     if not 0 <= hidden < 1:
-        raise ValueError(f"hidden must be a share from 0 to below 1, got {hidden!r}")
+        raise ValueError(f"hidden must be at least 0 and below 1, got {hidden!r}")
     visible = np.ones((n, skeleton.n_joints), dtype=bool)
     order = rng.random((n, skeleton.n_joints))
     for root in skeleton.roots:
-        (joints,) = np.nonzero(np.equal(trees(skeleton), root))
+        (joints,) = np.nonzero(np.equal(joint_roots(skeleton), root))
         count = min(round(hidden * len(joints)), len(joints) - 1)
         ranks = np.argsort(np.argsort(order[:, joints], axis=-1), axis=-1)
         visible[:, joints] = ranks >= count

@@ -1,13 +1,12 @@
-"""One rigid body turned to fit orthographic pictures of it, many pictures at once.
+"""Rotation of a rigid body from orthographic projections, vectorised over projections.
 
 Least squares over rotations R and image translations c,
 
     min Σ_m ‖x_m − P R t_m − c‖²,   P = the first two rows of I,
 
-over the visible points m. For a given viewing direction the best turn in the image has a closed
-form, so that starts are searched on a sphere of directions alone; damped least squares do the rest.
-An almost flat body and its reflection in the image plane have almost the same picture, which makes
-two minima: the search descends into both and keeps the better.
+over the visible points m. The in-plane rotation has a closed form for each viewing direction, so
+the initial rotation is found by a grid search over directions and refined by Levenberg-Marquardt.
+A nearly flat body has a second minimum, its reflection in the image plane; both are refined.
 """
 
 from __future__ import annotations
@@ -24,22 +23,16 @@ __all__ = ["BodyFit", "fit_body"]
 
 _DIRECTIONS = 200  # about 14 degrees apart
 _STEPS = 20
-_DAMPING = 1e-3  # of the mean curvature, at first; ten times less after each step that helped
+_DAMPING = 1e-3  # initial damping relative to the mean curvature
 _LEAST_DAMPING = 1e-12
 _ROWS = 1024
 
 
 class BodyFit(NamedTuple):
-    """What :func:`fit_body` found for n pictures.
+    """Fit of n projections.
 
-    Attributes
-    ----------
-    rotations : ndarray, (n, 3, 3)
-        R, from the body's axes to the image's.
-    translations : ndarray, (n, 2)
-        c, where the body's origin appears.
-    residuals : ndarray, (n,)
-        Root-mean-square distance of the visible points from the fit.
+    ``rotations`` R (n, 3, 3), from the body's axes to the image's; ``translations`` c (n, 2);
+    ``residuals`` (n,), root-mean-square residual of the visible points.
     """
 
     rotations: np.ndarray
@@ -48,16 +41,16 @@ class BodyFit(NamedTuple):
 
 
 def fit_body(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
-    """Return the rotation and translation of a rigid body that fit each picture best.
+    """Return the least-squares rotation and translation of a rigid body for each projection.
 
     Parameters
     ----------
     points : ndarray, (n, M, 2)
-        The pictures, x right and y up; hidden points are not read.
+        Projections, x right and y up; occluded points are ignored.
     visible : ndarray, (n, M)
-        Which points are seen, at least one in each picture.
+        Mask of visible points, at least one per projection.
     body : ndarray, (M, 3)
-        The body, in the pictures' unit.
+        Points of the body, in the unit of the projections.
     """
     n = len(points)
     fit = BodyFit(np.empty((n, 3, 3)), np.empty((n, 2)), np.empty(n))
@@ -74,7 +67,7 @@ def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
     points = np.where(visible[..., np.newaxis], points, 0.0)
     point_mean = points.sum(axis=1) / count[:, np.newaxis]
     body_mean = weights @ body / count[:, np.newaxis]
-    # The best c for any R is what the means say: centred points have none.
+    # Centring both point sets eliminates c.
     x = (points - point_mean[:, np.newaxis]) * weights[..., np.newaxis]
     t = (body - body_mean[:, np.newaxis]) * weights[..., np.newaxis]
     start = _best_start(x, t)
@@ -89,7 +82,7 @@ def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
 
 @lru_cache(maxsize=1)
 def _directions() -> np.ndarray:
-    """Return rotations (G, 3, 3) whose third rows lie evenly on the sphere (a spiral)."""
+    """Return rotations (G, 3, 3) with third rows on a spherical spiral."""
     number = np.arange(_DIRECTIONS) + 0.5
     z = 1 - 2 * number / _DIRECTIONS
     turn = np.pi * (1 + np.sqrt(5)) * number
@@ -102,10 +95,10 @@ def _directions() -> np.ndarray:
 
 
 def _best_start(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the best rotation (n, 3, 3) over all directions, each turned best in the image."""
+    """Return the best rotation (n, 3, 3) over all directions and in-plane rotations."""
     grid = _directions()
     axes = grid[:, :2]
-    # Σ‖x − Q A t‖² = Σ‖x‖² + ⟨AᵀA, Σ t tᵀ⟩ − 2 ⟨Q, Σ x (A t)ᵀ⟩; the last is a cos + b sin.
+    # Σ‖x − Q A t‖² = Σ‖x‖² + ⟨AᵀA, Σ t tᵀ⟩ − 2 ⟨Q, Σ x (A t)ᵀ⟩; the last term is a cos + b sin.
     size = np.einsum("gai,gaj,nmi,nmj->ng", axes, axes, t, t, optimize=True)
     product = np.einsum("nma,nmj,gbj->ngab", x, t, axes, optimize=True)
     cosine = product[..., 0, 0] + product[..., 1, 1]
@@ -117,10 +110,7 @@ def _best_start(x: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _mirrored(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return D R S, D the reflection in the image plane, S that in the body's flattest plane.
-
-    Where the body is flat S changes no point, and D changes no picture.
-    """
+    """Return D R S with reflections D in the image plane and S in the body's flattest plane."""
     _, axes = np.linalg.eigh(np.einsum("nmi,nmj->nij", t, t))
     normal = axes[..., 0]
     reflection = np.eye(3) - 2 * normal[:, :, np.newaxis] * normal[:, np.newaxis, :]
@@ -128,12 +118,12 @@ def _mirrored(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotations after Levenberg-Marquardt steps, and their sums of squares; none rises.
+    """Return rotations after Levenberg-Marquardt steps, and their sums of squares.
 
-    Plain Gauss-Newton overshoots where a flat body is seen from its front: to first order no
-    tilt shows there.
+    Gauss-Newton would overshoot for a flat body in frontal view, where tilt has no first-order
+    effect.
     """
-    residual = x - _pictures(rotations, t)
+    residual = x - _projections(rotations, t)
     squares = (residual**2).sum(axis=(1, 2))
     damping = np.full(len(x), _DAMPING)
     for _ in range(_STEPS):
@@ -145,7 +135,7 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
         slope = np.einsum("nmai,nma->ni", jacobian, residual)
         step = np.linalg.solve(normal, slope[..., np.newaxis])[..., 0]
         tried = rotations @ vector_to_matrix(step)
-        left = x - _pictures(tried, t)
+        left = x - _projections(tried, t)
         tried_squares = (left**2).sum(axis=(1, 2))
         better = tried_squares < squares
         rotations = np.where(better[:, np.newaxis, np.newaxis], tried, rotations)
@@ -155,6 +145,6 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
     return rotations, squares
 
 
-def _pictures(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _projections(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return P R t: ``(n, M, 2)``."""
     return np.matmul(t, np.swapaxes(rotations[:, :2], 1, 2))

@@ -1,4 +1,4 @@
-"""Interaction coordinates, shape contexts, and the kernels that compute them."""
+"""Interaction coordinates, shape contexts and pose distances."""
 
 import lazy_loader
 

@@ -1,13 +1,11 @@
-"""Interaction coordinates of a pose-pair, and how unlike two pose-pairs are in them.
+"""Interaction coordinates of pose-pairs and their dissimilarity (Yin et al. 2018, eqs. 7-8).
 
-Yin, Huang, Cohen-Or and Zhang, "Sampling of closely interacting pose-pairs", eqs. 7 and 8. Edges
-come from :mod:`probmotion.interaction.geometry.graphs`; nothing here counts the characters.
+Edges come from :mod:`probmotion.interaction.geometry.graphs`; the number of people is arbitrary.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -26,28 +24,22 @@ __all__ = [
 
 
 def align_rigidly(source: Array, target: Array, visible: Array | None = None) -> Array:
-    """Return ``source`` after the rotation and translation that bring it nearest to ``target``.
+    """Return ``source`` rigidly aligned to ``target`` by least squares (Kabsch 1976).
 
-    Nearest in the sum of squares over the visible joints; no reflection, no scaling (Kabsch
-    1976). All joints of ``source`` are moved, hidden ones too.
+    Rotation and translation only, fitted to the visible joints and applied to all joints.
 
     Parameters
     ----------
     source, target : Array
         Joints, shape (…, J, D), D = 2 or 3, metres; batch axes broadcast.
     visible : Array, optional
-        Which joints count, bool, shape (…, J); all by default. A hidden joint of ``target`` is
-        never read.
+        Mask of the joints to fit, bool, shape (…, J); all by default. Occluded joints of
+        ``target`` are ignored.
 
     Returns
     -------
     Array
         Shape (…, J, D), metres.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
     """
     visible = _check_pairs(source, target, visible)
     xp = array_namespace(source, target)
@@ -61,7 +53,7 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
     centred = source - source_centre
     moments = xp.matrix_transpose(counted * centred) @ (target - target_centre)
     left, _, right = xp.linalg.svd(moments, full_matrices=False)
-    # Of the best orthogonal matrix that mirrors, the direction that matters least is turned back.
+    # Undo a reflection by flipping the direction of the smallest singular value.
     mirrored = (xp.linalg.det(left) * xp.linalg.det(right) < 0)[..., None, None]
     least = constant([0.0] * (source.shape[-1] - 1) + [1.0], source)[:, None]
     right = xp.where(mirrored, right * (1 - 2 * least), right)
@@ -69,22 +61,9 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
 
 
 def align_motions(motions: Array, target: Array) -> Array:
-    """Return ``motions`` each moved and turned, as a whole, to where it is nearest to ``target``.
+    """Return each motion aligned to ``target`` by one rigid transform for all its frames.
 
-    Parameters
-    ----------
-    motions, target : Array
-        Shapes (…, L, J, 3) and (L, J, 3), metres; see :func:`align_rigidly`.
-
-    Returns
-    -------
-    Array
-        Shape (…, L, J, 3), metres.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
+    Shapes (…, L, J, 3) and (L, J, 3), metres; see :func:`align_rigidly`.
     """
     xp = array_namespace(motions, target)
     points = xp.reshape(motions, (*motions.shape[:-3], -1, 3))
@@ -92,7 +71,7 @@ def align_motions(motions: Array, target: Array) -> Array:
 
 
 def interaction_coordinates(points: Array, edges: Array) -> Array:
-    """Return the vectors ``p_i − p_j`` of the edges (eq. 7), shape (…, E, D), metres.
+    """Return the edge vectors ``p_i − p_j`` (eq. 7), shape (…, E, D), metres.
 
     Parameters
     ----------
@@ -100,11 +79,6 @@ def interaction_coordinates(points: Array, edges: Array) -> Array:
         Joints, shape (…, J, D), metres.
     edges : Array
         Edges (i, j), integers, shape (E, 2).
-
-    Raises
-    ------
-    ValueError
-        If a shape is not as stated.
     """
     check_shape("points", points, ("…", "J", "D"))
     first, second = _ends(edges, points)
@@ -122,34 +96,25 @@ def dissimilarity(
 ) -> Array:
     """Return the dissimilarity of two pose-pairs in interaction coordinates (eq. 8), metres.
 
-    ``d = Σ_{T₁} w₁ ‖u₁ − u₂‖ / W₁ + Σ_{T₂} w₂ ‖u₁ − u₂‖ / W₂`` with the weights ``w_k = 1 / max(ε,
-    ‖u_k‖)`` of the pair whose graph it is, and ``W_k`` their sum: short edges count most. The
-    pairs are compared as they stand; see :func:`align_rigidly`.
-
-    Scaling both pairs and ε by s scales d by s. So does scaling the pairs alone where every edge
-    is at least ε before and after.
+    ``d = Σ_{T₁} w₁ ‖u₁ − u₂‖ / W₁ + Σ_{T₂} w₂ ‖u₁ − u₂‖ / W₂`` with weights ``w_k = 1 / max(ε,
+    ‖u_k‖)`` and their sums ``W_k``. The pairs are not aligned; see :func:`align_rigidly`.
 
     Parameters
     ----------
     first, second : Array
         Joints, shape (…, J, D), metres; batch axes broadcast.
     first_edges, second_edges : Array
-        The graph of each pair, integers, shape (E, 2) each; E may differ.
+        Edges of each pair's graph, integers, shape (E, 2); E may differ.
     epsilon : float
         ε, metres.
     visible : Array, optional
-        Which joints count, bool, shape (…, J); edges with a hidden end are left out of the sums
-        and of W.
+        Mask of visible joints, bool, shape (…, J). Edges with an occluded end are left out of
+        the sums and of W.
 
     Returns
     -------
     Array
-        Shape (…), metres; infinite where a graph has no edge that counts.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, or ``epsilon`` is not above 0.
+        Shape (…), metres; infinite if a graph has no visible edge.
     """
     visible = _check_pairs(first, second, visible)
     check_positive("epsilon", epsilon)
@@ -162,7 +127,7 @@ def dissimilarity(
         length = _norm(interaction_coordinates(own, edges))
         both = xp.take(counted, i, axis=-1) * xp.take(counted, j, axis=-1)
         weight = both / xp.where(length > epsilon, length, xp.full_like(length, epsilon))
-        # A hidden joint's number may be anything; its edges must not bring it in.
+        # Occluded joints may be NaN; a zero weight alone would not remove them.
         apart = xp.where(both > 0, _norm(between), xp.zeros_like(_norm(between)))
         term = _mean(apart, weight)
         total = term if total is None else total + term
@@ -172,9 +137,9 @@ def dissimilarity(
 def interaction_distance(
     first: Array, second: Array, graph: str = "delaunay", epsilon: float = 0.05
 ) -> Array:
-    """Return the dissimilarity (eq. 8) of pose-pairs, triangulated and rigidly aligned, metres.
+    """Return the dissimilarity (eq. 8) of pose-pairs after rigid alignment, metres.
 
-    It is symmetric, and the same wherever either pair stands and however it is turned.
+    Symmetric, and invariant to rigid motion of either pair.
 
     Parameters
     ----------
@@ -184,16 +149,6 @@ def interaction_distance(
         One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
     epsilon : float
         ε of eq. 8, metres.
-
-    Returns
-    -------
-    Array
-        Shape (…), metres.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, the graph is unknown, or ``epsilon`` is not above 0.
     """
     _check_pairs(first, second, None)
     check_graph(graph)
@@ -202,42 +157,29 @@ def interaction_distance(
     joints = tuple(first.shape[-2:])
     first = xp.reshape(xp.broadcast_to(first, batch + joints), (-1, *joints))
     second = xp.reshape(xp.broadcast_to(second, batch + joints), (-1, *joints))
-    edges_of = _remembering_edges(graph)
-    found = [
-        dissimilarity(
-            align_rigidly(first[k, ...], second[k, ...]),
-            second[k, ...],
-            edges_of(first[k, ...]),
-            edges_of(second[k, ...]),
-            epsilon,
-        )
-        for k in range(math.prod(batch))
-    ]
-    return xp.reshape(xp.stack(found), batch) if found else xp.zeros(batch, dtype=first.dtype)
+    aligned = align_rigidly(first, second)
+    dissimilarities = []
+    for k in range(math.prod(batch)):
+        own, other = (graph_edges(to_numpy(pair[k, ...]), graph) for pair in (first, second))
+        dissimilarities.append(dissimilarity(aligned[k, ...], second[k, ...], own, other, epsilon))
+    return (
+        xp.reshape(xp.stack(dissimilarities), batch)
+        if dissimilarities
+        else xp.zeros(batch, dtype=first.dtype)
+    )
 
 
 def cartesian_distance(first: Array, second: Array, visible: Array | None = None) -> Array:
-    """Return the root mean square distance of corresponding joints after rigid alignment, metres.
+    """Return the root-mean-square joint distance after rigid alignment, metres.
 
-    This is the paper's comparison with Cartesian coordinates. Symmetric, and the same wherever
-    either pair stands and however it is turned.
+    The Cartesian baseline of the paper; infinite if no joint is visible.
 
     Parameters
     ----------
     first, second : Array
         Joints, shape (…, J, D), metres; batch axes broadcast.
     visible : Array, optional
-        Which joints count, bool, shape (…, J); all by default.
-
-    Returns
-    -------
-    Array
-        Shape (…), metres; infinite where no joint is visible.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit.
+        Mask of visible joints, bool, shape (…, J); all by default.
     """
     visible = _check_pairs(first, second, visible)
     xp = array_namespace(first, second)
@@ -249,22 +191,8 @@ def cartesian_distance(first: Array, second: Array, visible: Array | None = None
     return _root(_mean(squared, weight))
 
 
-def _remembering_edges(graph: str) -> Callable[[Array], np.ndarray]:
-    """Return :func:`graph_edges`, which triangulates equal pairs once."""
-    known: dict[bytes, np.ndarray] = {}
-
-    def edges(points: Array) -> np.ndarray:
-        numbers = to_numpy(points).astype(np.float64)
-        key = numbers.tobytes()
-        if key not in known:
-            known[key] = graph_edges(numbers, graph)
-        return known[key]
-
-    return edges
-
-
 def _check_pairs(first: Array, second: Array, visible: Array | None) -> Array | None:
-    """Return ``visible`` after a check that all shapes fit."""
+    """Check the shapes and return ``visible``."""
     check_shape("first", first, ("…", "J", "D"))
     check_shape("second", second, ("…", *first.shape[-2:]))
     if visible is not None:
@@ -273,7 +201,7 @@ def _check_pairs(first: Array, second: Array, visible: Array | None) -> Array | 
 
 
 def _weights(points: Array, visible: Array | None) -> Array:
-    """Return 1 for visible joints and 0 for hidden ones, (…, J)."""
+    """Return 1 for visible and 0 for occluded joints, (…, J)."""
     xp = array_namespace(points)
     if visible is None:
         return xp.ones(points.shape[-2:-1], dtype=points.dtype)
@@ -281,7 +209,7 @@ def _weights(points: Array, visible: Array | None) -> Array:
 
 
 def _ends(edges: Array, like: Array) -> tuple[Array, Array]:
-    """Return the first and the second joints of edges, in the library of ``like``."""
+    """Return both joint indices of each edge, in the array library of ``like``."""
     numbers = to_numpy(edges)
     check_shape("edges", numbers, ("E", 2))
     xp = array_namespace(like)
@@ -290,18 +218,18 @@ def _ends(edges: Array, like: Array) -> tuple[Array, Array]:
 
 
 def _norm(vectors: Array) -> Array:
-    """Return the lengths of vectors, (…, D) → (…), whose gradient at 0 is 0."""
+    """Return the lengths of vectors, (…, D) → (…), with gradient 0 at 0."""
     return _root(array_namespace(vectors).sum(vectors**2, axis=-1))
 
 
 def _root(squared: Array) -> Array:
     xp = array_namespace(squared)
-    some = squared > 0
-    return xp.where(some, xp.sqrt(xp.where(some, squared, xp.ones_like(squared))), squared)
+    positive = squared > 0
+    return xp.where(positive, xp.sqrt(xp.where(positive, squared, xp.ones_like(squared))), squared)
 
 
 def _mean(values: Array, weight: Array) -> Array:
-    """Return the weighted mean over the last axis, infinite where no weight is above 0."""
+    """Return the weighted mean over the last axis, infinite if all weights are 0."""
     xp = array_namespace(values)
     weight = xp.broadcast_to(weight, values.shape)
     total = xp.sum(weight, axis=-1)

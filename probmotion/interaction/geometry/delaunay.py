@@ -1,9 +1,9 @@
-"""The Delaunay triangulation of some dozen joints in the plane, compiled (Bowyer and Watson 1981).
+"""Compiled 2D Delaunay triangulation of a few dozen joints (Bowyer and Watson 1981).
 
-Joints are inserted one by one: the triangles whose circumcircle holds the new joint make a hole,
-and the hole's border is joined to the joint. A ghost triangle stands outside each edge of the
-hull (its third vertex is at infinity), so that the outside needs no case of its own. SciPy's
-Qhull, in :mod:`probmotion.interaction.geometry.graphs`, is the reference.
+Joints are inserted one at a time: triangles with the new joint in their circumcircle form a cavity,
+and the boundary of the cavity is connected to the joint. Each hull edge has a ghost triangle with a
+vertex at infinity, so that joints outside the hull need no special case. The reference is
+:mod:`probmotion.interaction.geometry.graphs`.
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ import numpy as np
 from probmotion.interaction.geometry.graphs import JOGGLE, joggle_offsets
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["delaunay_edges", "delaunay_into", "most_edges"]
+__all__ = ["delaunay_edges", "max_planar_edges", "write_delaunay"]
 
-# Determinants of joints inside the unit box carry errors of some 1e-15; what is this close to 0
-# has no certain sign.
+# Determinants of joints in the unit box have errors of about 1e-15; below this size their sign is
+# uncertain.
 _TIE = 1e-13
 
 
 def delaunay_edges(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the edges of the 2D Delaunay triangulation, and whether the joints were degenerate.
+    """Return the edges of the 2D Delaunay triangulation and whether the joints were degenerate.
 
-    Where the triangulation is not unique or does not exist (joints that repeat, that all lie on a
-    line, or four of them on one circle met on the way), the joints are first moved by fixed tiny
-    offsets, those of :func:`~probmotion.interaction.geometry.graphs.joggle_offsets`.
+    Degenerate joints (coincident, collinear, or four of them cocircular) are first moved by
+    :func:`~probmotion.interaction.geometry.graphs.joggle_offsets`.
 
     Parameters
     ----------
@@ -38,39 +37,34 @@ def delaunay_edges(points: np.ndarray) -> tuple[np.ndarray, bool]:
     edges : numpy.ndarray
         Shape (E, 2), integers, the smaller joint first, rows in lexicographic order.
     degenerate : bool
-        Whether the joints had to be moved.
-
-    Raises
-    ------
-    ValueError
-        If ``points`` is not (J, 2) or not finite.
+        Whether the joints were joggled.
     """
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, ("J", 2))
     check_finite("points", points)
     n_joints = points.shape[0]
-    edges = np.empty((most_edges(n_joints), 2), dtype=np.uint16)
-    n_edges, degenerate = delaunay_into(points, joggle_offsets(n_joints, 2), edges)
+    edges = np.empty((max_planar_edges(n_joints), 2), dtype=np.uint16)
+    n_edges, degenerate = write_delaunay(points, joggle_offsets(n_joints, 2), edges)
     found = edges[:n_edges].astype(np.int64)
     return found[np.lexsort((found[:, 1], found[:, 0]))], bool(degenerate)
 
 
 @numba.njit(cache=True)
-def most_edges(n_joints: int) -> int:
-    """Return how many edges a planar graph of ``n_joints`` can have."""
+def max_planar_edges(n_joints: int) -> int:
+    """Return the maximum number of edges of a planar graph over ``n_joints``."""
     return 3 * n_joints - 6 if n_joints > 2 else max(n_joints - 1, 0)
 
 
 @numba.njit(cache=True)
-def delaunay_into(points: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> tuple[int, bool]:
-    """Write the triangulation's edges into ``edges``; return their number and whether degenerate.
+def write_delaunay(points: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> tuple[int, bool]:
+    """Write the triangulation's edges; return their number and whether it was degenerate.
 
     Parameters
     ----------
     points, offsets : numpy.ndarray
-        Joints and the offsets to move degenerate ones by, shape (J, 2), float64.
+        Joints and joggle offsets, shape (J, 2), float64.
     edges : numpy.ndarray
-        Receives one edge a row, the smaller joint first; at least ``most_edges(J)`` rows, uint16.
+        Output, uint16, at least :func:`max_planar_edges` rows; smaller joint first.
     """
     n_joints = points.shape[0]
     if n_joints < 3:
@@ -91,13 +85,13 @@ def delaunay_into(points: np.ndarray, offsets: np.ndarray, edges: np.ndarray) ->
 
 @numba.njit(cache=True)
 def _into_unit_box(points: np.ndarray, unit: np.ndarray) -> None:
-    """Write x, y, x² + y² of the joints in units of their extent, about the middle."""
+    """Write x, y and x² + y² of the joints, centred and scaled to the unit box."""
     low_x, high_x, low_y, high_y = points[0, 0], points[0, 0], points[0, 1], points[0, 1]
     for joint in range(1, points.shape[0]):
         low_x, high_x = min(low_x, points[joint, 0]), max(high_x, points[joint, 0])
         low_y, high_y = min(low_y, points[joint, 1]), max(high_y, points[joint, 1])
     extent = max(high_x - low_x, high_y - low_y)
-    # Below this its square is 0: the joints are one.
+    # Below this the square underflows: the joints coincide.
     extent = extent if extent > 1e-150 else 1.0
     middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
     for joint in range(points.shape[0]):
@@ -108,11 +102,11 @@ def _into_unit_box(points: np.ndarray, unit: np.ndarray) -> None:
 
 @numba.njit(cache=True)
 def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
-    """Write the edges and return their number, or 0 where a sign was not certain.
+    """Write the edges and return their number, or 0 if the sign of a determinant was uncertain.
 
-    With ``exact`` the signs of determinants of differences decide, however small: right for
-    joints that were moved apart. Otherwise each triangle carries the plane through its joints
-    lifted to the paraboloid z = x² + y², and a joint below it is inside the circumcircle.
+    With ``exact``, determinants of differences decide, however small (for joggled joints).
+    Otherwise each triangle stores the plane through its joints lifted to the paraboloid
+    z = x² + y²; a joint below the plane is inside the circumcircle.
     """
     n_joints = unit.shape[0]
     ghost = n_joints
@@ -124,8 +118,8 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
     plane = np.empty((4, room))
     inside = np.empty(room)
     seen = np.full((n_joints + 1) * (n_joints + 1), -1, dtype=np.int64)
-    hole = np.empty(room, dtype=np.int64)
-    border = np.empty((3 * room, 2), dtype=np.int64)
+    cavity = np.empty(room, dtype=np.int64)
+    boundary = np.empty((3 * room, 2), dtype=np.int64)
     a, b, c = order[0], order[1], order[2]
     _set_triangle(unit, corner, plane, 0, a, b, c)
     _set_triangle(unit, corner, plane, 1, b, a, ghost)
@@ -140,30 +134,30 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
             x, y, z = unit[joint, 0], unit[joint, 1], unit[joint, 2]
             for t in range(n_triangles):
                 inside[t] = plane[0, t] * x + plane[1, t] * y + plane[2, t] * z + plane[3, t]
-        n_hole = 0
+        n_cavity = 0
         for t in range(n_triangles):
             within = inside[t] > 0
             if not exact and abs(inside[t]) < _TIE:
                 if corner[t, 2] != ghost:
                     return 0
-                # On the line of a hull's edge: the hole has it where the joint splits it.
+                # Collinear with a hull edge: include the ghost if the joint splits the edge.
                 within = _between(unit, corner[t, 0], corner[t, 1], joint)
             if within:
-                hole[n_hole] = t
-                n_hole += 1
-        n_border = _border(corner, hole, n_hole, seen, position, n_joints + 1, border)
-        if n_hole == 0 or n_border != n_hole + 2 or n_triangles + 2 > room:
+                cavity[n_cavity] = t
+                n_cavity += 1
+        n_boundary = _boundary(corner, cavity, n_cavity, seen, position, n_joints + 1, boundary)
+        if n_cavity == 0 or n_boundary != n_cavity + 2 or n_triangles + 2 > room:
             return 0
-        for edge in range(n_border):
-            slot = hole[edge] if edge < n_hole else n_triangles + edge - n_hole
-            _set_triangle(unit, corner, plane, slot, border[edge, 0], border[edge, 1], joint)
+        for edge in range(n_boundary):
+            slot = cavity[edge] if edge < n_cavity else n_triangles + edge - n_cavity
+            _set_triangle(unit, corner, plane, slot, boundary[edge, 0], boundary[edge, 1], joint)
         n_triangles += 2
     return _collect(corner, n_triangles, n_joints, edges)
 
 
 @numba.njit(cache=True)
 def _first_triangle(unit: np.ndarray, order: np.ndarray, exact: bool) -> bool:
-    """Write the order of insertion, a wide counter-clockwise triangle first; is there one?"""
+    """Write the insertion order, a large counter-clockwise triangle first; False if none."""
     n_joints = unit.shape[0]
     second, farthest = 0, -1.0
     for joint in range(1, n_joints):
@@ -190,7 +184,7 @@ def _first_triangle(unit: np.ndarray, order: np.ndarray, exact: bool) -> bool:
 
 @numba.njit(cache=True)
 def _turn(unit: np.ndarray, a: int, b: int, c: int) -> float:
-    """Return twice the signed area of a triangle, above 0 where it turns to the left."""
+    """Return twice the signed area of a triangle, positive if counter-clockwise."""
     return (unit[b, 0] - unit[a, 0]) * (unit[c, 1] - unit[a, 1]) - (unit[b, 1] - unit[a, 1]) * (
         unit[c, 0] - unit[a, 0]
     )
@@ -198,7 +192,7 @@ def _turn(unit: np.ndarray, a: int, b: int, c: int) -> float:
 
 @numba.njit(cache=True)
 def _between(unit: np.ndarray, a: int, b: int, joint: int) -> bool:
-    """Return whether ``joint``, on the line of a and b, lies between them."""
+    """Return whether ``joint``, collinear with a and b, lies between them."""
     return (unit[a, 0] - unit[joint, 0]) * (unit[b, 0] - unit[joint, 0]) + (
         unit[a, 1] - unit[joint, 1]
     ) * (unit[b, 1] - unit[joint, 1]) < 0
@@ -208,7 +202,7 @@ def _between(unit: np.ndarray, a: int, b: int, joint: int) -> bool:
 def _set_triangle(
     unit: np.ndarray, corner: np.ndarray, plane: np.ndarray, slot: int, a: int, b: int, c: int
 ) -> None:
-    """Write a triangle, its ghost vertex last, and the plane that says which joints are inside."""
+    """Write a triangle, its ghost vertex last, and its lifted plane."""
     ghost = unit.shape[0]
     if a == ghost:
         a, b, c = b, c, a
@@ -218,7 +212,7 @@ def _set_triangle(
     ax, ay, az = unit[a, 0], unit[a, 1], unit[a, 2]
     ux, uy, uz = unit[b, 0] - ax, unit[b, 1] - ay, unit[b, 2] - az
     if c == ghost:
-        # The circle through infinity: the half-plane to the left of the edge.
+        # The circle through infinity is the half-plane left of the edge.
         nx, ny, nz = -uy, ux, 0.0
     else:
         vx, vy, vz = unit[c, 0] - ax, unit[c, 1] - ay, unit[c, 2] - az
@@ -231,7 +225,7 @@ def _set_triangle(
 def _inside_by_differences(
     unit: np.ndarray, corner: np.ndarray, n_triangles: int, joint: int, inside: np.ndarray
 ) -> None:
-    """Write the in-circle determinants about ``joint``, whose relative error is small."""
+    """Write the in-circle determinants relative to ``joint``, which have small relative errors."""
     ghost = unit.shape[0]
     px, py = unit[joint, 0], unit[joint, 1]
     for t in range(n_triangles):
@@ -249,33 +243,33 @@ def _inside_by_differences(
 
 
 @numba.njit(cache=True)
-def _border(
+def _boundary(
     corner: np.ndarray,
-    hole: np.ndarray,
-    n_hole: int,
+    cavity: np.ndarray,
+    n_cavity: int,
     seen: np.ndarray,
     stamp: int,
     stride: int,
-    border: np.ndarray,
+    boundary: np.ndarray,
 ) -> int:
-    """Write the directed edges of the hole whose reverse is not in it; return their number."""
-    for k in range(n_hole):
+    """Write the directed boundary edges of the cavity; return their number."""
+    for k in range(n_cavity):
         for side in range(3):
-            a, b = corner[hole[k], side], corner[hole[k], (side + 1) % 3]
+            a, b = corner[cavity[k], side], corner[cavity[k], (side + 1) % 3]
             seen[a * stride + b] = stamp
-    n_border = 0
-    for k in range(n_hole):
+    n_boundary = 0
+    for k in range(n_cavity):
         for side in range(3):
-            a, b = corner[hole[k], side], corner[hole[k], (side + 1) % 3]
+            a, b = corner[cavity[k], side], corner[cavity[k], (side + 1) % 3]
             if seen[b * stride + a] != stamp:
-                border[n_border, 0], border[n_border, 1] = a, b
-                n_border += 1
-    return n_border
+                boundary[n_boundary, 0], boundary[n_boundary, 1] = a, b
+                n_boundary += 1
+    return n_boundary
 
 
 @numba.njit(cache=True)
 def _collect(corner: np.ndarray, n_triangles: int, n_joints: int, edges: np.ndarray) -> int:
-    """Write every edge between joints once: each is in two triangles, once in each direction."""
+    """Write each edge once; it occurs in two triangles, once in each direction."""
     n_edges = 0
     for t in range(n_triangles):
         for side in range(3):

@@ -1,41 +1,41 @@
-"""The graphs of :mod:`probmotion.interaction.geometry.graphs` in the plane, compiled."""
+"""Compiled 2D versions of the graphs of :mod:`probmotion.interaction.geometry.graphs`."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-from probmotion.interaction.geometry.delaunay import delaunay_into, most_edges
+from probmotion.interaction.geometry.delaunay import max_planar_edges, write_delaunay
 from probmotion.interaction.geometry.graphs import GRAPHS, N_NEIGHBOURS
 
-__all__ = ["count_degenerate", "edge_room", "graph_into", "graphs_of_visible"]
+__all__ = ["count_degenerate", "graphs_of_visible", "max_edges", "write_graph"]
 
 _DELAUNAY, _NEAREST_NEIGHBOURS, _GABRIEL, _COMPLETE = range(len(GRAPHS))
 
 
 @numba.njit(cache=True)
-def edge_room(n_joints: int, graph: int) -> int:
-    """Return how many edges a graph over ``n_joints`` can have."""
-    return most_edges(n_joints) if graph == _DELAUNAY else n_joints * (n_joints - 1) // 2
+def max_edges(n_joints: int, graph: int) -> int:
+    """Return the maximum number of edges of a graph over ``n_joints``."""
+    return max_planar_edges(n_joints) if graph == _DELAUNAY else n_joints * (n_joints - 1) // 2
 
 
 @numba.njit(cache=True)
-def graph_into(
+def write_graph(
     points: np.ndarray, graph: int, offsets: np.ndarray, edges: np.ndarray
 ) -> tuple[int, bool]:
-    """Write a graph's edges into ``edges``; return their number and whether joints were moved.
+    """Write a graph's edges; return their number and whether joints were joggled.
 
     Parameters
     ----------
     points, offsets : numpy.ndarray
-        Joints and the offsets to move degenerate ones by, shape (J, 2), float64.
+        Joints and joggle offsets, shape (J, 2), float64.
     graph : int
-        The graph's place in :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
+        Index into :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
     edges : numpy.ndarray
-        Receives one edge a row, the smaller joint first; uint16, at least :func:`edge_room` rows.
+        Output, uint16, (E, 2) with at least :func:`max_edges` rows; smaller joint first.
     """
     if graph == _DELAUNAY:
-        return delaunay_into(points, offsets, edges)
+        return write_delaunay(points, offsets, edges)
     n_joints, n_edges = points.shape[0], 0
     near = np.zeros((n_joints, n_joints), dtype=np.bool_)
     if graph == _NEAREST_NEIGHBOURS:
@@ -54,7 +54,7 @@ def graph_into(
 
 @numba.njit(cache=True)
 def _mark_neighbours(points: np.ndarray, near: np.ndarray) -> None:
-    """Mark each joint's nearest ones; of equally near ones the first come first."""
+    """Mark the nearest neighbours of each joint; ties go to the lower index."""
     n_joints = points.shape[0]
     squared = np.empty(n_joints)
     for i in range(n_joints):
@@ -70,7 +70,7 @@ def _mark_neighbours(points: np.ndarray, near: np.ndarray) -> None:
 
 @numba.njit(cache=True)
 def _is_gabriel(points: np.ndarray, i: int, j: int) -> bool:
-    """Return whether no joint is strictly inside the circle whose diameter is i–j."""
+    """Return whether no joint is strictly inside the circle with diameter i–j."""
     for k in range(points.shape[0]):
         toward = (points[i, 0] - points[k, 0]) * (points[j, 0] - points[k, 0]) + (
             points[i, 1] - points[k, 1]
@@ -84,37 +84,33 @@ def _is_gabriel(points: np.ndarray, i: int, j: int) -> bool:
 def graphs_of_visible(
     points: np.ndarray, visible: np.ndarray, graph: int, epsilon: float, offsets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the graphs over the visible joints of many sets, and the weights of eq. 8.
+    """Return the graphs over the visible joints of n pose-pairs and the weights of eq. 8.
 
     Parameters
     ----------
     points, visible : numpy.ndarray
         Shapes (n, J, 2) and (n, J).
     graph : int
-        The graph's place in :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
+        Index into :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
     epsilon : float
         ε of eq. 8, in the unit of ``points``.
     offsets : numpy.ndarray
-        What degenerate joints are moved by, (J, 2).
+        Joggle offsets, (J, 2).
 
     Returns
     -------
-    n_edges : numpy.ndarray
-        Shape (n,).
-    edges : numpy.ndarray
-        Shape (n, E, 2), uint16; the first ``n_edges`` of each count.
-    weights : numpy.ndarray
-        Shape (n, E), each graph's sum to 1.
+    n_edges, edges, weights : numpy.ndarray
+        (n,), (n, E, 2) uint16 and (n, E); the weights of each graph sum to 1.
     """
     n, n_joints = visible.shape
-    most = edge_room(n_joints, graph)
+    most = max_edges(n_joints, graph)
     n_edges = np.zeros(n, dtype=np.int64)
     edges = np.zeros((n, most, 2), dtype=np.uint16)
     weights = np.zeros((n, most))
     for k in range(n):
         shown = np.flatnonzero(visible[k])
         joints = points[k][shown]
-        n_edges[k], _ = graph_into(joints, graph, offsets, edges[k])
+        n_edges[k], _ = write_graph(joints, graph, offsets, edges[k])
         total = 0.0
         for edge in range(n_edges[k]):
             i, j = edges[k, edge, 0], edges[k, edge, 1]
@@ -128,9 +124,9 @@ def graphs_of_visible(
 
 @numba.njit(cache=True)
 def count_degenerate(points: np.ndarray, graph: int, offsets: np.ndarray) -> int:
-    """Return how many of the joint sets, (n, J, 2), had to be moved."""
-    edges = np.empty((edge_room(points.shape[1], graph), 2), dtype=np.uint16)
+    """Return the number of joint sets, of (n, J, 2), that were joggled."""
+    edges = np.empty((max_edges(points.shape[1], graph), 2), dtype=np.uint16)
     count = 0
     for k in range(points.shape[0]):
-        count += graph_into(points[k], graph, offsets, edges)[1]
+        count += write_graph(points[k], graph, offsets, edges)[1]
     return count

@@ -1,7 +1,7 @@
-"""Which joints of a pose-pair are looked at together: the edges of a graph over all joints.
+"""Graphs over the joints of a pose-pair in 2D and 3D.
 
-The reference, in NumPy and SciPy, in the plane and in space. The compiled counterpart for many
-projections is :mod:`probmotion.interaction.geometry.graph_kernels`.
+Reference implementation in NumPy and SciPy. The compiled 2D version is
+:mod:`probmotion.interaction.geometry.graph_kernels`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ __all__ = [
 GRAPHS = ("delaunay", "nearest-neighbours", "gabriel", "complete")
 N_NEIGHBOURS = 6
 JOGGLE = 1e-5
-"""How far degenerate joints are moved, in units of their extent."""
+"""Displacement of degenerate joints, in units of their extent."""
 
-# Determinants of joints inside the unit box that are this close to 0 have no certain sign.
+# Determinants of joints in the unit box have an uncertain sign below this size.
 _TIE = 1e-13
 
 
 def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
     """Return the edges of a graph over joints.
 
-    - ``delaunay``: the Delaunay triangulation (Qhull), tetrahedra in space. Degenerate joints
-      (:func:`is_degenerate`) are first moved by fixed tiny offsets.
-    - ``nearest-neighbours``: i and j where either is among the other's six nearest.
-    - ``gabriel``: i and j where no joint lies strictly inside the ball whose diameter they are;
-      a part of the Delaunay triangulation.
-    - ``complete``: all.
+    - ``delaunay``: the Delaunay triangulation (Qhull). Degenerate joints
+      (:func:`is_degenerate`) are first joggled: moved by small fixed offsets.
+    - ``nearest-neighbours``: i–j if either is one of the other's six nearest joints.
+    - ``gabriel``: i–j if no joint lies strictly inside the ball with diameter i–j; a subgraph of
+      the Delaunay triangulation.
+    - ``complete``: all edges.
 
     Parameters
     ----------
@@ -52,11 +52,6 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
     -------
     numpy.ndarray
         Shape (E, 2), integers, i < j, rows in lexicographic order.
-
-    Raises
-    ------
-    ValueError
-        If ``points`` is not (J, 2) or (J, 3), not finite, or the graph is unknown.
     """
     points = _checked(points)
     check_graph(graph)
@@ -74,20 +69,10 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
 
 
 def is_degenerate(points: np.ndarray) -> bool:
-    """Return whether the Delaunay triangulation of joints does not exist or is not the only one.
+    """Return whether the Delaunay triangulation of joints, (J, 2) or (J, 3), is not unique.
 
-    That is where joints repeat, where all lie on a line (in space: in a plane), and where those
-    of two neighbouring triangles lie on one circle (tetrahedra, on one sphere).
-
-    Parameters
-    ----------
-    points : numpy.ndarray
-        Joints, shape (J, D), D = 2 or 3.
-
-    Raises
-    ------
-    ValueError
-        If ``points`` is not (J, 2) or (J, 3), or not finite.
+    True if joints coincide, are collinear (3D: coplanar), or if the joints of two neighbouring
+    triangles are cocircular (tetrahedra: cospherical).
     """
     points = _checked(points)
     if len(np.unique(points, axis=0)) < len(points):
@@ -102,7 +87,7 @@ def check_graph(graph: str) -> None:
 
 
 def joggle_offsets(n_joints: int, n_axes: int) -> np.ndarray:
-    """Return the fixed offsets in [-1, 1] that degenerate joints are moved by, (J, D)."""
+    """Return the fixed offsets in [-1, 1] for joggling degenerate joints, (J, D)."""
     return 2.0 * generator(0, "joggle").random((n_joints, 3))[:, :n_axes].copy() - 1.0
 
 
@@ -114,7 +99,7 @@ def _checked(points: np.ndarray) -> np.ndarray:
 
 
 def _delaunay_adjacency(points: np.ndarray) -> np.ndarray:
-    """Return which joints share a triangle, (J, J) bool."""
+    """Return the adjacency matrix of the Delaunay triangulation, (J, J) bool."""
     n_joints, n_axes = points.shape
     if n_joints <= n_axes:
         return np.ones((n_joints, n_joints), dtype=bool)
@@ -128,7 +113,7 @@ def _delaunay_adjacency(points: np.ndarray) -> np.ndarray:
 
 
 def _triangulation(points: np.ndarray) -> np.ndarray | None:
-    """Return the joints of every triangle or tetrahedron, None where degenerate."""
+    """Return the joints of each triangle or tetrahedron, None if degenerate."""
     unit = _in_unit_box(points)
     try:
         found = Delaunay(unit)
@@ -136,13 +121,13 @@ def _triangulation(points: np.ndarray) -> np.ndarray | None:
         return None
     if len(np.unique(found.simplices)) < len(unit) or _has_ties(unit, found):
         return None
-    # A joint between two others on the hull: rounding may have made a triangle of the three.
+    # Rounding can produce a flat triangle from a joint between two others on the hull.
     legs = unit[found.simplices[:, 1:]] - unit[found.simplices[:, :1]]
     return found.simplices[np.abs(np.linalg.det(legs)) >= _TIE]
 
 
 def _in_unit_box(points: np.ndarray) -> np.ndarray:
-    """Return the joints in units of their extent, about the middle."""
+    """Return the joints centred and scaled to the unit box."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = (high - low).max()
     return (points - 0.5 * (low + high)) / (extent if extent > 1e-150 else 1.0)
@@ -154,14 +139,14 @@ def _has_ties(unit: np.ndarray, found: Delaunay) -> bool:
     which, side = np.nonzero(neighbours >= 0)
     other = simplices[neighbours[which, side]]
     opposite = other[~(other[:, :, None] == simplices[which][:, None, :]).any(axis=-1)]
-    # Lifted to the paraboloid, joints of one circle lie in one plane: their determinant is 0.
+    # Cocircular joints are coplanar once lifted to the paraboloid: the determinant is 0.
     apart = unit[simplices[which]] - unit[opposite][:, None]
     lifted = np.concatenate([apart, (apart**2).sum(axis=-1, keepdims=True)], axis=-1)
     return bool((np.abs(np.linalg.det(lifted)) < _TIE).any())
 
 
 def _neighbour_adjacency(points: np.ndarray) -> np.ndarray:
-    """Return which joints are near, (J, J) bool; of equally near ones the first come first."""
+    """Return the symmetric nearest-neighbour matrix, (J, J) bool; ties go to the lower index."""
     n_joints = len(points)
     squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(squared, np.inf)
@@ -172,8 +157,8 @@ def _neighbour_adjacency(points: np.ndarray) -> np.ndarray:
 
 
 def _gabriel_adjacency(points: np.ndarray) -> np.ndarray:
-    """Return which balls on a diameter are empty, (J, J) bool."""
+    """Return the adjacency matrix of the Gabriel graph, (J, J) bool."""
     to = points[:, None] - points[None]  # [i, k]: from k to i
-    # k sees the diameter i–j under more than a right angle exactly when it is inside the ball.
-    seen = np.einsum("ikd,jkd->ijk", to, to)
-    return ~(seen < 0).any(axis=-1)
+    # k is inside the ball with diameter i–j if and only if the angle i–k–j is obtuse.
+    products = np.einsum("ikd,jkd->ijk", to, to)
+    return ~(products < 0).any(axis=-1)

@@ -1,7 +1,6 @@
-"""The annotation nearest to a projection: what the likelihood of pose-pairs asks, many times over.
+"""Nearest annotation of a 2D projection (Yin et al. 2018, eqs. 8-9).
 
-Yin, Huang, Cohen-Or and Zhang, "Sampling of closely interacting pose-pairs", eqs. 8 and 9. The
-compiled counterpart of :mod:`probmotion.interaction.geometry.coordinates` and
+Compiled counterpart of :mod:`probmotion.interaction.geometry.coordinates` and
 :mod:`probmotion.interaction.geometry.shape_context`.
 """
 
@@ -27,45 +26,36 @@ from probmotion.validation import check_finite, check_positive, check_shape
 __all__ = ["MEASURES", "PairComparer"]
 
 MEASURES = ("interaction", "cartesian", "shape-context")
-"""What pose-pairs can be compared by; the kernels know them by their places."""
+"""Distances of 2D pose-pairs; kernels use the index."""
 
 
 class PairComparer:
-    """Annotated 2D pose-pairs, prepared so that projections are compared with them fast.
+    """Distances of 2D projections to a fixed set of annotated pose-pairs.
 
-    A projection is first brought to the annotation by the least-squares rotation and translation
-    over the annotation's visible joints (no reflection), then compared:
+    A projection is first rigidly aligned to the visible joints of the annotation (no reflection).
 
-    - ``interaction``: eq. 8 over the graphs of both, metres. The projection's graph is that of
-      all its joints, the annotation's that of its visible ones; edges with a hidden end do not
-      count.
-    - ``cartesian``: the root mean square distance of the visible joints, metres.
-    - ``shape-context``: the mean χ² cost of the visible joints' shape contexts, in [0, 1].
+    - ``interaction``: eq. 8, metres. The graphs are those of all joints of the projection and of
+      the visible joints of the annotation; edges with an occluded end are ignored.
+    - ``cartesian``: root-mean-square distance of the visible joints, metres.
+    - ``shape-context``: mean χ² cost of the visible joints' shape contexts, in [0, 1].
 
     Parameters
     ----------
     keypoints : numpy.ndarray
-        Annotations, shape (n, J, 2), metres; those of hidden joints are never read.
+        Annotations, shape (n, J, 2), metres; occluded joints are ignored.
     visible : numpy.ndarray
-        Which joints are annotated, bool, shape (n, J).
+        Mask of annotated joints, bool, shape (n, J).
     measure : str
         One of :data:`MEASURES`.
     graph : str
-        One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`; only ``interaction`` has one.
+        One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`, for ``interaction``.
     epsilon : float
         ε of eq. 8, metres.
 
     Attributes
     ----------
-    prepared, options
-        What compiled code of others reads: the annotations, and measure, graph and ε as its
-        kernels know them.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, there is no annotation, a visible keypoint is not finite, or an
-        option is unknown.
+    prepared
+        Data and options for compiled code.
     """
 
     def __init__(
@@ -83,8 +73,8 @@ class PairComparer:
         check_shape("visible", visible, keypoints.shape[:2])
         if not 1 <= keypoints.shape[1] <= 256 or len(keypoints) == 0:
             raise ValueError(
-                f"keypoints has shape {keypoints.shape}, expected at least one annotation of 1 to "
-                "256 joints"
+                "keypoints must contain at least one annotation of 1 to 256 joints, got shape "
+                f"{keypoints.shape}"
             )
         if measure not in MEASURES:
             raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
@@ -94,77 +84,50 @@ class PairComparer:
         check_finite("keypoints", keypoints)
         self.measure, self.graph, self.epsilon = measure, graph, float(epsilon)
         self.n_annotations, self.n_joints = keypoints.shape[:2]
-        self.options = (MEASURES.index(measure), GRAPHS.index(graph), self.epsilon)
-        self.prepared = _prepare(keypoints, visible, *self.options)
+        self.prepared = _prepare(
+            keypoints, visible, MEASURES.index(measure), GRAPHS.index(graph), self.epsilon
+        )
 
     def nearest(
         self, projections: np.ndarray, candidates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the nearest candidate annotation is, and which it is.
+        """Return the distance and index of the nearest candidate annotation.
 
-        The result of a projection depends neither on its batch nor on the number of threads,
-        which is Numba's (``numba.set_num_threads``).
+        Results are bit-identical for any batch and number of threads (``numba.set_num_threads``).
 
         Parameters
         ----------
         projections : numpy.ndarray
-            Pose-pairs as seen in V views, shape (B, V, J, 2), metres.
+            Projections of pose-pairs to V views, shape (B, V, J, 2), metres.
         candidates : numpy.ndarray
-            The annotations to look at in each view, integers, shape (V, N), N at least 1.
+            Annotations to compare in each view, integers, shape (V, N), N at least 1.
 
         Returns
         -------
         distances : numpy.ndarray
-            Shape (B, V); infinite where no candidate shares an edge (joints, for the measures
-            without a graph) with the projection.
+            Shape (B, V); infinite if no candidate shares an edge (for measures without a graph: a
+            joint) with the projection.
         indices : numpy.ndarray
-            Shape (B, V), of equally near ones the first among the candidates.
-
-        Raises
-        ------
-        ValueError
-            If shapes do not fit, a projection is not finite, or a candidate is not an annotation.
+            Shape (B, V); ties go to the first candidate.
         """
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])
-        # One thread needs no pool of threads, which a process could not fork after.
+        # Avoid starting a thread pool for one thread: a process cannot fork after that.
         alone = only_one_thread() or numba.get_num_threads() == 1
         several = projections.shape[0] * projections.shape[1] > 1
         kernel = nearest_in_batch_on_threads if several and not alone else nearest_in_batch
-        return kernel(projections, candidates, self.prepared, *self.options)
+        return kernel(projections, candidates, self.prepared)
 
     def distances(self, projections: np.ndarray) -> np.ndarray:
-        """Return the distances to all annotations, (B, n), as for retrieval.
-
-        Parameters
-        ----------
-        projections : numpy.ndarray
-            Shape (B, J, 2), metres.
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit or a projection is not finite.
-        """
+        """Return the distances of projections, (B, J, 2) in metres, to all annotations, (B, n)."""
         projections = self._checked(projections, ("B", self.n_joints, 2))
-        return all_distances(projections, self.prepared, *self.options)
+        return all_distances(projections, self.prepared)
 
     def degenerate(self, projections: np.ndarray) -> int:
-        """Return how many projections had to be moved by tiny offsets to be triangulated.
-
-        Parameters
-        ----------
-        projections : numpy.ndarray
-            Shape (…, J, 2), metres. Graphs other than Delaunay's never need it.
-
-        Raises
-        ------
-        ValueError
-            If the shape does not fit or a projection is not finite.
-        """
+        """Return the number of projections, (…, J, 2), with a degenerate Delaunay graph."""
         projections = self._checked(projections, ("…", self.n_joints, 2))
         flat = projections.reshape(math.prod(projections.shape[:-2]), self.n_joints, 2)
-        return int(count_degenerate(flat, self.options[1], self.prepared.offsets))
+        return int(count_degenerate(flat, self.prepared.graph, self.prepared.offsets))
 
     def _checked(self, projections: np.ndarray, expected: tuple[int | str, ...]) -> np.ndarray:
         projections = np.ascontiguousarray(projections, dtype=np.float64)
@@ -177,15 +140,16 @@ class PairComparer:
         candidates = np.ascontiguousarray(candidates)
         check_shape("candidates", candidates, (n_views, "N"))
         if candidates.dtype.kind not in "iu":
-            raise ValueError(f"candidates has dtype {candidates.dtype}, expected integers")
+            raise ValueError(f"candidates must be integers, got {candidates.dtype}")
         if candidates.shape[1] == 0:
             raise ValueError(
-                f"candidates must have shape at least one annotation a view, got {candidates.shape}"
+                "candidates must contain at least one annotation per view, got shape "
+                f"{candidates.shape}"
             )
         if candidates.size and (candidates.min() < 0 or candidates.max() >= self.n_annotations):
             raise ValueError(
-                f"candidates holds {candidates.min()} to {candidates.max()}, expected 0 to "
-                f"{self.n_annotations - 1}"
+                f"candidates must be from 0 to {self.n_annotations - 1}, got "
+                f"{candidates.min()} to {candidates.max()}"
             )
         return candidates.astype(np.int64, copy=False)
 
@@ -193,13 +157,13 @@ class PairComparer:
 def _prepare(
     keypoints: np.ndarray, visible: np.ndarray, measure: int, graph: int, epsilon: float
 ) -> Prepared:
-    """Return what the kernels need of annotations; hidden keypoints are 0."""
+    """Precompute the data of the kernels; occluded keypoints must be 0."""
     n_joints = keypoints.shape[1]
     n_visible = visible.sum(axis=1)
     offsets = joggle_offsets(n_joints, 2)
     mean = keypoints.sum(axis=1) / np.maximum(n_visible, 1)[:, None]
     centred = np.where(visible[..., None], keypoints - mean[:, None], 0.0)
-    # Each measure prepares what it reads, and nothing of the others.
+    # Prepare only the data of the chosen measure.
     graphed = slice(None if MEASURES[measure] == "interaction" else 0)
     binned = slice(None if MEASURES[measure] == "shape-context" else 0)
     n_edges, edges, weights = graphs_of_visible(
@@ -217,4 +181,7 @@ def _prepare(
         contexts=shape_contexts(keypoints[binned], visible[binned]),
         shared=shared_table(n_joints - 1),
         offsets=offsets,
+        measure=measure,
+        graph=graph,
+        epsilon=epsilon,
     )

@@ -1,7 +1,6 @@
-"""One projection against annotations, compiled: align, compare, abandon what cannot be nearest.
+"""Compiled distances between projections and annotations, with early stopping.
 
-No sum here is reordered by the compiler, so a projection's result is the same bits whatever else
-is in its batch and however many threads share it.
+Sums are never reordered, so results are bit-identical for any batch and number of threads.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from probmotion.interaction.geometry.graph_kernels import edge_room, graph_into
+from probmotion.interaction.geometry.graph_kernels import max_edges, write_graph
 from probmotion.interaction.geometry.plane_contexts import context_cost, polar_bins
 
 __all__ = [
@@ -19,132 +18,107 @@ __all__ = [
     "INTERACTION",
     "SHAPE_CONTEXT",
     "Prepared",
+    "Projection",
     "all_distances",
+    "annotation_graph_distance",
     "centred",
-    "distance_by_its_graph",
     "distances_to",
-    "look",
+    "nearest_candidate",
     "nearest_in_batch",
     "nearest_in_batch_on_threads",
-    "nearest_of",
+    "prepare_projection",
 ]
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
-_SMALLEST = 1e-300  # keeps the weights of no edges from being divided by 0
+_SMALLEST = 1e-300  # avoids division by 0 if there are no edges
 
 
 class Prepared(NamedTuple):
-    """What is computed of n annotations once; joints about their visible mean, 0 where hidden."""
+    """Precomputed data of n annotations and the options of the comparison.
+
+    ``joints`` (n, 2, J), metres, centred on the visible mean, 0 if occluded; ``seen`` (n, J), 1 if
+    visible, else 0; ``n_visible`` (n,); ``square`` (n,), sums of squared coordinates;
+    ``edge_start`` (n + 1,), index of each annotation's first edge; ``edges`` (2, E) uint16;
+    ``weights`` (E,), w_ij / W of eq. 8; ``contexts`` (n, J, 60) uint8; ``shared``, their
+    :func:`~probmotion.interaction.geometry.shape_context.shared_table`; ``offsets`` (J, 2), joggle
+    offsets; ``measure`` and ``graph``, indices; ``epsilon``, ε of eq. 8, metres.
+    """
 
     joints: np.ndarray
-    """(n, 2, J) float64, metres."""
     seen: np.ndarray
-    """(n, J) float64, 1 where visible and 0 where hidden."""
     n_visible: np.ndarray
-    """(n,) int64."""
     square: np.ndarray
-    """(n,) sums of squared coordinates."""
     edge_start: np.ndarray
-    """(n + 1,) where each annotation's edges begin."""
     edges: np.ndarray
-    """(2, E) uint16."""
     weights: np.ndarray
-    """(E,) w_ij / W of eq. 8."""
     contexts: np.ndarray
-    """(n, J, 60) uint8 shape contexts."""
     shared: np.ndarray
-    """(J, J) of :func:`~probmotion.interaction.geometry.shape_context.shared_table`."""
     offsets: np.ndarray
-    """(J, 2) what degenerate joints are moved by."""
+    measure: int
+    graph: int
+    epsilon: float
 
 
-@numba.njit(cache=True)
-def _nearest_at(
-    flat: int,
-    projections: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    graph: int,
-    epsilon: float,
-) -> tuple[float, int]:
-    item, view = divmod(flat, projections.shape[1])
-    return nearest_of(
-        projections[item, view], candidates[view], prepared, measure, graph, epsilon, np.inf
-    )
+class Projection(NamedTuple):
+    """A prepared projection: centred joints (2, J), its weighted graph, or its polar bins."""
+
+    joints: np.ndarray
+    edges: np.ndarray
+    weights: np.ndarray
+    n_edges: int
+    bins: np.ndarray
 
 
-# Two loops, and not one that is compiled twice: files of compiled code are found by a function's
-# name, whatever it was compiled for, and one thread would be given the code for several.
+# Two functions instead of one compiled twice: Numba's cache is keyed by the function's name, so a
+# shared name would load parallel code in a single-threaded process.
 @numba.njit(cache=True)
 def nearest_in_batch(
-    projections: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    graph: int,
-    epsilon: float,
+    projections: np.ndarray, candidates: np.ndarray, prepared: Prepared
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least distance and its annotation for (B, V, J, 2) and (V, N)."""
-    shape = projections.shape[:2]
-    distances, indices = np.empty(shape[0] * shape[1]), np.empty(shape[0] * shape[1], np.int64)
-    for flat in range(distances.size):
-        distances[flat], indices[flat] = _nearest_at(
-            flat, projections, candidates, prepared, measure, graph, epsilon
+    """Return the distance and index of the nearest candidate for (B, V, J, 2) and (V, N)."""
+    n, n_views = projections.shape[:2]
+    distances, indices = np.empty((n, n_views)), np.empty((n, n_views), np.int64)
+    for flat in range(n * n_views):
+        item, view = divmod(flat, n_views)
+        distances[item, view], indices[item, view] = nearest_candidate(
+            projections[item, view], candidates[view], prepared, np.inf
         )
-    return distances.reshape(shape), indices.reshape(shape)
+    return distances, indices
 
 
 @numba.njit(cache=True, parallel=True)
 def nearest_in_batch_on_threads(
-    projections: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    graph: int,
-    epsilon: float,
+    projections: np.ndarray, candidates: np.ndarray, prepared: Prepared
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what :func:`nearest_in_batch` does, on as many threads as Numba has."""
-    shape = projections.shape[:2]
-    distances, indices = np.empty(shape[0] * shape[1]), np.empty(shape[0] * shape[1], np.int64)
-    for flat in numba.prange(distances.size):
-        distances[flat], indices[flat] = _nearest_at(
-            np.int64(flat), projections, candidates, prepared, measure, graph, epsilon
+    """Run :func:`nearest_in_batch` on all of Numba's threads."""
+    n, n_views = projections.shape[:2]
+    distances, indices = np.empty((n, n_views)), np.empty((n, n_views), np.int64)
+    for flat in numba.prange(n * n_views):
+        item, view = divmod(np.int64(flat), n_views)
+        distances[item, view], indices[item, view] = nearest_candidate(
+            projections[item, view], candidates[view], prepared, np.inf
         )
-    return distances.reshape(shape), indices.reshape(shape)
+    return distances, indices
 
 
 @numba.njit(cache=True)
-def all_distances(
-    projections: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
-) -> np.ndarray:
+def all_distances(projections: np.ndarray, prepared: Prepared) -> np.ndarray:
     """Return the distances of (B, J, 2) to all n annotations, (B, n)."""
     n_items, n_annotations = projections.shape[0], prepared.joints.shape[0]
     out, every = np.empty((n_items, n_annotations)), np.arange(n_annotations)
     for item in range(n_items):
-        points = projections[item]
-        joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
-        distances_to(
-            joints, edges, weights, n_edges, bins, every, prepared, measure, out[item]
-        )  # fmt: skip
+        projection = prepare_projection(projections[item], prepared)
+        distances_to(projection, every, prepared, out[item])
     return out
 
 
 @numba.njit(cache=True)
-def nearest_of(
-    points: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    graph: int,
-    epsilon: float,
-    within: float,
+def nearest_candidate(
+    points: np.ndarray, candidates: np.ndarray, prepared: Prepared, within: float
 ) -> tuple[float, int]:
-    """Return the least distance of one projection to its candidates, and which it is.
-
-    Where none is within ``within`` that is what is returned, and −1.
-    """
-    joints, edges, weights, n_edges, bins = look(points, prepared, measure, graph, epsilon)
+    """Return the distance and index of the nearest candidate, −1 if none is within ``within``."""
+    projection = prepare_projection(points, prepared)
+    joints = projection.joints
     n_candidates = candidates.shape[0]
     turns, left = np.empty((2, n_candidates)), np.empty(n_candidates)
     n_joints, square = joints.shape[1], 0.0
@@ -157,14 +131,12 @@ def nearest_of(
         if n_visible < n_joints:
             of_visible = _square_of_visible(joints, prepared.seen[k], n_visible)
         left[position] = (of_visible + prepared.square[k] - 2.0 * product) / max(n_visible, 1)
-    apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
+    apart, terms = np.empty_like(joints), np.empty(projection.edges.shape[1])
     best, where = within, n_candidates
-    # What aligns best is likely nearest: visited first, it lets others be abandoned soon.
+    # The candidate with the best alignment is likely nearest; starting there stops others early.
     for position in np.argsort(left):
-        found = _distance(
-            joints, edges, weights, n_edges, bins, candidates[position], turns[0, position],
-            turns[1, position], prepared, measure, best, apart, terms,
-        )  # fmt: skip
+        cosine, sine, k = turns[0, position], turns[1, position], candidates[position]
+        found = _distance(projection, k, cosine, sine, prepared, best, apart, terms)
         if found < best or (found == best and position < where):
             best, where = found, position
     return best, int(candidates[where]) if where < n_candidates else -1
@@ -172,40 +144,29 @@ def nearest_of(
 
 @numba.njit(cache=True)
 def distances_to(
-    joints: np.ndarray,
-    edges: np.ndarray,
-    weights: np.ndarray,
-    n_edges: int,
-    bins: np.ndarray,
-    candidates: np.ndarray,
-    prepared: Prepared,
-    measure: int,
-    found: np.ndarray,
+    projection: Projection, candidates: np.ndarray, prepared: Prepared, found: np.ndarray
 ) -> None:
-    """Write the distances to all candidates of a projection that was looked at before."""
-    apart, terms = np.empty_like(joints), np.empty(edges.shape[1])
+    """Write the distances of a prepared projection to its candidates."""
+    apart, terms = np.empty_like(projection.joints), np.empty(projection.edges.shape[1])
     for position in range(len(candidates)):
         k = candidates[position]
-        cosine, sine, _ = _rotation(joints, prepared.joints[k])
-        found[position] = _distance(
-            joints, edges, weights, n_edges, bins, k, cosine, sine, prepared, measure,
-            np.inf, apart, terms,
-        )  # fmt: skip
+        cosine, sine, _ = _rotation(projection.joints, prepared.joints[k])
+        found[position] = _distance(projection, k, cosine, sine, prepared, np.inf, apart, terms)
 
 
 @numba.njit(cache=True)
-def distance_by_its_graph(
+def annotation_graph_distance(
     joints: np.ndarray, k: int, prepared: Prepared, apart: np.ndarray, terms: np.ndarray
 ) -> float:
-    """Return eq. 8 with annotation k's graph in place of the projection's too."""
+    """Return eq. 8 with annotation k's graph used for the projection as well."""
     cosine, sine, _ = _rotation(joints, prepared.joints[k])
-    _turned_less(joints, prepared.joints[k], cosine, sine, apart)
-    return 2.0 * _annotated_part(apart, k, prepared, terms)
+    _residual(joints, prepared.joints[k], cosine, sine, apart)
+    return 2.0 * _annotation_sum(apart, k, prepared, terms)
 
 
 @numba.njit(cache=True)
 def centred(points: np.ndarray) -> np.ndarray:
-    """Return a projection's joints about their mean, ``(J, 2) → (2, J)``."""
+    """Return centred joints, ``(J, 2) → (2, J)``."""
     n_joints = points.shape[0]
     joints = np.empty((2, n_joints))
     for axis in range(2):
@@ -219,34 +180,32 @@ def centred(points: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def look(
-    points: np.ndarray, prepared: Prepared, measure: int, graph: int, epsilon: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
-    """Return a projection's joints about their mean, its graph and weights, or its polar bins."""
+def prepare_projection(points: np.ndarray, prepared: Prepared) -> Projection:
+    """Return a projection's centred joints and its weighted graph or polar bins."""
     n_joints, joints = points.shape[0], centred(points)
     n_edges = 0
-    most = edge_room(n_joints, graph) if measure == INTERACTION else 0
+    most = max_edges(n_joints, prepared.graph) if prepared.measure == INTERACTION else 0
     edges, weights = np.empty((2, most), dtype=np.uint16), np.empty(most)
     bins = np.empty((2, 0, 0))
-    if measure == INTERACTION:
+    if prepared.measure == INTERACTION:
         rows = np.empty((most, 2), dtype=np.uint16)
-        n_edges, _ = graph_into(points, graph, prepared.offsets, rows)
+        n_edges, _ = write_graph(points, prepared.graph, prepared.offsets, rows)
         for edge in range(n_edges):
             i, j = rows[edge, 0], rows[edge, 1]
             x, y = joints[0, i] - joints[0, j], joints[1, i] - joints[1, j]
             edges[0, edge], edges[1, edge] = i, j
-            weights[edge] = 1.0 / max(epsilon, np.sqrt(x * x + y * y))
+            weights[edge] = 1.0 / max(prepared.epsilon, np.sqrt(x * x + y * y))
         weights[:n_edges] /= max(_sum(weights, n_edges), _SMALLEST)
-    elif measure == SHAPE_CONTEXT:
+    elif prepared.measure == SHAPE_CONTEXT:
         bins = polar_bins(joints)
-    return joints, edges, weights, n_edges, bins
+    return Projection(joints, edges, weights, n_edges, bins)
 
 
 @numba.njit(cache=True)
 def _rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
-    """Return cos and sin of the least-squares rotation and Σ target · (rotated source).
+    """Return cosine and sine of the least-squares rotation, and Σ target · (rotated source).
 
-    ``target`` is about its mean and 0 where hidden, so ``source`` may be about any point.
+    ``target`` must be centred and 0 where occluded; ``source`` need not be centred.
     """
     along, across = 0.0, 0.0
     for joint in range(source.shape[1]):
@@ -260,7 +219,7 @@ def _rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, flo
 
 @numba.njit(cache=True)
 def _square_of_visible(joints: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
-    """Return the sum of squared distances of the visible joints from their mean."""
+    """Return the sum of squared distances of the visible joints to their mean."""
     square, sum_x, sum_y = 0.0, 0.0, 0.0
     for joint in range(joints.shape[1]):
         x, y = seen[joint] * joints[0, joint], seen[joint] * joints[1, joint]
@@ -270,40 +229,35 @@ def _square_of_visible(joints: np.ndarray, seen: np.ndarray, n_visible: int) -> 
 
 @numba.njit(cache=True)
 def _distance(
-    joints: np.ndarray,
-    edges: np.ndarray,
-    weights: np.ndarray,
-    n_edges: int,
-    bins: np.ndarray,
+    projection: Projection,
     k: int,
     cosine: float,
     sine: float,
     prepared: Prepared,
-    measure: int,
     best: float,
     apart: np.ndarray,
     terms: np.ndarray,
 ) -> float:
-    """Return the distance to annotation k, or infinity once it is certain to be above ``best``."""
+    """Return the distance to annotation k, or infinity once it exceeds ``best``."""
     seen = prepared.seen[k]
-    if measure == SHAPE_CONTEXT:
-        angle = np.arctan2(sine, cosine)
-        return context_cost(bins, angle, seen, prepared.contexts[k], prepared.shared, best)
-    _turned_less(joints, prepared.joints[k], cosine, sine, apart)
-    if measure == CARTESIAN:
+    if prepared.measure == SHAPE_CONTEXT:
+        angle, contexts = np.arctan2(sine, cosine), prepared.contexts[k]
+        return context_cost(projection.bins, angle, seen, contexts, prepared.shared, best)
+    _residual(projection.joints, prepared.joints[k], cosine, sine, apart)
+    if prepared.measure == CARTESIAN:
         return _root_mean_square(apart, seen, prepared.n_visible[k])
-    hidden = prepared.n_visible[k] < joints.shape[1]
-    total = _own_part(apart, edges, weights, n_edges, hidden, seen, terms)
+    occluded = prepared.n_visible[k] < projection.joints.shape[1]
+    total = _projection_sum(apart, projection, occluded, seen, terms)
     if total > best or prepared.edge_start[k] == prepared.edge_start[k + 1]:
         return np.inf
-    return total + _annotated_part(apart, k, prepared, terms)
+    return total + _annotation_sum(apart, k, prepared, terms)
 
 
 @numba.njit(cache=True)
-def _turned_less(
+def _residual(
     joints: np.ndarray, target: np.ndarray, cosine: float, sine: float, apart: np.ndarray
 ) -> None:
-    """Write a projection's joints, turned onto an annotation's, less those."""
+    """Write the difference of the rotated projection and an annotation."""
     for joint in range(joints.shape[1]):
         x, y = joints[0, joint], joints[1, joint]
         apart[0, joint] = cosine * x - sine * y - target[0, joint]
@@ -311,7 +265,7 @@ def _turned_less(
 
 
 @numba.njit(cache=True)
-def _annotated_part(apart: np.ndarray, k: int, prepared: Prepared, terms: np.ndarray) -> float:
+def _annotation_sum(apart: np.ndarray, k: int, prepared: Prepared, terms: np.ndarray) -> float:
     """Return the second sum of eq. 8, over the annotation's graph."""
     start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
     for edge in range(start, stop):
@@ -322,21 +276,16 @@ def _annotated_part(apart: np.ndarray, k: int, prepared: Prepared, terms: np.nda
 
 
 @numba.njit(cache=True)
-def _own_part(
-    apart: np.ndarray,
-    edges: np.ndarray,
-    weights: np.ndarray,
-    n_edges: int,
-    hidden: bool,
-    seen: np.ndarray,
-    terms: np.ndarray,
+def _projection_sum(
+    apart: np.ndarray, projection: Projection, occluded: bool, seen: np.ndarray, terms: np.ndarray
 ) -> float:
-    """Return the first sum of eq. 8, over the projection's graph, infinite if it is empty."""
+    """Return the first sum of eq. 8, over the projection's graph; infinite if empty."""
+    edges, weights, n_edges = projection.edges, projection.weights, projection.n_edges
     for edge in range(n_edges):
         i, j = edges[0, edge], edges[1, edge]
         x, y = apart[0, i] - apart[0, j], apart[1, i] - apart[1, j]
         terms[edge] = weights[edge] * np.sqrt(x * x + y * y)
-    if not hidden:
+    if not occluded:
         return _sum(terms, n_edges) if n_edges > 0 else np.inf
     for edge in range(n_edges):
         terms[edge] *= seen[edges[0, edge]] * seen[edges[1, edge]]
@@ -349,7 +298,7 @@ def _own_part(
 
 @numba.njit(cache=True)
 def _sum(terms: np.ndarray, n_terms: int) -> float:
-    """Return a sum in four strands, which the processor can add side by side."""
+    """Return a sum with four accumulators, for instruction-level parallelism."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     whole = n_terms - n_terms % 4
     for k in range(0, whole, 4):
@@ -361,7 +310,7 @@ def _sum(terms: np.ndarray, n_terms: int) -> float:
 
 @numba.njit(cache=True)
 def _root_mean_square(apart: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
-    """Return the root mean square over visible joints, their mean difference taken off."""
+    """Return the root-mean-square distance of the visible joints, mean difference removed."""
     if n_visible == 0:
         return np.inf
     sum_x, sum_y, square = 0.0, 0.0, 0.0

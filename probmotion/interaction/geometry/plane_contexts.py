@@ -1,4 +1,4 @@
-"""Shape contexts of projections, compiled: turned by adding an angle, never binned from scratch."""
+"""Compiled 2D shape contexts of projections, rotated by adding an angle."""
 
 from __future__ import annotations
 
@@ -17,17 +17,9 @@ _PER_RADIAN = N_ANGLES / (2 * math.pi)
 
 @numba.njit(cache=True)
 def polar_bins(joints: np.ndarray) -> np.ndarray:
-    """Return where joint j lies as seen from joint i: its ring's first bin, its angle in bins.
+    """Return the first bin of the ring and the angle in bins of joint j around i, (2, J, J).
 
-    Parameters
-    ----------
-    joints : numpy.ndarray
-        Shape (2, J), metres.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape (2, J, J).
+    ``joints`` is (2, J), metres.
     """
     n_joints = joints.shape[1]
     bins = np.zeros((2, n_joints, n_joints))
@@ -51,23 +43,20 @@ def context_cost(
     shared: np.ndarray,
     best: float,
 ) -> float:
-    """Return the mean χ² cost of a projection turned by ``turn`` and an annotation.
-
-    Infinity as soon as it is certain to exceed ``best``.
+    """Return the mean χ² cost of a rotated projection, infinite once it exceeds ``best``.
 
     Parameters
     ----------
     bins : numpy.ndarray
         From :func:`polar_bins`, (2, J, J).
     turn : float
-        Radians.
+        Rotation of the projection, radians.
     seen, contexts : numpy.ndarray
-        1 for the annotation's visible joints, (J,), and shape contexts over them, (J, 60) uint8.
+        The annotation's visibility, (J,), and shape contexts, (J, 60) uint8.
     shared : numpy.ndarray
-        From :func:`~probmotion.interaction.geometry.shape_context.shared_table`, J − 1 counts at
-        most.
+        :func:`~probmotion.interaction.geometry.shape_context.shared_table` of J − 1.
     best : float
-        The least cost so far.
+        Smallest cost so far.
     """
     n_joints, n_visible = contexts.shape[0], 0
     for joint in range(n_joints):
@@ -75,7 +64,7 @@ def context_cost(
     if n_visible < 2:
         return np.inf
     total, looked_at, turned = 0.0, 0, turn * _PER_RADIAN
-    # Rounding must not abandon a cost that equals the best.
+    # The tolerance keeps ties despite rounding.
     enough = (best + 1e-9) * n_visible * (n_visible - 1)
     counts = np.empty(contexts.shape[1], dtype=np.uint8)
     for i in range(n_joints):
@@ -85,7 +74,7 @@ def context_cost(
         for j in range(n_joints):
             if seen[j] > 0 and j != i:
                 sector = np.int64(np.floor(bins[1, i, j] + turned))
-                # Both angles are within half a turn: one turn brings their sum into [0, N).
+                # Both angles are in [−π, π], so one turn brings their sum into [0, N).
                 if sector < 0:
                     sector += N_ANGLES
                 elif sector >= N_ANGLES:
@@ -94,7 +83,7 @@ def context_cost(
         for k in range(counts.size):
             total += shared[counts[k], contexts[i, k]]
         looked_at += 1
-        # What is left may agree wholly, and then adds nothing.
+        # Lower bound of the cost: the remaining joints may match exactly.
         if looked_at * (n_visible - 1) - total > enough:
             return np.inf
     return 1.0 - total / (n_visible * (n_visible - 1))

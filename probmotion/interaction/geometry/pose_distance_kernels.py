@@ -1,8 +1,8 @@
-"""Compiled: how unlike 3D poses are after the best rigid motion, and the least over many.
+"""Compiled nearest-draw distances of 3D poses after rigid alignment.
 
-A pair of poses is given up (its distance is infinite) as soon as it is known to exceed a limit.
-Poses are centred on their mean joint. A graph is a list of edges, edge e of pose n at place
-``starts[n] ≤ e < starts[n + 1]``, with weights that sum to 1 for each pose.
+Evaluation of a pair of poses stops once its distance exceeds the smallest one so far. Poses are
+centred on their mean joint. Pose n has the edges ``starts[n] ≤ e < starts[n + 1]``, with weights
+that sum to 1.
 """
 
 from __future__ import annotations
@@ -14,58 +14,20 @@ import numpy as np
 
 from probmotion.interaction.geometry.rigid_kernels import align, residual
 
-__all__ = [
-    "cartesian_minima",
-    "cartesian_table",
-    "interaction_minima",
-    "interaction_table",
-]
+__all__ = ["cartesian_minima", "interaction_minima"]
 
 _MARGIN = 1.0 + 1e-6
-"""By how much a bound with rounding errors must exceed the limit before it counts."""
-
-
-@numba.njit(cache=True)
-def cartesian_table(first: np.ndarray, second: np.ndarray, table: np.ndarray) -> None:
-    """Write the root mean square joint distance of every two poses to ``table`` (n, m)."""
-    rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(first.shape[1:])
-    for a in range(first.shape[0]):
-        for b in range(second.shape[0]):
-            table[a, b] = _cartesian(first[a], second[b], np.inf, rotation, horn, apart)
+"""Tolerance of the early stop, for rounding errors."""
 
 
 @numba.njit(cache=True)
 def cartesian_minima(truths: np.ndarray, draws: np.ndarray, least: np.ndarray) -> None:
-    """Lower ``least`` (G,) to each true pose's distance from its nearest draw."""
+    """Lower ``least`` (G,) to the RMS joint distance of each true pose to its nearest draw."""
     rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
         for s in range(draws.shape[0]):
             found = _cartesian(truths[g], draws[s], least[g], rotation, horn, apart)
             least[g] = min(least[g], found)
-
-
-@numba.njit(cache=True)
-def interaction_table(
-    first: np.ndarray,
-    first_starts: np.ndarray,
-    first_edges: np.ndarray,
-    first_weights: np.ndarray,
-    second: np.ndarray,
-    second_starts: np.ndarray,
-    second_edges: np.ndarray,
-    second_weights: np.ndarray,
-    table: np.ndarray,
-) -> None:
-    """Write the dissimilarity of interaction coordinates of every two poses to ``table``."""
-    rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(first.shape[1:])
-    for a in range(first.shape[0]):
-        here = slice(first_starts[a], first_starts[a + 1])
-        for b in range(second.shape[0]):
-            there = slice(second_starts[b], second_starts[b + 1])
-            align(first[a], second[b], rotation, horn)
-            residual(first[a], second[b], rotation, apart)
-            half = _along(apart, first_edges[here], first_weights[here], 0.0, np.inf)
-            table[a, b] = _along(apart, second_edges[there], second_weights[there], half, np.inf)
 
 
 @numba.njit(cache=True)
@@ -80,7 +42,7 @@ def interaction_minima(
     draw_weights: np.ndarray,
     least: np.ndarray,
 ) -> None:
-    """Lower ``least`` (G,) to each true pose's dissimilarity from its nearest draw."""
+    """Lower ``least`` (G,) to the dissimilarity (eq. 8) of each true pose to its nearest draw."""
     rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
         here = slice(truth_starts[g], truth_starts[g + 1])
@@ -105,7 +67,7 @@ def _cartesian(
     apart: np.ndarray,
 ) -> float:
     joints = first.shape[0]
-    # The alignment's own sum is cheap but rounded; only what might win is summed again.
+    # The sum of squares from the alignment is cheap but less accurate.
     if align(first, second, rotation, horn) > _MARGIN * limit * limit * joints + 1e-12:
         return np.inf
     return math.sqrt(residual(first, second, rotation, apart) / joints)
@@ -115,9 +77,9 @@ def _cartesian(
 def _along(
     apart: np.ndarray, edges: np.ndarray, weights: np.ndarray, total: float, limit: float
 ) -> float:
-    """Add to ``total`` one graph's part of eq. 8: w_ij ‖u_ij(1) − u_ij(2)‖ = w_ij ‖a_i − a_j‖.
+    """Add one graph's sum of eq. 8, Σ w_ij ‖a_i − a_j‖, to ``total``; stop beyond ``limit``.
 
-    a is the difference of the aligned poses. What exceeds the limit is left unfinished.
+    a is the difference of the aligned poses.
     """
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]

@@ -1,4 +1,4 @@
-"""Compiled: the rotation that best turns one 3D pose onto another."""
+"""Compiled least-squares rotation of one 3D pose onto another."""
 
 from __future__ import annotations
 
@@ -10,27 +10,25 @@ __all__ = ["align", "residual"]
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-15
 _FLAT = 1e-6
-"""Below this share of λ³ the product of λ's distances from the other eigenvalues is no number to
-divide by: the poses are in line, or nearly mirrored."""
+"""Smallest slope of the characteristic polynomial relative to λ³: below it the largest eigenvalue
+is nearly degenerate (collinear or mirrored poses)."""
 
 
 @numba.njit(cache=True)
 def align(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, horn: np.ndarray) -> float:
-    """Write the proper rotation that best turns ``second`` onto ``first``; return Σ‖difference‖².
+    """Write the least-squares rotation of ``second`` onto ``first``; return Σ‖difference‖².
 
-    Horn's (1987) quaternion, the eigenvector of the largest eigenvalue of a symmetric 4×4 matrix
-    of no trace. The eigenvalue is found from above by Newton's method on the characteristic
-    polynomial, the vector is a row of an adjugate (Theobald 2005). The sum that is returned is
-    a difference of large numbers: its error is about 1e-16 of the poses' own squared size.
+    Horn's (1987) quaternion, the leading eigenvector of a traceless symmetric 4×4 matrix. The
+    eigenvalue comes from Newton's method on the characteristic polynomial, the eigenvector from
+    the adjugate (Theobald 2005). The returned sum has an error of about 1e-16 of the sum of
+    squares of the poses, which must be centred.
 
     Parameters
     ----------
     first, second : ndarray, (J, 3)
         Poses centred on their mean joint, metres.
-    rotation : ndarray, (3, 3)
-        Where the rotation is written.
-    horn : ndarray, (4, 4)
-        Room to work in.
+    rotation, horn : ndarray, (3, 3) and (4, 4)
+        Output and workspace.
     """
     square = _fill(first, second, horn)
     # λ⁴ + c₂ λ² + c₁ λ + c₀.
@@ -72,7 +70,7 @@ def residual(
 
 @numba.njit(cache=True)
 def _fill(first: np.ndarray, second: np.ndarray, horn: np.ndarray) -> float:
-    """Write Horn's matrix; return the sum of the squares of both poses."""
+    """Write Horn's matrix; return the sum of squares of both poses."""
     xx = xy = xz = yx = yy = yz = zx = zy = zz = square = 0.0
     for j in range(first.shape[0]):
         a, b, c = first[j, 0], first[j, 1], first[j, 2]
@@ -102,7 +100,7 @@ def _fill(first: np.ndarray, second: np.ndarray, horn: np.ndarray) -> float:
 
 @numba.njit(cache=True)
 def _linear_coefficient(horn: np.ndarray) -> float:
-    """Return the polynomial's c₁, minus the sum of the principal minors of order three."""
+    """Return c₁ of the characteristic polynomial, minus the sum of the principal 3×3 minors."""
     total = 0.0
     for left_out in range(4):
         i = 0 if left_out > 0 else 1
@@ -136,7 +134,7 @@ def _determinant(m: np.ndarray) -> float:
 
 @numba.njit(cache=True)
 def _eigenvector_rotation(horn: np.ndarray, rotation: np.ndarray) -> float:
-    """Write the rotation by a general method; return the largest eigenvalue."""
+    """Write the rotation from a full eigendecomposition; return the largest eigenvalue."""
     values, vectors = np.linalg.eigh(horn)
     _write_rotation(vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3], rotation)
     return values[3]
@@ -144,9 +142,9 @@ def _eigenvector_rotation(horn: np.ndarray, rotation: np.ndarray) -> float:
 
 @numba.njit(cache=True)
 def _adjugate_rotation(m: np.ndarray, rotation: np.ndarray) -> None:
-    """Write the rotation of the quaternion q that the singular matrix m takes to 0.
+    """Write the rotation of the quaternion q in the null space of m.
 
-    The adjugate is a multiple of q qᵀ: its row of largest diagonal entry is q with fewest errors.
+    The adjugate is a multiple of q qᵀ; its row with the largest diagonal entry is most accurate.
     """
     s01, s02, s03, s12, s13, s23 = _minors(m, 0, 1)
     _, c02, c03, c12, c13, c23 = _minors(m, 2, 3)
@@ -173,7 +171,7 @@ def _adjugate_rotation(m: np.ndarray, rotation: np.ndarray) -> None:
 
 @numba.njit(cache=True)
 def _write_rotation(w: float, x: float, y: float, z: float, rotation: np.ndarray) -> None:
-    """Write the matrix of the quaternion (w, x, y, z) of any length above zero."""
+    """Write the rotation matrix of a quaternion (w, x, y, z) of any length above 0."""
     scale = 2.0 / (w * w + x * x + y * y + z * z)
     rotation[0, 0] = 1.0 - scale * (y * y + z * z)
     rotation[1, 1] = 1.0 - scale * (x * x + z * z)

@@ -1,9 +1,8 @@
-"""Compiled: how unlike the 3D shape contexts of poses are after the best rigid motion.
+"""Compiled nearest-draw shape-context distances of 3D poses after rigid alignment.
 
-Bins are those of :func:`probmotion.interaction.geometry.shape_context.shape_contexts` in space,
-taken again for every two poses, because turning a pose moves its joints to other bins. That is
-dear, so a pair of poses is given up as soon as it must exceed a limit: merging bins never increases
-a χ² cost, and the counts of the rings alone do not change with the rotation.
+Bins are those of :func:`probmotion.interaction.geometry.shape_context.shape_contexts` in 3D,
+recomputed for every pair of poses because rotation changes them. Ring counts are invariant to
+rotation and give a lower bound (merging bins never increases a χ² cost) for stopping early.
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ import numpy as np
 from probmotion.interaction.geometry.rigid_kernels import align
 from probmotion.interaction.geometry.shape_context import RING_EDGES
 
-__all__ = ["N_RINGS", "ring_counts", "shape_minima", "shape_table"]
+__all__ = ["ring_counts", "shape_minima"]
 
-N_RINGS = len(RING_EDGES) + 1
+_N_RINGS = len(RING_EDGES) + 1
 _N_BANDS, _N_SECTORS = 4, 8
-_N_BINS = N_RINGS * _N_BANDS * _N_SECTORS
+_N_BINS = _N_RINGS * _N_BANDS * _N_SECTORS
 _SQUARED_EDGES = tuple(edge**2 for edge in RING_EDGES)
-_FEWER = 1e-12
-"""By how much rounded sums may differ."""
+_TOLERANCE = 1e-12
+"""Tolerance of the early stop, for rounding errors."""
 
 
 @numba.njit(cache=True)
 def ring_counts(poses: np.ndarray) -> np.ndarray:
-    """Return how many joints lie in each ring around each joint, (n, J, 5) uint8."""
-    counts = np.zeros((poses.shape[0], poses.shape[1], N_RINGS), dtype=np.uint8)
+    """Return the number of joints in each ring around each joint, (n, J, 5) uint8."""
+    counts = np.zeros((poses.shape[0], poses.shape[1], _N_RINGS), dtype=np.uint8)
     for n in range(poses.shape[0]):
         for i in range(poses.shape[1]):
             for j in range(poses.shape[1]):
@@ -40,29 +39,6 @@ def ring_counts(poses: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def shape_table(
-    first: np.ndarray,
-    first_rings: np.ndarray,
-    second: np.ndarray,
-    second_rings: np.ndarray,
-    table: np.ndarray,
-) -> None:
-    """Write the mean χ² cost of every two poses' shape contexts to ``table`` (n, m)."""
-    limits = np.empty(1)
-    for a in range(first.shape[0]):
-        for b in range(second.shape[0]):
-            limits[0] = np.inf
-            shape_minima(
-                first[a : a + 1],
-                first_rings[a : a + 1],
-                second[b : b + 1],
-                second_rings[b : b + 1],
-                limits,
-            )
-            table[a, b] = limits[0]
-
-
-@numba.njit(cache=True)
 def shape_minima(
     truths: np.ndarray,
     truth_rings: np.ndarray,
@@ -70,9 +46,9 @@ def shape_minima(
     draw_rings: np.ndarray,
     least: np.ndarray,
 ) -> None:
-    """Lower ``least`` (G,) to each true pose's cost against its nearest draw.
+    """Lower ``least`` (G,) to the mean χ² cost of each true pose and its nearest draw.
 
-    Draws are turned onto the true pose, whose vertical is the one that counts.
+    Draws are rotated onto the true pose, which defines the vertical.
     """
     n_joints = truths.shape[1]
     gains = _gains(n_joints - 1)
@@ -83,7 +59,7 @@ def shape_minima(
     for g in range(truths.shape[0]):
         _fill_contexts(truths[g], contexts, bins)
         for s in range(draws.shape[0]):
-            if _ring_costs(truth_rings[g], draw_rings[s], gains, spare) > least[g] + _FEWER:
+            if _ring_costs(truth_rings[g], draw_rings[s], gains, spare) > least[g] + _TOLERANCE:
                 continue
             align(truths[g], draws[s], rotation, horn)
             _turn(draws[s], rotation, turned)
@@ -93,7 +69,7 @@ def shape_minima(
 
 @numba.njit(cache=True)
 def _gains(most: int) -> np.ndarray:
-    """Return what a bin's k-th joint saves where the other pose has h: ``2hk/(h+k)``'s step."""
+    """Return the decrease of the cost by the k-th joint in a bin with h in the other pose."""
     gains = np.zeros((most + 1, most + 1))
     for h in range(1, most + 1):
         for k in range(1, most + 1):
@@ -106,13 +82,13 @@ def _gains(most: int) -> np.ndarray:
 def _ring_costs(
     first: np.ndarray, second: np.ndarray, gains: np.ndarray, after: np.ndarray
 ) -> float:
-    """Return the cost of rings alone, and write what the joints after each one add to it."""
+    """Return the cost of the ring counts; write the part due to the joints after each one."""
     n_joints = first.shape[0]
     total = 0.0
     for i in range(n_joints - 1, -1, -1):
         after[i] = total
         total += 1.0 / n_joints
-        for ring in range(N_RINGS):
+        for ring in range(_N_RINGS):
             h = first[i, ring]
             for k in range(1, second[i, ring] + 1):
                 total -= gains[h, k]
@@ -129,9 +105,9 @@ def _cost(
     counts: np.ndarray,
     bins: np.ndarray,
 ) -> float:
-    """Return the mean χ² cost of a pose against shape contexts, infinite where over the limit.
+    """Return the mean χ² cost of a pose and shape contexts, infinite if beyond the limit.
 
-    With N joints in both histograms a joint's cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
+    For histograms of N joints each, the cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
     """
     n_joints = joints.shape[0]
     across, along = _heading(joints)
@@ -145,7 +121,7 @@ def _cost(
                 total -= gains[contexts[i, bins[j]], counts[bins[j]]]
         for j in range(n_joints):
             counts[bins[j]] = 0
-        if total + after[i] > limit + _FEWER:
+        if total + after[i] > limit + _TOLERANCE:
             return np.inf
     return max(total, 0.0)
 
@@ -164,7 +140,7 @@ def _fill_contexts(joints: np.ndarray, contexts: np.ndarray, bins: np.ndarray) -
 
 @numba.njit(cache=True)
 def _heading(joints: np.ndarray) -> tuple[float, float]:
-    """Return where the second half of the joints is from the first half on the ground, x and z."""
+    """Return the horizontal offset (x, z) from the first to the second half of the joints."""
     half = joints.shape[0] // 2
     x = z = 0.0
     for j in range(half):
@@ -178,7 +154,7 @@ def _heading(joints: np.ndarray) -> tuple[float, float]:
 def _fill_bins(
     joints: np.ndarray, i: int, heading_x: float, heading_z: float, bins: np.ndarray
 ) -> None:
-    """Write the bin in which joint i sees each joint."""
+    """Write the bin of each joint in the context of joint i."""
     for j in range(joints.shape[0]):
         x = joints[j, 0] - joints[i, 0]
         y = joints[j, 1] - joints[i, 1]
@@ -191,7 +167,7 @@ def _fill_bins(
         bins[j] = (_ring(squared) * _N_BANDS + band) * _N_SECTORS + sector
 
 
-# No branches below, so that many joints are done at once.
+# The functions below are branch-free so that the compiler can vectorise them.
 
 
 @numba.njit(cache=True)
@@ -207,7 +183,7 @@ def _ring(squared: float) -> int:
 
 @numba.njit(cache=True)
 def _octant(across: float, along: float) -> int:
-    """Return which eighth of a turn atan2(across, along) is in, from 0 on."""
+    """Return the octant (0 to 7) of atan2(across, along)."""
     lower = (across < 0.0) | ((across == 0.0) & (along < 0.0))
     up, right = (-across, -along) if lower else (across, along)
     left = (right <= 0.0) & (up > 0.0)

@@ -1,4 +1,4 @@
-"""`StoredChain`: where a chain that takes hours is, in a file, so that it goes on if stopped."""
+"""`StoredChain`: resumable state of a long chain in a file."""
 
 from __future__ import annotations
 
@@ -18,45 +18,40 @@ _SECONDS = 30.0
 
 
 class StoredChain:
-    """Arrays that say where a chain is, written from time to time and whole.
+    """Periodic, atomic checkpoint of a chain's state.
 
-    When they are written changes no draw: a chain goes on from them with the same bits.
-
-    Parameters
-    ----------
-    path : Path, optional
-        A file of this chain alone, ``.npz`` without pickle; by default nothing is written.
+    Resuming reproduces the draws bit by bit, whenever the state was written. ``path`` is an
+    ``.npz`` file without pickle; by default nothing is written.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path, self._written = path, time.monotonic()
 
     def load(self) -> Mapping[str, np.ndarray] | None:
-        """Return what was written last; None if nothing was, or nothing is kept.
+        """Return the last state written, or None.
 
         Raises
         ------
         ValueError
-            If the file is not what :meth:`save` wrote.
+            If the file is not readable.
         """
         if self.path is None or not self.path.is_file():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as held:
-                return dict(held)
+            with np.load(self.path, allow_pickle=False) as state:
+                return dict(state)
         except (ValueError, EOFError, OSError, BadZipFile) as error:
             raise ValueError(
-                f"{self.path} holds no chain ({error}), expected one that was kept; without it "
-                "the chain is made anew"
+                f"{self.path} must contain a stored chain, got {error}; delete it to restart"
             ) from error
 
-    def save(self, held: Callable[[], Mapping[str, np.ndarray]]) -> None:
-        """Write what ``held`` returns, if it is time to; a file that fails stops no chain."""
+    def save(self, state: Callable[[], Mapping[str, np.ndarray]]) -> None:
+        """Write the state if it is due; write errors only warn."""
         if self.path is None or time.monotonic() < self._written + _SECONDS:
             return
         try:
             with written_whole(self.path) as unfinished:
-                np.savez(unfinished, allow_pickle=False, **held())
+                np.savez(unfinished, allow_pickle=False, **state())
         except OSError as error:
-            warnings.warn(f"{error}; the chain goes on", stacklevel=2)
+            warnings.warn(f"{error}; the chain continues", stacklevel=2)
         self._written = time.monotonic()

@@ -1,11 +1,10 @@
-"""`make_reference`: reference draws from two independent runs that agree.
+"""`make_reference`: certified reference draws from two independent runs.
 
-Both runs are the sampler's own, four chains each; their draws are kept only if each has mixed and
-they cannot be told apart, in where motions are as in what they are like wherever they stand: places
-that differ by metres would hide poses that do not mix. Chains start where the prior says: where
-that is a few seeds, they start together and say nothing of modes that none of them reached, and the
-certificate tells from how many points. Of a posterior that is known exactly they are two sets of
-exact draws, which are measured the same way.
+Each run has four chains. The draws are kept only if both runs have mixed and agree, in world
+coordinates and after rigid alignment, because large translations can hide poses that do not mix.
+Chains start where the prior says. If that is at few seeds, modes that no chain reached remain
+undetected, and the certificate records the number of seeds. Exact posteriors give two sets of exact
+draws, tested in the same way.
 """
 
 from __future__ import annotations
@@ -49,8 +48,8 @@ _LEVEL = 1e-3
 _STILL = 1e-9
 
 
-class ReferenceRefused(ValueError):  # noqa: N818 (a verdict, not a fault)
-    """Two runs that have not mixed, or do not agree: their draws are no reference."""
+class ReferenceRefused(ValueError):  # noqa: N818
+    """Raised if two runs have not mixed or disagree."""
 
 
 def make_reference(
@@ -62,55 +61,57 @@ def make_reference(
     sampler: Sampler | None = None,
     unfinished: str | Path | None = None,
 ) -> StoredReference:
-    """Return reference draws of a problem with their certificate.
+    """Return certified reference draws of a problem.
 
     Parameters
     ----------
     problem : Problem
-        The problem; its stored reference is not read.
+        The problem; its stored reference is ignored.
     draws : int
-        Draws to keep, half from each run: a multiple of 8, 4 chains each. The runs have 4000 at
-        least, because R-hat says little of short ones; of more, as many as asked for are kept,
-        evenly apart.
+        Number of draws, half from each run: a multiple of 8 (4 chains each). Runs have at least
+        4000 draws, as R-hat is unreliable for short ones, and are thinned to this number.
     seed : int
         Seed of both runs.
     progress : bool
-        Show bars.
+        Show progress bars.
     sampler : Sampler, optional
-        What draws where the posterior is not exact. By default
+        Sampler for posteriors that are not exact. By default
         :class:`~probmotion.problems.references.outlier_gibbs.OutlierGibbs` or
-        :class:`~probmotion.problems.references.tempered_pairs.TemperedPairs` where that can, else
-        NUTS with a longer warm-up; a random walk where there is no gradient.
+        :class:`~probmotion.problems.references.tempered_pairs.TemperedPairs` where suitable, else
+        NUTS with a long warm-up, or a random walk without gradients.
     unfinished : str or Path, optional
-        Folder in which each run is kept once it has ended, and chains of tempered pairs before: the
-        same call, stopped on the way, goes on there. Whoever named it deletes it. By default
-        nothing is written.
+        Folder for finished runs and the state of tempered chains, from which the same call
+        resumes; the caller deletes it. By default nothing is written.
 
     Raises
     ------
     ValueError
-        If ``draws`` is not such a number, or the prior has no density.
+        If ``draws`` is invalid or the prior has no density.
     ReferenceRefused
-        If R-hat is above 1.01, or the runs disagree.
+        If R-hat exceeds 1.01 or the runs disagree.
     OSError
-        If ``unfinished`` cannot be written to; once runs have begun that is a warning.
+        If ``unfinished`` is not writable; errors after the start only warn.
     """
     check_count("draws", draws, least=8 * _CHAINS)
     if draws % (2 * _CHAINS):
-        raise ValueError(f"draws must be a multiple of {2 * _CHAINS}, 4 chains twice, got {draws}")
+        raise ValueError(f"draws must be a multiple of {2 * _CHAINS}, got {draws}")
     shape = (problem.posterior.frames, problem.posterior.skeleton.n_joints, 3)
-    # A posterior that has no fingerprint is refused before hours are spent. Near the origin, where
-    # cameras look: density is problem at any points that tell one evidence from another.
+    # Compute the fingerprint first, so that unsupported posteriors fail before the long runs. Any
+    # points near the origin distinguish posteriors.
     probes = 0.1 * seeds.generator(0, "unfinished").standard_normal((_PROBES, *shape))
-    known = fingerprint_of(problem.posterior, probes)
-    used = load_sampler("exact")() if problem.known is not None else sampler or _long_run(problem)
+    fingerprint = fingerprint_of(problem.posterior, probes)
+    used = (
+        load_sampler("exact")()
+        if problem.exact_source is not None
+        else sampler or _long_run(problem)
+    )
     made = max(draws, _LEAST) // 2
     folder = None if unfinished is None else writable_folder(Path(unfinished))
-    made_by = [problem.name, known, used.name, settings_of(used), made, seed]
+    key = [problem.name, fingerprint, used.name, settings_of(used), made, seed]
     runs = []
     for half in range(2):
         make = partial(_run, problem, used, made, seed, half, progress)
-        runs.append(make(None) if folder is None else _kept_or_made(folder, half, made_by, make))
+        runs.append(make(None) if folder is None else _cached_run(folder, half, key, make))
     return certify(problem, runs, seed, draws)
 
 
@@ -146,21 +147,20 @@ def _run(
     )
 
 
-def _kept_or_made(
-    folder: Path, half: int, made_by: list[Any], make: Callable[[Path], MotionDraws]
+def _cached_run(
+    folder: Path, half: int, key: list[Any], make: Callable[[Path], MotionDraws]
 ) -> MotionDraws:
-    """Return a run that has ended, or make it and keep it; a file that fails stops neither.
+    """Load a finished run, or make and store it; file errors only warn.
 
-    The file's name tells by what it was made, and of what. A run that keeps its chains before it
-    has ended does so beside it.
+    The file name contains a hash of everything that determines the run.
     """
-    told = json.dumps([*made_by, library_versions()])
-    path = folder / f"run-{half}-{hashlib.sha256(told.encode()).hexdigest()[:16]}.nc"
+    text = json.dumps([*key, library_versions()])
+    path = folder / f"run-{half}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.nc"
     if path.is_file():
         try:
             return MotionDraws.load(path)
         except ValueError as error:
-            warnings.warn(f"{error}; the run is made anew", stacklevel=3)
+            warnings.warn(f"{error}; the run is repeated", stacklevel=3)
     run = make(path.with_suffix(""))
     try:
         run.save(path)
@@ -168,58 +168,57 @@ def _kept_or_made(
             chain.unlink()
     except OSError as error:
         reason = error.strerror or str(error)
-        warnings.warn(f"cannot keep the run in {path}: {reason}", stacklevel=3)
+        warnings.warn(f"cannot store the run in {path}: {reason}", stacklevel=3)
     return run
 
 
 def certify(
     problem: Problem, runs: list[MotionDraws], seed: int, draws: int | None = None
 ) -> StoredReference:
-    """Return the draws of two runs as a reference, if both have mixed and they agree.
+    """Return the draws of two runs as a reference if both have mixed and they agree.
 
-    ``draws`` of them are kept, evenly apart in every chain; all by default.
+    Keeps ``draws`` evenly spaced draws of the chains; all by default.
 
     Raises
     ------
     ReferenceRefused
-        If they have not or do not; the message says how far.
+        Otherwise, with the violated limit.
     """
-    there = [run.dataset["positions"].values for run in runs]
-    moved = [align_motions(positions, there[0][0, 0]) for positions in there]
+    world = [run.dataset["positions"].values for run in runs]
+    aligned = [align_motions(positions, world[0][0, 0]) for positions in world]
     measured = [chain_diagnostics(run) for run in runs]
-    # A rigid body looks the same wherever it stands; what is left of it is rounding.
-    several = not _alike(moved)
+    # After alignment a rigid body leaves only rounding errors.
+    several = not _alike(aligned)
     if several:
         measured += [
-            chain_diagnostics(*pair) for pair in zip(runs, map(_principal, moved), strict=True)
+            chain_diagnostics(*pair) for pair in zip(runs, map(_principal, aligned), strict=True)
         ]
     elif not _is_rigid(problem):
         raise ReferenceRefused(
-            f"the runs on {problem.name} hold one motion wherever it stands, expected several; "
-            "nothing was kept"
+            f"runs on {problem.name} must contain more than one motion up to rigid motion"
         )
-    found = [each["rhat"] for each in measured if "rhat" in each]
-    # Not-a-number is no R-hat that is small.
-    for number, rhat in enumerate(found):
+    diagnostic = [each["rhat"] for each in measured if "rhat" in each]
+    # The negation also refuses NaN.
+    for number, rhat in enumerate(diagnostic):
         if not rhat <= _RHAT:
             raise ReferenceRefused(
-                f"the runs on {problem.name} have an R-hat of {rhat:.3f}{_where(number > 1)}, "
-                f"expected at most {_RHAT}; more draws may help, nothing was kept"
+                f"R-hat of the runs on {problem.name}{_where(number > 1)} must be at most {_RHAT}, "
+                f"got {rhat:.3f}; try more draws"
             )
-    agreed = _agreed(problem.name, there, seed, "")
-    agreed_moved = _agreed(problem.name, moved, seed, _where(True)) if several else None
+    agreed = _agreed(problem.name, world, seed, "")
+    agreed_moved = _agreed(problem.name, aligned, seed, _where(True)) if several else None
     positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
     first = runs[0].dataset.attrs
     certificate: dict[str, Any] = {
         "problem": problem.name,
         "draws": len(positions),
-        "exact": problem.known is not None,
+        "exact": problem.exact_source is not None,
         "sampler": first["sampler"],
         "settings": json.loads(first["settings"]),
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
         "seeds": _n_seeds(problem),
-        "rhat": max(found, default=None),
+        "rhat": max(diagnostic, default=None),
         "ess_bulk": _least(measured, "ess_bulk"),
         "ess_tail": _least(measured, "ess_tail"),
         "agreement": agreed,
@@ -237,23 +236,23 @@ def _agreed(name: str, runs: list[np.ndarray], seed: int, where: str) -> dict[st
     for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
         if not agreed[measure] <= agreed[limit]:
             raise ReferenceRefused(
-                f"two runs on {name} disagree, {measure} is {agreed[measure]:.3g}{where}, "
-                f"expected at most {agreed[limit]:.3g}; nothing was kept"
+                f"{measure} of two runs on {name}{where} must be at most {agreed[limit]:.3g}, "
+                f"got {agreed[measure]:.3g}"
             )
     return agreed
 
 
-def _where(moved: bool) -> str:
-    return " wherever motions stand" if moved else ""
+def _where(aligned: bool) -> str:
+    return " after alignment" if aligned else ""
 
 
-def _alike(moved: list[np.ndarray]) -> bool:
-    flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in moved])
+def _alike(aligned: list[np.ndarray]) -> bool:
+    flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in aligned])
     return bool(np.ptp(flat, axis=0).max() < _STILL)
 
 
 def _is_rigid(problem: Problem) -> bool:
-    """Whether all motions of the prior are one, wherever it stands."""
+    """Whether all motions of the prior agree up to rigid motion."""
     prior, rng = problem.posterior.prior, seeds.generator(0, "rigid")
     if isinstance(prior, Samplable):
         positions = to_numpy(prior.sample(rng, 8))
@@ -262,12 +261,12 @@ def _is_rigid(problem: Problem) -> bool:
     return _alike([align_motions(positions, positions[0])])
 
 
-def _principal(moved: np.ndarray) -> np.ndarray:
-    return principal_coordinates(moved.reshape(*moved.shape[:2], -1))
+def _principal(aligned: np.ndarray) -> np.ndarray:
+    return principal_coordinates(aligned.reshape(*aligned.shape[:2], -1))
 
 
 def _n_seeds(problem: Problem) -> int | None:
-    """Return from how many points chains start; None where each starts at a draw of its own."""
+    """Return the number of starting points; None if chains start at draws from the prior."""
     prior = problem.posterior.prior
     return len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None
 
@@ -281,21 +280,15 @@ def _evenly(run: MotionDraws, draws: int | None) -> np.ndarray:
 
 
 def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, float]:
-    """Return how far two runs are apart, and how far two runs alike may be.
+    """Return the discrepancy of two runs and its limits.
 
-    - ``swd_ratio``: their sliced Wasserstein distance over that of halves which take half of
-      the chains of each run, so that they differ as runs that agree do, slow mixing included;
-      ``swd_ratio_at_most`` is 1 and five of those halves' standard deviations, or 1.5
-    - ``mean_z``: the largest difference of means over coordinates, in standard errors that count
-      each run's effective draws; ``mean_z_at_most`` is exceeded once in a thousand times by
-      runs that agree
+    - ``swd_ratio``: sliced Wasserstein distance, relative to the mean distance of halves that each
+      combine chains of both runs and so reflect slow mixing; ``swd_ratio_at_most`` is 1 plus five
+      standard deviations over these halves, at least 1.5
+    - ``mean_z``: largest difference of means in standard errors from the effective sample sizes;
+      ``mean_z_at_most`` is exceeded with probability .001 by equal distributions
 
-    Parameters
-    ----------
-    first, second : ndarray, (chain, draw, L, J, 3)
-        Positions, metres; as many of both.
-    seed : int
-        Of the directions of projection.
+    Takes positions (chain, draw, L, J, 3) of equal shape, metres, and the seed of the projections.
     """
     from scipy.stats import norm
 
@@ -306,7 +299,7 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     chains = len(runs[0])
     halves = [_apart(seen, chosen) for chosen in _mixed_halves(chains)]
     floor = float(np.mean(halves))
-    # A root whose center nothing moves has neither deviation nor difference.
+    # Skip constant coordinates, such as those of a centred root.
     spread = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _STILL
     z = _standard_errors_apart(*(run[..., spread] for run in runs))
     return {
@@ -318,13 +311,13 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
 
 
 def _mixed_halves(chains: int) -> list[tuple[int, ...]]:
-    """Chains of halves that take as many from each run; each of the two halves stands for both."""
+    """Return halves that contain equally many chains of both runs, one of each pair."""
     own = list(combinations(range(chains), chains // 2))
     return [(*a, *(chains + i for i in b)) for a in own for b in own if 0 in a]
 
 
 def _apart(seen: np.ndarray, chosen: tuple[int, ...]) -> float:
-    """The sliced Wasserstein distance of some chains to the others, all projected already."""
+    """Return the sliced Wasserstein distance of chosen chains to the others from projections."""
     others = [chain for chain in range(len(seen)) if chain not in chosen]
     x, y = (seen[list(some)].reshape(-1, seen.shape[-1]) for some in (chosen, others))
     return float(np.sqrt(np.mean((np.sort(x, axis=0) - np.sort(y, axis=0)) ** 2)))
@@ -342,5 +335,5 @@ def _standard_errors_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _least(measured: list[dict[str, float]], name: str) -> float | None:
-    values = [found[name] for found in measured if name in found]
+    values = [diagnostic[name] for diagnostic in measured if name in diagnostic]
     return min(values) if values and all(map(math.isfinite, values)) else None

@@ -1,4 +1,4 @@
-"""Compiled: how likely a pose-pair is, part by part, and in one view of the evidence."""
+"""Compiled log densities of pose pairs: prior terms and the likelihood of one view."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from probmotion.interaction.geometry.nearest_kernels import (
     INTERACTION,
     Prepared,
+    annotation_graph_distance,
     centred,
-    distance_by_its_graph,
     distances_to,
-    look,
-    nearest_of,
+    nearest_candidate,
+    prepare_projection,
 )
 from probmotion.models.pose_pairs.joint_limits_kernels import LimitArrays, project_poses
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
@@ -22,17 +22,17 @@ from probmotion.problems.references.pair_moves import Body, log_places
 
 __all__ = [
     "Physics",
-    "Sight",
-    "judge",
+    "ViewAnnotations",
     "log_annotations",
     "log_measure",
     "log_penetration",
     "log_prior",
-    "log_sketch",
+    "log_prior_terms",
+    "log_surrogate",
     "log_view",
     "log_views",
-    "picture_of",
-    "weigh",
+    "project_to_view",
+    "write_limit_terms",
 ]
 
 
@@ -40,7 +40,7 @@ _Vector = tuple[float, float, float]
 
 
 class Physics(NamedTuple):
-    """Eq. 2: joint limits, penetration and their numbers."""
+    """Parameters of eq. 2: joint limits and penetration."""
 
     trees: np.ndarray
     limits: LimitArrays
@@ -52,36 +52,34 @@ class Physics(NamedTuple):
     max_invalid: int
 
 
-class Sight(NamedTuple):
-    """Eqs. 6 to 9: views, the annotations near each, and how they are compared."""
+class ViewAnnotations(NamedTuple):
+    """Parameters of eqs. 6 to 9: views, nearby annotations, and their comparison.
+
+    ``vectors`` (V, 3); ``near`` (V, N) int64, the annotations near each view.
+    """
 
     vectors: np.ndarray
-    """(V, 3), V at least 1."""
     near: np.ndarray
-    """(V, N) int64."""
     prepared: Prepared
-    measure: int
-    graph: int
-    epsilon: float
     noise: float
 
 
 @numba.njit(cache=True, nogil=True)
-def weigh(pose: np.ndarray, body: Body, physics: Physics, parts: np.ndarray) -> None:
-    """Write what a pose's log prior is made of: ``parts`` (2 + 2 K,).
+def log_prior_terms(pose: np.ndarray, body: Body, physics: Physics, parts: np.ndarray) -> None:
+    """Write the terms of the log prior: ``parts`` (2 + 2 K,).
 
-    First the normal log lengths and places, then penetration, then each person's distance to the
-    joint limits (eq. 2), then each person's invalid angles, a count.
+    Normal log lengths and positions, penetration, each person's distance to the joint limits
+    (eq. 2), and each person's number of invalid angles.
     """
     parts[0] = log_measure(pose, body)
     parts[1] = log_penetration(pose, physics)
     for person in range(len(body.roots)):
-        judge(pose, person, physics, parts)
+        write_limit_terms(pose, person, physics, parts)
 
 
 @numba.njit(cache=True, nogil=True)
 def log_prior(parts: np.ndarray, physics: Physics) -> float:
-    """Return the log prior, up to a constant, of parts that :func:`weigh` wrote."""
+    """Return the log prior, up to a constant, from the terms of :func:`log_prior_terms`."""
     people = len(parts) // 2 - 1
     if parts[2 + people :].sum() > physics.max_invalid:
         return -np.inf
@@ -90,74 +88,73 @@ def log_prior(parts: np.ndarray, physics: Physics) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def log_view(
-    pose: np.ndarray, view: int, body: Body, sight: Sight, least: float = -np.inf
+    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, least: float = -np.inf
 ) -> float:
     """Return log L(Θ_v; v) of one view: −d²/2σ_l² of the nearest annotation (eq. 9).
 
-    −∞ where it is below ``least``, which is sooner known.
+    Returns −∞ below ``least``, which allows early termination.
     """
-    distance, nearest = nearest_of(
-        picture_of(pose, view, body, sight),
-        sight.near[view],
-        sight.prepared,
-        sight.measure,
-        sight.graph,
-        sight.epsilon,
-        sight.noise * np.sqrt(-2.0 * least),
+    distance, nearest = nearest_candidate(
+        project_to_view(pose, view, body, views),
+        views.near[view],
+        views.prepared,
+        views.noise * np.sqrt(-2.0 * least),
     )
-    return -0.5 * (distance / sight.noise) ** 2 if nearest >= 0 else -np.inf
+    return -0.5 * (distance / views.noise) ** 2 if nearest >= 0 else -np.inf
 
 
 @numba.njit(cache=True, nogil=True)
-def log_views(pose: np.ndarray, body: Body, sight: Sight) -> np.ndarray:
+def log_views(pose: np.ndarray, body: Body, views: ViewAnnotations) -> np.ndarray:
     """Return log L(Θ_v; v) of every view, (V,)."""
-    found = np.empty(len(sight.vectors))
-    for view in range(len(found)):
-        found[view] = log_view(pose, view, body, sight)
-    return found
+    logs = np.empty(len(views.vectors))
+    for view in range(len(logs)):
+        logs[view] = log_view(pose, view, body, views)
+    return logs
 
 
 @numba.njit(cache=True, nogil=True)
 def log_annotations(
-    pose: np.ndarray, view: int, body: Body, sight: Sight, found: np.ndarray
+    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, logs: np.ndarray
 ) -> None:
-    """Write −d²/2σ_l² to every annotation near a view: ``found`` (N,); its maximum is log L_v."""
-    picture = picture_of(pose, view, body, sight)
-    seen = look(picture, sight.prepared, sight.measure, sight.graph, sight.epsilon)
-    distances_to(*seen, sight.near[view], sight.prepared, sight.measure, found)
-    for position in range(len(found)):
-        found[position] = -0.5 * (found[position] / sight.noise) ** 2
+    """Write −d²/2σ_l² of all annotations near a view to ``logs`` (N,); the maximum is log L_v."""
+    image = project_to_view(pose, view, body, views)
+    seen = prepare_projection(image, views.prepared)
+    distances_to(seen, views.near[view], views.prepared, logs)
+    for position in range(len(logs)):
+        logs[position] = -0.5 * (logs[position] / views.noise) ** 2
 
 
 @numba.njit(cache=True, nogil=True)
-def log_sketch(
+def log_surrogate(
     pose: np.ndarray,
     view: int,
     annotation: int,
     body: Body,
-    sight: Sight,
+    views: ViewAnnotations,
     apart: np.ndarray,
     terms: np.ndarray,
 ) -> float:
-    """Return −d²/2σ_l² to one annotation, by its own graph alone: near it, for a tenth of the time.
+    """Return −d²/2σ_l² of one annotation with its own graph only, which takes a tenth of the time.
 
-    ``apart`` (2, J) and ``terms`` (edges,) are room to work in.
+    ``apart`` (2, J) and ``terms`` (edges,) are work space.
     """
-    picture = picture_of(pose, view, body, sight)
-    if sight.measure == INTERACTION:
-        distance = distance_by_its_graph(centred(picture), annotation, sight.prepared, apart, terms)
+    image = project_to_view(pose, view, body, views)
+    if views.prepared.measure == INTERACTION:
+        distance = annotation_graph_distance(
+            centred(image), annotation, views.prepared, apart, terms
+        )
     else:
-        # These distances have no graph: nothing is cheaper.
-        seen = look(picture, sight.prepared, sight.measure, sight.graph, sight.epsilon)
-        one, found = np.array([annotation]), np.empty(1)
-        distances_to(*seen, one, sight.prepared, sight.measure, found)
-        distance = found[0]
-    return -0.5 * (distance / sight.noise) ** 2
+        # Distances without a graph have no cheaper surrogate.
+        seen = prepare_projection(image, views.prepared)
+        one, logs = np.array([annotation]), np.empty(1)
+        distances_to(seen, one, views.prepared, logs)
+        distance = logs[0]
+    return -0.5 * (distance / views.noise) ** 2
 
 
 @numba.njit(cache=True, nogil=True)
 def log_measure(pose: np.ndarray, body: Body) -> float:
-    """Return the log density of normal log lengths and places of roots, 0 at the seed."""
+    """Return the log density of normal log lengths and root positions, 0 at the seed."""
     lengths = 0.0
     for joint in range(len(pose)):
         parent = body.parents[joint]
@@ -172,15 +169,15 @@ def log_measure(pose: np.ndarray, body: Body) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def log_penetration(pose: np.ndarray, physics: Physics) -> float:
-    """Return −w ρ²/2σ_p², ρ how deep bones stand in one another (eq. 2)."""
+    """Return −w ρ²/2σ_p² with penetration depth ρ (eq. 2)."""
     poses = pose.reshape(1, len(pose), 3)
     depth = total_depths(poses, physics.bones, physics.radii, physics.pairs)[0]
     return -0.5 * physics.penetration_weight * (depth / physics.position_noise) ** 2
 
 
 @numba.njit(cache=True, nogil=True)
-def judge(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) -> None:
-    """Write a person's part of ‖X − X̂‖² and the number of invalid angles."""
+def write_limit_terms(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) -> None:
+    """Write a person's term of ‖X − X̂‖² and number of invalid angles."""
     poses = pose.reshape(1, len(pose), 3)
     valid, nearest = project_poses(poses, physics.trees[person : person + 1], physics.limits)
     apart = 0.0
@@ -192,14 +189,14 @@ def judge(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) ->
 
 
 @numba.njit(cache=True, nogil=True)
-def picture_of(pose: np.ndarray, view: int, body: Body, sight: Sight) -> np.ndarray:
-    """Return a pose as seen in a view, (J, 2), metres.
+def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotations) -> np.ndarray:
+    """Project a pose to a view orthographically, (J, 2), metres.
 
-    An orthographic picture, as :func:`~probmotion.interaction.annotations.views.project_to_views`
-    takes it, in which anything across the view may be up: annotations are turned to fit.
+    Equals :func:`~probmotion.interaction.annotations.views.project_to_views` up to a rotation in
+    the image plane, to which annotations are aligned.
     """
     i, j, k = _local_frame(pose, body)
-    a, b, c = sight.vectors[view]
+    a, b, c = views.vectors[view]
     towards = _unit(
         (
             a * i[0] + b * j[0] + c * k[0],
@@ -216,18 +213,17 @@ def picture_of(pose: np.ndarray, view: int, body: Body, sight: Sight) -> np.ndar
         across = (0.0, 0.0, 1.0)
     right = _unit(_cross(across, towards))
     up = _cross(towards, right)
-    picture = np.empty((len(pose), 2))
+    image = np.empty((len(pose), 2))
     for joint in range(len(pose)):
         x, y, z = pose[joint, 0], pose[joint, 1], pose[joint, 2]
-        picture[joint, 0] = right[0] * x + right[1] * y + right[2] * z
-        picture[joint, 1] = up[0] * x + up[1] * y + up[2] * z
-    return picture
+        image[joint, 0] = right[0] * x + right[1] * y + right[2] * z
+        image[joint, 1] = up[0] * x + up[1] * y + up[2] * z
+    return image
 
 
 @numba.njit(cache=True, nogil=True)
 def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vector]:
-    """Return i, j and k of
-    :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
+    """Return i, j, k of :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
     x, y, z = 0.0, 0.0, 0.0
     for person in range(len(body.roots)):
         along = _unit(_between(pose, body.roots[person], body.chests[person]))
@@ -237,7 +233,7 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vecto
     return i, j, _cross(i, j)
 
 
-# Numbers in tuples: arrays of three would take longer to make than to fill.
+# Tuples avoid the allocation of small arrays.
 @numba.njit(cache=True, nogil=True)
 def _between(pose: np.ndarray, start: int, end: int) -> _Vector:
     return (
@@ -255,8 +251,4 @@ def _unit(v: _Vector) -> _Vector:
 
 @numba.njit(cache=True, nogil=True)
 def _cross(a: _Vector, b: _Vector) -> _Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

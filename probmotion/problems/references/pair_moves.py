@@ -1,9 +1,8 @@
-"""Compiled: how a pose-pair may move, and what its moves keep as it is.
+"""Compiled Metropolis proposals of pose pairs.
 
-The measure that densities are relative to is a product: bones point anywhere alike, their log
-lengths and the roots' places are normal, as in ``PoseChart.log_measure`` but for the roots'
-frames, which move nothing. Each move is a rotation of some bones, or a step of a length or a place:
-it keeps areas and volumes as they are, so that densities alone decide.
+The base measure is a product: uniform bone directions, normal log lengths and normal root
+positions, as in ``PoseChart.log_measure`` without the roots' frames. Proposals rotate bones or
+shift a length or position; they preserve areas and volumes and need no Jacobian.
 """
 
 from __future__ import annotations
@@ -22,48 +21,47 @@ __all__ = [
     "Body",
     "log_places",
     "moves_of",
-    "place_anew",
     "propose",
+    "resample_placement",
 ]
 
 SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)
 _ANY_ANGLE = 0.3
-"""How often a crank or hinge turns by any angle."""
+"""Probability of a uniform angle for cranks and hinges."""
 
 
 class Body(NamedTuple):
-    """Two people or more, and where their seed stands."""
+    """Skeleton and seed of two or more people.
+
+    ``parents`` (J,) int64, −1 for roots; ``below`` (J, J): whether a joint is another or its
+    descendant; ``roots``, ``chests`` (K,) int64; ``person`` (J,) int64, 0 to K − 1; ``seed``
+    (J, 3), metres.
+    """
 
     parents: np.ndarray
-    """(J,) int64, −1 for roots."""
     below: np.ndarray
-    """(J, J) bool: whether a joint is another, or hangs from it."""
     roots: np.ndarray
-    """(K,) int64."""
     chests: np.ndarray
-    """(K,) int64."""
     person: np.ndarray
-    """(J,) int64: whose each joint is, 0 to K − 1."""
     seed: np.ndarray
-    """(J, 3) metres."""
     bone_noise: float
     root_noise: float
 
 
 def moves_of(body: Body) -> np.ndarray:
-    """Return every move, its kind and the joint or root that it is of: (moves, 3).
+    """Return all moves, (moves, 3): kind, joint or root, and second joint or −1.
 
-    Last comes a crank's only child, or the sibling that a hinge moves along; else −1.
+    The second joint is a crank's only child or a hinge's sibling.
     """
     bones = np.flatnonzero(body.parents >= 0).tolist()
     children = [
         np.flatnonzero(body.parents == joint).tolist() for joint in range(len(body.parents))
     ]
-    found = [(kind, joint, -1) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
-    found += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
-    found += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
-    found += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots]
-    return np.array(found, dtype=np.int64)
+    moves = [(kind, joint, -1) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
+    moves += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
+    moves += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
+    moves += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots]
+    return np.array(moves, dtype=np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -75,7 +73,7 @@ def propose(
     rng: np.random.Generator,
     proposed: np.ndarray,
 ) -> None:
-    """Write where one of :func:`moves_of` takes a pose; ``size``: radians, metres or a share."""
+    """Write the proposal of one of :func:`moves_of`; ``size`` in radians, metres or log length."""
     kind, joint, other = move
     proposed[:] = pose
     parent = body.parents[joint]
@@ -118,7 +116,7 @@ def propose(
         angle = vector[0]
         if rng.random() < _ANY_ANGLE:
             angle = np.pi * (2.0 * rng.random() - 1.0)
-        # What a crank or hinge turns leaves its axis as it is.
+        # Rotation about the line between two joints leaves both bones' lengths unchanged.
         axis = pose[other] - pose[parent if kind == CRANK else joint]
         length = np.sqrt((axis**2).sum())
         if length == 0:
@@ -135,8 +133,10 @@ def propose(
 
 
 @numba.njit(cache=True, nogil=True)
-def place_anew(pose: np.ndarray, parts: np.ndarray, body: Body, rng: np.random.Generator) -> None:
-    """Turn the pair by any rotation and draw where it stands: all else sees the same pair."""
+def resample_placement(
+    pose: np.ndarray, parts: np.ndarray, body: Body, rng: np.random.Generator
+) -> None:
+    """Metropolis update of the rigid placement of the pair, which affects only the root density."""
     n_roots = len(body.roots)
     middle, start, new = np.zeros(3), np.zeros(3), np.empty(3)
     for root in body.roots:
@@ -146,8 +146,7 @@ def place_anew(pose: np.ndarray, parts: np.ndarray, body: Body, rng: np.random.G
         new[i] = start[i] + body.root_noise / np.sqrt(n_roots) * rng.standard_normal()
     turn = np.empty((3, 3))
     _any_rotation(rng, turn)
-    # The middle is drawn from what the roots' places say of it; what is left is how the roots
-    # stand about it.
+    # The centre is drawn from its conditional; accept by the density of the roots around it.
     before, after = 0.0, 0.0
     for root in body.roots:
         for i in range(3):
@@ -216,7 +215,7 @@ def _of_quaternion(w: float, x: float, y: float, z: float, turn: np.ndarray) -> 
 
 @numba.njit(cache=True, nogil=True)
 def log_places(pose: np.ndarray, body: Body) -> float:
-    """Return the log density of the roots' normal places, 0 at the seed."""
+    """Return the log density of the root positions, 0 at the seed."""
     total = 0.0
     for root in body.roots:
         for i in range(3):

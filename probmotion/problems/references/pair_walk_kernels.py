@@ -1,30 +1,30 @@
-"""Compiled: a Metropolis walk over pose-pairs in joint positions, and over the views of them."""
+"""Compiled Metropolis walk over pose pairs and views."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-from probmotion.interaction.geometry.graph_kernels import edge_room
+from probmotion.interaction.geometry.graph_kernels import max_edges
 from probmotion.problems.references.pair_densities import (
     Physics,
-    Sight,
-    judge,
+    ViewAnnotations,
     log_annotations,
     log_measure,
     log_penetration,
     log_prior,
-    log_sketch,
+    log_surrogate,
     log_view,
+    write_limit_terms,
 )
-from probmotion.problems.references.pair_moves import SHIFT, TURN, Body, place_anew, propose
+from probmotion.problems.references.pair_moves import SHIFT, TURN, Body, propose, resample_placement
 
 __all__ = ["walk"]
 
-_LOT = 40
-"""Steps by a sketch: of so many, two lots in three are taken."""
-_VIEWS_ASKED = 6
-"""Of any number of views: all would take longer than the steps between."""
+_SURROGATE_STEPS = 40
+"""Surrogate steps per proposal, for an acceptance of about two thirds."""
+_VIEW_PROPOSALS = 6
+"""View proposals per walk."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -40,72 +40,55 @@ def walk(
     taken: np.ndarray,
     body: Body,
     physics: Physics,
-    sight: Sight,
+    views: ViewAnnotations,
     rng: np.random.Generator,
 ) -> tuple[int, float]:
-    """Walk on prior · L_v^power in pose and view; return the view and log L_v.
+    """Metropolis walk on prior · L_v^power over pose and view; returns the view and log L_v.
 
-    Lots of steps go by a sketch of L_v, which is of one annotation and its own graph, and each lot
-    is taken or left as things are (surrogate transitions, Liu 2001). Meanwhile the annotation is a
-    part of the state: drawn in proportion to its likelihood to the power, given the pose.
+    Blocks of steps target a surrogate of L_v, the graph distance to one annotation, and are
+    accepted or rejected as a whole (surrogate transitions, Liu 2001). The annotation is an
+    auxiliary variable, drawn in proportion to its likelihood to the power given the pose.
 
-    Parameters
-    ----------
-    pose : ndarray, (J, 3)
-        Metres; changes in place.
-    parts : ndarray, (2 + 2 K,)
-        Of :func:`weigh`; kept up to date.
-    view : int
-        v.
-    power : float
-        Inverse temperature.
-    n_steps : int
-        Steps of the pose.
-    moves, sizes : ndarray, (moves, 3) and (moves,)
-        Of :func:`moves_of`, and how large each is: radians, metres, or shares of a length.
-    tried, taken : ndarray, (moves,)
-        Counts of steps by the sketch, added to.
-    body, physics, sight
-        The posterior's arrays.
-    rng : numpy.random.Generator
-        Of the chain.
+    Updates in place: ``pose`` (J, 3), metres; ``parts`` (2 + 2 K,) of :func:`log_prior_terms`; and
+    the counters of surrogate steps ``tried`` and ``taken`` (moves,).
     """
-    logs, new_logs = np.empty(sight.near.shape[1]), np.empty(sight.near.shape[1])
+    logs, new_logs = np.empty(views.near.shape[1]), np.empty(views.near.shape[1])
     there, parts_there = np.empty_like(pose), np.empty_like(parts)
     if power > 0:
-        log_annotations(pose, view, body, sight, logs)
-    for done in range(0, n_steps, _LOT):
+        log_annotations(pose, view, body, views, logs)
+    for done in range(0, n_steps, _SURROGATE_STEPS):
         there[:], parts_there[:] = pose, parts
-        chosen = _drawn(power * logs, rng) if power > 0 else 0
-        gained = _walk_by_sketch(
-            there, parts_there, view, sight.near[view, chosen], power, min(_LOT, n_steps - done),
-            moves, sizes, tried, taken, body, physics, sight, rng,
+        chosen = _draw_index(power * logs, rng) if power > 0 else 0
+        gained = _surrogate_walk(
+            there, parts_there, view, views.near[view, chosen], power,
+            min(_SURROGATE_STEPS, n_steps - done), moves, sizes, tried, taken, body, physics,
+            views, rng,
         )  # fmt: skip
         if power > 0:
-            log_annotations(there, view, body, sight, new_logs)
+            log_annotations(there, view, body, views, new_logs)
             ratio = power * (new_logs[chosen] - logs[chosen] - gained)
             ratio += _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
             if not -rng.standard_exponential() < ratio:
                 continue
             logs[:] = new_logs
         pose[:], parts[:] = there, parts_there
-    place_anew(pose, parts, body, rng)
+    resample_placement(pose, parts, body, rng)
     if power == 0:
-        view = int(rng.random() * len(sight.vectors))
-        return view, log_view(pose, view, body, sight)
+        view = int(rng.random() * len(views.vectors))
+        return view, log_view(pose, view, body, views)
     log_l = logs.max()
-    for _ in range(_VIEWS_ASKED):
-        # What a view must reach is drawn first: that it does not is sooner known than what it is.
-        other = int(rng.random() * len(sight.vectors))
+    for _ in range(_VIEW_PROPOSALS):
+        # Draw the acceptance threshold first, to terminate the evaluation early.
+        other = int(rng.random() * len(views.vectors))
         least = log_l - rng.standard_exponential() / power
-        found = log_view(pose, other, body, sight, least)
+        found = log_view(pose, other, body, views, least)
         if found >= least:
             view, log_l = other, found
     return view, log_l
 
 
 @numba.njit(cache=True, nogil=True)
-def _walk_by_sketch(
+def _surrogate_walk(
     pose: np.ndarray,
     parts: np.ndarray,
     view: int,
@@ -118,15 +101,15 @@ def _walk_by_sketch(
     taken: np.ndarray,
     body: Body,
     physics: Physics,
-    sight: Sight,
+    views: ViewAnnotations,
     rng: np.random.Generator,
 ) -> float:
-    """Take Metropolis steps on prior · sketch^power; return by how much the log sketch rose."""
+    """Take Metropolis steps on prior · surrogate^power; return the change of the log surrogate."""
     proposed, weighed = np.empty_like(pose), np.empty_like(parts)
-    apart, terms = np.empty((2, len(pose))), np.empty(edge_room(len(pose), sight.graph))
+    apart, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
     start = 0.0
     if power > 0:
-        start = log_sketch(pose, view, annotation, body, sight, apart, terms)
+        start = log_surrogate(pose, view, annotation, body, views, apart, terms)
     here = start
     for _ in range(n_steps):
         number = int(rng.random() * len(moves))
@@ -134,20 +117,20 @@ def _walk_by_sketch(
         tried[number] += 1
         propose(pose, moves[number], sizes[number], body, rng, proposed)
         weighed[:] = parts
-        # First by what is cheap, then by what is not (Christen and Fox 2005).
+        # Delayed acceptance: cheap terms first (Christen and Fox 2005).
         weighed[0] = log_measure(proposed, body)
         new = 0.0
         if power > 0:
-            new = log_sketch(proposed, view, annotation, body, sight, apart, terms)
+            new = log_surrogate(proposed, view, annotation, body, views, apart, terms)
         if not -rng.standard_exponential() < weighed[0] - parts[0] + power * (new - here):
             continue
         weighed[1] = log_penetration(proposed, physics)
         least = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
-        # Limits take away at most: without them, some are known to be left already.
+        # Joint limits only decrease the density, so penetration alone may suffice to reject.
         if weighed[1] < least:
             continue
         if kind != TURN and kind != SHIFT:
-            judge(proposed, body.person[joint], physics, weighed)
+            write_limit_terms(proposed, body.person[joint], physics, weighed)
         if not log_prior(weighed, physics) - weighed[0] >= least:
             continue
         pose[:], parts[:], here = proposed, weighed, new
@@ -156,8 +139,8 @@ def _walk_by_sketch(
 
 
 @numba.njit(cache=True, nogil=True)
-def _drawn(logs: np.ndarray, rng: np.random.Generator) -> int:
-    """Return one of several, drawn in proportion to exp(logs)."""
+def _draw_index(logs: np.ndarray, rng: np.random.Generator) -> int:
+    """Draw an index in proportion to exp(logs)."""
     total = np.cumsum(np.exp(logs - logs.max()))
     return min(int(np.searchsorted(total, rng.random() * total[-1], side="right")), len(logs) - 1)
 

@@ -1,4 +1,4 @@
-"""The stored references of problems: the user's own, and those of the package."""
+"""Lookup of stored references: the user's and the shipped ones."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _SHIPPED = Path(__file__).parent
 
 
 def references_folder() -> Path:
-    """Return where references are kept: ``references`` beside downloads, in the user's cache."""
+    """Return the user's folder of references, beside the downloads."""
     from probmotion.data.downloads import data_folder
 
     return data_folder() / "references"
 
 
 def find_reference(name: str) -> StoredReference | None:
-    """Return the reference kept of a problem: the user's own, else the package's, else None."""
+    """Return the stored reference of a problem, preferring the user's, or None."""
     for place in (references_folder(), _SHIPPED):
         if (place / name / "certificate.json").is_file():
             return StoredReference.load(place / name)

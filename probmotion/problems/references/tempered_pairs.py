@@ -1,19 +1,15 @@
-"""`TemperedPairs`: what draws reference pose-pairs, by parallel tempering over single views.
+"""`TemperedPairs`: reference draws of pose pairs by parallel tempering over single views.
 
-The posterior over pose-pairs is a mean over views, and in each view the nearest annotation alone
-counts: pairs that are like one annotation are far from those that are like another, and a random
-walk stays where it began. Here the view is a part of the state,
+The posterior over pose pairs is a mean over views, and each view depends on its nearest annotation.
+Modes near different annotations are far apart. The view is therefore part of the state,
 
     π(Θ, v) ∝ f(Θ) L(Θ_v; v),
 
-whose sum over v is the posterior: a step asks one view of the likelihood in place of all. Levels
-with L to a power between 0 and 1 stand below it, and neighbours exchange their states (Swendsen and
-Wang 1986): at power 0 pairs move through the prior, and come back in other views and near other
-annotations.
-Exchanges take even and odd neighbours in turn, and powers are set so that all exchanges are
-rejected alike (Syed et al. 2022).
+whose marginal is the posterior; a step evaluates one view. Levels temper L by powers from 0 to 1
+and neighbours exchange their states (Swendsen and Wang 1986), alternating even and odd pairs, with
+powers tuned to equal rejection rates (Syed et al. 2022).
 
-Where the density is cut (eq. 11), f* ≤ f: one more state, of f*, exchanges with that of power 1.
+A truncated density (eq. 11), f* ≤ f, adds one state of f* that exchanges with power 1.
 """
 
 from __future__ import annotations
@@ -27,23 +23,34 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import logsumexp
+from probmotion.interaction.annotated_pairs import AnnotatedPairs
+from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
+from probmotion.interaction.annotations.views import view_vectors
+from probmotion.models.pose_pairs.penetration import capsules_of
+from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems.references.chains import StoredChain
+from probmotion.problems.references.pair_densities import (
+    Physics,
+    ViewAnnotations,
+    log_prior,
+    log_prior_terms,
+    log_view,
+    log_views,
+)
+from probmotion.problems.references.pair_moves import Body, moves_of
+from probmotion.problems.references.pair_walk_kernels import walk
 from probmotion.validation import check_count
-
-if TYPE_CHECKING:
-    from probmotion.problems.references.pair_densities import Physics, Sight
-    from probmotion.problems.references.pair_moves import Body
 
 __all__ = ["TemperedPairs"]
 
@@ -61,16 +68,16 @@ _CUT_STATE = ("pose", "parts", "seen", "view", "log_share")
 
 @dataclass(frozen=True)
 class TemperedPairs:
-    """Parallel tempering of pose-pairs and views; each chain has levels of its own.
+    """Parallel tempering of pose pairs and views, with separate levels per chain.
 
     Parameters
     ----------
     levels : int
-        Powers of the likelihood, from 0 to 1.
+        Number of powers from 0 to 1.
     steps : int
-        Steps that a level takes between exchanges.
+        Steps per level between exchanges.
     warmup : int
-        Exchanges before the first draw, in which powers and step sizes are set.
+        Exchanges before the first draw, which tune powers and step sizes.
     thin : int
         Exchanges per draw.
     """
@@ -90,11 +97,7 @@ class TemperedPairs:
         check_count("thin", self.thin)
 
     def draws_from(self, posterior: MotionPosterior) -> bool:
-        """Whether the prior is that of pose-pairs, with annotations of all of its joints."""
-        # Compiled code is imported by those who use it.
-        from probmotion.interaction.annotated_pairs import AnnotatedPairs
-        from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-
+        """Whether the posterior is over pose pairs with annotations of all joints."""
         return (
             type(posterior) in (MotionPosterior, TruncatedPosterior)
             and type(posterior.prior) is PosePairPrior
@@ -113,30 +116,21 @@ class TemperedPairs:
         progress: bool = True,
         unfinished: Path | None = None,
     ) -> MotionDraws:
-        """Return ``draws`` states of each of ``chains`` chains; see the sampler's protocol.
+        """Return ``draws`` states of each of ``chains`` chains; see the sampler protocol.
 
-        Where each chain is, is kept in ``unfinished`` and the chain's number, twice a minute: the
-        same call goes on there after it was stopped. Whoever named it deletes these files.
-
-        Chains run side by side on threads, one a processor, wherever this is called: each has
-        random numbers of its own and shares nothing, so that bits do not depend on threads.
-        The run counts steps as evaluations of the density, though most ask a part of it.
-
-        Raises
-        ------
-        ValueError
-            If the posterior is not :meth:`draws_from`'s, or ``initial`` is given.
+        The state of each chain is stored twice a minute in files named after ``unfinished``, from
+        which the same call resumes; the caller deletes them. Chains run on threads with independent
+        generators, so results do not depend on their number. Steps count as density evaluations,
+        although most evaluate a part of it.
         """
         if not self.draws_from(posterior):
             raise ValueError(
-                f"posterior is a {type(posterior).__name__} of {type(posterior.prior).__name__} "
-                f"and {type(posterior.likelihood).__name__} with {_hidden(posterior)} hidden "
-                "joints, expected PosePairPrior and AnnotatedPairs with none"
+                "posterior must have PosePairPrior and AnnotatedPairs without occluded joints, got "
+                f"{type(posterior.prior).__name__} and {type(posterior.likelihood).__name__} with "
+                f"{_hidden(posterior)}"
             )
         if initial is not None:
-            raise ValueError(
-                f"initial is {type(initial).__name__}, expected None: chains start at the seeds"
-            )
+            raise ValueError(f"initial must be None, got {type(initial).__name__}")
         check_count("draws", draws)
         check_count("chains", chains)
         start, stop = time.perf_counter(), Event()
@@ -149,26 +143,26 @@ class TemperedPairs:
                 _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
                 for chain in range(chains)
             ]
-            kept = [
+            files = [
                 StoredChain(unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz"))
                 for chain in range(chains)
             ]
             try:
-                waiting = [
+                futures = [
                     threads.submit(ladder.draw, draws, bar, stop, own)
-                    for ladder, own in zip(ladders, kept, strict=True)
+                    for ladder, own in zip(ladders, files, strict=True)
                 ]
-                # One that fails stops all, not only those that were waited for before it.
-                ended, _ = wait(waiting, return_when=FIRST_EXCEPTION)
+                # The first failure stops all chains.
+                ended, _ = wait(futures, return_when=FIRST_EXCEPTION)
                 for each in ended:
                     each.result()
             finally:
                 stop.set()
-            found = [each.result() for each in waiting]
+            states = [each.result() for each in futures]
         return MotionDraws.of(
             posterior,
             self,
-            np.stack(found)[:, :, None],
+            np.stack(states)[:, :, None],
             seed=seed,
             seconds=time.perf_counter() - start,
             statistics={
@@ -180,24 +174,21 @@ class TemperedPairs:
 
 
 class _Ladder:
-    """The levels of one chain."""
+    """Tempering levels of one chain."""
 
     def __init__(
         self,
         sampler: TemperedPairs,
         posterior: MotionPosterior,
-        arrays: tuple[Body, Physics, Sight],
+        arrays: tuple[Body, Physics, ViewAnnotations],
         rng: np.random.Generator,
         chain: int,
     ) -> None:
-        from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-        from probmotion.problems.references.pair_densities import log_view, weigh
-        from probmotion.problems.references.pair_moves import moves_of
 
         prior = posterior.prior
         assert isinstance(prior, PosePairPrior)
         self.sampler, self.arrays, self.rng = sampler, arrays, rng
-        body, physics, sight = arrays
+        body, physics, views = arrays
         levels = sampler.levels
         self.powers = np.concatenate([[0.0], np.geomspace(_SMALLEST_POWER, 1.0, levels - 1)])
         self.moves = moves_of(body)
@@ -206,11 +197,11 @@ class _Ladder:
         pose = prior.seed[chain % len(prior.seed)]
         self.poses = np.repeat(pose[None], levels, axis=0)
         self.parts = np.empty((levels, 2 + 2 * len(body.roots)))
-        weigh(pose, body, physics, self.parts[0])
+        log_prior_terms(pose, body, physics, self.parts[0])
         self.parts[:] = self.parts[0]
-        self.views = rng.integers(len(sight.vectors), size=levels)
-        # log L_v of each level's view.
-        self.seen = np.array([log_view(pose, view, body, sight) for view in self.views])
+        self.views = rng.integers(len(views.vectors), size=levels)
+        # log L_v of each level.
+        self.seen = np.array([log_view(pose, view, body, views) for view in self.views])
         self.cut = _Cut(self, posterior) if _is_cut(posterior) else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
         self.odd = False
@@ -220,35 +211,35 @@ class _Ladder:
 
     @property
     def barrier(self) -> float:
-        """Sum over neighbours of how often an exchange is rejected: Λ of Syed et al."""
+        """Communication barrier Λ of Syed et al.: the sum of rejection rates over neighbours."""
         return float(self.rejected.sum() / max(self.asked, 1))
 
-    def draw(self, draws: int, bar: Any, stop: Event, kept: StoredChain) -> np.ndarray:
-        """Return the states at the top after a warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
-        found, done, held = np.empty((draws, *self.poses.shape[1:])), 0, kept.load()
+    def draw(self, draws: int, bar: Any, stop: Event, file: StoredChain) -> np.ndarray:
+        """Return states at power 1 after warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
+        states, done, held = np.empty((draws, *self.poses.shape[1:])), 0, file.load()
         if held is None:
             self._warm_up(stop)
         else:
             done = len(held["draws"])
-            found[:done] = held["draws"]
-            self._go_on_from(held)
+            states[:done] = held["draws"]
+            self._resume(held)
             bar.update(done)
         for draw in range(done, draws):
             for _ in range(self.sampler.thin):
                 self._exchange_after_walking(stop)
-            found[draw] = self.poses[-1] if self.cut is None else self.cut.pose
+            states[draw] = self.poses[-1] if self.cut is None else self.cut.pose
             bar.update(1)
-            kept.save(partial(self._held, found[: draw + 1]))
-        return found
+            file.save(partial(self._state, states[: draw + 1]))
+        return states
 
-    def _held(self, draws: np.ndarray) -> dict[str, np.ndarray]:
-        """Return draws so far, all that exchanges change, and what the warm-up has set."""
+    def _state(self, draws: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the draws so far and the complete state of the chain."""
         held = {name: np.asarray(getattr(self, name)) for name in _STATE}
         if self.cut is not None:
             held |= {f"cut_{name}": np.asarray(getattr(self.cut, name)) for name in _CUT_STATE}
         return held | {"draws": draws, "random": seeds.state_words(self.rng)}
 
-    def _go_on_from(self, held: Mapping[str, np.ndarray]) -> None:
+    def _resume(self, held: Mapping[str, np.ndarray]) -> None:
         for owner, names, prefix in ((self, _STATE, ""), (self.cut, _CUT_STATE, "cut_")):
             for name in names if owner is not None else ():
                 value = held[f"{prefix}{name}"]
@@ -256,7 +247,7 @@ class _Ladder:
         self.rng = seeds.resumed_generator(held["random"])
 
     def _warm_up(self, stop: Event) -> None:
-        """Set step sizes after every exchange, and powers after rounds of growing length."""
+        """Tune step sizes after every exchange and powers after rounds of growing length."""
         end_of_round, length = _FIRST_ROUND, _FIRST_ROUND
         for number in range(1, self.sampler.warmup + 1):
             self._exchange_after_walking(stop)
@@ -267,7 +258,7 @@ class _Ladder:
             self.tried[:], self.taken[:] = 0, 0
             if number == end_of_round:
                 self._set_powers()
-                # The last round is not cut short: what it says is what powers are set by.
+                # Extend the last round, as the final powers depend on it.
                 length = (
                     2 * length
                     if end_of_round + 6 * length <= self.sampler.warmup
@@ -279,7 +270,7 @@ class _Ladder:
             self.cut.check()
 
     def _set_powers(self) -> None:
-        """Move the powers to where the rejected exchanges so far say that all reject alike."""
+        """Move the powers to equalise the rejection rates."""
         rejected = np.maximum(self.rejected / self.asked, 1e-3)
         so_far = np.concatenate([[0.0], np.cumsum(rejected)])
         powers = np.interp(np.linspace(0.0, so_far[-1], len(so_far)), so_far, self.powers)
@@ -289,8 +280,6 @@ class _Ladder:
         self.rejected[:], self.asked = 0, 0
 
     def _exchange_after_walking(self, stop: Event) -> None:
-        from probmotion.problems.references.pair_walk_kernels import walk
-
         if stop.is_set():
             raise KeyboardInterrupt
         sizes = np.exp(self.log_sizes)
@@ -327,7 +316,7 @@ class _Ladder:
 
 
 class _Cut:
-    """One more state, of the density that is cut; it exchanges with that of power 1.
+    """State of the truncated density, which exchanges with the state of power 1.
 
     f*/f is 0 below the floor, cap/f above the cap, else 1.
     """
@@ -337,12 +326,12 @@ class _Cut:
         self.floor, self.cap = posterior.log_floor, posterior.log_cap
         self.pose, self.parts = ladder.poses[-1].copy(), ladder.parts[-1].copy()
         self.seen, self.view = ladder.seen[-1], ladder.views[-1]
-        self.log_share = self._log_share(ladder)
+        self.log_share = self._log_ratio(ladder)
 
     def exchange(self, ladder: _Ladder) -> None:
-        """Exchange states with the top level, or not."""
-        theirs = self._log_share(ladder)
-        # Of two states without share neither is taken for the other: no number is below none.
+        """Metropolis exchange with the top level."""
+        theirs = self._log_ratio(ladder)
+        # The comparison with NaN rejects if both densities are 0.
         if not -ladder.rng.standard_exponential() < theirs - self.log_share:
             return
         for own, top in ((self.pose, ladder.poses[-1]), (self.parts, ladder.parts[-1])):
@@ -352,37 +341,28 @@ class _Cut:
         self.log_share = theirs
 
     def check(self) -> None:
-        """Raise ``ValueError`` if no state was met that the cut leaves."""
+        """Raise ``ValueError`` if no state within the truncation was found."""
         if self.log_share == -math.inf:
             raise ValueError(
-                f"posterior is cut at {self.floor:.4g} nats and nothing above that was met in the "
-                "warm-up, expected a greater limit"
+                "posterior must have a larger limit: the warm-up found no state above "
+                f"{self.floor:.4g} nats"
             )
 
-    def _log_share(self, ladder: _Ladder) -> float:
-        """Return log f*/f of the top level's state, f relative to the measure, its first part."""
-        from probmotion.problems.references.pair_densities import log_prior, log_views
-
-        body, physics, sight = ladder.arrays
-        parts, logs = ladder.parts[-1], log_views(ladder.poses[-1], body, sight)
+    def _log_ratio(self, ladder: _Ladder) -> float:
+        """Return log f*/f of the top level, with f relative to the base measure."""
+        body, physics, views = ladder.arrays
+        parts, logs = ladder.parts[-1], log_views(ladder.poses[-1], body, views)
         log_f = log_prior(parts, physics) - parts[0] + logsumexp(logs) - math.log(len(logs))
         return min(0.0, self.cap - log_f) if log_f >= self.floor else -math.inf
 
 
-def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
-    """Return what compiled code reads of a posterior over pose-pairs."""
-    from probmotion.interaction.annotated_pairs import AnnotatedPairs
-    from probmotion.interaction.annotations.local_frames import chests, trees
-    from probmotion.interaction.annotations.views import view_vectors
-    from probmotion.models.pose_pairs.penetration import capsules_of
-    from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-    from probmotion.problems.references.pair_densities import Physics, Sight
-    from probmotion.problems.references.pair_moves import Body
+def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, ViewAnnotations]:
+    """Return the compiled-code arguments of a posterior over pose pairs."""
 
-    prior, evidence = posterior.prior, posterior.likelihood
+    prior, likelihood = posterior.prior, posterior.likelihood
     assert isinstance(prior, PosePairPrior)
-    assert isinstance(evidence, AnnotatedPairs)
-    skeleton, limits, comparer = prior.skeleton, prior.joint_limits, evidence.comparer
+    assert isinstance(likelihood, AnnotatedPairs)
+    skeleton, limits, comparer = prior.skeleton, prior.joint_limits, likelihood.comparer
     parents = np.array(skeleton.parents, dtype=np.int64)
     below = np.eye(skeleton.n_joints, dtype=bool)
     for joint in range(skeleton.n_joints):
@@ -393,8 +373,8 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
             parents=parents,
             below=below,
             roots=roots,
-            chests=np.array(chests(skeleton)),
-            person=np.searchsorted(roots, trees(skeleton)),
+            chests=np.array(chest_joints(skeleton)),
+            person=np.searchsorted(roots, joint_roots(skeleton)),
             seed=prior.seed[0],
             bone_noise=prior.bone_noise,
             root_noise=prior.root_noise,
@@ -407,21 +387,17 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, Sight]:
             prior.position_noise,
             prior.max_invalid,
         ),
-        Sight(
-            view_vectors(evidence.views),
-            evidence.near,
-            comparer.prepared,
-            *comparer.options,
-            evidence.noise,
+        ViewAnnotations(
+            view_vectors(likelihood.views), likelihood.near, comparer.prepared, likelihood.noise
         ),
     )
 
 
 def _hidden(posterior: MotionPosterior) -> int:
-    """Return how many annotated joints are hidden; 0 where there are none."""
+    """Return the number of occluded annotated joints."""
     annotations = getattr(posterior.likelihood, "annotations", None)
     return 0 if annotations is None else int((~annotations.visible).sum())
 
 
 def _is_cut(posterior: MotionPosterior) -> bool:
-    return isinstance(posterior, TruncatedPosterior) and posterior.reshaped
+    return isinstance(posterior, TruncatedPosterior) and posterior.truncated

@@ -1,9 +1,8 @@
-"""A fingerprint tells two questions apart and knows one question again."""
+"""Fingerprints distinguish different values and recognise equal ones."""
 
 from __future__ import annotations
 
 import copy
-import os
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -17,16 +16,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import expon, norm
-from threadpoolctl import threadpool_info, threadpool_limits
 from toy_samplers import Holder, Plain, PriorDraws, generation, monocular
 
 from probmotion.comparison.results import fingerprint as fingerprints
 from probmotion.comparison.results.fingerprint import fingerprint
-from probmotion.threads import one_thread
 
 
 def scaled(noise):
-    """Return a function within a function, as many are written."""
+    """Return a nested function with default values."""
 
     def log_density(x, *, power=2):
         return sum(-((each / noise) ** power) for each in x[..., 0])
@@ -44,7 +41,7 @@ def counting(n):
 
 
 def unfinished():
-    """Return a function of what is not assigned yet."""
+    """Return a function that reads an unassigned variable."""
 
     def read():
         return later
@@ -54,14 +51,14 @@ def unfinished():
     return read
 
 
-def told(function, **attributes):
+def with_attributes(function, **attributes):
     """Return the function with attributes."""
     vars(function).update(attributes)
     return function
 
 
 class Prior:
-    """An object that a method is bound to."""
+    """Object with methods."""
 
     def __init__(self, noise):
         self.noise = noise
@@ -79,7 +76,7 @@ class Prior:
 
 
 class Wrapper:
-    """A decorator with a number of its own and its function's name."""
+    """Decorator with a number and the name of its function."""
 
     def __init__(self, function, noise):
         update_wrapper(self, function)
@@ -93,7 +90,7 @@ MARKER = object()
 
 
 def functions():
-    """Return functions that differ though most have the same names."""
+    """Return different functions, most of them with the same names."""
     return [
         *(scaled(0.1), scaled(0.2), scaled(np.array(0.2)), counting(1), counting(2), unfinished()),
         *(lambda x: x, lambda x: 2 * x, lambda x: 3 * x, lambda x: abs(x), lambda x: all(x)),
@@ -105,17 +102,13 @@ def functions():
         *(Prior.log_density, Prior.named, Prior, [].append, [1].append, "a".upper, str.upper),
         *(partial(scaled(1), 1), partial(scaled(2), 1), partial(scaled(2), 2)),
         *(lru_cache(scaled(1)), lru_cache(scaled(2)), wraps(scaled(1))(scaled(2))),
-        *(told(scaled(1), noise=1), told(scaled(1), noise=2)),
+        *(with_attributes(scaled(1), noise=1), with_attributes(scaled(1), noise=2)),
         *(Wrapper(scaled(1), 1), Wrapper(scaled(1), 2), Wrapper(scaled(2), 2)),
         *(np.sin, np.cos, np.mean, torch.sin, torch.cos, np.add.reduce, np.maximum.reduce),
         *(norm.logpdf, norm.cdf, expon.logpdf, partial(norm.logpdf, scale=2), np.random.normal),
         *(lambda x, y=MARKER: x if y else y, lambda x, *, y=MARKER: x if y else y),
         *(np, torch, slice(1), slice(2), 1j, Network),
     ]
-
-
-def functions_found():
-    return [fingerprint(function) for function in functions()]
 
 
 class Slotted:
@@ -162,62 +155,45 @@ DIFFERENT = [
 ]
 
 
-def test_different_things_have_different_fingerprints():
-    assert len({fingerprint(value) for value in DIFFERENT}) == len(DIFFERENT)
+def fingerprints_of_all():
+    return [fingerprint(value) for value in (*DIFFERENT, *functions())]
+
+
+def test_different_values_and_functions_have_different_fingerprints():
+    found = fingerprints_of_all()
+    assert [k for k, each in enumerate(found) if each in found[:k]] == []
+    # The same in a process with another seed of Python's hashes.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert pool.submit(fingerprints_of_all).result() == found
 
 
 @pytest.mark.parametrize("value", DIFFERENT, ids=range(len(DIFFERENT)))
-def test_a_copy_has_the_same_fingerprint(value):
+def test_copies_have_the_same_fingerprint(value):
     assert fingerprint(copy.deepcopy(value)) == fingerprint(value)
 
 
-def test_a_worker_finds_the_same_fingerprints():
-    """They travel as cells do, to a process with another seed of Python's hashes."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(fingerprint, DIFFERENT))
-    assert found == [fingerprint(value) for value in DIFFERENT]
-
-
-def test_functions_are_told_apart_by_what_they_do():
-    found = functions_found()
-    doubles = [k for k, each in enumerate(found) if each in found[:k]]
-    assert doubles == []
-    assert found == functions_found()
-
-
-def test_a_worker_finds_the_same_fingerprints_of_functions():
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        assert pool.submit(functions_found).result() == functions_found()
-
-
-def test_where_a_function_stands_and_how_often_it_ran_do_not_count():
+def test_position_and_specialisation_of_a_function_do_not_count():
     source = "def f(x):\n    return [each + 0.5 for each in x]\n"
     found = set()
     for file, above in (("one", ""), ("another", "\n\n")):
         space = {"__name__": "somewhere"}
         exec(compile(above + source, file, "exec"), space)
         found.add(fingerprint(space["f"]))
-        for _ in range(1000):  # until Python has made its code faster
+        for _ in range(1000):  # until Python specialises its bytecode
             space["f"]([1.0, 2.0])
         found.add(fingerprint(space["f"]))
     assert len(found) == 1
 
 
-def test_an_own_posterior_of_another_noise_is_another_question():
-    found = [
-        fingerprint([Plain(function)])
-        for noise in (0.1, 0.2)
-        for function in (scaled(noise), Prior(noise).log_density, partial(scaled(noise), 0))
-    ]
-    assert len(set(found)) == 6
-
-
-def test_an_object_that_holds_its_own_method_ends():
+def test_cyclic_objects_have_fingerprints():
     knots = [Prior(1), Prior(1), Prior(2)]
     for knot in knots:
         knot.step = knot.log_density
     one, again, other = map(fingerprint, knots)
     assert one == again != other
+    knot = Plain(1)
+    knot.value = [knot]
+    assert fingerprint(knot) != fingerprint(Plain([1]))
 
 
 def test_caches_and_order_do_not_count():
@@ -232,7 +208,7 @@ def test_caches_and_order_do_not_count():
     assert fingerprint(problem) == fresh == fingerprint(monocular())
 
 
-def test_problems_and_samplers_are_told_apart_by_all_that_matters():
+def test_problems_and_samplers_differ_in_every_input():
     problem = monocular()
     louder = replace(problem.posterior.likelihood, noise=0.06)
     moved = replace(problem, truth=problem.truth + 1e-9)
@@ -242,7 +218,7 @@ def test_problems_and_samplers_are_told_apart_by_all_that_matters():
     assert fingerprint(PriorDraws()) != fingerprint(PriorDraws(spread=1.1))
 
 
-def test_a_network_is_its_weights():
+def test_networks_are_identified_by_their_weights():
     torch.manual_seed(0)
     one, two = Network(), Network()
     assert fingerprint(one) != fingerprint(two)
@@ -259,16 +235,10 @@ class Computes:
         return self.value / 2
 
 
-def test_what_an_object_computed_from_the_rest_does_not_count():
+def test_cached_properties_do_not_count():
     fresh, used = Computes(3.0), Computes(3.0)
     assert used.half == 1.5
     assert fingerprint(used) == fingerprint(fresh) != fingerprint(Computes(4.0))
-
-
-def test_an_object_that_holds_itself_ends():
-    knot = Plain(1)
-    knot.value = [knot]
-    assert fingerprint(knot) != fingerprint(Plain([1]))
 
 
 @pytest.mark.parametrize(
@@ -277,10 +247,10 @@ def test_an_object_that_holds_itself_ends():
         *(Lock(), np.random.default_rng(0), object(), (x for x in "a")),
         *(scaled(np.random.default_rng(0)), np.random.default_rng(0).normal),
     ],
-    ids=["lock", "generator", "object", "iteration", "closed over", "bound"],
+    ids=["lock", "generator", "object", "iterator", "closure", "bound method"],
 )
-def test_what_cannot_be_told_apart_is_refused(value):
-    with pytest.raises(ValueError, match="which cannot be told from another"):
+def test_objects_without_content_raise(value):
+    with pytest.raises(ValueError, match="value must contain only numbers, strings, arrays"):
         fingerprint([value])
 
 
@@ -308,14 +278,14 @@ def slotted(value):
     ],
     ids=["slots", "device", "torch dtype", "dtype", "range", "decimal", "deque", "objects"],
 )
-def test_what_a_sampler_may_hold_is_told_by_its_value(one, again, other):
+def test_attributes_are_identified_by_their_value(one, again, other):
     assert fingerprint(Plain(one)) == fingerprint(Plain(again))
     assert fingerprint(Plain(one)) != fingerprint(Plain(other))
 
 
-def test_methods_of_a_script_s_classes_count_and_an_installed_package_s_do_not(monkeypatch):
+def test_methods_count_for_user_classes_but_not_for_installed_ones(monkeypatch):
     def of(factor):
-        """Return an object of a class as it is after an edit."""
+        """Return an object of a class with edited methods."""
 
         class Mine:
             width = property(lambda self: factor)
@@ -379,7 +349,7 @@ def density(x):
 
 
 @pytest.mark.parametrize("asked", ["Mine()", "density"])
-def test_what_a_script_s_functions_read_of_it_counts(asked):
+def test_globals_that_user_functions_read_count(asked):
     def of(source, before=()):
         space = {"__name__": "a_script"}
         exec(compile(source, "script.py", "exec"), space)
@@ -396,11 +366,11 @@ def test_what_a_script_s_functions_read_of_it_counts(asked):
         changes += [("3.0", "4.0"), ("2 * x", "3 * x"), ("kept(self", "abs(self")]
     found = [of(SCRIPT), *(of(SCRIPT.replace(*change)) for change in changes)]
     assert len(set(found)) == len(found)
-    # Lists fill as it runs, and what is not read does not matter.
+    # Lists may fill during a run, and unused variables do not matter.
     assert of(SCRIPT, before=[1]) == of(SCRIPT + "\nother = 5\n") == found[0]
 
 
-def test_another_version_of_an_installed_package_is_another_question(monkeypatch):
+def test_versions_of_installed_packages_count(monkeypatch):
     from tqdm import tqdm
 
     held = [[tqdm], [tqdm.format_num], [tqdm([], disable=True)]]
@@ -409,25 +379,3 @@ def test_another_version_of_an_installed_package_is_another_question(monkeypatch
     fingerprints._installed_version.cache_clear()
     assert not set(before) & {fingerprint(each) for each in held}
     fingerprints._installed_version.cache_clear()
-
-
-def threads():
-    """Threads of every library that is loaded, by its file."""
-    return {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
-
-
-def test_one_thread_is_one_thread_and_then_what_it_was(monkeypatch):
-    with one_thread():
-        pass  # Loads what it needs, which another test may not have done yet.
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    with threadpool_limits(2):
-        before, torch_before = threads(), torch.get_num_threads()
-        with one_thread():
-            assert set(threads().values()) == {1}
-            assert torch.get_num_threads() == 1
-            assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
-        assert threads() == before
-        assert torch.get_num_threads() == torch_before
-    assert os.environ["OMP_NUM_THREADS"] == "3"
-    assert "OPENBLAS_NUM_THREADS" not in os.environ

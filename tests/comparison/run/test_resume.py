@@ -1,186 +1,154 @@
-"""A run that was stopped goes on: nothing finished is lost, nothing is computed twice."""
+"""Interrupted grids continue without losing or repeating finished runs."""
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from toy_samplers import CrashingOnce, Interrupting, PriorDraws, generation, monocular
+from toy_samplers import (
+    SMALL,
+    Failing,
+    PriorDraws,
+    count,
+    generation,
+    monocular,
+    numbers,
+    start,
+)
 
 from probmotion.comparison import Comparison, compare
 
-SMALL = {"draws": 20, "chains": 2, "workers": 0, "progress": False}
-
 SCRIPT = """
 import sys
-from toy_samplers import PriorDraws, generation, monocular
+from toy_samplers import PriorDraws, generation
 from probmotion.comparison import compare
 
-if __name__ == "__main__":
-    out, diary, nap, workers = sys.argv[1:]
-    samplers = {
-        name: PriorDraws(spread, float(nap), diary) for name, spread in (("a", 1.0), ("b", 2.0))
-    }
-    compare(generation(), samplers, seeds=4, draws=20, chains=2, out=out, workers=int(workers))
+out, diary, nap = sys.argv[1:]
+spreads = {"a": 1.0, "b": 2.0}
+samplers = {name: PriorDraws(spread, float(nap), diary) for name, spread in spreads.items()}
+compare(generation(), samplers, seeds=4, draws=20, chains=2, out=out, workers=2)
 """
 
 
-def numbers(folder):
-    table = pd.read_csv(Path(folder) / "table.csv")
-    return table[~table["metric"].isin(["seconds", "peak_memory_mib"])].to_csv(index=False)
+def table(folder: Path) -> str:
+    return numbers(pd.read_csv(folder / "table.csv"))
 
 
-def runs(diary):
-    return len(diary.read_text().split()) if diary.exists() else 0
-
-
-def start(script, out, diary, nap=0.0, workers=0):
-    command = [sys.executable, str(script), str(out), str(diary), str(nap), str(workers)]
-    paths = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True
-    )
-
-
-def finish(process):
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 0, said
-
-
-def wait_for_cells(out, n, seconds=60.0):
-    limit = time.monotonic() + seconds
-    while len(list(Path(out).glob("cells/*/*/[0-9]/cell.json"))) < n:
-        assert time.monotonic() < limit, "the run made no progress"
+def interrupted(folder: Path, finished: int, how: signal.Signals, nap: float) -> str:
+    """Start a grid of 8 runs, interrupt it after some, and return its error."""
+    (folder / "run.py").write_text(SCRIPT)
+    process = start(folder / "run.py", folder / "cut", folder / "diary", nap)
+    limit = time.monotonic() + 60
+    while len(list(folder.glob("cut/runs/*/*/[0-9]/run.json"))) < finished:
+        assert time.monotonic() < limit, "the grid made no progress"
         time.sleep(0.02)
+    process.send_signal(how)
+    errors = process.communicate(timeout=20)[1]
+    assert process.returncode != 0
+    return errors
 
 
-@pytest.fixture
-def script(tmp_path):
-    path = tmp_path / "run.py"
-    path.write_text(SCRIPT)
-    return path
-
-
-def test_workers_die_with_a_run_that_is_killed_and_it_goes_on_where_it_was(script, tmp_path):
+def test_a_killed_grid_stops_its_workers_and_can_be_continued(tmp_path):
     diary = tmp_path / "diary"
-    finish(start(script, tmp_path / "whole", diary))
-    assert runs(diary) == 8
-    diary.unlink()
-
-    # The nap is a setting, so that both runs below must take it to be the same run.
-    process = start(script, tmp_path / "cut", diary, nap=0.3, workers=2)
-    wait_for_cells(tmp_path / "cut", 3)
-    process.kill()
-    process.communicate()
-    finished = {
-        path: path.stat().st_mtime_ns for path in tmp_path.glob("cut/cells/*/*/[0-9]/cell.json")
-    }
+    interrupted(tmp_path, 3, signal.SIGKILL, nap=0.3)
+    finished = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cut/runs/*/*/*/run.json")}
     assert 3 <= len(finished) < 8
-    time.sleep(1.0)  # orphans, if they lived, would write here
-    assert len(list(tmp_path.glob("cut/cells/*/*/[0-9]/cell.json"))) <= len(finished) + 2
+    time.sleep(1.0)  # surviving workers would write now
+    assert len(list(tmp_path.glob("cut/runs/*/*/[0-9]/run.json"))) <= len(finished) + 2
     diary.unlink()
 
-    finish(start(script, tmp_path / "cut", diary, nap=0.3, workers=2))
-    assert 8 - len(finished) - 2 <= runs(diary) <= 8 - len(finished)
+    spreads = {"a": 1.0, "b": 2.0}
+    samplers = {name: PriorDraws(spread, 0.3, str(diary)) for name, spread in spreads.items()}
+    compare(generation(), samplers, seeds=4, out=tmp_path / "cut", **SMALL)
+    assert 8 - len(finished) - 2 <= count(diary) <= 8 - len(finished)
     for path, written in finished.items():
         assert path.stat().st_mtime_ns == written
-    assert numbers(tmp_path / "cut") == numbers(tmp_path / "whole")
     assert not list(tmp_path.glob("cut/**/*unfinished*"))
+    samplers = {name: PriorDraws(spread) for name, spread in spreads.items()}
+    compare(generation(), samplers, seeds=4, out=tmp_path / "whole", **SMALL)
+    assert table(tmp_path / "cut") == table(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_ctrl_c_stops_at_once_and_keeps_what_is_finished(script, tmp_path, workers):
-    diary = tmp_path / "diary"
-    process = start(script, tmp_path / "cut", diary, nap=0.5, workers=workers)
-    wait_for_cells(tmp_path / "cut", 2)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=20)
-    assert process.returncode != 0
-    assert "KeyboardInterrupt: interrupted with" in said
+def test_ctrl_c_stops_workers_and_keeps_finished_runs(tmp_path):
+    errors = interrupted(tmp_path, 2, signal.SIGINT, nap=0.5)
     finished = len(Comparison.load(tmp_path / "cut").results)
     assert 2 <= finished < 8
-    assert f"interrupted with {finished} of 8 cells finished, which are kept in" in said
+    assert f"KeyboardInterrupt: interrupted with {finished} of 8 runs finished and stored" in errors
     time.sleep(0.7)
     assert len(Comparison.load(tmp_path / "cut").results) == finished
 
 
-def test_without_a_folder_ctrl_c_says_where_the_cells_are(tmp_path):
-    sampler = Interrupting(diary=str(tmp_path / "diary"))
-    with pytest.raises(KeyboardInterrupt, match="interrupted with 1 of 3 cells") as caught:
-        compare(generation(), sampler, seeds=3, **SMALL)
-    folder = str(caught.value).split("kept in ")[1].split(";")[0]
-    assert len(Comparison.load(folder).results) == 1
-
-
-def test_a_finished_grid_is_not_run_again(tmp_path):
+def test_finished_runs_are_not_repeated(tmp_path):
     diary = tmp_path / "diary"
     sampler = PriorDraws(diary=str(diary))
-    for _ in range(2):
-        compare(generation(), sampler, seeds=3, out=tmp_path / "out", **SMALL)
-        assert runs(diary) == 3
-    compare(generation(), sampler, seeds=4, out=tmp_path / "out", **SMALL)
-    assert runs(diary) == 4
+    for seeds in (3, 3, 4):
+        compare(generation(), sampler, seeds=seeds, out=tmp_path / "out", **SMALL)
+        assert count(diary) == seeds
 
 
-def test_other_settings_need_another_folder(tmp_path):
-    diary = tmp_path / "diary"
-    out = tmp_path / "out"
+def test_other_inputs_require_another_folder(tmp_path):
+    diary, out = tmp_path / "diary", tmp_path / "out"
 
     def run(problem, spread=1.0, **settings):
         named = {"sampler": PriorDraws(spread, diary=str(diary))}
         compare({"problem": problem}, named, out=out, **(SMALL | settings))
-        return runs(diary)
+        return count(diary)
 
     assert run(generation()) == 1
-    kept = (out / "table.csv").read_bytes()
+    stored = (out / "table.csv").read_bytes()
     for change in (
         {"problem": generation(), "spread": 1.5},
         {"problem": generation(), "draws": 40},
         {"problem": generation(), "chains": 4},
         {"problem": monocular()},
     ):
-        with pytest.raises(ValueError, match="holds 1 finished cells made with other settings"):
+        with pytest.raises(ValueError, match="holds 1 finished runs made with other settings"):
             run(**change)
-    assert (out / "table.csv").read_bytes() == kept
+    assert (out / "table.csv").read_bytes() == stored
     assert run(generation()) == 1
-    # More of the same is no other comparison.
     assert run(generation(), seeds=2) == 2
 
 
-def test_failures_are_tried_again_and_unfit_samplers_are_not(tmp_path):
+def test_failures_are_retried_but_unsupported_samplers_are_not(tmp_path):
     mended, diary = tmp_path / "mended", tmp_path / "diary"
-    samplers = [CrashingOnce(mended=str(mended)), PriorDraws(diary=str(diary))]
+    samplers = {
+        "crashing": Failing(how="until the file exists", file=str(mended)),
+        "prior": PriorDraws(diary=str(diary)),
+    }
 
     def run():
         comparison = compare([generation(), monocular()], samplers, out=tmp_path / "out", **SMALL)
-        return {(each.problem, each.sampler): each.failure for each in comparison.results}
+        return {(r.problem, r.sampler): r.failure and r.failure.word for r in comparison.results}
 
     first = run()
-    assert first["generation", "crashing-once"].word == "RuntimeError"
-    assert first["monocular", "prior-draws"].word == "observations"
-    assert runs(diary) == 2
+    assert first["generation", "crashing"] == "RuntimeError"
+    assert first["monocular", "prior"] == "observations"
+    assert count(diary) == 2
     mended.touch()
     second = run()
-    assert second["generation", "crashing-once"] is None
-    assert second["monocular", "prior-draws"].word == "observations"
-    assert runs(diary) == 2
+    assert second["generation", "crashing"] is None
+    assert second["monocular", "prior"] == "observations"
+    assert count(diary) == 2
 
 
-def test_damaged_and_half_written_cells_are_run_again(tmp_path):
-    diary = tmp_path / "diary"
+def test_damaged_runs_are_repeated(tmp_path):
+    diary, out = tmp_path / "diary", tmp_path / "out"
     sampler = PriorDraws(diary=str(diary))
-    compare(generation(), sampler, seeds=2, out=tmp_path, **SMALL)
-    before = numbers(tmp_path)
-    cells = tmp_path / "cells" / "generation" / "prior-draws"
-    (cells / "0" / "cell.json").write_text('{"problem": "gen')
-    (cells / ".unfinished-1-77").mkdir()
-    compare(generation(), sampler, seeds=2, out=tmp_path, **SMALL)
-    assert runs(diary) == 3
-    assert numbers(tmp_path) == before
-    assert sorted(path.name for path in cells.iterdir()) == ["0", "1"]
+    first = compare(generation(), sampler, seeds=4, out=out, **SMALL)
+    before = table(out)
+    runs = out / "runs" / "generation" / "prior-draws"
+    whole = (runs / "3" / "draws.nc").read_bytes()
+    (runs / "0" / "run.json").write_text('{"problem": "gen')
+    (runs / "1" / "draws.nc").unlink()
+    (runs / "3" / "draws.nc").write_bytes(whole[:200])
+    (runs / ".unfinished-1-77").mkdir()
+    again = compare(generation(), sampler, seeds=4, out=out, **SMALL)
+    assert count(diary) == 4 + 3
+    assert table(out) == before
+    assert sorted(path.name for path in runs.iterdir() if path.is_dir()) == ["0", "1", "2", "3"]
+    for seed in range(4):
+        address = ("generation", "prior-draws", seed)
+        assert (again.draws(*address).flat() == first.draws(*address).flat()).all()

@@ -1,15 +1,10 @@
-"""Four-legged animals: real dogs and made ones on one skeleton, whole, upright and facing alike."""
-
-from __future__ import annotations
+"""Recorded dogs and synthetic quadrupeds on one skeleton."""
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from probmotion import Motion, Skeleton
-from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.data.synthetic.animals import (
     ANIMAL_SKELETON,
     DOG_CLIPS,
@@ -18,45 +13,44 @@ from probmotion.data.synthetic.animals import (
     synthetic_animals,
 )
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.io.files import load_motion
+from probmotion.io.files import load
 
 SIDES = ("left", "right")
 PAWS = [f"{side}_{end}_paw" for side in SIDES for end in ("front", "back")]
-# Pairs that no bone joins and that are of one rigid piece.
-PIECES = [
+# Pairs of joints of one rigid part without a bone between them.
+RIGID = [
     ("left_hip", "right_hip"), ("tail", "left_hip"), ("neck", "left_shoulder"),
     ("left_shoulder", "right_shoulder"),
 ]  # fmt: skip
 
 
-def path_of(clip: Motion, name: str) -> np.ndarray:
+def path_of(clip, name):
     return clip.positions[:, clip.skeleton.index(name)]
 
 
-def distances(clip: Motion, pairs: list[tuple[str, str]]) -> np.ndarray:
+def distances(clip, pairs):
     return np.stack(
         [np.linalg.norm(path_of(clip, a) - path_of(clip, b), axis=-1) for a, b in pairs]
     )
 
 
-def bones_of(skeleton: Skeleton) -> list[tuple[str, str]]:
+def bones_of(skeleton):
     return [(skeleton.joint_names[j], skeleton.joint_names[p]) for j, p in skeleton.bones]
 
 
 @pytest.fixture(scope="module")
-def dogs(real_data: Path) -> list[Motion]:
+def dogs(real_data):
     return [clip for part in dog_clips(real_data, seconds=4.0).values() for clip in part]
 
 
 @pytest.fixture(scope="module")
-def made() -> list[Motion]:
+def synthetic():
     return synthetic_animals(12, frames=120)
 
 
-def assert_is_an_animal(clip: Motion) -> None:
-    """On the skeleton, of constant bones, facing +Z with its left on +X, paws on the ground."""
+def assert_quadruped(clip):
     assert clip.skeleton == ANIMAL_SKELETON
-    for pairs in (bones_of(ANIMAL_SKELETON), PIECES):
+    for pairs in (bones_of(ANIMAL_SKELETON), RIGID):
         lengths = distances(clip, pairs)
         assert lengths.min() > 0.05
         np.testing.assert_allclose(lengths, lengths[:, [0]].repeat(clip.frames, 1), atol=1e-6)
@@ -66,17 +60,16 @@ def assert_is_an_animal(clip: Motion) -> None:
     for part in ("hip", "shoulder"):
         left = path_of(clip, f"left_{part}") - path_of(clip, f"right_{part}")
         assert left[0, 0] > 0.05
-        # forward × left is up in every frame: no clip is a mirror image, none lies on its back.
+        # forward × left is up: no clip is mirrored or upside down.
         assert (np.cross(trunk, left)[:, 1] > 0).all()
     for paw in PAWS:
-        # A paw's joint is in its middle, centimetres above the ground it stands on.
         assert -0.08 < path_of(clip, paw)[:, 1].min() < 0.08, paw
     legs = [path_of(clip, name)[:, 1] for name in ("left_hip", "right_shoulder")]
     assert min(legs[0].min(), legs[1].min()) > 0.3
 
 
-def bend(clip: Motion, upper: str, middle: str, lower: str) -> np.ndarray:
-    """How far the middle joint is before the line between the others, metres, for every frame."""
+def bend(clip, upper, middle, lower):
+    """Return how far the middle joint is in front of the line between the others, metres."""
     top, joint, end = (path_of(clip, name) for name in (upper, middle, lower))
     trunk = path_of(clip, "neck") - path_of(clip, "pelvis")
     forward = trunk * [1.0, 0.0, 1.0] / np.linalg.norm(trunk[:, [0, 2]], axis=-1)[:, None]
@@ -84,7 +77,7 @@ def bend(clip: Motion, upper: str, middle: str, lower: str) -> np.ndarray:
     return ((joint - top - share[:, None] * (end - top)) * forward).sum(axis=-1)
 
 
-def assert_bends_like_a_dog(clip: Motion) -> None:
+def assert_bends(clip):
     for side in SIDES:
         front = [f"{side}_{name}" for name in ("shoulder", "elbow", "wrist", "front_paw")]
         hind = [f"{side}_{name}" for name in ("hip", "knee", "ankle", "back_paw")]
@@ -93,50 +86,44 @@ def assert_bends_like_a_dog(clip: Motion) -> None:
         assert np.median(bend(clip, *hind[1:])) < -0.02  # hocks backwards
 
 
-def test_the_skeleton_is_one_body_with_sides() -> None:
+def test_skeleton_is_symmetric():
     assert len(ANIMAL_SKELETON.roots) == 1
     assert len(ANIMAL_SKELETON.mirrored_pairs) == 8
     assert ANIMAL_SKELETON.canonical_names == ANIMAL_SKELETON.joint_names
     order = ANIMAL_SKELETON.mirrored_order
     for joint, parent in ANIMAL_SKELETON.bones:
         assert ANIMAL_SKELETON.parents[order[joint]] == order[parent]
-    missing = set(Skeleton.preset("apt36k17").joint_names) - set(ANIMAL_SKELETON.joint_names)
-    assert missing == {"nose", "left_eye", "right_eye"}
 
 
-def test_made_animals_are_animals(made: list[Motion]) -> None:
-    for clip in made:
-        assert_is_an_animal(clip)
-        assert_bends_like_a_dog(clip)
+def test_synthetic_animals(synthetic):
+    for clip in synthetic:
+        assert_quadruped(clip)
+        assert_bends(clip)
         assert clip.frames == 120
         assert clip.fps == 30
-    assert [clip.name for clip in made[:3]] == [
-        "quadruped-walk-0",
-        "quadruped-trot-0",
-        "quadruped-walk-1",
-    ]
+    names = ["quadruped-walk-0", "quadruped-trot-0", "quadruped-walk-1"]
+    assert [clip.name for clip in synthetic[:3]] == names
 
 
-def test_made_animals_have_the_gaits_trunk_and_paws(made: list[Motion]) -> None:
-    for clip in made[:4]:
+def test_trunk_and_paws_follow_the_gaits(synthetic):
+    for clip in synthetic[:4]:
         style, _, number = clip.name.rpartition("-")
         gait = make_gait(style, int(number), frames=120)
         for name in (*PAWS, "neck", "left_hip", "right_hip"):
             np.testing.assert_array_equal(path_of(clip, name), path_of(gait, name))
         np.testing.assert_array_equal(path_of(clip, "pelvis"), path_of(gait, "tail"))
-        # Shoulders lean with the trunk, by millimetres.
         apart = path_of(clip, "left_shoulder") - path_of(gait, "left_shoulder")
         assert np.linalg.norm(apart, axis=-1).max() < 0.05
 
 
-def test_an_animal_is_the_same_whatever_else_is_made(made: list[Motion]) -> None:
-    for clip, again in zip(synthetic_animals(3, frames=60), made, strict=False):
+def test_animal_does_not_depend_on_other_animals(synthetic):
+    for clip, again in zip(synthetic_animals(3, frames=60), synthetic, strict=False):
         np.testing.assert_allclose(clip.positions[:, 0], again.positions[:60, 0])
     other = synthetic_animals(1, frames=120, seed=1)[0]
-    assert not np.array_equal(other.positions, made[0].positions)
+    assert not np.array_equal(other.positions, synthetic[0].positions)
 
 
-def test_the_parts_are_of_different_animals() -> None:
+def test_parts_are_disjoint_and_have_both_gaits():
     parts = animal_clips(n=10, seconds=2.0)
     assert list(parts) == list(DOG_CLIPS) == ["train", "validation", "test"]
     assert [len(clips) for clips in parts.values()] == [10, 2, 2]
@@ -147,87 +134,60 @@ def test_the_parts_are_of_different_animals() -> None:
         assert all(clip.frames == 60 for clip in clips)
 
 
-def test_animals_are_filmed_at_ten_frames_a_second(made: list[Motion]) -> None:
-    slow = [clip.resample(10.0) for clip in made[:2]]
-    for clip, whole in zip(slow, made, strict=False):
-        # Every third frame: nothing is interpolated, and bones stay as long as they are.
-        np.testing.assert_array_equal(clip.positions, whole.positions[::3])
-    tracks = project_clips(slow, views=3, noise=DetectorNoise.none())
-    assert len(tracks) == 6
-    for track in tracks:
-        assert track.frames == 40
-        assert track.skeleton == ANIMAL_SKELETON
-        np.testing.assert_allclose(track.keypoints[:, 0], 0, atol=1e-12)
-        assert abs(track.keypoints).max() < 1.5
+def test_recorded_dogs(dogs):
+    assert [clip.name[6:] for clip in dogs] == ["canter", "pace", "spin", "trot"]
+    for clip in dogs:
+        assert clip.frames == 120
+        assert clip.fps == 30
+        assert_quadruped(clip)
+        assert_bends(clip)
+        np.testing.assert_allclose(clip.positions[0, 0, [0, 2]], 0, atol=1e-12)
 
 
-class TestDogs:
-    def test_dogs_are_animals(self, dogs: list[Motion]) -> None:
-        assert [clip.name for clip in dogs] == [
-            "dog3d_canter",
-            "dog3d_pace",
-            "dog3d_spin",
-            "dog3d_trot",
-        ]
-        for clip in dogs:
-            assert clip.frames == 120
-            assert clip.fps == 30
-            assert_is_an_animal(clip)
-            assert_bends_like_a_dog(clip)
-            np.testing.assert_allclose(clip.positions[0, 0, [0, 2]], 0, atol=1e-12)
-
-    def test_dogs_go_on_as_their_cycles_do(self, dogs: list[Motion], real_data: Path) -> None:
-        for clip in dogs:
-            source = load_motion(real_data / f"deepmimic_dog/{clip.name}.npz")
-            period = source.frames - 1
-            went = source.positions[-1, 0] - source.positions[0, 0]
-            for number in (0, 1):
-                begin, end = clip.positions[[number * period, (number + 1) * period], 0]
-                step = np.linalg.norm((end - begin)[[0, 2]])
-                assert step == pytest.approx(np.linalg.norm(went[[0, 2]]), abs=1e-6)
-            # Where a dog runs, it runs the way it faces, for as long as it runs.
-            if clip.name != "dog3d_spin":
-                speed = np.linalg.norm(went) / period
-                assert clip.positions[-1, 0, 2] > 0.95 * speed * (clip.frames - 1)
-            # The first cycle is the file's, turned: what is made up for is centimetres.
-            first = clip.positions[: source.frames]
-            moved = source.retarget(ANIMAL_SKELETON).positions
-            heights = first[..., 1] - moved[..., 1]
-            assert np.sqrt((heights**2).mean()) < 0.03
-
-    def test_seams_are_not_visible(self, dogs: list[Motion], real_data: Path) -> None:
-        for clip in dogs:
-            source = load_motion(real_data / f"deepmimic_dog/{clip.name}.npz")
-            cycle = source.retarget(ANIMAL_SKELETON).positions
-            within = np.linalg.norm(np.diff(cycle, n=2, axis=0), axis=-1).max()
-            bends = np.linalg.norm(np.diff(clip.positions, n=2, axis=0), axis=-1).max(axis=-1)
-            seams = np.arange(len(cycle) - 1, clip.frames - 2, len(cycle) - 1)
-            for place in (seams - 2, seams - 1, seams):
-                assert bends[place].max() <= within, clip.name
-
-    def test_they_join_made_animals(self, real_data: Path) -> None:
-        parts = animal_clips(real_data, n=4, seconds=2.0)
-        made = animal_clips(n=4, seconds=2.0)
-        for part, clips in parts.items():
-            names = [name.rpartition("/")[2] for name in DOG_CLIPS[part]]
-            assert [clip.name for clip in clips] == names + [clip.name for clip in made[part]]
-            assert {clip.frames for clip in clips} == {60}
-        held_out = set(DOG_CLIPS["test"] + DOG_CLIPS["validation"])
-        assert not held_out & set(DOG_CLIPS["train"])
-
-    def test_a_file_that_is_no_cycle_is_refused(self, real_data: Path, tmp_path: Path) -> None:
-        folder = tmp_path / "deepmimic_dog"
-        shutil.copytree(real_data / "deepmimic_dog", folder, copy_function=shutil.copyfile)
-        folder.chmod(0o755)
-        with np.load(real_data / "deepmimic_dog" / "dog3d_pace.npz") as archive:
-            arrays = dict(archive)
-        np.savez(folder / "dog3d_pace.npz", **{**arrays, "loop": np.array("none")})
-        with pytest.raises(ValueError, match=r"folder has dog3d_pace.npz with loop 'none' at 30 "):
-            dog_clips(tmp_path)
+def test_dogs_move_as_in_their_cycles(dogs, real_data):
+    for clip in dogs:
+        source = load(real_data / f"deepmimic_dog/{clip.name}.npz")
+        period = source.frames - 1
+        went = source.positions[-1, 0] - source.positions[0, 0]
+        for number in (0, 1):
+            begin, end = clip.positions[[number * period, (number + 1) * period], 0]
+            step = np.linalg.norm((end - begin)[[0, 2]])
+            assert step == pytest.approx(np.linalg.norm(went[[0, 2]]), abs=1e-6)
+        # Dogs run the way they face.
+        if clip.name != "dog3d_spin":
+            speed = np.linalg.norm(went) / period
+            assert clip.positions[-1, 0, 2] > 0.95 * speed * (clip.frames - 1)
+        # The first cycle is that of the file, rotated, with corrections of centimetres.
+        first = clip.positions[: source.frames]
+        moved = source.retarget(ANIMAL_SKELETON).positions
+        heights = first[..., 1] - moved[..., 1]
+        assert np.sqrt((heights**2).mean()) < 0.03
 
 
-def test_a_folder_without_dogs_is_said(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"folder has no deepmimic_dog/dog3d_canter\.npz"):
+def test_dogs_are_added_to_synthetic_animals(real_data):
+    parts = animal_clips(real_data, n=4, seconds=2.0)
+    synthetic = animal_clips(n=4, seconds=2.0)
+    for part, clips in parts.items():
+        names = [name.rpartition("/")[2] for name in DOG_CLIPS[part]]
+        assert [clip.name for clip in clips] == names + [clip.name for clip in synthetic[part]]
+        assert {clip.frames for clip in clips} == {60}
+    held_out = set(DOG_CLIPS["test"] + DOG_CLIPS["validation"])
+    assert not held_out & set(DOG_CLIPS["train"])
+
+
+def test_file_without_a_cycle_is_rejected(real_data, tmp_path):
+    folder = tmp_path / "deepmimic_dog"
+    shutil.copytree(real_data / "deepmimic_dog", folder, copy_function=shutil.copyfile)
+    folder.chmod(0o755)
+    with np.load(real_data / "deepmimic_dog" / "dog3d_pace.npz") as archive:
+        arrays = dict(archive)
+    np.savez(folder / "dog3d_pace.npz", **{**arrays, "loop": np.array("none")})
+    with pytest.raises(ValueError, match=r"dog3d_pace.npz must be a cycle .* 'none' at 30"):
+        dog_clips(tmp_path)
+
+
+def test_invalid_input(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"folder must contain deepmimic_dog/dog3d_can"):
         animal_clips(tmp_path, n=2)
     with pytest.raises(ValueError, match="seconds must be a finite number above 0, got 0"):
         animal_clips(seconds=0)

@@ -1,6 +1,4 @@
-"""A cycle repeated: moved and turned as its root was, closed without a seam, its pieces rigid."""
-
-from __future__ import annotations
+"""Repeated cycles: motion and rotation of the root, seams and rigid groups."""
 
 import numpy as np
 import pytest
@@ -11,18 +9,14 @@ from probmotion.data.synthetic.animals import synthetic_animals
 from probmotion.data.synthetic.cycles import repeated_cycle
 
 
-def distances(clip: Motion, pairs: list[tuple[int, int]]) -> np.ndarray:
-    """Distances between joints, (pairs, L)."""
+def distances(clip, pairs):
     return np.stack(
         [np.linalg.norm(clip.positions[:, a] - clip.positions[:, b], axis=-1) for a, b in pairs]
     )
 
 
-def sway(frames: int, degrees: float = 50.0, miss: float = 0.1) -> Motion:
-    """A made cycle of a trunk, its two sides and a tail that walks an arc 1 m long.
-
-    At the end its joints miss by a share of their swing where they were at the beginning.
-    """
+def sway(frames, degrees=50.0, miss=0.1):
+    """Return a cycle of a trunk with sides and tail that walks a 1 m arc, with a mismatch."""
     skeleton = Skeleton(
         ["pelvis", "tail", "left_hip", "right_hip", "chest", "neck"], [-1, 0, 0, 0, 0, 4]
     )
@@ -44,13 +38,13 @@ def sway(frames: int, degrees: float = 50.0, miss: float = 0.1) -> Motion:
     return Motion(np.stack(parts, axis=1), skeleton, 30.0, name="sway")
 
 
-def test_what_a_cycle_misses_is_made_up_for_evenly() -> None:
-    # About fixed axes, what is made up for is just the drift that was put in, piece by piece.
-    found = repeated_cycle(sway(21, degrees=0, miss=0.3), 21)
-    np.testing.assert_allclose(found.positions, sway(21, degrees=0, miss=0).positions, atol=1e-12)
+def test_mismatch_is_distributed_evenly():
+    # About fixed axes the correction is exactly the added drift.
+    result = repeated_cycle(sway(21, degrees=0, miss=0.3), 21)
+    np.testing.assert_allclose(result.positions, sway(21, degrees=0, miss=0).positions, atol=1e-12)
 
 
-def test_every_cycle_is_the_first_moved_and_turned() -> None:
+def test_cycles_are_rigid_motions_of_the_first():
     period = 20
     cycle = sway(period + 1)
     clip = repeated_cycle(cycle, 3 * period + 5)
@@ -62,7 +56,7 @@ def test_every_cycle_is_the_first_moved_and_turned() -> None:
         power = turn**number
         expected = power.apply((first - first[0, 0]).reshape(-1, 3)).reshape(first.shape)
         np.testing.assert_allclose(later - later[0, 0], expected, atol=2e-2)
-    # Every cycle turns by the same angle, that of the cycle's ends up to what they miss.
+    # Every cycle turns by the same angle.
     heading = clip.positions[:, 2] - clip.positions[:, 3]
     angle = np.unwrap(np.arctan2(-heading[:, 2], heading[:, 0]))
     step = np.diff(angle[[0, period, 2 * period, 3 * period]])
@@ -73,7 +67,7 @@ def test_every_cycle_is_the_first_moved_and_turned() -> None:
     np.testing.assert_allclose(clip.positions[::period, 0, 1], 0.6, atol=1e-12)
 
 
-def test_a_closed_cycle_stays_what_it_is() -> None:
+def test_closed_cycle_is_unchanged():
     walk = synthetic_animals(1, frames=31)[0]
     frame = walk.positions[:1]
     bob = 0.05 * np.sin(2 * np.pi * np.arange(11) / 10)
@@ -86,7 +80,7 @@ def test_a_closed_cycle_stays_what_it_is() -> None:
     )
 
 
-def test_pieces_stay_rigid_and_seams_smooth() -> None:
+def test_groups_stay_rigid_and_seams_are_smooth():
     period = 20
     cycle = sway(period + 1)
     clip = repeated_cycle(cycle, 4 * period)
@@ -99,12 +93,12 @@ def test_pieces_stay_rigid_and_seams_smooth() -> None:
     assert bends[seams].max() < 1.2 * within
 
 
-def test_bad_input() -> None:
+def test_invalid_cycles():
     cycle = sway(3)
-    with pytest.raises(ValueError, match="cycle has 2 frames, expected at least 3"):
+    with pytest.raises(ValueError, match="cycle must have at least 3 frames, got 2"):
         repeated_cycle(cycle.window(0, 2), 9)
     with pytest.raises(ValueError, match="frames must be an integer of at least 1, got 0"):
         repeated_cycle(cycle, 0)
     pair = Motion(np.zeros((4, 2, 3)), Skeleton(["one", "other"], [-1, -1]), 30.0)
-    with pytest.raises(ValueError, match="cycle has 2 roots, expected one body"):
+    with pytest.raises(ValueError, match="cycle must have one root, got 2"):
         repeated_cycle(pair, 9)

@@ -1,6 +1,4 @@
-"""Steps that drop: by hand-computed cases, and reports that add up."""
-
-from __future__ import annotations
+"""Filters of tracks in hand-computed cases."""
 
 import numpy as np
 import pytest
@@ -9,10 +7,9 @@ from probmotion.data.tracks.filters import (
     drop_crowds,
     drop_low_quality,
     drop_short,
-    hide_strays,
-    hide_uncertain,
+    mask_outliers,
+    mask_uncertain,
 )
-from probmotion.data.tracks.step_reports import StepReport
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
@@ -20,50 +17,48 @@ SQUARE = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
 CORNERS = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
 
 
-def square(
-    frames: int = 10, at: tuple[float, float] = (0, 0), side: float = 1.0, **more: object
-) -> KeypointTrack:
-    """A square that stands still, with its least corner at ``at``."""
+def square(frames=10, at=(0, 0), side=1.0, **more):
+    """Return a static square with its least corner at ``at``."""
     keypoints = np.tile(CORNERS * side + at, (frames, 1, 1))
     settings = {"fps": 10.0, "name": "square"} | more
     return KeypointTrack(keypoints, np.full((frames, 4), 0.9), SQUARE, **settings)
 
 
-def with_confidence(track: KeypointTrack, confidence: np.ndarray) -> KeypointTrack:
+def with_confidence(track, confidence):
     return KeypointTrack(track.keypoints, confidence, SQUARE, track.fps, track.name)
 
 
-def assert_adds_up(report: StepReport) -> None:
+def assert_sums(report):
     assert report.tracks_before == report.tracks_after + report.tracks_dropped
     assert report.frames_before == report.frames_after + report.frames_dropped
 
 
-def test_uncertain_entries_are_hidden_and_the_threshold_itself_is_sure() -> None:
+def test_uncertain_detections_are_dropped():
     confidence = np.full((10, 4), 0.9)
     confidence[0], confidence[1, 2] = 0.3, 0.29
-    (track,), report = hide_uncertain([with_confidence(square(), confidence)], threshold=0.3)
+    (track,), report = mask_uncertain([with_confidence(square(), confidence)], threshold=0.3)
     hidden = np.zeros((10, 4), dtype=bool)
     hidden[1, 2] = True
     np.testing.assert_array_equal(np.isnan(track.keypoints).all(-1), hidden)
     np.testing.assert_array_equal(track.confidence, np.where(hidden, 0, confidence))
     assert report.entries_changed == 1
-    assert_adds_up(report)
-    (again,), second = hide_uncertain([track], threshold=0.3)
+    assert_sums(report)
+    (again,), second = mask_uncertain([track], threshold=0.3)
     assert second.entries_changed == 0
     np.testing.assert_array_equal(again.keypoints, track.keypoints)
 
 
-def test_short_tracks_are_dropped_by_their_time_and_not_their_frames() -> None:
+def test_short_tracks_are_dropped_by_duration():
     tracks = [square(9), square(10), square(15, fps=15.0), square(14, fps=15.0), square(30, fps=60)]
     kept, report = drop_short(tracks, seconds=1.0)
     assert kept == [tracks[1], tracks[2]]
     assert (report.tracks_dropped, report.frames_dropped) == (3, 9 + 14 + 30)
-    assert_adds_up(report)
-    # Frame rates that files round keep their tracks.
+    assert_sums(report)
+    # Rounded frame rates are tolerated.
     assert drop_short([square(60, fps=1 / 0.016666)], seconds=1.0)[0]
 
 
-def test_quality_is_the_share_of_sure_entries() -> None:
+def test_quality_is_the_fraction_of_confident_detections():
     confidence = np.full((10, 4), 0.9)
     confidence[:4] = 0.2  # 16 of 40 entries
     tracks = [with_confidence(square(), confidence), square()]
@@ -71,13 +66,13 @@ def test_quality_is_the_share_of_sure_entries() -> None:
     kept, report = drop_low_quality(tracks, threshold=0.3, share=0.61)
     assert kept == tracks[1:]
     assert (report.tracks_dropped, report.frames_dropped) == (1, 10)
-    assert_adds_up(report)
+    assert_sums(report)
     assert drop_low_quality(tracks, threshold=0.2, share=1.0)[0] == tracks
-    with pytest.raises(ValueError, match=r"share must be a share of at most 1, got 1.5"):
+    with pytest.raises(ValueError, match=r"share must be at most 1, got 1.5"):
         drop_low_quality(tracks, share=1.5)
 
 
-def test_crowds_small_ones_behind_are_dropped_and_the_large_one_kept() -> None:
+def test_crowd_keeps_the_large_person():
     large = square(side=4, name="video 0")
     inside = square(at=(1, 1), name="video 1")  # all of it inside; a sixteenth of the large one
     beside = square(at=(3.75, 0), name="video 2")  # a quarter inside
@@ -85,16 +80,16 @@ def test_crowds_small_ones_behind_are_dropped_and_the_large_one_kept() -> None:
     tracks = [large, inside, beside, other]
     kept, report = drop_crowds(tracks, overlap=0.3)
     assert kept == [large, beside, other]
-    assert_adds_up(report)
+    assert_sums(report)
     assert drop_crowds(tracks, overlap=0.2)[0] == [large, other]
     assert drop_crowds(tracks, overlap=1.0)[0] == tracks
     never = with_confidence(square(name="video 3"), np.zeros((10, 4)))
     assert drop_crowds([*tracks, never], overlap=0.3)[0] == [*kept, never]
-    # Whatever the order.
+    # The order does not matter.
     assert drop_crowds(tracks[::-1], overlap=0.2)[0] == [other, large]
 
 
-def test_crowds_two_alike_are_both_dropped_and_views_are_none() -> None:
+def test_crowd_of_twins_is_dropped_and_views_are_kept():
     twins = [square(name="walk 0"), square(name="walk 1")]
     assert drop_crowds(twins)[0] == []
     views = [square(name="walk/0"), square(name="walk/1")]
@@ -103,20 +98,20 @@ def test_crowds_two_alike_are_both_dropped_and_views_are_none() -> None:
     assert drop_crowds([twins[0], square(11, name="walk 1")])[1].tracks_dropped == 0
 
 
-def test_crowds_count_the_frames_in_which_the_track_is_seen() -> None:
-    """Seen in 4 frames, of which the other is there in 1: overlap 1/4; and of 10, 1: 1/10."""
+def test_overlap_is_averaged_over_seen_frames():
+    """The overlap of a track seen in 4 frames with one present in 1 of them is 1/4."""
     own, other = np.zeros((10, 4)), np.zeros((10, 4))
     own[:4], other[3:] = 0.9, 0.9
     tracks = [with_confidence(square(name=f"v {i}"), c) for i, c in enumerate((own, other))]
     assert drop_crowds(tracks, overlap=0.26)[0] == tracks
     assert drop_crowds(tracks, overlap=0.24)[0] == tracks[1:]
-    with pytest.raises(ValueError, match="videos has 1 names, expected 2, one per track"):
+    with pytest.raises(ValueError, match="videos must have one name per track, 2, got 1"):
         drop_crowds(tracks, videos=["v"])
-    with pytest.raises(ValueError, match=r"the video 'v' have \[10, 12\] frames, expected one"):
+    with pytest.raises(ValueError, match=r"video 'v' must have as many frames, got \[10, 12\]"):
         drop_crowds([tracks[0], square(12)], videos=["v", "v"])
 
 
-def test_strays_are_hidden_and_quick_joints_are_not() -> None:
+def test_outliers_are_dropped_and_fast_joints_kept():
     frames = 30
     track = square(frames)
     keypoints = track.keypoints.copy()
@@ -124,45 +119,30 @@ def test_strays_are_hidden_and_quick_joints_are_not() -> None:
     keypoints[12, 2] += (0, 3.0)
     keypoints[20:22, 3] -= (5.0, 0)
     wild = KeypointTrack(keypoints, track.confidence, SQUARE, 30)
-    (kept,), report = hide_strays([wild], distance=0.15, window=0.25)
+    (kept,), report = mask_outliers([wild], distance=0.15, window=0.25)
     hidden = np.argwhere(kept.confidence == 0).tolist()
     assert hidden == [[12, 2], [20, 3], [21, 3]]
     assert np.isnan(kept.keypoints[12, 2]).all()
     assert report.entries_changed == 3
-    assert_adds_up(report)
-    (again,), second = hide_strays([kept], distance=0.15, window=0.25)
+    assert_sums(report)
+    (again,), second = mask_outliers([kept], distance=0.15, window=0.25)
     assert second.entries_changed == 0
     np.testing.assert_array_equal(again.keypoints, kept.keypoints)
 
 
-def test_strays_are_not_judged_with_too_few_neighbours() -> None:
+def test_outliers_need_three_detections():
     confidence = np.full((10, 4), 0.9)
     confidence[:, 1] = 0
     for frames, changed in (((4, 5), 0), ((4, 5, 6), 1)):
         confidence[frames, 1] = 0.9
         track = with_confidence(square(), confidence)
         track.keypoints[5, 1] = 50.0
-        assert hide_strays([track], distance=0.1, window=1.0)[1].entries_changed == changed
+        assert mask_outliers([track], distance=0.1, window=1.0)[1].entries_changed == changed
 
 
-def test_a_single_joint_has_no_size_and_no_strays() -> None:
+def test_empty_input_and_single_joints():
+    for step in (mask_uncertain, mask_outliers, drop_short, drop_low_quality, drop_crowds):
+        assert step([])[0] == []
     track = with_confidence(square(), 0.9 * (np.arange(40).reshape(10, 4) % 4 == 0))
-    track.keypoints[5, 0] = 50.0
-    (same,), report = hide_strays([track])
-    assert same is track
-    assert report.entries_changed == 0
-
-
-def test_no_tracks_give_no_tracks() -> None:
-    for step in (hide_uncertain, hide_strays, drop_short, drop_low_quality, drop_crowds):
-        kept, report = step([])
-        assert kept == []
-        assert report.tracks_before == report.frames_before == report.tracks_dropped == 0
-
-
-def test_a_report_is_one_line_of_numbers_and_words() -> None:
-    _, report = drop_short([square(9), square(20)])
-    assert str(report) == (
-        "short: 2 tracks of 29 frames became 1 of 20; 1 track and 9 frames dropped, 0 joints "
-        "changed; dropped tracks of less than 1 s"
-    )
+    track.keypoints[5, 0] = 50.0  # a single joint has no size
+    assert mask_outliers([track])[0] == [track]

@@ -1,15 +1,12 @@
-"""The whole preparation: raw tracks with every defect become what was there, and reports add up."""
-
-from __future__ import annotations
+"""Preparation of raw tracks: known motions are recovered and reports add up."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.data.tracks.preparation import PreparedTracks, prepare_tracks
+from probmotion.data.tracks.preparation import prepare_tracks
 from probmotion.data.tracks.scales import bone_sizes
 from probmotion.io.files import read_keypoints
 from probmotion.motion.motion import KeypointTrack
@@ -17,18 +14,18 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.motion.splits import clip_of
 
 PERSON = Skeleton.preset("person14")
-JUMP = 70  # the frame at which the tracker takes up somebody else
+JUMP = 70  # frame at which the tracker switches to another person
 
 
-def walk(number: int) -> KeypointTrack:
-    """A walk from the side in metres, 60 fps, 2 s."""
+def walk(number):
+    """Return a side view of a walk in metres, 60 fps, 2 s."""
     motion = make_gait("walk", number, frames=120, fps=60.0).retarget(PERSON).turned(np.pi / 2)
     keypoints = motion.positions[..., :2] * [1, -1]
     return KeypointTrack(keypoints, np.ones((120, 14)), PERSON, 60, f"video{number}")
 
 
-def detected(track: KeypointTrack, seed: int) -> KeypointTrack:
-    """The same in pixels, as a detector gives it: noise, lapses, gaps and unsure joints."""
+def detected(track, seed):
+    """Return detections in pixels, with noise, outliers, gaps and uncertain joints."""
     rng = np.random.default_rng(seed)
     keypoints = 200 * track.keypoints + 500 + rng.normal(scale=2, size=track.keypoints.shape)
     confidence = rng.uniform(0.5, 1, size=track.confidence.shape)
@@ -42,30 +39,28 @@ def detected(track: KeypointTrack, seed: int) -> KeypointTrack:
 
 
 @pytest.fixture(scope="module")
-def clean() -> list[KeypointTrack]:
+def clean():
     return [walk(number) for number in range(6)]
 
 
 @pytest.fixture(scope="module")
-def raw(clean: list[KeypointTrack]) -> list[KeypointTrack]:
-    """Six people; one track jumps, one is a poor copy, one is short, one was never seen."""
+def raw(clean):
+    """Six people, one with a jump, and a poor, a short and an unseen track."""
     tracks = [detected(track, seed) for seed, track in enumerate(clean)]
     tracks[2].keypoints[JUMP:] += 900
-    doubt = np.where(np.arange(14) < 6, 1.0, 0.45)  # 8 of 14 joints are never sure
+    doubt = np.where(np.arange(14) < 6, 1.0, 0.45)
     poor = KeypointTrack(tracks[0].keypoints, doubt * tracks[0].confidence, PERSON, 60, "poor")
     short = KeypointTrack(tracks[1].keypoints[:40], tracks[1].confidence[:40], PERSON, 60, "short")
     never = KeypointTrack(np.full((50, 14, 2), np.nan), np.zeros((50, 14)), PERSON, 60, "never")
     return [*tracks, poor, short, never]
 
 
-def prepared(
-    tracks: list[KeypointTrack], clean: list[KeypointTrack], **more: object
-) -> PreparedTracks:
+def prepared(tracks, clean, **more):
     settings = {"fps": 20, "sizes": bone_sizes(clean), "threshold": 0.5} | more
     return prepare_tracks(tracks, **settings)
 
 
-def assert_reports_chain(result: PreparedTracks, tracks: list[KeypointTrack]) -> None:
+def assert_reports_chain(result, tracks):
     first, last = result.reports[0], result.reports[-1]
     assert (first.tracks_before, last.tracks_after) == (len(tracks), len(result.tracks))
     assert first.frames_before == sum(track.frames for track in tracks)
@@ -74,15 +69,13 @@ def assert_reports_chain(result: PreparedTracks, tracks: list[KeypointTrack]) ->
         assert before.tracks_after == after.tracks_before
         assert before.frames_after == after.frames_before
     for report in result.reports:
-        if report.step not in ("resample", "mirror"):
+        if report.step != "resample":
             assert report.frames_before == report.frames_after + report.frames_dropped
-        if report.step not in ("pieces", "mirror"):
+        if report.step != "segments":
             assert report.tracks_before == report.tracks_after + report.tracks_dropped
 
 
-def test_what_was_there_comes_back_in_metres(
-    raw: list[KeypointTrack], clean: list[KeypointTrack]
-) -> None:
+def test_known_motions_are_recovered_in_metres(raw, clean):
     result = prepared(raw, clean)
     assert_reports_chain(result, raw)
     assert [track.name for track in result.tracks] == [
@@ -90,7 +83,7 @@ def test_what_was_there_comes_back_in_metres(
     ]  # fmt: skip
     dropped = {report.step: report.tracks_dropped for report in result.reports[:-1]}
     assert {step: number for step, number in dropped.items() if number} == {
-        "pieces": 1, "quality": 1, "short": 2,
+        "segments": 1, "quality": 1, "short": 2,
     }  # fmt: skip
     for track in result.tracks:
         truth = next(c for c in clean if c.name == clip_of(track.name))
@@ -98,13 +91,11 @@ def test_what_was_there_comes_back_in_metres(
         assert (track.fps, track.frames) == (20, 24 if "/" in track.name else 40)
         assert (track.confidence > 0).mean() > 0.98
         off = np.linalg.norm(track.keypoints - centred, axis=-1)
-        assert np.nanmean(off) < 0.014  # 0.018 is what the noise alone makes of centred tracks
+        assert np.nanmean(off) < 0.014  # 0.018 without smoothing
         assert np.nanmax(off) < 0.1
 
 
-def test_neither_the_order_of_tracks_nor_their_company_matters(
-    raw: list[KeypointTrack], clean: list[KeypointTrack]
-) -> None:
+def test_tracks_are_prepared_independently(raw, clean):
     together = prepared(raw, clean).tracks
     backwards = {track.name: track for track in prepared(raw[::-1], clean).tracks}
     for track in together:
@@ -113,26 +104,17 @@ def test_neither_the_order_of_tracks_nor_their_company_matters(
     np.testing.assert_array_equal(alone.keypoints, together[3].keypoints)
 
 
-def test_prepared_tracks_are_left_alone_by_what_drops(
-    raw: list[KeypointTrack], clean: list[KeypointTrack]
-) -> None:
-    result = prepared(raw, clean)
-    again = prepared(list(result.tracks), clean)
-    assert len(again.tracks) == len(result.tracks)
-    assert sum(report.tracks_dropped + report.frames_dropped for report in again.reports) == 0
-
-
-def test_options_add_and_leave_out_their_steps(
-    raw: list[KeypointTrack], clean: list[KeypointTrack]
-) -> None:
+def test_options_select_steps(raw, clean):
     steps = [
-        "uncertain", "crowds", "pieces", "strays", "quality", "gaps", "smooth", "resample",
+        "uncertain", "crowds", "segments", "outliers", "quality", "gaps", "smooth", "resample",
         "short", "scale", "centre", "quality",
     ]  # fmt: skip
-    assert [report.step for report in prepared(raw, clean).reports] == steps
-    mirrored = prepared(raw, clean, mirror=True)
-    assert [report.step for report in mirrored.reports] == [*steps, "mirror"]
-    assert len(mirrored.tracks) == 2 * 6
+    result = prepared(raw, clean)
+    assert [report.step for report in result.reports] == steps
+    head, *lines = str(result).splitlines()
+    assert head.split() == ["step", "tracks", "frames", "dropped", "changed"]
+    assert [line.split()[0] for line in lines] == steps
+    assert "9 → 9" in lines[0]
     pixels = prepared(raw, clean, sizes=None)
     assert "scale" not in [report.step for report in pixels.reports]
     assert np.ptp(pixels.tracks[0].keypoints) > 100
@@ -140,52 +122,29 @@ def test_options_add_and_leave_out_their_steps(
     assert np.ptp(path.tracks[0].keypoints[:, 0, 0]) > 0.5
     crowd = prepared(raw[:2], clean, videos=["one", "other"])
     assert len(crowd.tracks) == 2
-    with pytest.raises(ValueError, match=r"tracks has none left, .* after crowds: 2 tracks of 240"):
+    with pytest.raises(ValueError, match="no track is left after step crowds: tracks 2 → 0"):
         prepared([raw[0], raw[0]], clean, videos=["one", "one"])
 
 
-def test_the_table_has_a_line_for_each_step(
-    raw: list[KeypointTrack], clean: list[KeypointTrack]
-) -> None:
-    result = prepared(raw, clean)
-    head, *lines = str(result).splitlines()
-    assert head.split() == ["step", "tracks", "frames", "dropped", "changed"]
-    assert [line.split()[0] for line in lines] == [report.step for report in result.reports]
-    assert "9 → 9" in lines[0]
-    assert all(line == line.rstrip() for line in [head, *lines])
-
-
-def test_bad_input_is_one_sentence(raw: list[KeypointTrack], clean: list[KeypointTrack]) -> None:
-    with pytest.raises(ValueError, match="tracks must contain at least one, got none"):
-        prepare_tracks([], fps=20)
-    with pytest.raises(ValueError, match="fps must be a finite number above 0, got None"):
-        prepare_tracks(raw, fps=None)
-    with pytest.raises(TypeError, match="fps"):
-        prepare_tracks(raw)
-    with pytest.raises(ValueError, match="none left, expected at least one, after pieces: 1 track"):
-        prepared(raw[-1:], clean)
-    with pytest.raises(
-        ValueError, match="none left, expected at least one, after pieces: 6 tracks"
-    ):
-        prepared(raw[:6], clean, threshold=2)
+def test_invalid_input(raw, clean):
     snake = Skeleton(["tail", "mid", "head"], [-1, 0, 1])
     own = KeypointTrack(np.ones((50, 3, 2)), np.ones((50, 3)), snake, 30.0)
-    with pytest.raises(
-        ValueError, match=r"skeleton has joints that tracks of tail, mid, head do not say: .*own"
+    for tracks, options, message in (
+        ([], {}, "tracks must contain at least one, got none"),
+        (raw, {"fps": None}, "fps must be a finite number above 0, got None"),
+        (raw[-1:], {}, "no track is left after step segments: tracks 1"),
+        (raw[:6], {"threshold": 2}, "no track is left after step segments: tracks 6"),
+        ([own], {"skeleton": PERSON}, "tracks of tail, mid, head cannot be retargeted: .*own"),
+        ([raw[0], own], {}, "tracks must have one skeleton, got several; pass skeleton"),
     ):
-        prepare_tracks([own], skeleton=Skeleton.preset("person14"), fps=20)
-    body = Skeleton.preset("body25b")
-    other = KeypointTrack(np.ones((30, 25, 2)), np.ones((30, 25)), body, 30, "other")
-    with pytest.raises(
-        ValueError, match="tracks have several skeletons, expected one, or skeleton"
-    ):
-        prepare_tracks([raw[0], other], fps=20)
+        with pytest.raises(ValueError, match=message):
+            prepared(tracks, clean, **options)
 
 
 # --- real detections --------------------------------------------------------------------------
 
 
-def test_real_detections_become_a_data_set(real_data: Path, clean: list[KeypointTrack]) -> None:
+def test_real_detections(real_data, clean):
     files = sorted((real_data / "pose2sim_multiview").glob("*_cam_0*.npz"))
     raw = [track for file in files for track in read_keypoints(file)]
     result = prepare_tracks(
@@ -196,7 +155,7 @@ def test_real_detections_become_a_data_set(real_data: Path, clean: list[Keypoint
         videos=[track.name.removesuffix("_bystander") for track in raw],
     )
     assert_reports_chain(result, raw)
-    # The bystander of the first camera hides a hip, so that nothing says where the root is.
+    # The bystander of the first camera has an occluded hip, hence no root.
     assert [track.name[-12:] for track in result.tracks] == [
         "Trial_cam_01", "Trial_cam_02", "02_bystander", "Trial_cam_03", "Trial_cam_04",
     ]  # fmt: skip
@@ -209,13 +168,3 @@ def test_real_detections_become_a_data_set(real_data: Path, clean: list[Keypoint
         assert 1.0 < np.nanmax(track.keypoints[..., 1]) - np.nanmin(track.keypoints[..., 1]) < 2.0
     smooth = next(report for report in result.reports if report.step == "smooth")
     assert smooth.entries_changed > 7000
-
-
-def test_one_real_image_is_read_and_too_short(real_data: Path) -> None:
-    (track,) = read_keypoints(real_data / "originals" / "cam01.0050.json", 60, "body25b")
-    result = prepare_tracks([track], fps=20, skeleton=PERSON, shortest=1 / 60)
-    (pose,) = result.tracks
-    assert (pose.confidence > 0.3).all()
-    np.testing.assert_array_equal(pose.keypoints[0, 0], [0, 0])
-    with pytest.raises(ValueError, match=r"none left, .* after short: 1 track of 1 frame became 0"):
-        prepare_tracks([track], fps=20, skeleton=PERSON)

@@ -1,9 +1,7 @@
-"""Tracks of bodies that are not made: in metres by bones they share, or in lengths of their own."""
+"""Tracks from files of keypoints: formats, names, crowds and scale."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,187 +10,300 @@ from probmotion import Cameras, Skeleton
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.synthetic.walks import shared_skeleton
 from probmotion.data.tracks.learning import body_sizes, read_tracks
-from probmotion.data.tracks.scale_reports import body_extent, per_track_scales
-from probmotion.data.tracks.scales import bone_sizes, scale_to_bones
+from probmotion.data.tracks.scales import (
+    body_extent,
+    bone_sizes,
+    per_track_scales,
+    scale_to_bones,
+)
 from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.splits import clip_of
 
 PERSON = Skeleton.preset("person14")
+COCO = Skeleton.preset("coco17")
 WORM = Skeleton(["snout", "back", "rump", "tail_tip"], [-1, 0, 1, 2])
+PIXELS = 183.0  # per metre
 
 
-def archive(track: KeypointTrack, folder: Path, name: str) -> Path:
-    np.savez(
-        folder / f"{name}.npz",
-        keypoints=track.keypoints,
-        confidence=track.confidence,
-        fps=track.fps,
-        joint_names=np.array(track.skeleton.joint_names),
-        parents=np.array(track.skeleton.parents, dtype=np.int32),
-    )
-    return folder / f"{name}.npz"
-
-
-def walk_on(skeleton: Skeleton, number: int, pixels: float) -> KeypointTrack:
-    """A person who walks, on the joints that it has; what else there is lies beside the root."""
-    body = make_gait("walk", number, frames=60)
+def detected_walk(number, seconds=4.0, skeleton=COCO, pixels=PIXELS):
+    """Return a walk as detected at 30 fps, in pixels; joints that the walk lacks are unseen."""
+    body = make_gait("walk", number, frames=round(30 * seconds))
     camera = Cameras.around(np.array([1.2]), np.array([0.2]), distance=7.0, perspective=True)
+    root = body.positions[:, :1]
+    image = camera.project(body.positions - root)[0]
+    image = image + camera.project(0.1 * (root - root.mean(axis=0)))[0]
+    image = pixels * image + 500
+    image = image + np.random.default_rng(number).normal(scale=1.0, size=image.shape)
+    keypoints = np.full((body.frames, skeleton.n_joints, 2), np.nan)
     known = body.skeleton.canonical_names
-    points = camera.project(body.positions - body.positions[:, :1])[0]
-    keypoints = np.stack(
-        [
-            points[:, known.index(name)] if name in known else points[:, 0] + 0.1
-            for name in skeleton.canonical_names
-        ],
-        axis=1,
+    for joint, name in enumerate(skeleton.canonical_names):
+        if name in known and name in PERSON.canonical_names:
+            keypoints[:, joint] = image[:, known.index(name)]
+    confidence = np.where(np.isfinite(keypoints[..., 0]), 0.9, 0.0)
+    return KeypointTrack(keypoints, confidence, skeleton, 30.0, f"walk{number}")
+
+
+@pytest.fixture(scope="module")
+def person():
+    return detected_walk(0)
+
+
+def flat(values):
+    """Return x, y, confidence of each keypoint, with zeros for NaN."""
+    return np.nan_to_num(values, nan=0.0).ravel().tolist()
+
+
+def values_of(track):
+    return np.concatenate([track.keypoints, track.confidence[..., None]], axis=-1)
+
+
+def as_coco(track, folder):
+    content = [
+        {"image_id": f"{frame}.jpg", "keypoints": flat(values), "score": 2.0}
+        for frame, values in enumerate(values_of(track))
+    ]
+    (folder / "coco.json").write_text(json.dumps(content))
+    return folder / "coco.json"
+
+
+def as_table(track, folder):
+    """Write a DeepLabCut table."""
+    names = [name for name in COCO.joint_names for _ in range(3)]
+    rows = [
+        ["scorer", *["net"] * len(names)],
+        ["bodyparts", *names],
+        ["coords", *["x", "y", "likelihood"] * 17],
+        *([str(frame), *map(str, flat(values))] for frame, values in enumerate(values_of(track))),
+    ]
+    (folder / "table.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+    return folder / "table.csv"
+
+
+# Formats, names and crowds.
+
+
+@pytest.mark.parametrize("write", [as_coco, as_table, None])
+def test_formats_give_the_same_walk_in_metres(person, tmp_path, write, write_archive):
+    path = (write or write_archive)(person, tmp_path)
+    rate = None if path.suffix == ".npz" else 30.0
+    (track,) = read_tracks([path], PERSON, 20.0, file_fps=rate).tracks
+    assert track.name.startswith(f"{path.stem}/{path.stem}")
+    assert clip_of(track.name) == path.stem
+    assert (track.skeleton, track.fps, track.frames) == (PERSON, 20.0, 80)
+    assert (track.confidence > 0).all()
+    # Every second frame at 20 fps is every third frame of the file.
+    truth = (person.keypoints / PIXELS)[::3]
+    for joint, name in enumerate(PERSON.canonical_names):
+        if name in ("pelvis", "neck"):
+            continue
+        own, left, right = (
+            truth[:, COCO.canonical_names.index(n)] for n in (name, "left_hip", "right_hip")
+        )
+        expected = own - (left + right) / 2
+        scale = (track.keypoints[::2, joint] * expected).sum() / (expected**2).sum()
+        assert scale == pytest.approx(1, abs=0.12)  # reference sizes are those of other people
+        np.testing.assert_allclose(track.keypoints[::2, joint], scale * expected, atol=0.03)
+
+
+def test_several_files_and_patterns(person, tmp_path, write_archive):
+    for name in ("c", "a", "b"):
+        write_archive(person, tmp_path, name)
+    as_table(person, tmp_path)
+    (alone,) = read_tracks([tmp_path / "a.npz"], PERSON, 20.0).tracks
+    paths = [str(tmp_path / "*.npz"), tmp_path / "table.csv"]
+    result = read_tracks(paths, PERSON, 20.0, file_fps=60.0).tracks
+    assert [track.name for track in result] == ["a/a", "b/b", "c/c", "table/table"]
+    # Archives contain their frame rate, 30 fps.
+    for track in result[:3]:
+        np.testing.assert_array_equal(track.keypoints, alone.keypoints)
+    with pytest.raises(FileNotFoundError):
+        read_tracks([str(tmp_path / "*.bvh")], PERSON, 20.0)
+    with pytest.raises(ValueError, match="fps"):
+        read_tracks(paths, PERSON, 20.0)
+    (tmp_path / "other").mkdir()
+    twin = write_archive(person, tmp_path / "other", "a")
+    for paths in ([tmp_path / "a.npz", twin], [twin, twin]):
+        with pytest.raises(ValueError, match=r"files must have unique names, got .*a\.npz and"):
+            read_tracks(paths, PERSON, 20.0)
+
+
+def test_views_in_one_archive_are_no_crowd(person, tmp_path):
+    np.savez(
+        tmp_path / "rig.npz",
+        keypoints=np.stack([person.keypoints] * 4),
+        confidence=np.stack([person.confidence] * 4),
+        fps=30.0,
+        joint_names=np.array(COCO.joint_names),
+        parents=np.array(COCO.parents, dtype=np.int32),
     )
-    sure = np.full(keypoints.shape[:2], 0.9)
-    return KeypointTrack(pixels * keypoints + 500, sure, skeleton, 30.0, f"walk{number}")
+    tracks = read_tracks([tmp_path / "rig.npz"], PERSON, 20.0).tracks
+    assert len({track.name for track in tracks}) == 4
+    assert {clip_of(track.name) for track in tracks} == {"rig"}
 
 
-def worm(number: int, pixels: float, stretched: float = 1.0) -> KeypointTrack:
-    """An animal that winds, of proportions 3 : 5 : 2."""
-    time = np.arange(60) / 30
-    angles = 0.4 * np.sin(3 * time[:, None] + np.arange(3) + number)
-    lengths = stretched * np.array([3.0, 5.0, 2.0])
-    steps = lengths[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    points = np.concatenate([np.zeros((60, 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-    return KeypointTrack(pixels * points + 300, np.full((60, 4), 0.9), WORM, 30.0, f"worm{number}")
+def test_people_in_one_video_may_be_a_crowd_and_videos_are_separate(person, tmp_path):
+    values = values_of(person)
+
+    def read(content):
+        (tmp_path / "people.json").write_text(json.dumps(content))
+        return read_tracks([tmp_path / "people.json"], PERSON, 20.0, file_fps=30.0).tracks
+
+    def pair(shift):
+        return [
+            {"image_id": f"{frame}.jpg", "keypoints": flat(pose), "idx": who}
+            for who, everyone in enumerate((values, np.add(values, [shift, 0, 0])))
+            for frame, pose in enumerate(everyone)
+        ]
+
+    assert [track.name[-9:] for track in read(pair(800))] == ["/people 0", "/people 1"]
+    with pytest.raises(ValueError, match="no track is left after step crowds"):
+        read(pair(5))
+    videos = [
+        {"image_id": f"{video}/{frame}.jpg", "keypoints": flat(values[frame])}
+        for video, frames in (("a", 60), ("b", 90))
+        for frame in range(frames)
+    ]
+    result = read(videos)
+    assert [track.frames for track in result] == [40, 60]
+    # Image names contain a slash; the clip is still the file.
+    assert {clip_of(track.name) for track in result} == {"people"}
 
 
-def shin(tracks: Sequence[KeypointTrack]) -> list[float]:
-    return [bone_sizes([track])["left_ankle"] for track in tracks]
+# Scale of people.
 
 
-# --- bones that are shared ----------------------------------------------------------------------
+def shin(track):
+    return bone_sizes([track])["left_ankle"]
 
 
-def test_a_person_s_bones_are_the_same_on_any_skeleton_that_has_them() -> None:
-    whole = body_sizes(PERSON)
-    limbs = {f"{side}_{end}" for side in ("left", "right") for end in ("elbow", "knee", "ankle")}
-    for name in ("coco17", "body25b", "alphapose16"):
-        sizes = body_sizes(Skeleton.preset(name))
-        assert limbs <= sizes.keys() <= set(Skeleton.preset(name).joint_names)
-        # Roots differ, and with them how far from the camera a limb is.
-        for limb in limbs:
-            assert sizes[limb] == pytest.approx(whole[limb], rel=0.03), name
+@pytest.mark.parametrize("scale", [1e-3, 40.0])
+def test_scale_does_not_depend_on_the_unit(person, tmp_path, scale, write_archive):
+    other = replace(person, keypoints=scale * person.keypoints)
+    (track,) = read_tracks([write_archive(other, tmp_path)], PERSON, 20.0).tracks
+    (expected,) = read_tracks([write_archive(person, tmp_path)], PERSON, 20.0).tracks
+    np.testing.assert_allclose(track.keypoints, expected.keypoints, atol=1e-9)
 
 
-def test_what_is_shared_has_both_ends() -> None:
-    coco = Skeleton.preset("coco17")
-    shared = shared_skeleton(coco)
-    assert shared is not None
-    assert set(coco.joint_names) - set(shared.joint_names) == {
-        f"{side}_{part}" for side in ("left", "right") for part in ("eye", "ear")
-    }
-    assert len(shared.bones) == 12  # of 16: not those of eyes and ears
+@pytest.mark.parametrize("name", ["coco17", "body25b", "gymnast-ball"])
+def test_people_on_other_skeletons_are_scaled_to_metres(tmp_path, name, write_archive):
+    skeleton = Skeleton.preset(name)
+    walks = [detected_walk(k, skeleton=skeleton, pixels=p) for k, p in enumerate((183.0, 60.0))]
+    for walk in walks:
+        walk.keypoints[..., :] = np.nan_to_num(walk.keypoints, nan=520.0)
+        walk.confidence[:] = 0.9
+    files = [write_archive(walk, tmp_path, walk.name) for walk in walks]
+    result = read_tracks(files, skeleton, 20.0)
+    for track, walk, pixels in zip(result.tracks, walks, (183.0, 60.0), strict=True):
+        assert shin(track) == pytest.approx(shin(walk) / pixels, rel=0.12)
+    assert [report.step for report in result.reports].count("scale") == 1
+
+
+def test_given_sizes_of_all_or_some_bones(person, tmp_path, write_archive):
+    file = write_archive(person, tmp_path)
+    sizes = body_sizes(PERSON)
+    double = {name: 2 * size for name, size in sizes.items()}
+    (track,) = read_tracks([file], PERSON, 20.0, sizes=double).tracks
+    (expected,) = read_tracks([file], PERSON, 20.0).tracks
+    np.testing.assert_allclose(track.keypoints, 2 * expected.keypoints, atol=1e-9)
+    (track,) = read_tracks([file], PERSON, 20.0, sizes={"left_ankle": 0.5}).tracks
+    assert shin(track) == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="sizes must contain the size of at least one bone"):
+        read_tracks([file], PERSON, 20.0, sizes={})
+
+
+def test_body_sizes_are_close_to_bone_lengths_on_any_skeleton():
+    sizes = body_sizes(PERSON)
+    assert set(sizes) == set(PERSON.joint_names) - {"pelvis"}
+    body = make_gait("walk").retarget(PERSON).positions[0]
+    for joint, parent in PERSON.bones:
+        length = np.linalg.norm(body[joint] - body[parent])
+        assert 0.8 * length < sizes[PERSON.joint_names[joint]] < 1.1 * length
+    other = body_sizes(COCO)
+    for limb in (f"{side}_{end}" for side in ("left", "right") for end in ("elbow", "ankle")):
+        assert other[limb] == pytest.approx(sizes[limb], rel=0.03)
+
+
+def test_shared_skeleton_has_both_ends_of_its_bones():
+    shared = shared_skeleton(COCO)
+    dropped = {f"{side}_{part}" for side in ("left", "right") for part in ("eye", "ear")}
+    assert set(COCO.joint_names) - set(shared.joint_names) == dropped
+    assert len(shared.bones) == 12
     for joint, parent in shared.bones:
         names = shared.joint_names
-        assert coco.parents[coco.index(names[joint])] == coco.index(names[parent])
+        assert COCO.parents[COCO.index(names[joint])] == COCO.index(names[parent])
     assert shared_skeleton(PERSON) is PERSON
     horse = Skeleton(["nose", "left_eye", "withers", "neck", "tail"], [-1, 0, 0, 0, 3])
-    found = shared_skeleton(horse)
-    assert found is not None
-    assert found.joint_names == ("nose", "left_eye", "neck", "tail")
-    assert found.parents == (-1, 0, 0, 2)
-    assert set(body_sizes(horse)) == {"left_eye", "neck", "tail"}
-    # A joint alone is no bone.
+    result = shared_skeleton(horse)
+    assert result.joint_names == ("nose", "left_eye", "neck", "tail")
+    assert result.parents == (-1, 0, 0, 2)
+    # A single joint is no bone.
     assert shared_skeleton(Skeleton(["nose", "back"], [-1, 0])) is None
     assert shared_skeleton(WORM) is None
     assert body_sizes(WORM) == {}
 
 
-@pytest.mark.parametrize("name", ["body25b", "gymnast-ball"])
-def test_people_of_other_joints_come_in_metres(tmp_path: Path, name: str) -> None:
-    skeleton = Skeleton.preset(name)
-    files = [
-        archive(walk_on(skeleton, number, pixels), tmp_path, f"film{number}")
-        for number, pixels in enumerate((183.0, 40.0))
-    ]
-    found = read_tracks(files, skeleton, 20.0)
-    true = [walk_on(skeleton, number, 1.0) for number in range(2)]
-    assert np.array(shin(found.tracks)) == pytest.approx(np.array(shin(true)), rel=0.12)
-    assert [report.step for report in found.reports].count("scale") == 1
+# Scale of unknown bodies.
 
 
-def test_sizes_of_some_bones_are_enough(tmp_path: Path) -> None:
-    file = archive(walk_on(Skeleton.preset("coco17"), 0, 90.0), tmp_path, "film")
-    sizes = {"left_ankle": 0.5}
-    (track,) = read_tracks([file], Skeleton.preset("coco17"), 20.0, sizes=sizes).tracks
-    assert shin([track]) == pytest.approx([0.5])
-    with pytest.raises(
-        ValueError, match="sizes must contain the size of at least one bone, got none"
-    ):
-        read_tracks([file], Skeleton.preset("coco17"), 20.0, sizes={})
+def worm(number, pixels):
+    """Return a winding animal with proportions 3 : 5 : 2."""
+    time = np.arange(60) / 30
+    angles = 0.4 * np.sin(3 * time[:, None] + np.arange(3) + number)
+    steps = np.array([[3.0], [5.0], [2.0]]) * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    points = np.concatenate([np.zeros((60, 1, 2)), np.cumsum(steps, axis=1)], axis=1)
+    return KeypointTrack(pixels * points + 300, np.full((60, 4), 0.9), WORM, 30.0, f"worm{number}")
 
 
-# --- a body of its own --------------------------------------------------------------------------
+def test_unknown_bodies_are_scaled_to_body_lengths(tmp_path, write_archive):
+    def read(unit):
+        scales = enumerate((20.0, 3.0, 300.0))
+        worms = [worm(number, unit * scale) for number, scale in scales]
+        return read_tracks([write_archive(w, tmp_path, w.name) for w in worms], WORM, 30.0)
 
-
-def test_an_animal_of_its_own_comes_in_body_lengths(tmp_path: Path) -> None:
-    pixels = (20.0, 3.0, 300.0)
-    files = [
-        archive(worm(number, scale), tmp_path, f"worm{number}")
-        for number, scale in enumerate(pixels)
-    ]
-    found = read_tracks(files, WORM, 30.0)
-    assert np.median([body_extent(track) for track in found.tracks]) == pytest.approx(1)
-    for number, track in enumerate(found.tracks):
+    result = read(1.0)
+    assert np.median([body_extent(track) for track in result.tracks]) == pytest.approx(1)
+    for number, track in enumerate(result.tracks):
         truth = worm(number, 1.0).keypoints
         truth = truth - truth[:, :1]
         inner = slice(8, -8)  # smoothing bends the ends
         factor = (track.keypoints * truth)[inner].sum() / (truth**2)[inner].sum()
-        assert factor == pytest.approx(0.1, rel=0.1)  # ten long, but for its bends
+        assert factor == pytest.approx(0.1, rel=0.1)  # about ten long
         np.testing.assert_allclose(track.keypoints[inner], factor * truth[inner], atol=0.01)
-    assert found.reports[-1].step == "scale"
-    # No frame of reference but their own: the unit of the files is nothing.
-    other = [
-        archive(worm(number, 7 * scale), tmp_path, f"worm{number}")
-        for number, scale in enumerate(pixels)
-    ]
-    for track, again in zip(found.tracks, read_tracks(other, WORM, 30.0).tracks, strict=True):
+    assert result.reports[-1].step == "scale"
+    for track, again in zip(result.tracks, read(7.0).tracks, strict=True):
         np.testing.assert_allclose(again.keypoints, track.keypoints, atol=1e-9)
 
 
-def test_own_sizes_are_the_median_track_s_proportions() -> None:
-    straight = np.array([[0.0, 0], [3, 0], [8, 0], [10, 0]])
-    tracks = [
-        KeypointTrack(np.tile(scale * straight, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
-        for scale in (1.0, 1.0, 70.0)
-    ]
-    sizes = per_track_scales(tracks)
-    assert sizes == pytest.approx({"back": 0.3, "rump": 0.5, "tail_tip": 0.2})
-    # Of two bodies each counts alike, however large its pictures are. By hand: 0.3, 0.5, 0.2 and
-    # 0.1, 0.8, 0.1 have the median 0.2, 0.65, 0.15, and scaled to it extents of 0.75 and 1.5.
-    thick = np.array([[0.0, 0], [1, 0], [9, 0], [10, 0]])
-    other = KeypointTrack(np.tile(20 * thick, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
-    pair = [tracks[0], other]
-    wanted = {"back": 0.2 / 1.125, "rump": 0.65 / 1.125, "tail_tip": 0.15 / 1.125}
-    assert per_track_scales(pair) == pytest.approx(wanted)
+def straight(scale, places=(0, 3, 8, 10)):
+    points = np.stack([scale * np.array(places), np.zeros(len(places))], axis=-1)
+    return KeypointTrack(np.tile(points, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
+
+
+def test_per_track_scales_are_median_proportions():
+    tracks = [straight(scale) for scale in (1.0, 1.0, 70.0)]
+    assert per_track_scales(tracks) == pytest.approx({"back": 0.3, "rump": 0.5, "tail_tip": 0.2})
+    # By hand: 0.3, 0.5, 0.2 and 0.1, 0.8, 0.1 have the medians 0.2, 0.65, 0.15; scaled to them the
+    # extents are 0.75 and 1.5.
+    pair = [tracks[0], straight(20.0, (0, 1, 9, 10))]
+    expected = {"back": 0.2 / 1.125, "rump": 0.65 / 1.125, "tail_tip": 0.15 / 1.125}
+    assert per_track_scales(pair) == pytest.approx(expected)
     both, _ = scale_to_bones(pair, per_track_scales(pair))
     assert np.median([body_extent(track) for track in both]) == pytest.approx(1)
-    # One whose tail is lost in every frame is a worm all the same.
-    confidence = np.ones((5, 4))
-    confidence[:, 3] = 0
-    docked = KeypointTrack(
-        np.where(confidence[..., None] > 0, 4 * straight, np.nan), confidence, WORM, 30.0
-    )
+    # A body without a visible tail is scaled by its other bones.
+    docked = straight(4.0)
+    docked.confidence[:, 3] = 0
+    docked.keypoints[:, 3] = np.nan
     assert body_extent(docked) == pytest.approx(32)
     sizes = per_track_scales([*tracks, docked])
     (scaled,), _ = scale_to_bones([docked], sizes)
     assert bone_sizes([scaled])["back"] == pytest.approx(sizes["back"], rel=0.05)
 
 
-def test_a_ball_is_no_part_of_the_body() -> None:
+def test_body_extent_ignores_joints_without_bones():
     skeleton = Skeleton([*WORM.joint_names, "ball"], [*WORM.parents, -1])
     points = np.tile([[0.0, 0], [3, 0], [8, 0], [10, 0], [1000, 0]], (5, 1, 1))
     assert body_extent(KeypointTrack(points, np.ones((5, 5)), skeleton, 30.0)) == 10
-
-
-def test_without_a_bone_there_is_no_length(tmp_path: Path) -> None:
     dots = Skeleton(["snout", "back"], [-1, -1])
-    points = np.tile([[0.0, 0], [3, 4]], (60, 1, 1))
-    file = archive(KeypointTrack(points, np.ones((60, 2)), dots, 30.0), tmp_path, "dots")
-    with pytest.raises(
-        ValueError, match=r"^tracks never shows a bone, expected some to scale by; or give sizes$"
-    ):
-        read_tracks([file], dots, 30.0)
+    track = KeypointTrack(np.ones((5, 2, 2)), np.ones((5, 2)), dots, 30.0)
+    with pytest.raises(ValueError, match="tracks must show at least one bone"):
+        per_track_scales([track])

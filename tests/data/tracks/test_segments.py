@@ -1,6 +1,4 @@
-"""Tracks cut at jumps and gaps: nothing is lost but the gap."""
-
-from __future__ import annotations
+"""Segmentation of tracks at jumps and gaps."""
 
 import numpy as np
 import pytest
@@ -14,71 +12,66 @@ SKELETON = Skeleton(["a", "b", "c"], [-1, 0, 1])
 BODY = np.array([[0.0, 0], [3, 0], [3, 4]])  # a box with a diagonal of 5
 
 
-def walking(frames: int, speed: float = 0.5, name: str = "walk") -> KeypointTrack:
+def walking(frames, speed=0.5, name="walk"):
     keypoints = BODY + speed * np.arange(frames)[:, None, None] * np.array([1.0, 0])
     return KeypointTrack(keypoints, np.ones((frames, 3)), SKELETON, 10.0, name)
 
 
-def unseen(track: KeypointTrack, frames: slice) -> KeypointTrack:
+def unseen(track, frames):
     confidence = track.confidence.copy()
     confidence[frames] = 0
     keypoints = np.where(confidence[..., None] > 0, track.keypoints, np.nan)
     return KeypointTrack(keypoints, confidence, track.skeleton, track.fps, track.name)
 
 
-def test_the_size_is_the_diagonal_of_the_seen_box() -> None:
+def test_size_is_the_diagonal_of_the_bounding_box():
     assert track_size(walking(5)) == pytest.approx(5)
     assert track_size(unseen(walking(7), slice(0, 3))) == pytest.approx(5)
-    with pytest.raises(ValueError, match="track 'walk' has no seen joint, expected at least one"):
+    with pytest.raises(ValueError, match="track 'walk' must have a seen joint"):
         track_size(unseen(walking(5), slice(0, 5)))
 
 
-def test_a_track_that_moves_steadily_stays_whole() -> None:
-    track = walking(20, speed=2.4)  # just below half of its size per frame
+def test_cuts_at_jumps_of_more_than_half_the_size():
+    track = walking(20, speed=2.4)
     (whole,), report = split_discontinuities([track], jump=0.5)
     assert whole.name == "walk"
     np.testing.assert_array_equal(whole.keypoints, track.keypoints)
     assert (report.tracks_after, report.frames_dropped) == (1, 0)
     assert len(split_discontinuities([walking(20, speed=2.6)], jump=0.5)[0]) == 20
-
-
-def test_a_jump_cuts_and_loses_nothing() -> None:
-    track = walking(20)
     track.keypoints[8:] += 100.0
-    pieces, report = split_discontinuities([track])
-    assert [piece.frames for piece in pieces] == [8, 12]
-    assert [piece.name for piece in pieces] == ["walk/0", "walk/1"]
-    np.testing.assert_array_equal(
-        np.concatenate([piece.keypoints for piece in pieces]), track.keypoints
-    )
+    segments, report = split_discontinuities([track])
+    assert [segment.name for segment in segments] == ["walk/0", "walk/1"]
+    assert [segment.frames for segment in segments] == [8, 12]
+    joined = np.concatenate([segment.keypoints for segment in segments])
+    np.testing.assert_array_equal(joined, track.keypoints)
     assert (report.tracks_before, report.tracks_after, report.frames_dropped) == (1, 2, 0)
     assert "cut at 1 jumps" in report.why
 
 
-def test_a_long_gap_cuts_and_loses_the_gap_alone() -> None:
+def test_long_gap_is_cut_out():
     track = unseen(walking(30, 0.3, "walk/left"), slice(10, 16))  # six frames of 10 a second
     (whole,), report = split_discontinuities([track], unseen=0.6)
     assert (whole.frames, report.frames_dropped) == (30, 0)
-    pieces, report = split_discontinuities([track], unseen=0.5)
-    assert [piece.name for piece in pieces] == ["walk/left 0", "walk/left 1"]
-    assert {clip_of(piece.name) for piece in pieces} == {"walk"}
-    np.testing.assert_array_equal(pieces[0].keypoints, track.keypoints[:10])
-    np.testing.assert_array_equal(pieces[1].keypoints, track.keypoints[16:])
+    segments, report = split_discontinuities([track], unseen=0.5)
+    assert [segment.name for segment in segments] == ["walk/left 0", "walk/left 1"]
+    assert {clip_of(segment.name) for segment in segments} == {"walk"}
+    np.testing.assert_array_equal(segments[0].keypoints, track.keypoints[:10])
+    np.testing.assert_array_equal(segments[1].keypoints, track.keypoints[16:])
     assert (report.frames_dropped, report.frames_after) == (6, 24)
     assert "at 1 gaps" in report.why
 
 
-def test_a_jump_across_a_short_gap_is_one_and_the_ends_are_trimmed() -> None:
+def test_jump_across_a_short_gap_and_trimmed_ends():
     track = unseen(unseen(unseen(walking(30), slice(0, 4)), slice(27, 30)), slice(10, 12))
     (whole,), report = split_discontinuities([track])
     assert (whole.frames, report.frames_dropped) == (23, 7)
     track.keypoints[12:] -= 50.0
-    pieces, report = split_discontinuities([track])
-    assert [piece.frames for piece in pieces] == [6, 15]
+    segments, report = split_discontinuities([track])
+    assert [segment.frames for segment in segments] == [6, 15]
     assert report.frames_before == report.frames_after + report.frames_dropped == 30
 
 
-def test_one_wild_joint_is_no_jump_nor_is_one_that_appears() -> None:
+def test_single_outlier_or_appearing_joint_is_no_jump():
     track = walking(20)
     track.keypoints[9, 1] += 500.0
     assert len(split_discontinuities([track])[0]) == 1
@@ -90,18 +83,18 @@ def test_one_wild_joint_is_no_jump_nor_is_one_that_appears() -> None:
     assert whole.frames == 20
 
 
-def test_without_a_common_joint_centres_are_compared() -> None:
+def test_centres_are_compared_without_common_joints():
     confidence = np.zeros((6, 3))
     confidence[:3, :2], confidence[3:, 2] = 1, 1
     base = walking(6, speed=0.0)
-    for offset, pieces in ((0.0, 2), (-4.0, 1)):  # centres (1.5, 0) and (3, 4 + offset)
+    for offset, segments in ((0.0, 2), (-4.0, 1)):  # centres (1.5, 0) and (3, 4 + offset)
         keypoints = base.keypoints + np.array([0, offset]) * (np.arange(6) > 2)[:, None, None]
         track = KeypointTrack(keypoints, confidence, SKELETON, 10.0)
         assert track_size(track) == pytest.approx(1.5)  # three frames of 3, three of a point
-        assert len(split_discontinuities([track], jump=1.1)[0]) == pieces
+        assert len(split_discontinuities([track], jump=1.1)[0]) == segments
 
 
-def test_a_track_that_was_never_seen_is_dropped_and_reported() -> None:
+def test_unseen_track_is_dropped():
     kept, report = split_discontinuities([unseen(walking(5), slice(0, 5)), walking(5)])
     assert len(kept) == 1
     assert (report.tracks_dropped, report.frames_dropped) == (1, 5)
@@ -109,8 +102,7 @@ def test_a_track_that_was_never_seen_is_dropped_and_reported() -> None:
     assert split_discontinuities([])[0] == []
 
 
-def test_a_single_joint_has_no_size_and_no_jumps() -> None:
-    ball = KeypointTrack(
-        np.arange(10.0)[:, None, None] * np.ones(2), np.ones((10, 1)), Skeleton(["ball"], [-1]), 10
-    )
+def test_single_joint_has_no_jumps():
+    points = np.arange(10.0)[:, None, None] * np.ones(2)
+    ball = KeypointTrack(points, np.ones((10, 1)), Skeleton(["ball"], [-1]), 10)
     assert len(split_discontinuities([ball])[0]) == 1

@@ -1,6 +1,4 @@
-"""Steps along time: exact on the motions that they must leave alone."""
-
-from __future__ import annotations
+"""Gap filling, smoothing and resampling against exact solutions."""
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from probmotion.motion.skeleton import Skeleton
 BALL = Skeleton(["ball"], [-1])
 
 
-def ball(path: np.ndarray, fps: float = 10.0, gaps: tuple[int, ...] = ()) -> KeypointTrack:
+def ball(path, fps=10.0, gaps=()):
     """One joint along ``path`` (L, 2), unseen in the frames ``gaps``."""
     confidence = np.linspace(0.5, 0.9, len(path))[:, None]
     confidence[list(gaps)] = 0
@@ -20,12 +18,12 @@ def ball(path: np.ndarray, fps: float = 10.0, gaps: tuple[int, ...] = ()) -> Key
     return KeypointTrack(keypoints, confidence, BALL, fps, "ball")
 
 
-def line(frames: int, fps: float = 10.0) -> np.ndarray:
+def line(frames, fps=10.0):
     time = np.arange(frames) / fps
     return np.stack([3 * time - 1, 2 - time], axis=-1)
 
 
-def test_short_gaps_of_a_straight_path_are_filled_exactly() -> None:
+def test_gaps_of_straight_paths_are_filled_exactly():
     track = ball(line(20), gaps=(0, 5, 6, 10, 11, 12, 19))
     (filled,), report = fill_gaps([track], longest=0.2)
     np.testing.assert_allclose(filled.keypoints[[5, 6], 0], line(20)[[5, 6]], atol=1e-12)
@@ -40,7 +38,7 @@ def test_short_gaps_of_a_straight_path_are_filled_exactly() -> None:
     assert fill_gaps([filled], longest=0.2)[1].entries_changed == 0
 
 
-def test_gaps_are_filled_smoothly_and_without_overshoot() -> None:
+def test_gaps_are_filled_without_overshoot():
     step = np.zeros((12, 2))
     step[6:] = 1.0
     (filled,), _ = fill_gaps([ball(step, gaps=(5, 6))], longest=0.2)
@@ -52,7 +50,7 @@ def test_gaps_are_filled_smoothly_and_without_overshoot() -> None:
     np.testing.assert_allclose(path[5:7], [7 / 27, 20 / 27], atol=1e-12)
 
 
-def test_parabolas_are_left_alone_ends_included() -> None:
+def test_smoothing_reproduces_parabolas():
     time = np.arange(40) / 10
     path = np.stack([time**2 - 3 * time, 1 - 0.5 * time**2], axis=-1)
     track = ball(path, gaps=(9, 10, 17))
@@ -60,15 +58,15 @@ def test_parabolas_are_left_alone_ends_included() -> None:
     np.testing.assert_allclose(smoothed.keypoints, track.keypoints, atol=1e-10)
     np.testing.assert_array_equal(smoothed.confidence, track.confidence)
     assert report.entries_changed == 9 + 6 + 22
-    # A run of fewer than five frames is left as it is: bit for bit.
+    # Runs of fewer than five frames are unchanged.
     short = ball(np.random.default_rng(0).normal(size=(9, 2)), gaps=(4,))
     (same,), report = smooth_tracks([short], window=0.7)
     np.testing.assert_array_equal(same.keypoints, short.keypoints)
     assert report.entries_changed == 0
 
 
-def test_noise_is_lessened_by_what_the_fit_says() -> None:
-    """The variance left is the sum of squared weights, (3 n² - 7) · 3 / (4 n (n² - 4))."""
+def test_smoothing_reduces_noise_as_predicted():
+    """The remaining variance is the sum of squared weights, 3 (3 n² - 7) / (4 n (n² - 4))."""
     noise = np.random.default_rng(1).normal(size=(4000, 2))
     (smoothed,), _ = smooth_tracks([ball(noise)], window=0.7)
     expected = 3 * (3 * 7**2 - 7) / (4 * 7 * (7**2 - 4))
@@ -76,7 +74,7 @@ def test_noise_is_lessened_by_what_the_fit_says() -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), [(60, 20), (60, 25), (30, 30), (20, 50), (29.97, 20)])
-def test_resampling_a_straight_path_is_exact(old: float, new: float) -> None:
+def test_resampling_straight_paths_is_exact(old, new):
     (track,), report = resample_tracks([ball(line(61, old), old)], fps=new)
     assert track.fps == new
     np.testing.assert_allclose(track.keypoints[:, 0], line(track.frames, new), atol=1e-9)
@@ -86,13 +84,13 @@ def test_resampling_a_straight_path_is_exact(old: float, new: float) -> None:
     assert report.frames_after == track.frames
 
 
-def test_unseen_stays_unseen_and_only_neighbours_that_count_matter() -> None:
+def test_resampled_frames_are_seen_if_their_neighbours_are():
     track = ball(line(13, 60), 60, gaps=(4, 6))
     (third,), _ = resample_tracks([track], fps=20)  # frames 0 3 6 9 12
     np.testing.assert_array_equal(third.confidence[:, 0] > 0, [True, True, False, True, True])
     np.testing.assert_array_equal(third.keypoints[1], track.keypoints[3])
     assert np.isnan(third.keypoints[2]).all()
-    # A rate that a file rounds: 3.0000000000000004 old frames per new one are 3.
+    # Rounded frame rates: 3.0000000000000004 old frames per new one are 3.
     rounded = ball(line(13), 1 / 0.016667, gaps=(4, 8))
     (third,), _ = resample_tracks([rounded], fps=1 / 0.050001)
     np.testing.assert_array_equal(third.confidence[:, 0] > 0, np.ones(5, dtype=bool))
@@ -103,18 +101,24 @@ def test_unseen_stays_unseen_and_only_neighbours_that_count_matter() -> None:
     assert resample_tracks([single], fps=3)[0][0].frames == 1
 
 
-def test_tracks_of_several_rates_and_bad_numbers() -> None:
+def test_tracks_of_several_frame_rates():
     tracks = [ball(line(31, 30), 30), ball(line(61, 60), 60)]
     resampled, report = resample_tracks(tracks, fps=20)
     np.testing.assert_allclose(resampled[0].keypoints, resampled[1].keypoints, atol=1e-12)
-    assert report.why == "brought 30 and 60 fps to 20"
+    assert report.why == "resampled 30 and 60 fps to 20"
     for step in (fill_gaps, smooth_tracks):
         assert step([])[0] == []
-    with pytest.raises(ValueError, match="fps must be a finite number above 0, got None"):
-        resample_tracks(tracks, fps=None)
-    with pytest.raises(ValueError, match="fps must be at most 10000, got 20000"):
-        resample_tracks(tracks, fps=20000)
-    with pytest.raises(ValueError, match="longest is 0, expected"):
-        fill_gaps(tracks, longest=0)
-    with pytest.raises(ValueError, match="window is -1, expected"):
-        smooth_tracks(tracks, window=-1)
+
+
+@pytest.mark.parametrize(
+    ("step", "options"),
+    [
+        (resample_tracks, {"fps": None}),
+        (resample_tracks, {"fps": 20000}),
+        (fill_gaps, {"longest": 0}),
+        (smooth_tracks, {"window": -1}),
+    ],
+)
+def test_invalid_options(step, options):
+    with pytest.raises(ValueError, match=f"^{next(iter(options))} must be"):
+        step([ball(line(5))], **options)

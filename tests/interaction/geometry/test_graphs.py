@@ -1,4 +1,4 @@
-"""Graphs over joints: what each is by definition, and joints that lie degenerately."""
+"""Graphs over joints: definitions, compiled versions and degenerate configurations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
 
+from probmotion.interaction.geometry.delaunay import delaunay_edges, max_planar_edges
+from probmotion.interaction.geometry.graph_kernels import write_graph
 from probmotion.interaction.geometry.graphs import (
     GRAPHS,
     graph_edges,
@@ -16,119 +20,86 @@ from probmotion.interaction.geometry.graphs import (
     joggle_offsets,
 )
 
+both_dimensions = pytest.mark.parametrize("axes", [2, 3])
 
-def joints(n: int, axes: int, seed: int = 0) -> np.ndarray:
+
+def joints(n, axes, seed=0):
     return np.random.default_rng(seed).standard_normal((n, axes))
 
 
-def as_set(edges: np.ndarray) -> set[tuple[int, int]]:
+def as_set(edges):
     return {(int(i), int(j)) for i, j in edges}
 
 
-def circumball(corners: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centre and the radius of the sphere through D + 1 points."""
+def circumball(corners):
+    """Return the centre and radius of the sphere through D + 1 points."""
     legs = corners[1:] - corners[0]
     to_centre = np.linalg.solve(2 * legs, (legs**2).sum(axis=1))
     return corners[0] + to_centre, float(np.sqrt((to_centre**2).sum()))
 
 
-def is_connected(edges: np.ndarray, n: int) -> bool:
-    reached, front = {0}, [0]
-    while front:
-        joint = front.pop()
-        for i, j in edges.tolist():
-            for a, b in ((i, j), (j, i)):
-                if a == joint and b not in reached:
-                    reached.add(b)
-                    front.append(b)
-    return len(reached) == n
+def is_connected(edges, n):
+    adjacency = np.zeros((n, n))
+    adjacency[tuple(edges.T)] = 1
+    return connected_components(adjacency, directed=False)[0] == 1
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-def test_delaunay_edges_are_those_of_empty_circumballs(axes: int) -> None:
+@both_dimensions
+def test_delaunay_circumballs_are_empty(axes):
     points = joints(11, axes)
-    wanted = set()
+    expected = set()
     for corners in itertools.combinations(range(11), axes + 1):
         centre, radius = circumball(points[list(corners)])
         others = np.delete(points, corners, axis=0)
         if (np.linalg.norm(others - centre, axis=1) > radius).all():
-            wanted |= set(itertools.combinations(corners, 2))
-    assert as_set(graph_edges(points)) == wanted
+            expected |= set(itertools.combinations(corners, 2))
+    assert as_set(graph_edges(points)) == expected
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-def test_gabriel_edges_are_those_of_empty_balls_on_a_diameter(axes: int) -> None:
+@both_dimensions
+def test_gabriel_balls_are_empty(axes):
     points = joints(20, axes)
-    wanted = set()
+    expected = set()
     for i, j in itertools.combinations(range(20), 2):
         middle, radius = 0.5 * (points[i] + points[j]), 0.5 * np.linalg.norm(points[i] - points[j])
         others = np.delete(points, (i, j), axis=0)
         if (np.linalg.norm(others - middle, axis=1) >= radius).all():
-            wanted.add((i, j))
+            expected.add((i, j))
     gabriel = as_set(graph_edges(points, "gabriel"))
-    assert gabriel == wanted
+    assert gabriel == expected
     assert gabriel < as_set(graph_edges(points))
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-def test_neighbours_are_six_each_at_least(axes: int) -> None:
+@both_dimensions
+def test_each_joint_has_its_six_nearest_neighbours(axes):
     points = joints(34, axes)
-    edges = graph_edges(points, "nearest-neighbours")
-    wanted = set()
+    expected = set()
     for i in range(34):
         near = np.argsort(np.linalg.norm(points - points[i], axis=1))[1:7]
-        wanted |= {(min(i, int(j)), max(i, int(j))) for j in near}
-    assert as_set(edges) == wanted
-    assert np.bincount(edges.ravel(), minlength=34).min() >= 6
+        expected |= {(min(i, int(j)), max(i, int(j))) for j in near}
+    assert as_set(graph_edges(points, "nearest-neighbours")) == expected
 
 
 @pytest.mark.parametrize("graph", GRAPHS)
-@pytest.mark.parametrize("axes", [2, 3])
-def test_edges_are_ordered_and_follow_the_joints(graph: str, axes: int) -> None:
+@both_dimensions
+def test_edges_are_sorted_connected_and_invariant(graph, axes):
     points = joints(34, axes, seed=3)
     edges = graph_edges(points, graph)
     assert (edges[:, 0] < edges[:, 1]).all()
     assert list(map(tuple, edges.tolist())) == sorted(as_set(edges))
     assert is_connected(edges, 34)
-    # Numbering the joints otherwise, moving, turning and scaling them leaves the graph alone.
+    if graph == "complete":
+        assert len(edges) == 34 * 33 // 2
     order = np.random.default_rng(4).permutation(34)
     turn, _ = np.linalg.qr(joints(axes, axes, seed=5))
     relabelled = np.sort(order[graph_edges(3.0 * points[order] @ turn + 2.0, graph)], axis=1)
     assert as_set(relabelled) == as_set(edges)
 
 
-def test_the_complete_graph_has_every_edge() -> None:
-    assert len(graph_edges(joints(34, 2), "complete")) == 34 * 33 // 2
-
-
-DEGENERATE = {
-    "one point": np.zeros((12, 2)),
-    "a line": np.outer(np.arange(12), [0.3, 0.1]),
-    "a lattice": np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), axis=-1).reshape(-1, 2),
-    "twins": np.tile(joints(6, 2, seed=6), (2, 1)),
-    "one at a point": np.concatenate([joints(6, 2, seed=7), np.ones((6, 2))]),
-}
-
-
-@pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("graph", GRAPHS)
-@pytest.mark.parametrize("axes", [2, 3])
-def test_degenerate_joints_have_a_graph_all_the_same(name: str, graph: str, axes: int) -> None:
-    """In space they lie in a plane as well."""
-    points = np.pad(DEGENERATE[name], ((0, 0), (0, axes - 2)))
-    assert is_degenerate(points)
-    edges = graph_edges(points, graph)
-    np.testing.assert_array_equal(edges, graph_edges(points, graph))
-    if graph != "nearest-neighbours":  # clusters of joints at one place have neighbours enough
-        assert is_connected(edges, 12)
-
-
-def test_a_joint_between_two_others_is_no_degenerate_case() -> None:
-    """A pelvis midway between hips, on the hull: the hips' own edge is left out."""
+def test_midpoint_of_two_joints_is_not_degenerate():
+    """A pelvis midway between the hips on the hull, where the edge of the hips is left out."""
     for seed in range(100):
         points = joints(20, 2, seed)
-        points[0] = 0.5 * (points[11] + points[14])
-        assert not is_degenerate(points)
         points[[11, 14]] = (-9.1, -9.3), (9.7, -9.2)
         points[0] = 0.5 * (points[11] + points[14])
         assert not is_degenerate(points)
@@ -137,16 +108,19 @@ def test_a_joint_between_two_others_is_no_degenerate_case() -> None:
         assert (11, 14) not in edges
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-def test_too_few_joints_for_a_triangle_are_all_joined(axes: int) -> None:
+@both_dimensions
+def test_too_few_joints_for_a_triangle_are_all_connected(axes):
     for n in range(1, axes + 2):
         points = joints(n, axes)
         assert not is_degenerate(points)
         assert len(graph_edges(points)) == n * (n - 1) // 2
+        if n <= 3 and axes == 2:
+            assert delaunay_edges(points)[0].tolist() == graph_edges(points).tolist()
     assert is_degenerate(np.zeros((2, axes)))
+    assert delaunay_edges(np.zeros((2, 2)))[1]
 
 
-def test_offsets_are_fixed() -> None:
+def test_joggle_offsets_are_fixed():
     offsets = joggle_offsets(34, 3)
     np.testing.assert_array_equal(joggle_offsets(17, 2), offsets[:17, :2])
     assert np.abs(offsets).max() <= 1
@@ -154,15 +128,126 @@ def test_offsets_are_fixed() -> None:
 
 
 @given(arrays(float, (9, 3), elements=st.integers(-2, 2).map(float)))
-def test_joints_on_a_small_lattice_never_fail(points: np.ndarray) -> None:
+def test_joints_on_a_small_lattice_are_triangulated(points):
     for lying in (points, points[:, :2]):
         assert is_connected(graph_edges(lying), 9)
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match="graph must be one of delaunay, got 'tree'"):
+def test_invalid_arguments_are_rejected():
+    with pytest.raises(ValueError, match=r"graph must be one of delaunay, .*, got 'tree'"):
         graph_edges(joints(5, 2), "tree")
     with pytest.raises(ValueError, match=r"points must have shape \(J, 2\), got \(5, 4\)"):
         graph_edges(joints(5, 4))
-    with pytest.raises(ValueError, match="points must be finite, got 1 values that are NaN"):
-        graph_edges(np.array([[0.0, np.nan], [1.0, 2.0]]))
+
+
+# Compiled triangulation and graphs.
+
+
+def is_triangulation(points, edges):
+    """Return whether edges do not cross and their number is that of a triangulation."""
+    n, hull = len(points), len(ConvexHull(points).vertices)
+    p, q = points[edges[:, 0]], points[edges[:, 1]]
+
+    def side(a, b, c):
+        u, v = b - a, c - a
+        return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+    apart = side(p[:, None], q[:, None], p) * side(p[:, None], q[:, None], q)
+    crossing = (apart < 0) & (apart.T < 0)
+    shared = (edges[:, None, :, None] == edges[None, :, None, :]).any(axis=(-1, -2))
+    return len(edges) == 3 * n - 3 - hull and not (crossing & ~shared).any()
+
+
+def assert_scipys_edges(points):
+    edges, degenerate = delaunay_edges(points)
+    assert not degenerate
+    np.testing.assert_array_equal(edges, graph_edges(points))
+
+
+@pytest.mark.parametrize("n", [3, 4, 5, 10, 34, 64])
+def test_random_joints_have_scipys_edges(n):
+    rng = np.random.default_rng(n)
+    for scale, shift in ((1.0, 0.0), (1e-3, 5.0), (1e3, -7.0)):
+        for _ in range(100 if n == 34 else 40):
+            assert_scipys_edges(scale * rng.standard_normal((n, 2)) + shift)
+
+
+def test_collinear_spine_and_midpoint_pelvis_are_not_degenerate():
+    """Annotations place the pelvis midway between the hips and the spine on a line to the neck."""
+    rng = np.random.default_rng(1)
+    for _ in range(150):
+        points = rng.standard_normal((34, 2))
+        for first in (0, 17):
+            body = points[first : first + 17]
+            body[0], body[3] = 0.5 * (body[11] + body[14]), 0.5 * (body[5] + body[8])
+            body[1], body[2] = (2 * body[0] + body[3]) / 3, (body[0] + 2 * body[3]) / 3
+        assert_scipys_edges(points)
+        assert not is_degenerate(points)
+
+
+RANDOM = np.random.default_rng(2).standard_normal((34, 2))
+LATTICE = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+ANGLE = 2 * np.pi * np.arange(34) / 34
+DEGENERATE = {
+    "one point": np.full((34, 2), 2.5),
+    "a line": np.outer(np.arange(34), [0.3, -0.7]),
+    "a lattice": 0.1 * LATTICE[:34],
+    "a circle": np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=-1),
+    "duplicates": np.concatenate([RANDOM[:17], RANDOM[:17]]),
+    "half at one point": np.concatenate([RANDOM[:17], np.tile(RANDOM[17], (17, 1))]),
+    "two points": np.repeat(RANDOM[:2], 17, axis=0),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_joints_have_scipys_joggled_edges(name):
+    points = DEGENERATE[name]
+    edges, degenerate = delaunay_edges(points)
+    assert degenerate
+    np.testing.assert_array_equal(edges, graph_edges(points))
+    np.testing.assert_array_equal(edges, delaunay_edges(points)[0])
+    for axes in (2, 3):  # in 3D the joints are also coplanar
+        padded = np.pad(points, ((0, 0), (0, axes - 2)))
+        assert is_degenerate(padded)
+        for graph in ("delaunay", "gabriel", "complete"):
+            assert is_connected(graph_edges(padded, graph), 34)
+
+
+@given(
+    arrays(float, st.tuples(st.integers(3, 24), st.just(2)), elements=st.integers(-3, 3).map(float))
+)
+def test_compiled_triangulation_of_a_small_lattice(points):
+    edges, degenerate = delaunay_edges(points)
+    low, high = points.min(axis=0), points.max(axis=0)
+    unit = (points - 0.5 * (low + high)) / (max((high - low).max(), 1e-300))
+    if degenerate:
+        assert is_triangulation(unit + 1e-5 * joggle_offsets(len(points), 2), edges)
+    else:
+        assert not is_degenerate(points)
+        np.testing.assert_array_equal(edges, graph_edges(points))
+
+
+@given(arrays(float, (12, 2), elements=st.floats(-1, 1)), st.floats(-8, 0))
+def test_arbitrarily_close_joints_are_triangulated(points, exponent):
+    points[6:] = points[:6] + 10.0**exponent * points[6:]
+    edges, _ = delaunay_edges(points)
+    assert len(np.unique(edges)) == 12
+    assert len(edges) <= max_planar_edges(12)
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_compiled_graphs_equal_the_reference(graph):
+    rng = np.random.default_rng(3)
+    for n in (2, 5, 34):
+        for points in (rng.standard_normal((n, 2)), rng.integers(0, 4, (n, 2)).astype(float)):
+            edges = np.empty((n * (n - 1) // 2 + 3 * n, 2), dtype=np.uint16)
+            n_edges, _ = write_graph(points, GRAPHS.index(graph), joggle_offsets(n, 2), edges)
+            assert sorted(edges[:n_edges].tolist()) == graph_edges(points, graph).tolist()
+
+
+def test_real_pairs_have_scipys_edges(real_data):
+    for file in sorted((real_data / "cmu_salsa_pairs").glob("*.npz")):
+        pairs = np.load(file)["positions"][::50, :, :17].reshape(-1, 34, 3).astype(float)
+        for view, pair in enumerate(pairs):
+            c, s = np.cos(view), np.sin(view)
+            assert_scipys_edges(np.stack([c * pair[:, 0] + s * pair[:, 2], pair[:, 1]], axis=-1))

@@ -1,3 +1,7 @@
+"""Evaluator: features of single motions, style separation, training loss and checkpoints."""
+
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -12,294 +16,207 @@ from probmotion.models.evaluation.evaluator import KIND, EvaluatorSettings, Trac
 from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
 from probmotion.models.evaluation.track_autoencoder import TrackAutoencoder, divergence_from_normal
 from probmotion.models.training import checkpoints
-from probmotion.models.training.checkpoints import Checkpoint, CheckpointError, save_checkpoint
+from probmotion.models.training.checkpoints import load_checkpoint
 from probmotion.models.training.settings import TrainingSettings
-from probmotion.models.training.track_batches import Augmentation
 from probmotion.models.training.trainer import train
 
 FRAMES = 16
 STYLES = ("walk", "run")
+SIZE = EvaluatorSettings.tiny(FRAMES)
+CPU = torch.device("cpu")
 
 
-def gaits(style, numbers):
-    return [make_gait(style, number, frames=24) for number in numbers]
+def positions_of(style, numbers):
+    clips = [make_gait(style, number, frames=24) for number in numbers]
+    return np.stack([clip.positions[:FRAMES] for clip in clips])
 
 
-def tracks_of(numbers, seed=0):
-    clips = [clip for style in STYLES for clip in gaits(style, numbers)]
-    return project_clips(clips, views=4, seed=seed, noise=DetectorNoise.none())
+def tracks_of(numbers):
+    clips = [make_gait(style, number, frames=24) for style in STYLES for number in numbers]
+    return project_clips(clips, views=4, noise=DetectorNoise.none())
 
 
 def views_of(style, numbers, seed=0):
-    positions = np.stack([clip.positions[:FRAMES] for clip in gaits(style, numbers)])
-    return film_motions(positions, np.random.default_rng(seed))
+    return film_motions(positions_of(style, numbers), np.random.default_rng(seed))
+
+
+def held_out_loss(trainee):
+    with torch.no_grad():
+        return trainee.validation_loss(trainee.network, CPU)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of a short training, and its result."""
-    folder = tmp_path_factory.mktemp("run")
+    """The loss before a short training, and its result."""
     trainee = EvaluatorTrainee(tracks_of(range(12)), tracks_of(range(12, 16)), SIZE)
     settings = TrainingSettings(
         steps=120, batch=24, learning_rate=3e-3, warmup=10, ema=0.9, checkpoint_every=60
     )
-    return folder, train(trainee, settings, folder, progress=False)
-
-
-SIZE = EvaluatorSettings.tiny(FRAMES)
+    before = held_out_loss(trainee)
+    return before, train(trainee, settings, tmp_path_factory.mktemp("run"), progress=False)
 
 
 @pytest.fixture(scope="module")
 def evaluator(run):
-    return TrackEvaluator.load(run[0])
+    return TrackEvaluator.load(run[1].model.parent)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     return views_of("walk", range(30, 42))
 
 
-# ---- features
-
-
-def test_features_depend_on_a_motion_alone(evaluator, views, monkeypatch):
-    many = np.concatenate([views] * 10)
-    found = evaluator.features(many)
-    assert found.shape == (120, SIZE.latent)
-    assert found.dtype == np.float64
-    # 56 motions fit a chunk: the same motion stands at other places of several chunks.
-    for copy in range(1, 10):
-        np.testing.assert_array_equal(found[12 * copy : 12 * copy + 12], found[:12])
-    np.testing.assert_array_equal(evaluator.features(views[7:8]), found[7:8])
+def test_features_do_not_depend_on_the_batch(evaluator, views):
+    features = evaluator.features(np.concatenate([views] * 10))
+    assert features.shape == (120, SIZE.latent)
+    assert features.dtype == np.float64
+    # A chunk has 56 motions, so copies are at different places.
+    np.testing.assert_array_equal(features, np.tile(features[:12], (10, 1)))
+    np.testing.assert_array_equal(evaluator.features(views[7:8]), features[7:8])
     assert evaluator.features(views[:0]).shape == (0, SIZE.latent)
 
 
-def test_what_pads_a_motion_does_not_matter(evaluator, views):
+def test_padding_has_no_effect(evaluator, views):
     lengths = np.arange(4, 16)
     padded = views.copy()
     for motion, length in zip(padded, lengths, strict=True):
         motion[length:] = np.nan
-    found = evaluator.features(padded, lengths)
+    features = evaluator.features(padded, lengths)
     for number, length in enumerate(lengths):
         alone = evaluator.features(views[number : number + 1, :length])
-        np.testing.assert_array_equal(found[number : number + 1], alone)
-    # But its frames do.
-    assert np.abs(found - evaluator.features(views)).min(axis=1).max() > 1e-3
+        np.testing.assert_array_equal(features[number : number + 1], alone)
+    assert np.abs(features - evaluator.features(views)).min(axis=1).max() > 1e-3
 
 
-def test_features_are_the_encoders_mean(evaluator, run, views):
-    """Computed once more from the checkpoint: the whole autoencoder, one motion, no padding."""
-    kept = checkpoints.load_checkpoint(run[1].model, KIND)
+def test_features_are_the_mean_of_the_encoder(evaluator, run, views):
+    stored = load_checkpoint(run[1].model, KIND)
     network = TrackAutoencoder(SIZE, 17).eval()
-    network.load_state_dict(dict(kept.tensors))
-    deviation = np.array(kept.settings["network"]["deviation"])
-    mean = np.array(kept.settings["network"]["mean"])
+    network.load_state_dict(dict(stored.tensors))
+    deviation = np.array(stored.settings["network"]["deviation"])
+    mean = np.array(stored.settings["network"]["mean"])
     assert (deviation[0] == 0).all()
     standardised = (views[0] - mean) / np.where(deviation > 0, deviation, np.inf)
     motion = torch.tensor(standardised, dtype=torch.float32).flatten(1)[None]
     with torch.no_grad():
-        found, _ = network.encoder(motion, torch.ones(1, FRAMES, dtype=torch.bool))
-    np.testing.assert_allclose(evaluator.features(views[:1]), found, atol=1e-5)
-
-
-def test_a_joint_that_never_varied_is_not_looked_at(evaluator, views):
+        wanted, _ = network.encoder(motion, torch.ones(1, FRAMES, dtype=torch.bool))
+    np.testing.assert_allclose(evaluator.features(views[:1]), wanted, atol=1e-5)
+    # Joints without variation are ignored.
     moved = views.copy()
     moved[:, :, 0] += 1e-7
     np.testing.assert_array_equal(evaluator.features(moved), evaluator.features(views))
 
 
-def test_features_tell_styles_apart(evaluator):
-    features = {
-        (style, half): evaluator.features(views_of(style, range(start, start + 60), start))
-        for style in STYLES
-        for half, start in (("first", 100), ("second", 200))
-    }
-    walk = features["walk", "first"]
-    same = frechet_distance(walk, features["walk", "second"])
-    other = frechet_distance(walk, features["run", "second"])
+def test_features_separate_styles(evaluator):
+    walk, again, run = (
+        evaluator.features(views_of(style, range(start, start + 60), start))
+        for style, start in (("walk", 100), ("walk", 200), ("run", 200))
+    )
     assert frechet_distance(walk, walk) < 1e-9
-    assert 10 * same < other
+    assert 10 * frechet_distance(walk, again) < frechet_distance(walk, run)
 
 
-def test_generation_is_scored_with_it(evaluator):
+def test_generated_motions_are_scored(evaluator):
     assert isinstance(evaluator, EncodesViews)
-    held_out = evaluator.features(views_of("walk", range(100, 140)))
-    reference = GenerationReference(evaluator, held_out)
-    motions = {
-        style: np.stack([clip.positions[:FRAMES] for clip in gaits(style, range(40))])
+    reference = GenerationReference(
+        evaluator, evaluator.features(views_of("walk", range(100, 140)))
+    )
+    walk, run = (
+        reference.score_motions(positions_of(style, range(40)), seed=0, repeats=2)
         for style in STYLES
-    }
-    walk, run = (reference.score_motions(motions[s], seed=0, repeats=2) for s in STYLES)
+    )
     assert walk["fid"][0] < run["fid"][0]
     assert walk["precision"][0] > 0.5 > run["precision"][0]
 
 
-# ---- learning
+def test_training_reduces_the_validation_loss(run):
+    before, result = run
+    losses = [row["validation_loss"] for row in result.history]
+    # An uninformative autoencoder has a loss of about 1.
+    assert before > 0.9
+    assert losses[-1] < 0.75 * before
+    assert losses[-1] < losses[0]
 
 
-def held_out_loss(trainee):
-    with torch.no_grad():
-        return trainee.validation_loss(trainee.network, torch.device("cpu"))
-
-
-def test_training_lowers_the_loss_on_held_out_tracks(run):
-    before = EvaluatorTrainee(tracks_of(range(12)), tracks_of(range(12, 16)), SIZE)
-    first = held_out_loss(before)
-    history = run[1].history
-    # An autoencoder that says nothing has a loss of about 1.
-    assert first > 0.9
-    assert history[-1]["validation_loss"] < 0.75 * first
-    assert history[-1]["validation_loss"] < history[0]["validation_loss"]
-
-
-def test_the_divergence_is_that_of_torch():
+def test_divergence_matches_torch():
     mean, log_variance = torch.randn(2, 6, 5, generator=torch.Generator().manual_seed(0))
-    normal = torch.distributions.Normal
-    expected = torch.distributions.kl_divergence(
-        normal(mean, (0.5 * log_variance).exp()), normal(0.0, 1.0)
-    )
-    torch.testing.assert_close(divergence_from_normal(mean, log_variance), expected.sum(dim=1))
+    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    wanted = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
+    torch.testing.assert_close(divergence_from_normal(mean, log_variance), wanted.sum(dim=1))
 
 
-def test_the_loss_is_the_error_where_joints_are_seen_plus_the_divergence():
-    tracks = tracks_of(range(2))
-    confident = np.ones(tracks[0].confidence.shape)
-    neck = tracks[0].skeleton.canonical_names.index("neck")
-    confident[:, neck] = 0.2
-    tracks = [replace(track, confidence=confident) for track in tracks]
+def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
+    (first, *_) = tracks = tracks_of(range(2))
+    neck = first.skeleton.index("neck")
+    confidence = np.where(np.arange(17) == neck, 0.2, np.ones(first.confidence.shape))
+    tracks = [replace(track, confidence=confidence) for track in tracks]
     trainee = EvaluatorTrainee(tracks, tracks, replace(SIZE, kl_weight=0.5))
-    seen = []
+    inputs = []
 
-    class Blind(torch.nn.Module):
+    class Zero(torch.nn.Module):
         def forward(self, motions, valid, noise):
-            seen.append((motions, valid, noise))
+            inputs.append((motions.unflatten(2, (17, 2)), valid, noise))
             return torch.zeros_like(motions), torch.full((len(motions),), 3.0)
 
-    rng = np.random.default_rng(0)
-    loss = trainee.training_loss(Blind(), rng, 8, torch.device("cpu"))
-    motions, valid, noise = seen[0]
+    loss = trainee.training_loss(Zero(), np.random.default_rng(0), 8, CPU)
+    motions, valid, noise = inputs[0]
     assert noise.shape == (8, SIZE.latent)
-    # The root (never varies) and the neck (never sure) are not there, nor frames past the end.
-    motions = motions.unflatten(2, (17, 2))
+    # The fixed root, the occluded neck and padding do not count.
     assert (motions[:, :, [0, neck]] == 0).all()
     assert (motions[~valid] == 0).all()
-    counted = valid.sum() * 15 * 2
-    assert float(loss) == pytest.approx(float((motions**2).sum() / counted + 0.5 * 3), rel=1e-5)
+    wanted = (motions**2).sum() / (valid.sum() * 15 * 2) + 0.5 * 3
+    assert float(loss) == pytest.approx(float(wanted), rel=1e-5)
 
 
-def test_weights_and_losses_follow_the_seed():
-    tracks = tracks_of(range(2))
-    one, same, other = (
-        EvaluatorTrainee(tracks, tracks, SIZE, augmentation=Augmentation.none(), seed=seed)
-        for seed in (0, 0, 1)
-    )
-    for a, b in zip(one.network.parameters(), same.network.parameters(), strict=True):
-        assert torch.equal(a, b)
-    losses = [held_out_loss(trainee) for trainee in (one, same, other)]
+def test_weights_and_losses_depend_on_the_seed():
+    tracks = tracks_of(range(1))
+    losses = [held_out_loss(EvaluatorTrainee(tracks, tracks, SIZE, seed=n)) for n in (0, 0, 1)]
     assert losses[0] == losses[1] != losses[2]
 
 
-def test_another_skeleton_for_validation_is_refused():
-    quadrupeds = project_clips([make_gait("quadruped-walk", frames=24)], views=1)
-    with pytest.raises(ValueError, match="validation has another skeleton than tracks"):
-        EvaluatorTrainee(tracks_of(range(1)), quadrupeds, SIZE)
-
-
-# ---- files
-
-
-def test_the_encoder_alone_gives_the_same_features(evaluator, views, tmp_path, run):
-    evaluator.save(tmp_path / "whole.safetensors")
-    again = TrackEvaluator.load(tmp_path / "whole.safetensors")
-    np.testing.assert_array_equal(again.features(views), evaluator.features(views))
-    assert again.skeleton == evaluator.skeleton
-    assert (again.fps, again.frames) == (30.0, FRAMES)
-    assert again.card == evaluator.card
-    assert not any(
-        name.startswith("decoder.")
-        for name in checkpoints.load_checkpoint(tmp_path / "whole.safetensors", KIND).tensors
-    )
-    evaluator.save(tmp_path / "half.safetensors", half=True)
-    near = TrackEvaluator.load(tmp_path / "half.safetensors").features(views)
-    assert 0 < np.abs(near - again.features(views)).max() < 0.01 * again.features(views).std()
-    size = (tmp_path / "half.safetensors").stat().st_size
-    assert size < 0.5 * run[1].model.stat().st_size
-
-
-def test_an_evaluator_that_comes_with_the_package_is_loaded_by_name(
-    evaluator, tmp_path, monkeypatch
-):
+def test_saved_encoder_gives_the_same_features(evaluator, views, tmp_path, run, monkeypatch):
     monkeypatch.setattr(checkpoints, "WEIGHTS", tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"checkpoint walk, .* one of no names"):
+    with pytest.raises(FileNotFoundError, match=r"checkpoint whole; .* one of no names"):
+        TrackEvaluator.load("whole")
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    evaluator.save(whole)
+    again = TrackEvaluator.load("whole")
+    features = again.features(views)
+    np.testing.assert_array_equal(features, evaluator.features(views))
+    assert (again.fps, again.frames, again.card) == (30.0, FRAMES, evaluator.card)
+    assert not any(name.startswith("decoder.") for name in load_checkpoint(whole, KIND).tensors)
+    evaluator.save(half, half=True)
+    error = np.abs(TrackEvaluator.load(half).features(views) - features).max()
+    assert 0 < error < 0.01 * features.std()
+    assert half.stat().st_size < 0.5 * run[1].model.stat().st_size
+    with pytest.raises(FileNotFoundError, match="run or one of half, whole"):
         TrackEvaluator.load("walk")
-    evaluator.save(tmp_path / "walk2d-evaluator.safetensors", half=True)
-    assert TrackEvaluator.load("walk2d-evaluator").frames == FRAMES
-    with pytest.raises(FileNotFoundError, match="run or one of walk2d-evaluator"):
-        TrackEvaluator.load("walk")
 
 
-def test_the_small_size_ships_in_a_megabyte():
-    weights = sum(p.numel() for p in TrackAutoencoder(SMALL, 14).encoder.parameters())
-    assert 2 * weights < 1e6
-
-
-SMALL = EvaluatorSettings.small()
-
-
-def test_the_reference_size_is_the_published_codes():
+def test_sizes_match_the_publication_and_the_shipped_file():
     size = EvaluatorSettings.reference_code()
     assert (size.layers, size.width, size.latent, size.kl_weight) == (6, 256, 256, 1e-5)
+    encoder = TrackAutoencoder(EvaluatorSettings.small(), 14).encoder
+    assert 2 * sum(p.numel() for p in encoder.parameters()) < 1e6
 
 
-# ---- bad input
+@pytest.mark.parametrize(
+    ("change", "lengths", "message"),
+    [
+        (lambda v: v[:, :, :14], None, r"views must have shape \(N, L, 17, 2\)"),
+        (lambda v: np.zeros((1, 17, 17, 2)), None, "views must have 1 to 16 frames, got 17"),
+        (lambda v: v * np.nan, None, "views must be finite"),
+        (lambda v: v + 0.3, None, "views must have the pelvis at the origin, .* got 0.3 m from it"),
+        (lambda v: v, np.array([3, 3, 3]), r"lengths must have shape \(12\), got \(3,\)"),
+        (lambda v: v, np.full(12, 17), "lengths must be integers from 1 to 16"),
+        (lambda v: v, np.full(12, 3.0), "lengths must be integers from 1 to 16"),
+    ],
+)
+def test_invalid_views_are_rejected(evaluator, views, change, lengths, message):
+    with pytest.raises(ValueError, match=message):
+        evaluator.features(change(views), lengths)
 
 
-def test_files_of_other_networks_are_refused(evaluator, run, tmp_path):
-    path = tmp_path / "other.safetensors"
-    kept = checkpoints.load_checkpoint(run[1].model, KIND)
-    missing = {name: tensor for name, tensor in kept.tensors.items() if "mean.bias" not in name}
-    save_checkpoint(path, Checkpoint(KIND, kept.settings, missing))
-    with pytest.raises(CheckpointError, match="holds weights of another network than its"):
-        TrackEvaluator.load(path)
-    save_checkpoint(path, Checkpoint("motion-diffusion", kept.settings, kept.tensors))
-    with pytest.raises(CheckpointError, match="holds a motion-diffusion, expected a track-evalua"):
-        TrackEvaluator.load(path)
-
-
-def test_views_that_do_not_fit_are_refused(evaluator, views):
-    with pytest.raises(ValueError, match=r"views has shape .*, expected \(N, L, 17, 2\)"):
-        evaluator.features(views[:, :, :14])
-    with pytest.raises(ValueError, match="views has 17 frames, expected 1 to 16"):
-        evaluator.features(np.zeros((1, 17, 17, 2)))
-    broken = views.copy()
-    broken[3, 2, 5] = np.nan
-    with pytest.raises(
-        ValueError, match="views must be finite, got 2 values that are NaN or infinite"
-    ):
-        evaluator.features(broken)
-    with pytest.raises(ValueError, match=r"lengths must have shape \(12\), got \(3,\)"):
-        evaluator.features(views, np.array([3, 3, 3]))
-    for lengths in (np.full(12, 17), np.full(12, 0), np.full(12, 3.0)):
-        with pytest.raises(ValueError, match=r"lengths must be integers from 1 to 16, got \[.*\]"):
-            evaluator.features(views, lengths)
-
-
-def test_views_that_are_not_centred_are_refused(evaluator, views):
-    with pytest.raises(ValueError, match=r"views has pelvis up to 0.3 m off the origin, expected"):
-        evaluator.features(views + 0.3)
-
-
-def test_sizes_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="width must be an even multiple of heads, 4, got 30"):
-        EvaluatorSettings(width=30)
-    with pytest.raises(ValueError, match="latent must be an integer of at least 1, got 0"):
-        EvaluatorSettings(latent=0)
-    with pytest.raises(ValueError, match="kl_weight must be a finite number above 0, got 0"):
-        EvaluatorSettings(kl_weight=0)
-
-
-def test_no_cuda_is_said(evaluator, run):
-    if torch.cuda.is_available():
-        pytest.skip("this machine has CUDA")
-    with pytest.raises(ValueError, match="device is 'cuda', but this machine has no CUDA"):
-        TrackEvaluator.load(run[0], device="cuda")
+@pytest.mark.parametrize(("name", "value"), [("width", 30), ("latent", 0), ("kl_weight", 0)])
+def test_invalid_sizes_are_rejected(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be .*, got {value}"):
+        EvaluatorSettings(**{name: value})

@@ -1,7 +1,8 @@
-"""`decode_rows`: batches of any shape through a decoder of rows, for NumPy's and torch's arrays."""
+"""Batched decoding by a torch decoder, for NumPy and torch arrays."""
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 import torch
@@ -10,13 +11,13 @@ from probmotion.models.latent.row_decoding import decode_rows
 
 
 class Decoder:
-    """θ ↦ [θ, θ²], (B, 3) → (B, 2, 3), which notes what it is given."""
+    """θ ↦ [θ, θ²], (B, 3) → (B, 2, 3), recording its inputs."""
 
     def __init__(self):
-        self.given = []
+        self.inputs = []
 
     def __call__(self, theta):
-        self.given.append(theta)
+        self.inputs.append(theta)
         return torch.stack([theta, theta**2], dim=1)
 
     def at(self, theta):
@@ -28,46 +29,46 @@ def decoder():
     return Decoder()
 
 
-@pytest.mark.parametrize("batch", [(), (1,), (4,), (9,), (2, 5), (2, 0)])
-@pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_any_batch_is_decoded_in_its_own_precision(decoder, batch, kind):
-    theta = np.random.default_rng(0).normal(size=(*batch, 3)).astype(kind)
+@pytest.mark.parametrize("batch", [(), (4,), (9,), (2, 5), (2, 0)])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_batches_are_decoded_in_their_own_precision(decoder, batch, dtype):
+    theta = np.random.default_rng(0).normal(size=(*batch, 3)).astype(dtype)
     wanted = np.stack([theta, theta**2], axis=-2)
-    found = decoder.at(theta)
-    assert found.dtype == kind
-    np.testing.assert_array_equal(found, wanted)
-    # Never more rows at a time than asked for.
-    assert max(len(rows) for rows in decoder.given) <= 4
+    decoded = decoder.at(theta)
+    assert decoded.dtype == dtype
+    np.testing.assert_array_equal(decoded, wanted)
+    assert max(len(rows) for rows in decoder.inputs) <= 4
     whole = decoder.at(torch.tensor(theta))
     assert isinstance(whole, torch.Tensor)
     np.testing.assert_array_equal(whole, wanted)
 
 
-def test_integers_and_strided_arrays_are_decoded_in_double(decoder):
-    found = decoder.at(np.arange(6).reshape(3, 2).T)
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found[1], [[1, 3, 5], [1, 9, 25]])
+def test_integers_and_strided_arrays_are_decoded_in_double_precision(decoder):
+    decoded = decoder.at(np.arange(6).reshape(3, 2).T)
+    assert decoded.dtype == np.float64
+    np.testing.assert_array_equal(decoded[1], [[1, 3, 5], [1, 9, 25]])
 
 
-def test_torch_keeps_its_gradient_and_numpy_needs_none(decoder):
+def test_gradients_flow_for_torch_only(decoder):
     theta = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(decoder.at(theta).sum(), theta)
     torch.testing.assert_close(gradient, torch.full_like(theta, 3.0))
     weight = torch.ones(3, dtype=torch.float64, requires_grad=True)
-    found = decode_rows(lambda rows: (rows * weight)[:, None], np.ones(3), 3, (1, 3), 4)
-    np.testing.assert_array_equal(found, np.ones((1, 3)))
+    decoded = decode_rows(lambda rows: (rows * weight)[:, None], np.ones(3), 3, (1, 3), 4)
+    np.testing.assert_array_equal(decoded, np.ones((1, 3)))
 
 
-def test_what_is_no_theta_is_refused_in_a_sentence(decoder):
-    sentence = "expected NumPy's or torch's: this prior is torch's$"
-    with pytest.raises(TypeError, match=f"^theta is a list, {sentence}"):
-        decoder.at([0.0, 0.0, 0.0])
-    jax = pytest.importorskip("jax")
-    with pytest.raises(TypeError, match=f"^theta is a JAX array, {sentence}"):
-        decoder.at(jax.numpy.zeros(3))
-    for wrong in (np.zeros((2, 4)), torch.zeros(2, 4)):
-        with pytest.raises(ValueError, match=r"^theta has shape \(2, 4\), expected"):
-            decoder.at(wrong)
-    with pytest.raises(ValueError, match=r"^theta .*finite"):
-        decoder.at(np.full((1, 3), np.nan))
-    assert decoder.given == []
+@pytest.mark.parametrize(
+    ("theta", "error", "message"),
+    [
+        ([0.0, 0.0, 0.0], TypeError, "theta must be a NumPy or torch array, got a list"),
+        (jax.numpy.zeros(3), TypeError, "theta must be a NumPy or torch array, got a JAX array"),
+        (np.zeros((2, 4)), ValueError, r"theta must have shape .*, got \(2, 4\)"),
+        (torch.zeros(2, 4), ValueError, r"theta must have shape .*, got \(2, 4\)"),
+        (np.full((1, 3), np.nan), ValueError, "theta must be finite"),
+    ],
+)
+def test_invalid_theta_is_rejected(decoder, theta, error, message):
+    with pytest.raises(error, match=message):
+        decoder.at(theta)
+    assert decoder.inputs == []

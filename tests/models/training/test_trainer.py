@@ -1,4 +1,4 @@
-"""The trainer: exact solutions, exact resumption, and what it says when it cannot go on."""
+"""Trainer: exact solutions, bit-identical resumption, early stopping and divergence."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import csv
 import math
 import os
 import signal
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 
@@ -16,16 +14,15 @@ import pytest
 import torch
 from torch import nn
 
+from probmotion.cli.training_options import run_training
 from probmotion.models.training.checkpoints import CheckpointError, load_checkpoint
 from probmotion.models.training.runs import steps_taken
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import Diverged, check_device, train
 
-CPU = torch.device("cpu")
-
 
 class Line:
-    """Linear regression on all data at once: its least-squares solution is known."""
+    """Linear regression on all data, with a known least-squares solution."""
 
     kind = "line"
 
@@ -35,12 +32,10 @@ class Line:
         true = torch.tensor([[1.0, -2.0, 0.5]])
         noise = torch.tensor(rng.normal(size=(50, 1)), dtype=torch.float32)
         self.y = self.x @ true.T + 0.3 + noise
-        torch_state = torch.random.get_rng_state()
-        self.network = nn.Linear(3, 1)
-        torch.random.set_rng_state(torch_state)
-        with torch.no_grad():
-            self.network.weight.zero_()
-            self.network.bias.zero_()
+        with torch.random.fork_rng(devices=[]):
+            self.network = nn.Linear(3, 1)
+        nn.init.zeros_(self.network.weight)
+        nn.init.zeros_(self.network.bias)
         self.settings = {"data": "line", "rates": [0.5, 1 / 3]}
 
     def training_loss(self, network, rng, batch, device):
@@ -48,11 +43,6 @@ class Line:
 
     def validation_loss(self, network, device):
         return float(((network(self.x) - self.y) ** 2).mean())
-
-    @property
-    def solution(self):
-        design = np.column_stack([self.x.numpy(), np.ones(50)]).astype(float)
-        return np.linalg.lstsq(design, self.y.numpy().astype(float), rcond=None)[0].ravel()
 
 
 class Curve(Line):
@@ -79,13 +69,38 @@ class Curve(Line):
         return ((network(noisy) - self.y[rows]) ** 2).mean()
 
 
+class Overfits:
+    """One weight that moves to 1; its validation loss is lowest at 0.4."""
+
+    kind = "line"
+
+    def __init__(self):
+        self.network = nn.Linear(1, 1, bias=False)
+        nn.init.zeros_(self.network.weight)
+        self.settings = {}
+
+    def training_loss(self, network, rng, batch, device):
+        return ((network.weight - 1) ** 2).sum()
+
+    def validation_loss(self, network, device):
+        return abs(float(network.weight) - 0.4)
+
+
+SETTINGS = TrainingSettings(steps=30, batch=8, learning_rate=3e-3, warmup=5, checkpoint_every=10)
+PLAIN = TrainingSettings(steps=1, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0)
+
+
+def run(trainee, folder, settings=SETTINGS, **changes):
+    return train(trainee, replace(settings, **changes), folder, progress=False)
+
+
 def tensors(folder, name="state", kind="curve"):
     known = kind if name == "model" else f"{kind} in training"
     return load_checkpoint(folder / f"{name}.safetensors", known).tensors
 
 
 def assert_same(folder, other):
-    """Two runs left the same network, moving average, optimiser and losses, bit for bit."""
+    """Assert that network, moving average, optimiser and losses are bit-identical."""
     for name in ("model", "state"):
         ours, theirs = tensors(folder, name), tensors(other, name)
         assert ours.keys() == theirs.keys()
@@ -97,397 +112,317 @@ def numbers(result):
     return [(row["step"], row["loss"], row["validation_loss"]) for row in result.history]
 
 
-SETTINGS = TrainingSettings(steps=30, batch=8, learning_rate=3e-3, warmup=5, checkpoint_every=10)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder and result of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(Curve(), folder)
+
+
+@pytest.fixture
+def copied(whole, tmp_path):
+    """A copy of the folder of the uninterrupted run."""
+    for file in whole[0].iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
 
 
 def test_regression_reaches_the_least_squares_solution(tmp_path):
     line = Line()
-    settings = TrainingSettings(
-        steps=1500, learning_rate=0.01, weight_decay=0.0, ema=0.99, checkpoint_every=500
-    )
-    result = train(line, settings, tmp_path, progress=False)
+    result = run(line, tmp_path, PLAIN, steps=300, ema=0.9, checkpoint_every=150)
     got = tensors(tmp_path, "model", "line")
+    design = np.column_stack([line.x.numpy(), np.ones(50)]).astype(float)
+    y = line.y.numpy().ravel().astype(float)
+    solution, (residual,) = np.linalg.lstsq(design, y, rcond=None)[:2]
     found = np.append(got["weight"].numpy().ravel(), got["bias"].numpy())
-    np.testing.assert_allclose(found, line.solution, atol=1e-4)
-    losses = [row["loss"] for row in result.history]
-    assert losses[0] > losses[1]
-    design = np.column_stack([line.x.numpy(), np.ones(50)])
-    residual = line.y.numpy().ravel() - design @ line.solution
-    assert result.history[-1]["validation_loss"] == pytest.approx((residual**2).mean(), rel=1e-5)
+    np.testing.assert_allclose(found, solution, atol=1e-4)
+    assert result.history[-1]["validation_loss"] == pytest.approx(residual / 50, rel=1e-5)
 
 
-def test_weight_decay_shrinks_and_clipping_and_warm_up_are_as_said(tmp_path):
-    # AdamW's first step moves every weight by the rate of that step, whatever the gradient's size.
-    line = Line()
-    settings = TrainingSettings(steps=1, learning_rate=0.1, warmup=10, weight_decay=0.0, ema=0.0)
-    train(line, settings, tmp_path / "a", progress=False)
+def test_warm_up_clipping_and_weight_decay(tmp_path):
+    # The first step of AdamW has the length of its learning rate for every weight.
+    settings = replace(PLAIN, warmup=10)
+    run(Line(), tmp_path / "a", settings)
     moved = tensors(tmp_path / "a", "model", "line")["weight"]
     np.testing.assert_allclose(abs(moved.numpy()), 0.01, rtol=1e-4)
     assert [settings.rate(step) for step in (1, 5, 10, 11)] == pytest.approx([0.01, 0.05, 0.1, 0.1])
-    assert replace(settings, warmup=0).rate(1) == 0.1
-    # The second moment that the optimiser keeps is that of the clipped gradient.
-    line = Line()
-    train(line, replace(settings, clip=1e-3), tmp_path / "b", progress=False)
+    # The optimiser's moments are those of the clipped gradient.
+    run(Line(), tmp_path / "b", settings, clip=1e-3)
     state = tensors(tmp_path / "b", "state", "line")
     gradient = [state[f"optimiser.{n}.exp_avg"].ravel() / 0.1 for n in (0, 1)]
     assert float(torch.cat(gradient).norm()) == pytest.approx(1e-3, rel=1e-3)
-    # Decay alone: the gradient is 0 at the solution, and AdamW multiplies by 1 − rate · decay.
+    # Without a gradient, AdamW multiplies weights by 1 − rate · decay.
     line = Line()
-    with torch.no_grad():
-        line.network.weight.copy_(torch.ones(1, 3))
+    nn.init.ones_(line.network.weight)
     line.training_loss = lambda network, rng, batch, device: 0 * network(line.x).sum()
-    train(line, replace(settings, weight_decay=0.5, warmup=0), tmp_path / "c", progress=False)
+    run(line, tmp_path / "c", PLAIN, weight_decay=0.5)
     np.testing.assert_allclose(tensors(tmp_path / "c", "model", "line")["weight"], 0.95, rtol=1e-6)
 
 
-def test_the_rate_is_halved_where_asked(tmp_path):
+def test_learning_rate_is_halved(tmp_path):
     settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
-    found = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
-    assert found == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
-    # Under warm-up too, and marks in any order.
+    rates = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
+    assert rates == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
+    # Also during warm-up, and for marks in any order.
     assert replace(settings, halve_at=(10, 2)).rate(3) == pytest.approx(0.3)
-    # A constant slope: Adam's steps are as long as the rate of each.
+    # With a constant gradient the steps of Adam have the length of the learning rate.
     line = Line()
     line.training_loss = lambda network, rng, batch, device: network.weight.sum()
-    plain = TrainingSettings(
-        steps=6, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0, halve_at=(2, 4)
-    )
-    train(line, plain, tmp_path / "run", progress=False)
-    moved = tensors(tmp_path / "run", "model", "line")["weight"]
+    run(line, tmp_path, PLAIN, steps=6, halve_at=(2, 4))
+    moved = tensors(tmp_path, "model", "line")["weight"]
     np.testing.assert_allclose(moved, -2 * (0.1 + 0.05 + 0.025), rtol=1e-4)
-    # It is of the run: another is refused, the same goes on.
-    with pytest.raises(ValueError, match=r"holds a run with halve_at \[2, 4\], expected \[2\]"):
-        train(Line(), replace(plain, halve_at=(2,)), tmp_path / "run", progress=False)
-    train(Line(), replace(plain, steps=7), tmp_path / "run", progress=False)
+    with pytest.raises(ValueError, match=r"contains a run with halve_at \[2, 4\], expected \[2\]"):
+        run(Line(), tmp_path, PLAIN, steps=6, halve_at=(2,))
 
 
-def test_adamax_divides_by_the_largest_gradient_and_resumes(tmp_path):
+def test_adamax_matches_its_definition_and_resumes(tmp_path):
     """u ← max(0.999 u, |g|), m ← 0.9 m + 0.1 g, θ ← θ − rate/(1 − 0.9ᵏ) m/u (Kingma and Ba)."""
     slopes = [1.0, -4.0, 0.5]
-    line = Line()
-
-    def loss(network, rng, batch, device):
-        return slopes[loss.calls] * network.weight.sum()
-
-    def counted(*arguments):
-        found = loss(*arguments)
-        loss.calls += 1
-        return found
-
-    loss.calls = 0
-    line.training_loss = counted
-    settings = TrainingSettings(
-        steps=3, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0, clip=np.inf
-    )
-    train(line, replace(settings, optimiser="adamax"), tmp_path / "a", progress=False)
+    line, remaining = Line(), iter(slopes)
+    line.training_loss = lambda network, *_: next(remaining) * network.weight.sum()
+    run(line, tmp_path / "a", PLAIN, steps=3, clip=np.inf, optimiser="adamax")
     weight = largest = mean = 0.0
     for step, slope in enumerate(slopes, start=1):
         largest, mean = max(0.999 * largest, abs(slope)), 0.9 * mean + 0.1 * slope
         weight -= 0.1 / (1 - 0.9**step) * mean / largest
     moved = tensors(tmp_path / "a", "model", "line")["weight"]
     np.testing.assert_allclose(moved, weight, rtol=1e-5)
-    asked = replace(SETTINGS, optimiser="adamax")
-    train(Curve(), asked, tmp_path / "whole", progress=False)
-    train(Curve(), replace(asked, steps=10), tmp_path / "parts", progress=False)
-    train(Curve(), asked, tmp_path / "parts", progress=False)
+    run(Curve(), tmp_path / "whole", optimiser="adamax")
+    for steps in (10, 30):
+        run(Curve(), tmp_path / "parts", optimiser="adamax", steps=steps)
     assert_same(tmp_path / "whole", tmp_path / "parts")
-    with pytest.raises(ValueError, match="holds a run with optimiser adamax, expected adamw"):
-        train(Curve(), SETTINGS, tmp_path / "whole", progress=False)
 
 
-def test_weights_that_are_frozen_stay_and_a_trainee_knows_the_step(tmp_path):
+def test_frozen_weights_are_unchanged_and_anneal_receives_the_step(tmp_path):
     class Steps(Curve):
         def __init__(self):
             super().__init__()
             self.network[0].requires_grad_(False)
-            self.asked = []
+            self.steps = []
 
         def anneal(self, step):
-            self.asked.append((step, self.calls))
+            self.steps.append((step, self.calls))
 
-    made = Steps()
-    before = made.network[0].weight.clone()
-    train(made, SETTINGS, tmp_path, progress=False)
-    assert made.asked == [(step, step - 1) for step in range(1, 31)]
-    assert torch.equal(made.network[0].weight, before)
-    assert not torch.equal(made.network[4].weight, Curve().network[4].weight)
+    trainee = Steps()
+    before = trainee.network[0].weight.clone()
+    run(trainee, tmp_path)
+    assert trainee.steps == [(step, step - 1) for step in range(1, 31)]
+    assert torch.equal(trainee.network[0].weight, before)
+    assert not torch.equal(trainee.network[4].weight, Curve().network[4].weight)
 
 
-def test_the_moving_average_is_the_one_made_by_hand(tmp_path):
-    path, weights = tmp_path / "run", []
+def test_moving_average_matches_its_recursion(tmp_path):
+    weights = []
 
     def note(curve):
         weights.append([value.detach().clone() for value in curve.network.parameters()])
 
     curve = Curve(note)
-    first = [value.detach().clone() for value in curve.network.parameters()]
-    train(curve, replace(SETTINGS, ema=0.5), path, progress=False)
-    weights = [*weights[1:], [value.detach() for value in curve.network.parameters()]]
-    average = first
-    for step, now in enumerate(weights, start=1):
+    run(curve, tmp_path / "a", ema=0.5)
+    note(curve)
+    average = weights[0]
+    for step, now in enumerate(weights[1:], start=1):
         decay = min(0.5, (1 + step) / (10 + step))
         average = [decay * a + (1 - decay) * b for a, b in zip(average, now, strict=True)]
-    kept = tensors(path, "model")
+    saved = tensors(tmp_path / "a", "model")
     for (name, _), wanted in zip(curve.network.named_parameters(), average, strict=True):
-        torch.testing.assert_close(kept[name], wanted, rtol=1e-5, atol=1e-6)
-    # Running means are the network's own.
-    running = curve.network.state_dict()["1.running_mean"]
-    assert torch.equal(kept["1.running_mean"], running)
-
-
-def test_without_an_average_the_weights_themselves_are_kept(tmp_path):
-    curve = Curve()
-    train(curve, replace(SETTINGS, ema=0.0), tmp_path, progress=False)
-    for name, value in tensors(tmp_path, "model").items():
+        torch.testing.assert_close(saved[name], wanted, rtol=1e-5, atol=1e-6)
+    # Buffers are copied.
+    assert torch.equal(saved["1.running_mean"], curve.network.state_dict()["1.running_mean"])
+    run(curve := Curve(), tmp_path / "b", ema=0.0)
+    for name, value in tensors(tmp_path / "b", "model").items():
         assert torch.equal(value, curve.network.state_dict()[name])
 
 
-def test_fewer_steps_and_then_more_are_the_same_run(tmp_path):
-    whole = train(Curve(), SETTINGS, tmp_path / "whole", progress=False)
-    train(Curve(), replace(SETTINGS, steps=10), tmp_path / "parts", progress=False)
+def test_more_steps_continue_the_same_run(whole, tmp_path):
+    run(Curve(), tmp_path / "parts", steps=10)
     later = Curve()
-    parts = train(later, SETTINGS, tmp_path / "parts", progress=False)
+    parts = run(later, tmp_path / "parts")
     assert later.calls == 20
-    assert_same(tmp_path / "whole", tmp_path / "parts")
-    assert numbers(whole) == numbers(parts)
-    # Dropout does something: without it the run is another.
+    assert_same(whole[0], tmp_path / "parts")
+    assert numbers(whole[1]) == numbers(parts)
+    # Dropout has an effect.
     other = Curve()
     other.network[3].p = 0.0
-    train(other, SETTINGS, tmp_path / "other", progress=False)
+    run(other, tmp_path / "other")
     with pytest.raises(AssertionError):
-        assert_same(tmp_path / "whole", tmp_path / "other")
+        assert_same(whole[0], tmp_path / "other")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_run_goes_on_bit_for_bit(tmp_path, number):
-    whole = train(Curve(), SETTINGS, tmp_path / "whole", progress=False)
-
+def test_interrupted_run_resumes_bit_identically(whole, tmp_path, number):
     def stop(curve):
         if curve.calls == 13:
             os.kill(os.getpid(), number)
 
     before = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt, match="stopped at step 13 of 30, which is kept in"):
-        train(Curve(stop), SETTINGS, tmp_path / "parts", progress=False)
+    with pytest.raises(KeyboardInterrupt, match="stopped at step 13 of 30, saved in"):
+        run(Curve(stop), tmp_path)
     assert signal.getsignal(number) is before
     later = Curve()
-    parts = train(later, SETTINGS, tmp_path / "parts", progress=False)
+    parts = run(later, tmp_path)
     assert later.calls == 17
-    assert_same(tmp_path / "whole", tmp_path / "parts")
-    assert numbers(whole) == numbers(parts)
+    assert_same(whole[0], tmp_path)
+    assert numbers(whole[1]) == numbers(parts)
 
 
-def test_ctrl_c_in_a_process_of_its_own(tmp_path):
-    """All runs are processes of their own: what else a process has loaded may round otherwise."""
-    program = f"""
-import importlib.util, sys, time
-spec = importlib.util.spec_from_file_location("toys", {__file__!r})
-toys = importlib.util.module_from_spec(spec)
-sys.modules["toys"] = toys
-spec.loader.exec_module(toys)
-def wait(curve):
-    print(curve.calls, flush=True)
-    time.sleep(0.01)
-settings = toys.replace(toys.SETTINGS, steps=int(sys.argv[2]))
-toys.train(toys.Curve(wait), settings, sys.argv[1], progress=False)
-"""
-
-    def started(name, steps):
-        return subprocess.Popen(
-            [sys.executable, "-c", program, str(tmp_path / name), str(steps)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    process = started("parts", 100_000)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip() == "12":
-            process.send_signal(signal.SIGINT)
-            break
-    _, words = process.communicate(timeout=60)
-    assert process.returncode != 0
-    stopped = int(words.rpartition("stopped at step ")[2].split()[0])
-    assert 12 <= stopped < 1000
-    later, _ = started("parts", stopped + 5).communicate(timeout=60)
-    assert later.split()[-1] == "5"
-    whole, _ = started("whole", stopped + 5).communicate(timeout=60)
-    assert whole.split()[-1] == str(stopped + 5)
-    assert_same(tmp_path / "whole", tmp_path / "parts")
-
-
-def test_a_finished_run_does_nothing_more(tmp_path):
-    first = train(Curve(), SETTINGS, tmp_path, progress=False)
+def test_finished_run_takes_no_steps(whole):
     again = Curve()
-    second = train(again, SETTINGS, tmp_path, progress=True)
-    assert again.calls == 0
-    assert second.model == first.model == tmp_path / "model.safetensors"
-    assert second.history == first.history
+    second = train(again, SETTINGS, whole[0], progress=True)
+    assert again.calls == second.steps == 0
+    assert second.model == whole[0] / "model.safetensors"
+    assert second.history == whole[1].history
+    with open(whole[0] / "losses.csv", encoding="utf-8") as file:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    assert rows == second.history
+    assert [row["step"] for row in rows] == [10, 20, 30]
 
 
-@pytest.mark.parametrize("steps", [15, 30, 40])
-@pytest.mark.parametrize("harm", ["missing", "cut", "rubbish"])
-def test_a_model_that_is_missing_or_damaged_is_written_anew_from_the_state(tmp_path, harm, steps):
-    train(Curve(), SETTINGS, tmp_path / "run", progress=False)
-    model = tmp_path / "run" / "model.safetensors"
+@pytest.mark.parametrize("steps", [15, 40])
+@pytest.mark.parametrize("content", [None, slice(-50), b"mine"])
+def test_missing_or_damaged_model_is_restored_from_the_state(copied, tmp_path, content, steps):
+    model = copied / "model.safetensors"
     before = model.read_bytes()
-    if harm == "missing":
+    if content is None:
         model.unlink()
     else:
-        model.write_bytes(before[:-50] if harm == "cut" else b"mine")
-    asked = replace(SETTINGS, steps=steps)
-    train(Curve(), asked, tmp_path / "run", progress=False)
+        model.write_bytes(before[content] if isinstance(content, slice) else content)
+    run(Curve(), copied, steps=steps)
     if steps <= 30:
         assert model.read_bytes() == before
     else:
-        train(Curve(), asked, tmp_path / "whole", progress=False)
-        assert_same(tmp_path / "whole", tmp_path / "run")
+        run(Curve(), tmp_path / "whole", steps=steps)
+        assert_same(tmp_path / "whole", copied)
 
 
-def test_a_run_that_is_refused_writes_no_model(tmp_path):
-    train(Curve(), SETTINGS, tmp_path, progress=False)
-    (tmp_path / "model.safetensors").unlink()
-    with pytest.raises(ValueError, match="holds a run with batch "):
-        train(Curve(), replace(SETTINGS, batch=9), tmp_path, progress=False)
-    assert not (tmp_path / "model.safetensors").exists()
+def test_steps_taken_are_read_from_the_state(copied, tmp_path):
+    (copied / "model.safetensors").unlink()
+    assert steps_taken(copied, "curve") == 30
+    assert steps_taken(tmp_path / "none", "curve") == 0
+    with pytest.raises(CheckpointError, match="contains a curve in training, expected a line in"):
+        steps_taken(copied, "line")
 
 
-def test_steps_taken_are_those_of_the_state(tmp_path):
-    assert steps_taken(tmp_path, "curve") == 0
-    train(Curve(), SETTINGS, tmp_path, progress=False)
-    (tmp_path / "model.safetensors").unlink()
-    assert steps_taken(tmp_path, "curve") == 30
-    with pytest.raises(CheckpointError, match="holds a curve in training, expected a line in"):
-        steps_taken(tmp_path, "line")
-
-
-def test_other_settings_or_data_are_refused(tmp_path):
-    train(Curve(), SETTINGS, tmp_path, progress=False)
-    for changed in ({"batch": 9}, {"seed": 1}, {"learning_rate": 0.1}, {"clip": np.inf}):
-        with pytest.raises(ValueError, match=f"holds a run with {next(iter(changed))} "):
-            train(Curve(), replace(SETTINGS, **changed), tmp_path, progress=False)
+def test_other_settings_or_data_are_rejected(copied):
+    (copied / "model.safetensors").unlink()
+    for changed in (
+        {"batch": 9},
+        {"seed": 1},
+        {"learning_rate": 0.1},
+        {"clip": np.inf},
+        {"optimiser": "adamax"},
+    ):
+        with pytest.raises(ValueError, match=f"contains a run with {next(iter(changed))} "):
+            run(Curve(), copied, **changed)
     other = Curve()
     other.settings = other.settings | {"data": "other"}
-    with pytest.raises(ValueError, match="holds a run with data line, expected other; give it"):
-        train(other, SETTINGS, tmp_path, progress=False)
-    with pytest.raises(CheckpointError, match="holds a curve in training, expected a line in"):
-        train(Line(), SETTINGS, tmp_path, progress=False)
-    train(Curve(), replace(SETTINGS, checkpoint_every=7, steps=31), tmp_path, progress=False)
+    with pytest.raises(ValueError, match="contains a run with data line, expected other; use ano"):
+        run(other, copied)
+    with pytest.raises(CheckpointError, match="contains a curve in training, expected a line in"):
+        run(Line(), copied)
+    assert not (copied / "model.safetensors").exists()
+    run(Curve(), copied, checkpoint_every=7, steps=31)
 
 
-def test_checkpoints_that_come_more_often_change_no_step(tmp_path):
-    train(Curve(), SETTINGS, tmp_path / "a", progress=False)
-    train(Curve(), replace(SETTINGS, checkpoint_every=3), tmp_path / "b", progress=False)
-    ours, theirs = tensors(tmp_path / "a", "model"), tensors(tmp_path / "b", "model")
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-
-
-@pytest.mark.parametrize("what", ["loss", "gradient"])
-def test_divergence_is_said_and_the_last_good_checkpoint_stays(tmp_path, what):
+@pytest.mark.parametrize(
+    ("what", "step", "message"),
+    [
+        ("loss", 15, "the loss is nan"),
+        ("gradient", 15, "the gradient is not finite"),
+        ("validation", 20, "the validation loss is nan"),
+    ],
+)
+def test_divergence_leaves_the_last_good_checkpoint(tmp_path, what, step, message):
     class Explodes(Curve):
         def training_loss(self, network, rng, batch, device):
             loss = super().training_loss(network, rng, batch, device)
-            if self.calls != 15:
+            if self.calls != 15 or what == "validation":
                 return loss
             if what == "loss":
                 return loss * float("nan")
-            # √ has an infinite slope at 0.
+            # The square root has an infinite slope at 0.
             return loss + torch.sqrt(0 * network[0].weight.sum())
 
-    said = "the loss is nan" if what == "loss" else "the gradient is not finite"
-    with pytest.raises(
-        Diverged, match=f"training diverged at step 15: {said}; the last good"
-    ) as stopped:
-        train(Explodes(), SETTINGS, tmp_path, progress=False)
-    # This folder would refuse another rate; one without a checkpoint would not.
-    assert str(stopped.value).endswith("; try a smaller learning_rate in another folder")
-    with pytest.raises(ValueError, match="holds a run with learning_rate "):
-        train(Curve(), replace(SETTINGS, learning_rate=1e-4), tmp_path, progress=False)
-    train(Curve(), replace(SETTINGS, steps=10), tmp_path / "good", progress=False)
-    assert_same(tmp_path / "good", tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == [
+        def validation_loss(self, network, device):
+            loss = super().validation_loss(network, device)
+            return math.nan if what == "validation" and self.calls == 20 else loss
+
+    with pytest.raises(Diverged, match=f"diverged at step {step}: {message}; the last.*another fo"):
+        run(Explodes(), tmp_path / "run")
+    run(Curve(), tmp_path / "good", steps=10)
+    assert_same(tmp_path / "good", tmp_path / "run")
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
         "losses.csv",
         "model.safetensors",
         "state.safetensors",
     ]
-    early = replace(SETTINGS, checkpoint_every=100)
-    with pytest.raises(Diverged, match=r"no checkpoint yet; try a smaller learning_rate$"):
-        train(Explodes(), early, tmp_path / "early", progress=False)
+    if what != "validation":
+        with pytest.raises(Diverged, match=r"no checkpoint yet; try a smaller learning_rate$"):
+            run(Explodes(), tmp_path / "early", checkpoint_every=100)
 
 
-def test_losses_are_in_a_table(tmp_path):
-    result = train(Curve(), SETTINGS, tmp_path, progress=False)
-    with open(tmp_path / "losses.csv", encoding="utf-8") as file:
-        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-    assert rows == result.history
-    assert [row["step"] for row in rows] == [10, 20, 30]
-
-
-def test_global_random_numbers_are_left_alone(tmp_path):
+def test_run_depends_neither_on_thread_nor_global_generator_nor_checkpoint_interval(
+    whole, tmp_path
+):
     torch.manual_seed(11)
     wanted = torch.rand(3)
     torch.manual_seed(11)
-    curve = Curve()
-    train(curve, SETTINGS, tmp_path / "a", progress=False)
-    assert torch.equal(torch.rand(3), wanted)
-    # And they do not matter.
-    torch.manual_seed(12)
-    train(Curve(), SETTINGS, tmp_path / "b", progress=False)
-    assert_same(tmp_path / "a", tmp_path / "b")
-
-
-def test_a_run_in_another_thread_is_the_same(tmp_path):
-    train(Curve(), SETTINGS, tmp_path / "here", progress=False)
-    failed = []
-
-    def work():
-        try:
-            train(Curve(), SETTINGS, tmp_path / "there", progress=False)
-        except BaseException as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=work)
+    options = {"checkpoint_every": 3}
+    thread = threading.Thread(target=run, args=(Curve(), tmp_path), kwargs=options)
     thread.start()
     thread.join()
-    assert failed == []
-    assert_same(tmp_path / "here", tmp_path / "there")
+    assert torch.equal(torch.rand(3), wanted)
+    assert_same(whole[0], tmp_path)
 
 
-def test_bad_input_is_refused_in_a_sentence(tmp_path):
-    for name, value in [
-        ("steps", 0),
-        ("batch", 1.5),
-        ("warmup", -1),
-        ("learning_rate", 0.0),
-        ("learning_rate", float("nan")),
-        ("ema", 1.0),
-        ("clip", 0.0),
-        ("clip", float("nan")),
-        ("weight_decay", -0.1),
-        ("weight_decay", float("inf")),
-        ("seed", True),
-        ("optimiser", "sgd"),
-        ("halve_at", (10, 0)),
-    ]:
-        with pytest.raises(ValueError, match=f"^{name} is .*expected"):
-            TrainingSettings(**{name: value})
+EARLY = replace(PLAIN, steps=100, checkpoint_every=1, patience=3)
+
+
+def test_early_stopping_saves_the_best_model(tmp_path):
+    whole = run(Overfits(), tmp_path / "run", EARLY)
+    losses = [row["validation_loss"] for row in whole.history]
+    best = int(np.argmin(losses))
+    assert whole.steps == len(losses) == best + 1 + 3 < 100
+    assert whole.kept == whole.history[best]
+    saved = load_checkpoint(whole.model, "line")
+    assert saved.settings["step"] == best + 1
+    assert abs(float(saved.tensors["weight"]) - 0.4) == pytest.approx(min(losses))
+    again = run(Overfits(), tmp_path / "run", EARLY)
+    assert (again.history, again.kept, again.steps) == (whole.history, whole.kept, 0)
+    run(Overfits(), tmp_path / "parts", EARLY, steps=3)
+    resumed = run(Overfits(), tmp_path / "parts", EARLY)
+    assert [row["validation_loss"] for row in resumed.history] == losses
+    weight = load_checkpoint(resumed.model, "line").tensors["weight"]
+    assert weight == saved.tensors["weight"]
+
+
+def test_command_reports_early_stopping(tmp_path, capsys):
+    run_training(Overfits(), EARLY, tmp_path, "cpu")
+    best = load_checkpoint(tmp_path / "model.safetensors", "line").settings["step"]
+    said = capsys.readouterr().out
+    assert f": step {best}, loss" in said
+    assert f"step {best + 3}, as the validation loss" in said
+    run_training(Overfits(), EARLY, tmp_path, "cpu")
+    assert "is finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"ema": 1.0}, {"clip": 0.0}, {"clip": math.nan}, {"weight_decay": -0.1}),
+        *({"weight_decay": math.inf}, {"optimiser": "sgd"}, {"halve_at": (10, 0)}, {"warmup": -1}),
+    ],
+)
+def test_invalid_settings_are_rejected(changes):
+    with pytest.raises(ValueError, match=f"^{next(iter(changes))} must be .*got"):
+        TrainingSettings(**changes)
+
+
+def test_unknown_and_unavailable_devices_are_rejected(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match="device must be cpu or cuda, got 'tpu'"):
         check_device("tpu")
-    if not torch.cuda.is_available():
-        with pytest.raises(ValueError, match="this machine has no CUDA; expected 'cpu'"):
-            train(Curve(), SETTINGS, tmp_path / "new", device="cuda")
-        assert not (tmp_path / "new").exists()
-    assert check_device("cpu") == CPU
-
-
-def test_a_validation_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path):
-    class Blind(Curve):
-        def validation_loss(self, network, device):
-            self.asked = getattr(self, "asked", 0) + 1
-            return math.nan if self.asked > 1 else super().validation_loss(network, device)
-
-    with pytest.raises(Diverged, match="diverged at step 20: the validation loss is nan; the last"):
-        train(Blind(), SETTINGS, tmp_path, progress=False)
-    train(Curve(), replace(SETTINGS, steps=10), tmp_path / "good", progress=False)
-    assert_same(tmp_path / "good", tmp_path)
+    with pytest.raises(ValueError, match="device must be cpu, got cuda, which is not available"):
+        train(Curve(), SETTINGS, tmp_path / "new", device="cuda")
+    assert not (tmp_path / "new").exists()
+    assert check_device("cpu") == torch.device("cpu")

@@ -1,4 +1,4 @@
-"""What motion is learnt from in pictures: cameras, closed forms, the best hypothesis."""
+"""Losses of the motion VAE: projection, closed forms and hypothesis selection."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.losses import (
-    best_guess,
-    guess_terms,
-    pictured,
+    best_hypothesis,
+    hypothesis_losses,
+    project_to_image,
     reconstruction,
     roughness,
     weighted_sum,
 )
-from probmotion.models.vae.pose_network import PoseGuesses
+from probmotion.models.vae.pose_network import PoseHypotheses
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.motion.skeleton import Skeleton
 
@@ -36,10 +36,10 @@ REST = np.array(
 BODY = ArticulatedBody(SKELETON, REST)
 
 
-def random_guesses(seed: int = 0, size: float = 0.3) -> PoseGuesses:
+def random_hypotheses(seed: int = 0, size: float = 0.3) -> PoseHypotheses:
     rng = np.random.default_rng(seed)
     n = len(BODY.bones)
-    return PoseGuesses(
+    return PoseHypotheses(
         torch.tensor(vector_to_matrix(rng.normal(size=(B, H, L, 3)))),
         torch.tensor(0.1 * rng.normal(size=(B, H, L, 2))),
         torch.tensor(size * rng.normal(size=(B, H, L, n, 3))),
@@ -47,24 +47,26 @@ def random_guesses(seed: int = 0, size: float = 0.3) -> PoseGuesses:
     )
 
 
-def positions_of(guesses: PoseGuesses) -> torch.Tensor:
-    translation = torch.nn.functional.pad(guesses.translation, (0, 1))
-    return BODY.positions(guesses.turns, guesses.rotation, translation, guesses.log_lengths)
+def positions_of(hypotheses: PoseHypotheses) -> torch.Tensor:
+    translation = torch.nn.functional.pad(hypotheses.translation, (0, 1))
+    return BODY.positions(
+        hypotheses.turns, hypotheses.rotation, translation, hypotheses.log_lengths
+    )
 
 
 @pytest.mark.parametrize("perspective", [True, False])
-def test_pictures_are_those_of_cameras_on_the_horizon(perspective: bool) -> None:
+def test_projection_matches_cameras(perspective):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4, 6, 3))
     camera = Cameras.around([0.7], [0.0], distance=7.0, perspective=perspective)
     expected = camera.project(points)[0]
-    # World → the camera's axes, y up and z towards it.
+    # Camera axes with y up and z towards the camera.
     turned = np.einsum("ij,...j->...i", camera.rotation[0], points) * [1, -1, -1]
-    found = pictured(torch.tensor(turned), 7.0 if perspective else None)
+    found = project_to_image(torch.tensor(turned), 7.0 if perspective else None)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_what_is_not_seen_is_not_missed() -> None:
+def test_reconstruction_ignores_occluded_joints():
     rng = np.random.default_rng(1)
     positions = torch.tensor(rng.normal(size=(B, L, 8, 3)))
     keypoints = torch.tensor(rng.normal(size=(B, L, 8, 2)))
@@ -79,7 +81,7 @@ def test_what_is_not_seen_is_not_missed() -> None:
     np.testing.assert_array_equal(reconstruction(positions, other, weight, None), found)
 
 
-def test_roughness_of_a_steady_turn_is_known() -> None:
+def test_roughness_of_a_uniform_rotation():
     step = torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)
     times = torch.arange(L, dtype=torch.float64)
     rotation = vector_to_matrix(times[:, None] * step)
@@ -93,33 +95,33 @@ def test_roughness_of_a_steady_turn_is_known() -> None:
     assert float(still) == 0
 
 
-def test_the_terms_of_the_truth_are_what_they_should_be() -> None:
-    guesses = random_guesses()
-    positions = positions_of(guesses)
-    truth = pictured(positions[:, 2], 7.0)
-    terms = guess_terms(BODY, guesses, truth, torch.ones(B, L, 8), 7.0)
+def test_loss_terms_of_the_true_hypothesis():
+    hypotheses = random_hypotheses()
+    positions = positions_of(hypotheses)
+    truth = project_to_image(positions[:, 2], 7.0)
+    terms = hypothesis_losses(BODY, hypotheses, truth, torch.ones(B, L, 8), 7.0)
     assert {name: tuple(value.shape) for name, value in terms.items()} == dict.fromkeys(
         ("reconstruction", "smoothness", "ranges", "lengths"), (B, H)
     )
     np.testing.assert_allclose(terms["reconstruction"][:, 2], 0, atol=1e-20)
     assert terms["reconstruction"][:, [0, 1, 3]].min() > 0.1
-    np.testing.assert_allclose(terms["ranges"], BODY.range_excess(guesses.turns).sum(dim=-1))
-    lengths = L * (guesses.log_lengths**2).sum(dim=-1)
+    np.testing.assert_allclose(terms["ranges"], BODY.range_excess(hypotheses.turns).sum(dim=-1))
+    lengths = L * (hypotheses.log_lengths**2).sum(dim=-1)
     np.testing.assert_allclose(terms["lengths"], lengths)
-    one = roughness(guesses.turns[1, 3], guesses.rotation[1, 3], guesses.translation[1, 3])
+    one = roughness(hypotheses.turns[1, 3], hypotheses.rotation[1, 3], hypotheses.translation[1, 3])
     assert float(terms["smoothness"][1, 3]) == pytest.approx(float(one))
 
 
-def test_weights_are_those_of_the_settings() -> None:
+def test_weighted_sum_uses_the_settings():
     terms = {"reconstruction": torch.tensor([1.0, 2.0]), "kl": torch.tensor([10.0, 0.0])}
     settings = replace(MotionVAESettings.tiny(), reconstruction=3.0, kl=0.5)
     np.testing.assert_allclose(weighted_sum(terms, settings), [8.0, 6.0])
 
 
-def test_the_best_guess_of_each_sequence_is_taken_whole() -> None:
-    guesses = random_guesses()
+def test_best_hypothesis_is_selected_per_sequence():
+    hypotheses = random_hypotheses()
     losses = torch.tensor([[3.0, 1, 2, 4], [0, 1, 2, 3], [3, 2, 1, 0.5]])
-    best = best_guess(guesses, losses)
+    best = best_hypothesis(hypotheses, losses)
     for b, h in enumerate((1, 0, 3)):
         for name in ("rotation", "translation", "turns", "log_lengths"):
-            np.testing.assert_array_equal(getattr(best, name)[b], getattr(guesses, name)[b, h])
+            np.testing.assert_array_equal(getattr(best, name)[b], getattr(hypotheses, name)[b, h])

@@ -1,4 +1,4 @@
-"""The pose network: each frame alone, views in their quadrants, one body a sequence."""
+"""Pose network: independent frames, view hypotheses and shared bone lengths."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TINY = replace(MotionVAESettings.tiny(), layers=2)
 B, T, J, BONES, G, H = 3, 7, 5, 4, 3, 4
 
 
-def made_input(seed=0, frames=T):
+def random_input(seed=0, frames=T):
     generator = torch.Generator().manual_seed(seed)
     keypoints = torch.randn(B, frames, J, 2, generator=generator)
     confidence = torch.rand(B, frames, J, generator=generator).add(0.1)
@@ -25,8 +25,8 @@ def made_input(seed=0, frames=T):
     return keypoints, confidence, torch.randn(J, 3, generator=generator)
 
 
-def awake(network):
-    """Fresh networks hardly move: let what they return depend on what they read."""
+def amplified(network):
+    """Increase the outputs of random networks."""
     with torch.no_grad():
         for part in network.modules():
             if isinstance(part, Readout):
@@ -36,28 +36,18 @@ def awake(network):
 
 @pytest.fixture(scope="module")
 def network():
-    return awake(PoseNetwork(TINY, J, BONES, G))
+    return amplified(PoseNetwork(TINY, J, BONES, G))
 
 
-@pytest.mark.parametrize("hypotheses", [1, 2, 4])
-@pytest.mark.parametrize("frames", [1, 7])
-def test_shapes(hypotheses, frames):
-    found = PoseNetwork(replace(TINY, hypotheses=hypotheses), J, BONES, G)(*made_input(0, frames))
-    assert found.rotation.shape == (B, hypotheses, frames, 3, 3)
-    assert found.translation.shape == (B, hypotheses, frames, 2)
-    assert found.turns.shape == (B, hypotheses, frames, BONES, 3)
-    assert found.log_lengths.shape == (B, hypotheses, G)
-
-
-def test_hypotheses_begin_in_their_quadrants_near_the_rest_pose():
-    found = PoseNetwork(TINY, J, BONES, G)(*made_input())
+def test_initial_hypotheses_lie_in_their_quadrants():
+    found = PoseNetwork(TINY, J, BONES, G)(*random_input())
     for view in range(H):
         angle = math.pi / 4 + view * math.pi / 2
         turn = torch.zeros(3, 3)
         turn[0, 0] = turn[2, 2] = math.cos(angle)
         turn[0, 2], turn[2, 0], turn[1, 1] = math.sin(angle), -math.sin(angle), 1.0
         assert geodesic_angle(found.rotation[:, view], turn.expand(B, T, 3, 3)).max() < 0.3
-        # Where the body's front, +Z, looks: towards the camera in the first and last quadrant.
+        # The front, +Z, faces the camera in the first and last quadrant.
         front = found.rotation[:, view, :, :, 2]
         assert (front[..., 0].sign() == (1 if view < 2 else -1)).all()
         assert (front[..., 2].sign() == (1 if view in (0, 3) else -1)).all()
@@ -65,30 +55,30 @@ def test_hypotheses_begin_in_their_quadrants_near_the_rest_pose():
         assert near.abs().max() < 0.3
 
 
-def test_rotations_are_rotations(network):
-    rotation = network(*made_input()).rotation
+def test_rotations_are_orthonormal(network):
+    rotation = network(*random_input()).rotation
     identity = torch.eye(3).expand_as(rotation)
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(B, H, T))
     assert geodesic_angle(rotation[:, :, 1:], rotation[:, :, :-1]).mean() > 1e-2
 
 
-def test_a_body_turns_in_the_picture_after_its_quarter():
-    """The six numbers turn what the quarter has turned: a tilt of the camera is one for all."""
+def test_predicted_rotation_follows_the_quarter_turn():
+    """A camera tilt is the same for all hypotheses."""
     network = PoseNetwork(TINY, J, BONES, G)
     with torch.no_grad():
         for weights in network.rigid[-1].parameters():
             weights.zero_()
-        # A turn about X by 0.2: its first two columns, less the identity's.
+        # Rotation about X by 0.2: its first two columns minus those of the identity.
         tilt = [0, 0, 0, 0, math.cos(0.2) - 1, math.sin(0.2)]
         network.rigid[-1].bias[:6] = torch.tensor(tilt)
-        rotation = network(*made_input()).rotation
+        rotation = network(*random_input()).rotation
     up = torch.tensor([0.0, math.cos(0.2), math.sin(0.2)])
     torch.testing.assert_close(rotation[..., 1], up.expand(B, H, T, 3))
 
 
-def test_a_frame_is_read_alone_but_for_the_lengths(network):
-    keypoints, confidence, rest = made_input()
+def test_frames_are_independent_except_for_lengths(network):
+    keypoints, confidence, rest = random_input()
     before = network(keypoints, confidence, rest)
     changed = keypoints.clone()
     changed[1, 3] += 0.5
@@ -103,25 +93,8 @@ def test_a_frame_is_read_alone_but_for_the_lengths(network):
     torch.testing.assert_close(after.log_lengths[::2], before.log_lengths[::2])
 
 
-def test_frames_in_another_order_are_poses_in_that_order_of_the_same_body(network):
-    keypoints, confidence, rest = made_input()
-    before = network(keypoints, confidence, rest)
-    after = network(keypoints.flip(1), confidence.flip(1), rest)
-    torch.testing.assert_close(after.turns.flip(2), before.turns)
-    torch.testing.assert_close(after.rotation.flip(2), before.rotation)
-    torch.testing.assert_close(after.log_lengths, before.log_lengths)
-
-
-def test_a_sequence_does_not_depend_on_those_beside_it(network):
-    keypoints, confidence, rest = made_input()
-    whole = network(keypoints, confidence, rest)
-    alone = network(keypoints[1:2], confidence[1:2], rest)
-    for found, wanted in zip(vars(alone).values(), vars(whole).values(), strict=True):
-        torch.testing.assert_close(found, wanted[1:2], rtol=1e-4, atol=1e-5)
-
-
-def test_what_is_not_seen_does_not_matter(network):
-    keypoints, confidence, rest = made_input()
+def test_occluded_inputs_have_no_effect(network):
+    keypoints, confidence, rest = random_input()
     before = network(keypoints, confidence, rest)
     keypoints[:, :, 2] = float("nan")
     for found, wanted in zip(
@@ -132,26 +105,16 @@ def test_what_is_not_seen_does_not_matter(network):
 
 def test_gradients_reach_all_weights():
     network = PoseNetwork(TINY, J, BONES, G)
-    found = network(*made_input())
+    found = network(*random_input())
     sum((part * torch.randn_like(part)).sum() for part in vars(found).values()).backward()
     for name, weight in network.named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.abs().max() > 0, name
 
 
-def test_mixed_precision_keeps_rotations_exact():
-    network = awake(PoseNetwork(replace(TINY, mixed_precision=True), J, BONES, G)).train()
-    found = network(*made_input())
+def test_mixed_precision_keeps_rotations_orthonormal():
+    network = amplified(PoseNetwork(replace(TINY, mixed_precision=True), J, BONES, G)).train()
+    found = network(*random_input())
     assert {part.dtype for part in vars(found).values()} == {torch.float32}
     identity = torch.eye(3).expand_as(found.rotation)
     torch.testing.assert_close(found.rotation @ found.rotation.mT, identity, atol=1e-5, rtol=0)
-
-
-def test_image_features_have_their_shapes():
-    network = PoseNetwork(replace(TINY, image_features=6), J, BONES, G)
-    features = torch.randn(B, T, 6), torch.randn(B, T, J, 6)
-    assert network(*made_input(), features).turns.shape == (B, H, T, BONES, 3)
-    with pytest.raises(ValueError, match="features must be image features, got None"):
-        network(*made_input())
-    with pytest.raises(ValueError, match="expected None where image_features is 0"):
-        PoseNetwork(TINY, J, BONES, G)(*made_input(), features)

@@ -1,4 +1,4 @@
-"""What a teacher says of frames it has been asked about once is what it says when asked again."""
+"""Precomputed teacher poses equal those of the network on every window."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.data.tracks.learning import film_clips
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.training.track_batches import Augmentation, TrackBatches
-from probmotion.models.vae.losses import pictured
+from probmotion.models.vae.losses import project_to_image
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.teacher_forcing import TeacherForcedPoses, scaled
@@ -27,41 +27,41 @@ SIZE = replace(MotionVAESettings.tiny(), frames=8, mixed_precision=True)
 
 @pytest.fixture(scope="module")
 def tracks():
-    """Walks of which detections are missing."""
+    """Walks with missing detections."""
     clips = make_gaits(3, styles={"walk": 1.0}, frames=90, seed=1)
     return film_clips(clips, PERSON, 10.0, views=1, noise=DetectorNoise(share=0.1)).tracks
 
 
 @pytest.fixture(scope="module")
-def body(tracks) -> ArticulatedBody:
+def body(tracks):
     return ArticulatedBody(PERSON, estimate_rest_pose(tracks))
 
 
 @pytest.fixture(scope="module")
-def rest(body) -> torch.Tensor:
+def rest(body):
     return torch.as_tensor(body.rest_positions, dtype=torch.float32)
 
 
 @pytest.fixture(scope="module")
-def network(body) -> PoseNetwork:
+def network(body):
     found = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
     with torch.no_grad():
-        # Poses that differ from frame to frame and view to view.
+        # Poses that vary between frames and views.
         found.bone_decoder.leave.weight.mul_(20)
         found.rigid[-1].weight.mul_(20)
         found.log_lengths.weight.mul_(10)
     return found
 
 
-def batches_of(tracks, **augmentation) -> TrackBatches:
+def batches_of(tracks, **augmentation):
     return TrackBatches(tracks, SIZE.frames, 0.3, replace(Augmentation.none(), **augmentation))
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest, mirror):
+def test_poses_match_the_network_on_windows(tracks, network, rest, mirror):
     batches = batches_of(tracks, mirror=mirror)
     drawn = batches.draw(np.random.default_rng(0), 12)
-    # A trainer has set it to train; what it says is not of the half precision it would train in.
+    # In training mode the network would use bfloat16.
     found = TeacherForcedPoses(network.train(), batches, rest).of(drawn)
     seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
     with torch.no_grad():
@@ -73,36 +73,34 @@ def test_what_was_said_of_frames_is_said_of_their_windows(tracks, network, rest,
     assert asked.log_lengths.std() > 0.01
 
 
-@pytest.mark.parametrize(("distance", "off"), [(None, 1e-6), (7.0, 0.02)])
-def test_of_a_scaled_window_the_picture_is_scaled(tracks, network, rest, body, distance, off):
+@pytest.mark.parametrize(("distance", "tolerance"), [(None, 1e-6), (7.0, 0.02)])
+def test_scaled_poses_have_scaled_projections(tracks, network, rest, body, distance, tolerance):
     batches = batches_of(tracks, scale=0.4)
     drawn = batches.draw(np.random.default_rng(0), 12)
     every = TeacherForcedPoses(network, batches, rest).of(drawn)
     scale = torch.as_tensor(drawn.scale)
     assert scale.std() > 0.1
-    pictures = []
-    for said in (scaled(every, scale), every):
-        moved = torch.nn.functional.pad(said.translation, (0, 1))
-        positions = body.positions(said.turns, said.rotation, moved, said.log_lengths)
-        pictures.append(pictured(positions, distance))
-    wanted = scale[:, None, None, None, None] * pictures[1]
+    projections = []
+    for poses in (scaled(every, scale), every):
+        moved = torch.nn.functional.pad(poses.translation, (0, 1))
+        positions = body.positions(poses.turns, poses.rotation, moved, poses.log_lengths)
+        projections.append(project_to_image(positions, distance))
+    wanted = scale[:, None, None, None, None] * projections[1]
     size = wanted.abs().mean()
-    assert (pictures[0] - wanted).abs().mean() < off * size
+    assert (projections[0] - wanted).abs().mean() < tolerance * size
 
 
 @pytest.mark.parametrize("lengths", [0.0, 100.0])
-def test_the_view_that_teaches_does_not_depend_on_how_a_window_is_scaled(
-    tracks, network, body, lengths
-):
+def test_selected_view_does_not_depend_on_scale(tracks, network, body, lengths):
     size = replace(SIZE, lengths=lengths, smoothness=0.0, ranges=0.0)
     trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
     batches = batches_of(tracks)
     drawn = batches.draw(np.random.default_rng(0), 40)
-    keypoints, seen, rest = trainee._shown(drawn, torch.device("cpu"))
-    plain = trainee._taught(batches, drawn, keypoints, seen, rest)
+    keypoints, seen, rest = trainee._inputs(drawn, torch.device("cpu"))
+    plain = trainee._teacher_poses(batches, drawn, keypoints, seen, rest)
     larger = np.geomspace(0.05, 20, 40, dtype=np.float32)
     shown = keypoints * torch.as_tensor(larger)[:, None, None, None]
-    found = trainee._taught(batches, drawn._replace(scale=larger), shown, seen, rest)
+    found = trainee._teacher_poses(batches, drawn._replace(scale=larger), shown, seen, rest)
     torch.testing.assert_close(found.turns, plain.turns)
     torch.testing.assert_close(found.rotation, plain.rotation)
     torch.testing.assert_close(
@@ -110,7 +108,7 @@ def test_the_view_that_teaches_does_not_depend_on_how_a_window_is_scaled(
     )
 
 
-def test_what_is_lost_is_in_single_precision_whatever_the_trainer_asks_for(tracks, network, body):
+def test_loss_ignores_the_trainer_s_autocast(tracks, network, body):
     size = replace(SIZE, mixed_precision=False)
     trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
     learner, n, device = trainee.network, 8, torch.device("cpu")
@@ -120,7 +118,7 @@ def test_what_is_lost_is_in_single_precision_whatever_the_trainer_asks_for(track
     torch.testing.assert_close(asked, plain, rtol=0, atol=0)
 
 
-def test_a_teacher_is_asked_once_of_what_is_learnt_and_of_what_is_watched(tracks, network, body):
+def test_teacher_is_evaluated_once_per_frame(tracks, network, body):
     trainee = MotionVAETrainee(tracks, tracks, SIZE, body, network, distance=7.0)
     asked = []
     network.register_forward_hook(lambda _, given, __: asked.append(len(given[0])))
@@ -129,21 +127,14 @@ def test_a_teacher_is_asked_once_of_what_is_learnt_and_of_what_is_watched(tracks
         trainee.training_loss(trainee.network, rng, 4, torch.device("cpu"))
         with torch.no_grad():
             trainee.validation_loss(trainee.network, torch.device("cpu"))
-    # Each frame of both once, in lots.
     assert sum(asked) == sum(
         len(batches.all_frames()[0]) for batches in (trainee.batches, trainee.held_out)
     )
 
 
-def test_frames_are_mirrored_only_where_windows_are(tracks):
-    plain, _ = batches_of(tracks).all_frames()
-    both, _ = batches_of(tracks, mirror=True).all_frames()
-    assert len(both) == 2 * len(plain)
-
-
-def test_windows_that_are_moved_or_padded_are_refused(tracks, network, rest):
+def test_shifted_or_padded_windows_are_rejected(tracks, network, rest):
     long = TrackBatches(tracks, 99, 0.3, Augmentation.none())
-    with pytest.raises(ValueError, match="drawn has windows that are padded"):
+    with pytest.raises(ValueError, match="drawn must not contain padded windows"):
         TeacherForcedPoses(network, long, rest).of(long.draw(np.random.default_rng(0), 2))
-    with pytest.raises(ValueError, match=r"batches has shift=0\.1, expected 0"):
+    with pytest.raises(ValueError, match=r"must have shift=0 .* got 0\.1"):
         TeacherForcedPoses(network, batches_of(tracks, shift=0.1), rest)

@@ -1,4 +1,4 @@
-"""Proposals: symmetry, detailed balance counted out, adaptation in the warm-up alone."""
+"""Tests of symmetric proposals: detailed balance, independence of chains, adaptation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHAINS = 8_000
 
 @dataclass(frozen=True)
 class DriftingStep:
-    """θ' ~ N(θ + d, s² I): a step with a bias, such as the velocity of what is drawn."""
+    """θ' ~ N(θ + d, s² I), an asymmetric proposal."""
 
     guided: ClassVar[bool] = False
 
@@ -47,10 +47,10 @@ class DriftingStep:
 
 
 def worst_imbalance(prior, proposal):
-    """Count one step of many chains that start in the target between quarters along (1, 1, 1).
+    """Count transitions between quartiles along (1, 1, 1) in one step of chains from the target.
 
-    Under detailed balance N(A → B) and N(B → A) have the same mean; the largest of the 6
-    |N(A → B) − N(B → A)| / √(N(A → B) + N(B → A)) is returned, each about standard normal.
+    Under detailed balance N(A → B) and N(B → A) have the same mean. Returns the largest of
+    |N(A → B) − N(B → A)| / √(N(A → B) + N(B → A)), each about standard normal.
     """
     start = prior.initial(np.random.default_rng(1), CHAINS)
     sampler = MetropolisHastings(proposal=proposal, warmup=0, thin=1)
@@ -69,7 +69,8 @@ def worst_imbalance(prior, proposal):
     return (np.abs(flow - flow.T)[counted] / np.sqrt(both[counted])).max()
 
 
-LIMIT = norm.isf(1e-3 / 4 / 12)  # family-wise 1e-3 over four tests of 6 pairs, two-sided
+# Family-wise failure rate 1e-3 over four two-sided tests of 6 pairs.
+LIMIT = norm.isf(1e-3 / 4 / 12)
 
 
 @pytest.mark.parametrize(
@@ -77,12 +78,12 @@ LIMIT = norm.isf(1e-3 / 4 / 12)  # family-wise 1e-3 over four tests of 6 pairs, 
     [Isotropic(scale=0.8), AdaptiveCovariance(scale=0.8), DriftingStep()],
     ids=["isotropic", "adaptive", "asymmetric"],
 )
-def test_one_step_satisfies_detailed_balance(two_bumps, proposal):
-    assert worst_imbalance(two_bumps, proposal) < LIMIT
+def test_one_step_satisfies_detailed_balance(two_modes, proposal):
+    assert worst_imbalance(two_modes, proposal) < LIMIT
 
 
-def test_leaving_out_the_ratio_of_an_asymmetric_proposal_is_noticed(two_bumps):
-    assert worst_imbalance(two_bumps, DriftingStep(corrected=False)) > LIMIT
+def test_detailed_balance_detects_a_missing_proposal_ratio(two_modes):
+    assert worst_imbalance(two_modes, DriftingStep(corrected=False)) > LIMIT
 
 
 def generators(chains, seed=0):
@@ -90,14 +91,14 @@ def generators(chains, seed=0):
 
 
 @pytest.mark.parametrize("proposal", [Isotropic(), AdaptiveCovariance()])
-def test_a_chain_proposes_the_same_beside_others(proposal):
+def test_chains_propose_independently(proposal):
     theta = np.random.default_rng(0).normal(size=(5, 4))
     acceptance = np.linspace(0.1, 0.9, 5)
 
     def run(chains):
         streams, at = generators(chains), theta[:chains]
         state = proposal.begin(at)
-        for _ in range(120):  # beyond the end of the first window
+        for _ in range(120):  # more than the first window
             at = proposal.propose(streams, at, np.empty((chains, 0)), state)
             state = proposal.learn(state, at, acceptance[:chains])
         return at
@@ -105,8 +106,8 @@ def test_a_chain_proposes_the_same_beside_others(proposal):
     np.testing.assert_array_equal(run(5)[:2], run(2))
 
 
-def test_the_covariance_that_was_walked_on_is_learnt():
-    """Fed independent points, C Cᵀ becomes their covariance and s its optimal 2.38/√dim."""
+def test_adaptive_covariance_learns_the_covariance_of_the_chain():
+    """For independent points C Cᵀ converges to their covariance, and s is 2.38/√dim."""
     rng = np.random.default_rng(0)
     covariance = np.array([[4.0, 1.5, 0.0], [1.5, 1.0, 0.1], [0.0, 0.1, 0.05]])
     root = np.linalg.cholesky(covariance)
@@ -122,7 +123,7 @@ def test_the_covariance_that_was_walked_on_is_learnt():
         np.testing.assert_allclose(white, np.eye(3), atol=5 * np.sqrt(2 / 1600))
 
 
-def test_a_chain_that_never_moved_can_still_propose():
+def test_a_chain_that_never_moved_has_a_valid_covariance():
     proposal = AdaptiveCovariance()
     state = proposal.begin(np.zeros((1, 3)))
     for _ in range(50):
@@ -133,31 +134,17 @@ def test_a_chain_that_never_moved_can_still_propose():
 
 
 @pytest.mark.parametrize("proposal", [Isotropic(target=0.4), AdaptiveCovariance(target=0.4)])
-def test_the_warm_up_reaches_its_target(two_bumps, proposal):
+def test_warm_up_reaches_the_target_acceptance(two_modes, proposal):
     sampler = MetropolisHastings(proposal=proposal, warmup=1500, thin=1)
-    draws = sampler.sample(MotionPosterior(two_bumps), draws=1500, chains=8, progress=False)
+    draws = sampler.sample(MotionPosterior(two_modes), draws=1000, chains=8, progress=False)
     chains = draws.dataset["acceptance"].values.mean(axis=1)
-    # Robbins-Monro steps of n^(−0.6) leave log s with a spread of about n^(−0.3).
+    # Robbins-Monro steps of size n^(−0.6) leave log s with a spread of about n^(−0.3).
     assert np.abs(chains.mean() - 0.4) < 0.04
     assert np.abs(chains - 0.4).max() < 0.12
 
 
-def test_without_a_target_the_scale_stays():
+def test_no_target_disables_the_adaptation():
     proposal = Isotropic(scale=0.25, target=None)
     state = proposal.begin(np.zeros((3, 2)))
     state = proposal.learn(state, np.zeros((3, 2)), np.ones(3))
     np.testing.assert_allclose(np.exp(state["log_scale"]), 0.25)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Isotropic(scale=0.0), "scale must be a finite number above 0, got 0.0"),
-        (lambda: Isotropic(target=1.0), "target must be an acceptance between 0 and 1, got 1.0"),
-        (lambda: AdaptiveCovariance(scale=np.inf), "scale is inf, expected"),
-        (lambda: AdaptiveCovariance(target=0.0), "target is 0.0, expected"),
-    ],
-)
-def test_wrong_settings_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

@@ -1,0 +1,85 @@
+"""Base class of trained networks of 2D tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from torch import nn
+
+from probmotion.models.training.checkpoints import Checkpoint, CheckpointError, load_checkpoint
+from probmotion.models.training.standardisation import Standards
+from probmotion.models.training.trainer import check_device
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_positive, check_shape
+
+__all__ = ["TrackNetwork", "load_track_checkpoint"]
+
+Size = TypeVar("Size")
+
+
+class TrackNetwork:
+    """Trained network with the description of its data.
+
+    Parameters
+    ----------
+    network : Module
+        Network in standardised units.
+    settings : dataclass
+        Size of the network.
+    standards : Standards
+        Standards of the training data.
+    skeleton : Skeleton
+        The J joints.
+    fps : float
+        Frames per second.
+    device : str
+        ``cpu`` or ``cuda``.
+    card : mapping, optional
+        Description of the training.
+
+    Raises
+    ------
+    ValueError
+        If shapes are inconsistent, a number is out of range or the device is not available.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        settings: Any,
+        standards: Standards,
+        skeleton: Skeleton,
+        fps: float,
+        *,
+        device: str = "cpu",
+        card: Mapping[str, Any] | None = None,
+    ) -> None:
+        check_shape("standards", standards.mean, (skeleton.n_joints, 2))
+        check_positive("fps", fps)
+        self.settings = settings
+        self.standards = standards
+        self.card = dict(card or {})
+        self.skeleton = skeleton
+        self.fps = float(fps)
+        self._device = check_device(device).type
+        self._network = network.to(self._device).eval().requires_grad_(False)
+
+
+def load_track_checkpoint(
+    source: str | Path, kind: str, size: type[Size]
+) -> tuple[Checkpoint, Size, Standards, Skeleton, float]:
+    """Return a checkpoint and the settings, standards, skeleton and frame rate in it."""
+    checkpoint = load_checkpoint(source, kind)
+    try:
+        stored = checkpoint.settings["network"]
+        settings = size(**stored["size"])
+        skeleton = Skeleton(stored["joint_names"], stored["parents"])
+        standards = Standards(np.array(stored["mean"]), np.array(stored["deviation"]))
+        return checkpoint, settings, standards, skeleton, float(stored["fps"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{source} does not have the settings of a {kind}: {error}"
+        ) from error

@@ -1,0 +1,104 @@
+"""Base class for training on 2D tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from probmotion import seeds
+from probmotion.models.training.track_batches import (
+    Augmentation,
+    TrackBatches,
+    learning_and_held_out,
+)
+from probmotion.motion.motion import KeypointTrack
+
+__all__ = ["TrackTrainee"]
+
+_VALIDATION_BATCH = 256
+
+
+class TrackTrainee:
+    """Data, standards and settings of a network trained on windows of 2D tracks.
+
+    Parameters
+    ----------
+    tracks : sequence of KeypointTrack
+        Prepared tracks of one skeleton and frame rate: metres, centred.
+    validation : sequence of KeypointTrack
+        Tracks of other clips.
+    size : dataclass
+        Settings of the network, with its ``frames``.
+    threshold : float
+        Minimum confidence of a joint to contribute to the loss. Design of the data sets,
+        section 6.1: .3 for people, .5 for horses, .01 with a ball.
+    augmentation : Augmentation, optional
+        Augmentation of ``tracks``.
+    seed : int
+        Seed of the initial weights and of the validation batch.
+
+    Raises
+    ------
+    ValueError
+        If there is no track, tracks differ in skeleton or frame rate, or none has a confident
+        joint.
+    """
+
+    network: nn.Module
+
+    def __init__(
+        self,
+        tracks: Sequence[KeypointTrack],
+        validation: Sequence[KeypointTrack],
+        size: Any,
+        *,
+        threshold: float = 0.3,
+        augmentation: Augmentation | None = None,
+        seed: int = 0,
+    ) -> None:
+        varied = Augmentation() if augmentation is None else augmentation
+        self.size = size
+        self.batches, self.held_out = learning_and_held_out(
+            tracks, validation, size.frames, threshold, varied
+        )
+        self.standards = self.batches.standards
+        self._seed = seed
+        skeleton = self.batches.skeleton
+        self.settings: Mapping[str, Any] = {
+            "size": asdict(size),
+            "joint_names": list(skeleton.joint_names),
+            "parents": list(skeleton.parents),
+            "fps": self.batches.fps,
+            "mean": self.standards.mean.tolist(),
+            "deviation": self.standards.deviation.tolist(),
+            "threshold": threshold,
+            "augmentation": asdict(varied),
+            "data": self.batches.description,
+            "validation_data": self.held_out.description,
+        }
+
+    def training_loss(
+        self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
+    ) -> torch.Tensor:
+        """Return the loss of a random batch."""
+        return self._loss(network, self.batches, rng, batch, device)
+
+    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
+        """Return the loss of a fixed batch of held-out tracks."""
+        rng = seeds.generator(self._seed, "validation")
+        return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
+
+    def _loss(
+        self,
+        network: nn.Module,
+        batches: TrackBatches,
+        rng: np.random.Generator,
+        n: int,
+        device: torch.device,
+    ) -> torch.Tensor:
+        raise NotImplementedError

@@ -1,0 +1,207 @@
+"""Runs of a grid: one sampler on one problem with one seed, stored in a folder.
+
+The folder is filled under a temporary name and renamed, so that it is never incomplete.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from probmotion import seeds
+from probmotion.comparison.results.failures import Failure, NonFiniteDraws, ResultNotWritten
+from probmotion.comparison.results.run_results import DRAWS, RESULT, RunResult, read_result
+from probmotion.comparison.run.grid_tasks import GridTask
+from probmotion.comparison.run.memory import watched_memory
+from probmotion.comparison.run.time_limits import time_limit
+from probmotion.files import forget_killed
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
+from probmotion.threads import one_thread
+
+__all__ = ["GridRun", "forget_unfinished"]
+
+_UNFINISHED = ".unfinished-"
+_FARTHEST = 1e100
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GridRun(GridTask):
+    """One sampler on one problem with one seed; ``path`` is the folder of draws and result.
+
+    With a budget, ``settings`` are those that the pilot chose, or ``pilot_failure`` is its failure.
+    """
+
+    stores_draws: ClassVar[bool] = True
+
+    seed: int
+    settings: dict[str, int] | None = None
+    pilot_failure: Failure | None = None
+
+    def __str__(self) -> str:
+        return f"{self.problem}/{self.sampler}/{self.seed}"
+
+    def result(self) -> RunResult | None:
+        """Return the stored result, possibly for other inputs, or None."""
+        return read_result(self.path)
+
+    def finished(self) -> bool:
+        """Whether a result for the same inputs is stored, with complete draws."""
+        result = self.result()
+        if result is None or not super().finished():
+            return False
+        if result.failure is not None or not self.stores_draws:
+            return True
+        return _has_size(self.path / DRAWS, result.draws_bytes)
+
+    def prepare(self) -> None:
+        """Load the problem and the libraries of the metrics."""
+        from probmotion.metrics.measures import load_libraries
+
+        load_libraries()
+        super().prepare()
+
+    def fail(self, error: BaseException) -> None:
+        """Store a failure."""
+        self._store({}, None, Failure.of(error))
+
+    def run(self, progress: bool) -> None:
+        """Draw, measure and store the result; errors of the sampler are stored as failures.
+
+        Raises
+        ------
+        ResultNotWritten
+            If the result cannot be written.
+        """
+        if self.pilot_failure is not None:
+            self._store({}, None, self.pilot_failure)
+            return
+        try:
+            with one_thread():
+                self.prepare()
+                problem = self.load()
+                with time_limit(self.limit):
+                    draws, metrics = self._measure(problem, progress)
+        # A sampler that calls sys.exit() must not end the grid.
+        except (Exception, SystemExit) as error:
+            self.fail(error)
+        else:
+            self._store(metrics, draws, None)
+
+    def _measure(self, problem: Problem, progress: bool) -> tuple[MotionDraws, dict[str, float]]:
+        from probmotion.metrics.measures import measure
+
+        # Changing "cell" would change all draws.
+        seed = seeds.integer(self.seed, "cell", self.problem, self.sampler)
+        with watched_memory() as peak:
+            draws = self._draw(problem.posterior, seed, progress)
+        # All samplers are measured against the same reference draws.
+        metrics = measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
+        if peak.mebibytes is not None:
+            metrics["peak_memory_mib"] = peak.mebibytes
+        return draws, metrics
+
+    def _draw(self, posterior: MotionPosterior, seed: int, progress: bool) -> MotionDraws:
+        """Return the sampler's draws after checking their number and values."""
+        draws = self.with_sampler.sample(
+            posterior,
+            draws=self.draws // self.chains,
+            chains=self.chains,
+            seed=seed,
+            progress=progress,
+        )
+        if not isinstance(draws, MotionDraws):
+            raise TypeError(f"{self.sampler} must return MotionDraws, got {type(draws).__name__}")
+        if draws.skeleton != posterior.skeleton:
+            raise ValueError(f"{self.sampler} must return draws of the posterior's skeleton")
+        found = tuple(draws.positions.sizes[axis] for axis in ("chain", "draw"))
+        if found != (wanted := (self.chains, self.draws // self.chains)):
+            raise ValueError(
+                f"{self.sampler} must return {wanted[0]} chains of {wanted[1]} draws, got "
+                f"{found[0]} of {found[1]}"
+            )
+        if not (math.isfinite(draws.seconds) and draws.seconds >= 0):
+            raise ValueError(
+                f"{self.sampler} must return draws with their run time, got seconds={draws.seconds}"
+            )
+        # Metrics sum squares of positions, which must not overflow.
+        if bad := int((~(np.abs(draws.positions.values) < _FARTHEST)).sum()):
+            raise NonFiniteDraws(
+                f"{self.sampler} returned {bad} positions that are not finite or beyond "
+                f"{_FARTHEST:g} metres"
+            )
+        return draws
+
+    def _store(
+        self, metrics: dict[str, float], draws: MotionDraws | None, failure: Failure | None
+    ) -> None:
+        budget = None
+        if self.budget is not None:
+            used = None if draws is None else self.budget.spent(draws)
+            budget = {"allowed": str(self.budget), "settings": self.settings, "used": used}
+            if used is not None:
+                chosen = {f"set_{name}": float(n) for name, n in (self.settings or {}).items()}
+                metrics = {**metrics, "budget_used": used, **chosen}
+        _remove_unfinished(self.path.parent, self.path.name)
+        unfinished = self.path.parent / f"{_UNFINISHED}{self.path.name}-{os.getpid()}"
+        try:
+            unfinished.mkdir(parents=True, exist_ok=True)
+            size = None
+            if draws is not None and self.stores_draws:
+                draws.save(unfinished / DRAWS)
+                size = (unfinished / DRAWS).stat().st_size
+            address = (self.problem, self.sampler, self.seed)
+            result = RunResult(*address, self.fingerprint, metrics, failure, budget, size)
+            with open(unfinished / RESULT, "w", encoding="utf-8") as file:
+                json.dump(_without_nan(asdict(result)), file, indent=1)
+            if self.path.exists():
+                shutil.rmtree(self.path)
+            unfinished.rename(self.path)
+        except OSError as error:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise ResultNotWritten(error.strerror or str(error)) from error
+        except Exception as error:
+            # The sampler returned draws that cannot be saved.
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if draws is None:
+                raise
+            self.fail(error)
+
+
+def _has_size(file: Path, size: int | None) -> bool:
+    """Whether a file exists with the given size; None allows any size."""
+    try:
+        return size in (None, file.stat().st_size)
+    except OSError:
+        return False
+
+
+def forget_unfinished(folder: Path, problems: Iterable[str]) -> None:
+    """Remove the incomplete files and folders that a killed process left in a grid's folder."""
+    for problem in problems:
+        for place in (folder / "runs" / problem).glob("*/"):
+            _remove_unfinished(place, "*")
+        for kind in ("pilots", "problems"):
+            forget_killed(folder / kind / problem)
+    forget_killed(folder)
+
+
+def _remove_unfinished(place: Path, seed: str) -> None:
+    for left in place.glob(f"{_UNFINISHED}{seed}-*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _without_nan(value: Any) -> Any:
+    """Replace NaN and infinite values, which JSON cannot hold, by None."""
+    if isinstance(value, dict):
+        return {name: _without_nan(entry) for name, entry in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

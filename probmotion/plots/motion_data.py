@@ -1,0 +1,151 @@
+"""Motions encoded for animations in a browser."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probmotion.comparison.results.stored_problems import StoredProblem
+from probmotion.interaction.geometry.coordinates import align_motions
+from probmotion.plots.skeletons import face_heading, joint_sides
+
+__all__ = ["Shown", "choose_draws", "motion_numbers"]
+
+_HEADING = np.pi / 2 - 0.35
+"""Heading of bodies without observations, radians."""
+_LARGEST = np.iinfo(np.int16).max
+_TILT = 0.3
+"""Largest elevation of the view, in radians, at which a body stays in its place."""
+_SIDES = {"middle": "ink", "left": "left", "right": "right"}
+"""Name of each side's colour in the style sheet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Motions that an animation shows: every ``step``-th frame of rows (n, L, J, 3) in metres.
+
+    The first row sets the scale. With ``turned``, motions without observations and truth are turned
+    to the same heading and poses aligned with the first.
+    """
+
+    problem: StoredProblem
+    rows: Mapping[str, np.ndarray]
+    step: int = 1
+    turned: bool = True
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that are shown."""
+        return -(-next(iter(self.rows.values())).shape[1] // self.step)
+
+
+def choose_draws(motions: np.ndarray, n: int) -> np.ndarray:
+    """Return n evenly spaced draws, as consecutive draws of a chain are similar."""
+    return motions[:: max(1, len(motions) // n)][:n]
+
+
+def motion_numbers(shown: Shown) -> dict[str, Any]:
+    """Return the data of animation.js, ready for JSON.
+
+    With observations or a truth, all bodies of a frame are moved by the same translation, so that
+    errors of position remain visible. Otherwise each body is centred.
+    """
+    problem, step = shown.problem, shown.step
+    skeleton = problem.skeleton
+    rows = {label: motions[:, ::step] for label, motions in shown.rows.items()}
+    truth = None if problem.truth is None else problem.truth[::step]
+    path = None
+    if problem.camera is not None or problem.joints is not None or truth is not None:
+        first = next(iter(rows.values())) if truth is None else truth[None]
+        path = first[:, :, list(skeleton.roots)].mean(axis=(0, 2)) * [1.0, 0.0, 1.0]
+        rows = {label: motions - path[:, None] for label, motions in rows.items()}
+        truth = None if truth is None else truth - path[:, None]
+    else:
+        rows = _centred(rows, shown)
+    first = next(iter(rows.values()))
+    sides = joint_sides(skeleton)
+    data: dict[str, Any] = {
+        "fps": problem.fps / step,
+        "frames": shown.frames,
+        "joints": skeleton.n_joints,
+        "bones": [(*bone, _SIDES[sides[bone[0]]]) for bone in skeleton.bones],
+        "columns": max(map(len, rows.values())),
+        "azimuth": 0.6,
+        "rows": [[_encoded(motion) for motion in motions] for motions in rows.values()],
+        "truth": None if truth is None else _encoded(truth),
+        "dots": None,
+        "keypoints": None,
+        "camera": None,
+        **_extent(first if truth is None else np.concatenate([first, truth[None]])),
+    }
+    if problem.joints is not None:
+        assert path is not None
+        data["dots"] = _base64((problem.joints[::step] - path[:, None]).astype("<f4"))
+    if problem.camera is not None:
+        assert path is not None
+        data |= _camera(problem, step)
+        data["anchor"] = np.round(path[:, [0, 2]], 4).tolist()
+    return data
+
+
+def _centred(rows: Mapping[str, np.ndarray], shown: Shown) -> dict[str, np.ndarray]:
+    """Return bodies in the middle of their places, turned if requested."""
+    skeleton = shown.problem.skeleton
+    moved = {}
+    first = next(iter(rows.values()))[0]
+    for label, motions in rows.items():
+        if shown.turned and motions.shape[1] == 1:
+            motions = align_motions(motions, first)
+        elif shown.turned and skeleton.mirrored_pairs:
+            motions = face_heading(motions, skeleton, _HEADING)
+        middle = motions[:, :, list(skeleton.roots)].mean(axis=2, keepdims=True)
+        moved[label] = motions - middle * [1.0, 0.0, 1.0]
+    return moved
+
+
+def _extent(motions: np.ndarray) -> dict[str, float]:
+    """Return the part of the world that a place shows, metres."""
+    reach = 1.05 * float(np.quantile(np.hypot(motions[..., 0], motions[..., 2]), 0.99)) + 1e-9
+    low, high = float(motions[..., 1].min()), float(motions[..., 1].max())
+    return {
+        "low": round(low, 3),
+        "middle": round((low + high) / 2, 3),
+        "reach": round(reach, 3),
+        "across": round(2.1 * reach, 3),
+        "up": round(1.05 * (high - low) + 2 * reach * np.sin(_TILT), 3),
+    }
+
+
+def _camera(problem: StoredProblem, step: int) -> dict[str, Any]:
+    camera = problem.camera
+    assert camera is not None
+    assert camera.centre is not None
+    keypoints = problem.keypoints
+    return {
+        # Beside the camera, where depth is visible.
+        "azimuth": round(float(camera.azimuth[0]) + 1.0, 4),
+        "keypoints": None if keypoints is None else _base64(keypoints[::step].astype("<f4")),
+        "camera": {
+            "rotation": np.round(camera.rotation[0], 9).tolist(),
+            "translation": camera.translation[0].tolist(),
+            "focal": float(camera.focal[0]),
+            "centre": camera.centre[0].tolist(),
+            "perspective": not camera.orthographic,
+            "azimuth": float(camera.azimuth[0]),
+            "elevation": float(camera.elevation[0]),
+        },
+    }
+
+
+def _encoded(motion: np.ndarray) -> dict[str, Any]:
+    """Return a motion in 16-bit multiples of a unit, one millimetre unless it is too large."""
+    unit = max(1, int(np.ceil(1000 * np.abs(motion).max() / _LARGEST)))
+    return {"unit": unit, "numbers": _base64(np.rint(1000 * motion / unit).astype("<i2"))}
+
+
+def _base64(numbers: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(numbers).tobytes()).decode("ascii")

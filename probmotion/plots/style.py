@@ -1,0 +1,88 @@
+"""Colours, markers and axes shared by all figures, and writing of figures.
+
+The palette is that of Okabe and Ito (2008), distinguishable with colour-vision deficiency, with
+lighter colours darkened for text on white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probmotion.files import written_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "CYCLE",
+    "GREY",
+    "INK",
+    "LEFT",
+    "RIGHT",
+    "finish_figure",
+    "legend_below",
+    "plain_axes",
+    "style_of",
+]
+
+LEFT = "#0072B2"
+RIGHT = "#D55E00"
+INK = "#333333"
+GREY = "#C4C4C4"
+
+CYCLE = (
+    "#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A",
+    "#7A7A7A",
+)  # fmt: skip
+"""Colours of samplers in order."""
+
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p", "<", ">")
+"""Markers of samplers in order, which distinguish them without colour."""
+_DOTS_PER_INCH = 150
+
+
+def style_of(place: int) -> tuple[str, str]:
+    """Return colour and marker of the sampler at a place in the order; 90 places differ."""
+    return CYCLE[place % len(CYCLE)], _MARKERS[place % len(_MARKERS)]
+
+
+def plain_axes(axes: Axes, hidden: Sequence[str] = ("top", "right"), size: float = 8.5) -> None:
+    """Hide some spines and style the ticks."""
+    for name in hidden:
+        axes.spines[name].set_visible(False)
+    axes.tick_params(which="both", color=GREY, labelcolor=INK, labelsize=size)
+
+
+def legend_below(figure: Figure, ncols: int) -> None:
+    """Add the legend of the first axes below the figure."""
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=ncols,
+        frameon=False, labelcolor=INK,
+    )  # fmt: skip
+
+
+def finish_figure(figure: Figure, path: str | Path | None) -> Figure:
+    """Write a figure as PNG if a path is given, and return it; failed writing leaves no file.
+
+    Raises
+    ------
+    ValueError
+        If the path does not end in ``.png``.
+    OSError
+        If the folder cannot be written to.
+    """
+    if path is None:
+        return figure
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"path must end in .png, got {str(path)!r}")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with written_whole(path) as unfinished:
+        FigureCanvasAgg(figure).figure.savefig(
+            unfinished, format="png", dpi=_DOTS_PER_INCH, facecolor="white"
+        )
+    return figure

@@ -1,0 +1,39 @@
+"""Fixtures of the command-line tests."""
+
+import pytest
+
+from probmotion.cli.main import main
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.io.files import save
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command that must fail with one line on standard error, and return the line."""
+
+    def run(*words):
+        assert main([str(word) for word in words]) == 2, words
+        lines = capsys.readouterr().err.splitlines()
+        (line,) = (line for line in lines if line.startswith("probmotion: "))
+        return line.removeprefix("probmotion: ")
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def write_walks():
+    """Write walk0.npz, walk1.npz, … to a folder and return a pattern of them."""
+
+    def write(folder, n=5, frames=40, fps=30.0):
+        folder.mkdir(exist_ok=True)
+        for number in range(n):
+            save(make_gait("walk", number, frames=frames, fps=fps), folder / f"walk{number}.npz")
+        return str(folder / "walk*.npz")
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def walks(write_walks, tmp_path_factory):
+    """A pattern of five clips of two seconds."""
+    return write_walks(tmp_path_factory.mktemp("walks"), frames=60)

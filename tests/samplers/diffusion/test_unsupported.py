@@ -1,0 +1,72 @@
+"""Tests of warnings and of unsupported posteriors of the denoising samplers."""
+
+from __future__ import annotations
+
+import pytest
+
+from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, UnsupportedPosterior
+from probmotion.samplers import (
+    Ancestral3D,
+    MultiViewAncestral,
+    MultiViewPredictorCorrector,
+    ScoreDistillation,
+)
+from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+
+
+@pytest.mark.parametrize("kind", [MultiViewAncestral, MultiViewPredictorCorrector])
+def test_elevation_0_warns(gaussian, kind):
+    sampler = kind(steps=2, elevation=0.0)
+    message = f"{sampler.name} cannot distinguish a motion from its mirror image with elevation 0"
+    with pytest.warns(UserWarning, match=message) as warned:
+        sampler.sample(MotionPosterior(gaussian), draws=1, progress=False)
+    assert warned[0].filename == __file__
+
+
+def test_likelihoods_that_are_not_linear_gaussian_are_refused(gaussian):
+    motion = Motion(gaussian.mean, gaussian.skeleton, gaussian.fps)
+    near = Cameras.ring(1, distance=9.0, perspective=True)
+    perspective = Keypoints2D.observe(motion, near, noise=0.1, seed=0)
+    outliers = Joints3D.observe(motion, noise=0.1, seed=0, degrees_of_freedom=3)
+
+    class Other:
+        frames, n_joints = 2, 2
+
+        def log_density(self, positions):
+            return 0.0
+
+        def simulate(self, rng, positions):
+            return self
+
+    for likelihood, reason in (
+        (perspective, "the cameras are perspective"),
+        (outliers, "Student-t with 3 degrees"),
+        (Other(), r"but Other has no method linear\(\)"),
+    ):
+        for kind in (Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector):
+            with pytest.raises(UnsupportedPosterior, match=reason) as refused:
+                kind().sample(MotionPosterior(gaussian, likelihood), draws=1, progress=False)
+            assert refused.value.word == "observations"
+
+
+def test_samplers_without_guidance_refuse_observations(gaussian):
+    posterior = MotionPosterior(gaussian, Joints3D(gaussian.mean, noise=0.1))
+    for sample in (ScoreDistillation().sample, Ancestral2D().sample_views):
+        with pytest.raises(
+            UnsupportedPosterior, match=r"does not support observations.*; try .*mas, .*mvpc"
+        ) as refused:
+            sample(posterior, draws=1, progress=False)
+        assert refused.value.word == "observations"
+    for options in ({"perspective": True}, {"shared_noise": False}):
+        with pytest.raises(UnsupportedPosterior, match="observations only with perspective=False"):
+            MultiViewAncestral(**options).sample(posterior, progress=False)
+
+
+def test_perspective_views_need_a_denoiser_that_supports_them(gaussian, gaussian_motion):
+    class Orthographic(gaussian_motion):
+        def denoise(self, x_t, alpha_bar, cameras):
+            raise ValueError("cameras must be orthographic")
+
+    posterior = MotionPosterior(Orthographic(gaussian.mean, gaussian.covariance))
+    with pytest.raises(UnsupportedPosterior, match="Orthographic raised: cameras must be ortho"):
+        MultiViewAncestral(perspective=True).sample(posterior, draws=1, progress=False)

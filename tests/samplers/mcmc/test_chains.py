@@ -1,0 +1,116 @@
+"""Tests that all Markov chain samplers share: θ and positions, continuation, Ctrl-C."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probmotion import MotionDraws, MotionPosterior
+from probmotion.posteriors.sampling import Interrupted
+from probmotion.samplers import NUTS, Ensemble, MetropolisHastings
+from probmotion.samplers.mcmc import nuts as nuts_module
+
+SAMPLERS = {
+    "mh": MetropolisHastings(warmup=60, thin=3, candidates=1),
+    "ensemble": Ensemble(walkers=8, warmup=20, thin=5, candidates=1),
+    "nuts": NUTS(warmup=60, candidates=1),
+}
+DENSITY, CHUNK = (MotionPosterior, "log_density"), (nuts_module._Run, "_advance")
+
+
+@pytest.fixture(scope="module", params=SAMPLERS)
+def sampler(request):
+    return SAMPLERS[request.param]
+
+
+@pytest.fixture(scope="module")
+def whole(sampler, run):
+    return run(sampler, 100)
+
+
+def assert_joined(parts, whole):
+    for name in ("theta", "positions", "log_density"):
+        joined = np.concatenate([part.dataset[name].values for part in parts], axis=1)
+        np.testing.assert_array_equal(joined, whole.dataset[name].values)
+
+
+def test_positions_and_densities_are_those_of_theta(whole, two_modes):
+    theta = whole.dataset["theta"].values
+    np.testing.assert_allclose(whole.dataset["log_density"], two_modes.log_density(theta))
+    np.testing.assert_array_equal(whole.positions.values, two_modes.motion(theta))
+    assert not whole.independent
+
+
+def test_continuing_equals_one_run(sampler, run, whole, tmp_path):
+    """Also from within an iteration of an ensemble, and without a new one."""
+    parts, last = [], None
+    for draws in (11, 3, 1, 85):
+        parts.append(run(sampler, draws, initial=last))
+        parts[-1].save(tmp_path / "part.nc")
+        last = MotionDraws.load(tmp_path / "part.nc")
+    assert_joined(parts, whole)
+    for count in whole.counts:
+        assert sum(part.counts[count] for part in parts) == whole.counts[count]
+
+
+def test_chains_are_independent(sampler, run, whole):
+    many = run(sampler, 20, chains=4, progress=True)
+    # In mh the rounding of log densities depends on the batch, and adapts the proposal.
+    np.testing.assert_allclose(
+        many.dataset["theta"][:2], whole.dataset["theta"][:, :20], rtol=1e-9, atol=1e-12
+    )
+
+
+def interrupt(monkeypatch, owner, name, n):
+    """Raise KeyboardInterrupt at the n-th call of a method, once."""
+    calls, method = [], getattr(owner, name)
+
+    def interrupted(*arguments):
+        calls.append(1)
+        if len(calls) == n:
+            raise KeyboardInterrupt
+        return method(*arguments)
+
+    monkeypatch.setattr(owner, name, interrupted)
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "n", "finished"),
+    [
+        ("mh", DENSITY, 1 + 60 + 4 * 3 + 2, 4),
+        # All starts at once, then two evaluations per iteration and ensemble.
+        ("ensemble", DENSITY, 1 + 2 * 2 * (20 + 3 * 5 + 2) + 1, 24),
+        # Each of two chains has 2 chunks of warm-up and 1 of draws; then the second of chain 1.
+        ("nuts", CHUNK, 4 + 2 + 2, 50),
+    ],
+)
+def test_an_interrupted_run_can_be_continued(run, monkeypatch, name, method, n, finished):
+    sampler = SAMPLERS[name]
+    whole = run(sampler, 100)
+    interrupt(monkeypatch, *method, n)
+    with pytest.raises(Interrupted, match=f"after {finished} draws per chain") as stopped:
+        run(sampler, 100)
+    first = stopped.value.draws
+    assert_joined([first, run(sampler, 100 - finished, initial=first)], whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "n"), [("mh", DENSITY, 30), ("ensemble", DENSITY, 20), ("nuts", CHUNK, 2)]
+)
+def test_an_interrupt_during_warm_up_has_no_draws(run, monkeypatch, name, method, n):
+    interrupt(monkeypatch, *method, n)
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run(SAMPLERS[name], 10)
+    assert not isinstance(stopped.value, Interrupted)
+
+
+def test_starts_of_density_zero_are_refused(sampler, run):
+    shape = (2, 8, 3) if sampler.name == "ensemble" else (2, 3)
+    points = 1e200 * (1 + np.random.default_rng(0).random(shape))
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(
+            ValueError, match=r"initial must have a finite log density, got (-inf|nan) at"
+        ),
+    ):
+        run(sampler, 2, initial=points)
