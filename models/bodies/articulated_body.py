@@ -125,18 +125,18 @@ class ArticulatedBody:
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
         names, parents = self.skeleton.canonical_names, self.skeleton.parents
         animal, n_joints = is_four_legged(self.skeleton), self.skeleton.n_joints
-        found = []
+        limits = []
         for joint in self._turning:
             if joint < n_joints:
                 children = [child for child, parent in self.skeleton.bones if parent == joint]
                 below = self.rest[children].mean(axis=0)
-                found.append(range_of(names[joint], animal, self.rest[joint], below))
+                limits.append(range_of(names[joint], animal, self.rest[joint], below))
             else:
                 (end,) = (j for j, parent in enumerate(self._rig.parents) if parent == joint)
                 at_root = parents[end] in self.skeleton.roots
                 name = "trunk" if at_root and names[end] != "tail" else names[end]
-                found.append(range_of(name, animal, self.rest[end], self.rest[end]))
-        lower, upper = np.array(found).reshape(-1, 2, 3).swapaxes(0, 1)
+                limits.append(range_of(name, animal, self.rest[end], self.rest[end]))
+        lower, upper = np.array(limits).reshape(-1, 2, 3).swapaxes(0, 1)
         return lower, upper
 
     def range_excess(self, turns: Array) -> Array:
@@ -186,13 +186,13 @@ class ArticulatedBody:
         more = xp.zeros_like(offsets[..., :1, :])
         n_more = self._rig.n_joints - self.skeleton.n_joints
         rotations = self._rotations(xp, vector_to_matrix(turns), root_rotation, shape)
-        found, _ = forward_kinematics(
+        joints, _ = forward_kinematics(
             self._rig,
             rotations,
             xp.broadcast_to(root_translation, (*shape, 3))[..., None, :],
             xp.concat([offsets, *[more] * n_more], axis=-2),
         )
-        return found[..., : self.skeleton.n_joints, :]
+        return joints[..., : self.skeleton.n_joints, :]
 
     def _rotations(
         self, xp: Any, turned: Array, root_rotation: Array, shape: tuple[int, ...]

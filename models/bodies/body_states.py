@@ -168,10 +168,10 @@ class BodyStates:
         joints = range(self._rig.n_joints)
         rotations = [matrices[..., which[j], :, :] if j in which else still for j in joints]
         offsets = self._rigged(constant(body, states) if isinstance(body, np.ndarray) else body)
-        found, _ = forward_kinematics(
+        joints, _ = forward_kinematics(
             self._rig, xp.stack(rotations, axis=-3), states[..., None, :3], offsets
         )
-        return found[..., : self.skeleton.n_joints, :]
+        return joints[..., : self.skeleton.n_joints, :]
 
     def _turns(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
         """Return the global rotations of the rig's joints, (L, J', 3, 3)."""

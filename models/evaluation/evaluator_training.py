@@ -65,6 +65,6 @@ class EvaluatorTrainee(TrackTrainee):
 
         wanted = moved(standardised.astype(np.float32)).flatten(2)
         weight = moved(counted).flatten(2)
-        found, divergence = network(wanted, moved(drawn.valid), moved(noise))
-        error = (weight * (found.float() - wanted) ** 2).sum() / weight.sum().clamp(min=1)
+        decoded, divergence = network(wanted, moved(drawn.valid), moved(noise))
+        error = (weight * (decoded.float() - wanted) ** 2).sum() / weight.sum().clamp(min=1)
         return error + self.size.kl_weight * divergence.mean()

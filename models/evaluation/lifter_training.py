@@ -102,13 +102,13 @@ def lifting_losses(
     here = torch.zeros_like(azimuth)
     depth, elevation = network(poses)
     points = raise_points(poses, depth, here, elevation, distance)
-    pictures = project_points(points, azimuth, elevation[order], distance)
-    depth_again, elevation_again = network(pictures)
-    again = raise_points(pictures, depth_again, azimuth, elevation_again, distance)
+    projections = project_points(points, azimuth, elevation[order], distance)
+    depth_again, elevation_again = network(projections)
+    again = raise_points(projections, depth_again, azimuth, elevation_again, distance)
     back = project_points(again, here, elevation, distance)
     lengths = torch.linalg.norm(points[:, bones[:, 0]] - points[:, bones[:, 1]], dim=-1)
     return {
-        "likelihood": -flow.log_density(pictures).mean() / (2 * len(flow.joints)),
+        "likelihood": -flow.log_density(projections).mean() / (2 * len(flow.joints)),
         "points": ((again - points) ** 2).sum(dim=-1).mean(),
         "picture": ((back - poses) ** 2).sum(dim=-1).mean(),
         "bones": ((lengths / sizes - 1) ** 2).mean(),

@@ -31,13 +31,13 @@ def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray
     if not tracks:
         raise ValueError("tracks must contain at least one track, got none")
     skeleton = tracks[0].skeleton
-    found = []
+    visible = []
     for track in tracks:
         if track.skeleton != skeleton:
             raise ValueError(f"tracks must have one skeleton, {track.name!r} has other joints")
         whole = ((track.confidence >= threshold) & (track.confidence > 0)).all(axis=1)
-        found.append(track.keypoints[whole])
-    poses = np.concatenate(found)
+        visible.append(track.keypoints[whole])
+    poses = np.concatenate(visible)
     if len(poses) == 0:
         raise ValueError(
             f"tracks must contain a frame with every joint at confidence {threshold:g} or more, "

@@ -65,7 +65,7 @@ class ReducedLatent(StandardNormalPrior):
         self.directions = chosen * np.sign(chosen[largest, np.arange(k)])
 
     @cached_property
-    def kept(self) -> float:
+    def explained(self) -> float:
         """Fraction of tr E[JᵀJ] along the directions, estimated from independent draws."""
         other = _mean_square(self.prior, seeds.generator(self.seed, "kept"))
         along = np.einsum("zk,zy,yk->", self.directions, other, self.directions)

@@ -80,7 +80,7 @@ class TrainingResult:
         Checkpoint of the network, with the moving average of the weights.
     history : list of dict
         Per checkpoint: step, loss (mean since the last one), validation_loss, seconds.
-    kept : dict
+    saved : dict
         Entry of ``history`` whose weights were saved: that of the lowest validation loss with
         ``patience``, else the last.
     steps : int
@@ -89,7 +89,7 @@ class TrainingResult:
 
     model: Path
     history: list[dict[str, float]]
-    kept: dict[str, float]
+    saved: dict[str, float]
     steps: int
 
 
@@ -172,8 +172,8 @@ def train(
                     f"stopped at step {run.step} of {settings.steps}, saved in {folder}; run the "
                     "same command to resume"
                 )
-    kept = run.history[-1 - _since_best(run)] if settings.patience else run.history[-1]
-    return TrainingResult(folder / MODEL, run.history, kept, run.step - before)
+    saved = run.history[-1 - _since_best(run)] if settings.patience else run.history[-1]
+    return TrainingResult(folder / MODEL, run.history, saved, run.step - before)
 
 
 def _start(trainee: Trainee, settings: TrainingSettings, device: torch.device) -> Run:
@@ -213,10 +213,10 @@ def _take_step(
     run.optimiser.step()
     decay = settings.decay(step) if settings.ema else 0.0
     with torch.no_grad():
-        for kept, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
-            kept.lerp_(new, 1 - decay)
-        for kept, new in zip(run.average.buffers(), run.network.buffers(), strict=True):
-            kept.copy_(new)
+        for mean, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
+            mean.lerp_(new, 1 - decay)
+        for mean, new in zip(run.average.buffers(), run.network.buffers(), strict=True):
+            mean.copy_(new)
     run.step = step
     return value
 

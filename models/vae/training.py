@@ -301,11 +301,12 @@ class MotionVAETrainee(_TrackTrainee):
                 "pose_network must have the width, layers, heads, feedforward and image_features "
                 f"of size, {own}, got {theirs}"
             )
-        own = (body.skeleton.n_joints, len(body.bones), body.n_groups)
-        theirs = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
-        if own != theirs:
+        counts = (body.skeleton.n_joints, len(body.bones), body.n_groups)
+        given = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
+        if counts != given:
             raise ValueError(
-                f"pose_network must have the body's joints, bones and lengths, {own}, got {theirs}"
+                f"pose_network must have the body's joints, bones and lengths, {counts}, "
+                f"got {given}"
             )
         teacher = pose_network.eval().requires_grad_(False)
         if size.spatial:

@@ -155,7 +155,8 @@ class Calibration:
 
         Quantity "all" is the sampler as a whole. Columns: ``p_value`` of uniform ranks (all:
         smallest after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over
-        central intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over quantities),
+        central intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over
+        quantities),
         ``simulations`` that succeeded and ``failed`` ones.
         """
         from probmotion.calibration.table import CalibrationTable

@@ -78,7 +78,7 @@ def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: st
     if not before and (out / MODEL).exists():
         load_checkpoint(out / MODEL, trainee.kind)  # never overwrite another kind of network
     result = train(trainee, settings, out, device=device)
-    last, kept = result.history[-1], result.kept
+    last, saved = result.history[-1], result.saved
     ended = ""
     if last["step"] < settings.steps:
         ended = f"; stopped early at step {last['step']:.0f}, as the validation loss no longer fell"
@@ -86,6 +86,6 @@ def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: st
         print(f"{result.model} is finished: {before} of {settings.steps} steps{ended}")
         return
     print(
-        f"wrote {result.model}: step {kept['step']:.0f}, loss {kept['loss']:.4f}, validation loss "
-        f"{kept['validation_loss']:.4f}, {last['seconds']:.0f} s of steps{ended}"
+        f"wrote {result.model}: step {saved['step']:.0f}, loss {saved['loss']:.4f}, validation loss "
+        f"{saved['validation_loss']:.4f}, {last['seconds']:.0f} s of steps{ended}"
     )

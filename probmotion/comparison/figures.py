@@ -74,7 +74,7 @@ def _draw_problem(comparison: GridResults, problem: Problem, path: Path) -> None
     if "exact" in drawn:
         rows["exact"] = drawn.pop("exact")
     elif problem.has_reference:
-        label = "reference" if problem.known is None else "exact draws"
+        label = "reference" if problem.exact_source is None else "exact draws"
         rows[label] = problem.reference(0, shown)
     rows |= drawn
     if not rows:

@@ -308,7 +308,7 @@ def test_interrupted_runs_resume(tmp_path):
 
 def test_gaits_have_a_manifold_measure_and_a_plot(tmp_path):
     problem = load_problem("gait", frames=4, components=3)
-    found = decompose(problem, steps=6, seeds=2, draws=30)
+    found = decompose(problem, steps=8, seeds=2, draws=40)
     assert list(found.values) == ["spread", "small", "off", "mean", "distance"]
     off = found.table().set_index(["measure", "part"]).loc["off"]
     assert abs(off.loc["floor", "mean"]) < 0.1

@@ -26,9 +26,9 @@ L, J, K, RANK, AZIMUTHS = 3, 4, 2, 2, 4
 PROBLEMS = ("prior", "monocular", "sparse")
 SAMPLERS = {
     "exact": (ExactSampler(), 2000, 2),
-    "nuts": (NUTS(warmup=300), 1000, 4),
-    "ensemble": (Ensemble(walkers=12, warmup=300, thin=10), 12 * 200, 4),
-    "mh": (MetropolisHastings(warmup=1000, thin=6), 1500, 8),
+    "nuts": (NUTS(warmup=300), 600, 4),
+    "ensemble": (Ensemble(walkers=12, warmup=300, thin=10), 12 * 200, 2),
+    "mh": (MetropolisHastings(warmup=1000, thin=6), 1000, 8),
 }
 DIRECTIONS, QUANTILES = 6, (0.1, 0.5, 0.9)
 COMPARISONS = DIRECTIONS * (2 + len(QUANTILES)) * len(PROBLEMS) * len(SAMPLERS)

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jupytext
+import nbformat
 import pytest
 
 from probmotion.citations import CITATIONS, OF_SETTINGS, POSE_PAIRS
@@ -86,6 +88,17 @@ def test_stored_tables_are_up_to_date():
         assert table in page.read_text(encoding="utf-8")
     with pytest.raises(ValueError, match="one block called 'weather', got 0"):
         which_sampler.replace_block(README, "weather", "x")
+
+
+@pytest.mark.parametrize(
+    "script", sorted((ROOT / "notebooks").glob("[0-9]*.py")), ids=lambda path: path.stem
+)
+def test_executed_notebooks_are_those_of_their_scripts(script):
+    executed = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
+    assert [cell.source for cell in executed.cells] == [
+        cell.source for cell in jupytext.read(script).cells
+    ]
+    assert any(cell.get("outputs") for cell in executed.cells)
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")

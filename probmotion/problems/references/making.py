@@ -197,9 +197,9 @@ def certify(
         raise ReferenceRefused(
             f"runs on {problem.name} must contain more than one motion up to rigid motion"
         )
-    diagnostic = [each["rhat"] for each in measured if "rhat" in each]
+    rhats = [each["rhat"] for each in measured if "rhat" in each]
     # The negation also refuses NaN.
-    for number, rhat in enumerate(diagnostic):
+    for number, rhat in enumerate(rhats):
         if not rhat <= _RHAT:
             raise ReferenceRefused(
                 f"R-hat of the runs on {problem.name}{_where(number > 1)} must be at most {_RHAT}, "
@@ -218,7 +218,7 @@ def certify(
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
         "seeds": _n_seeds(problem),
-        "rhat": max(diagnostic, default=None),
+        "rhat": max(rhats, default=None),
         "ess_bulk": _least(measured, "ess_bulk"),
         "ess_tail": _least(measured, "ess_tail"),
         "agreement": agreed,

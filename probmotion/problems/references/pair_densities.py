@@ -146,9 +146,9 @@ def log_surrogate(
     else:
         # Distances without a graph have no cheaper surrogate.
         seen = prepare_projection(image, views.prepared)
-        one, logs = np.array([annotation]), np.empty(1)
-        distances_to(seen, one, views.prepared, logs)
-        distance = logs[0]
+        one, distances = np.array([annotation]), np.empty(1)
+        distances_to(seen, one, views.prepared, distances)
+        distance = distances[0]
     return -0.5 * (distance / views.noise) ** 2
 
 

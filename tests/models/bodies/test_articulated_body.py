@@ -67,11 +67,11 @@ def positions_by_loop(body, turns, rotation, translation, factors):
 def test_positions_match_a_loop_over_joints(body):
     turns, rotation, translation = random_pose(body)
     log_lengths = 0.3 * np.random.default_rng(2).normal(size=body.n_groups)
-    found = body.positions(turns, rotation, translation, log_lengths)
+    joints = body.positions(turns, rotation, translation, log_lengths)
     factors = np.exp(log_lengths)[list(body.length_groups)]
     for frame in range(5):
         wanted = positions_by_loop(body, turns[frame], rotation[frame], translation[frame], factors)
-        np.testing.assert_allclose(found[frame], wanted, atol=1e-12)
+        np.testing.assert_allclose(joints[frame], wanted, atol=1e-12)
 
 
 def test_bones_are_joints_with_children_and_trunks():
@@ -90,9 +90,9 @@ def test_mirrored_rotations_give_the_mirrored_motion(body):
     swap = {"left": "right", "right": "left"}
     names = ["_".join(swap.get(word, word) for word in name.split("_")) for name in body.bones]
     other = turns[:, [body.bones.index(name) for name in names]] * -FLIP
-    found = body.positions(other, rotation * np.outer(FLIP, FLIP), translation * FLIP)
+    joints = body.positions(other, rotation * np.outer(FLIP, FLIP), translation * FLIP)
     wanted = mirrored(body.skeleton, body.positions(turns, rotation, translation))
-    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    np.testing.assert_allclose(joints, wanted, atol=1e-12)
     np.testing.assert_allclose(body.range_excess(other), body.range_excess(turns), atol=1e-12)
     assert (body.range_excess(3 * turns) > 0).all()
 
@@ -119,16 +119,16 @@ def test_positions_and_excess_broadcast_and_agree_across_libraries(body):
     turns, rotation, translation = random_pose(body, (2, 3, 4))
     log_lengths = 0.2 * np.random.default_rng(4).normal(size=(3, body.n_groups))
     parts = [turns[:1], rotation[..., :1, :, :], translation[0, 0], log_lengths]
-    found = body.positions(*parts)
-    assert found.shape == (2, 3, 4, body.skeleton.n_joints, 3)
+    joints = body.positions(*parts)
+    assert joints.shape == (2, 3, 4, body.skeleton.n_joints, 3)
     for a, b in np.ndindex(2, 3):
         each = [turns[0, b], np.repeat(rotation[a, b, :1], 4, 0), translation[0, 0]]
-        np.testing.assert_allclose(found[a, b], body.positions(*each, log_lengths[b]), atol=1e-12)
+        np.testing.assert_allclose(joints[a, b], body.positions(*each, log_lengths[b]), atol=1e-12)
     tensors = [torch.tensor(part) for part in parts]
-    np.testing.assert_allclose(body.positions(*tensors).numpy(), found, atol=1e-12)
+    np.testing.assert_allclose(body.positions(*tensors).numpy(), joints, atol=1e-12)
     single = body.positions(*(part.float() for part in tensors))
     assert single.dtype == torch.float32
-    np.testing.assert_allclose(single.numpy(), found, atol=1e-4)
+    np.testing.assert_allclose(single.numpy(), joints, atol=1e-4)
     excess = body.range_excess(3 * turns)
     np.testing.assert_allclose(body.range_excess(torch.tensor(3 * turns)).numpy(), excess)
     assert body.range_excess(0 * turns).max() == 0

@@ -111,8 +111,8 @@ def test_mirrored_motion_has_the_mirrored_body(walkers):
     body = states.body(clips[0].positions)
     order, flip = list(PERSON.mirrored_order), np.array([-1.0, 1.0, 1.0])
     mirrored = BodyStates(PERSON, states.rest[order] * flip)
-    found = mirrored.body(clips[0].positions[:, order] * flip)
-    np.testing.assert_allclose(found, body[order] * flip, atol=1e-9)
+    result = mirrored.body(clips[0].positions[:, order] * flip)
+    np.testing.assert_allclose(result, body[order] * flip, atol=1e-9)
 
 
 def test_bow_leaves_the_hips_in_place(walkers):

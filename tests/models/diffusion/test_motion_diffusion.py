@@ -69,10 +69,10 @@ def test_denoise_evaluates_the_network_in_standardised_units(prior, level):
     network = TINY.network(4, 0).eval()
     with torch.no_grad():
         flat = torch.tensor(unit.reshape(6, 12, 8), dtype=torch.float32)
-        found = network(flat, torch.full((6,), float(level))).numpy().reshape(x_t.shape)
+        result = network(flat, torch.full((6,), float(level))).numpy().reshape(x_t.shape)
     got = prior.denoise(x_t, alpha_bar, Cameras.ring(2))
     assert got.dtype == x_t.dtype
-    np.testing.assert_allclose(got, mean + deviation * found, atol=2e-5)
+    np.testing.assert_allclose(got, mean + deviation * result, atol=2e-5)
     # A fixed root stays at its mean.
     np.testing.assert_allclose(got[..., 0, :], np.broadcast_to(mean[0], got[..., 0, :].shape))
 
@@ -81,12 +81,12 @@ def test_denoise_evaluates_the_network_in_standardised_units(prior, level):
 def test_levels_invert_the_schedule(power):
     size = replace(TINY, schedule_power=power)
     schedule = NoiseSchedule.cosine(100, power=power)
-    found = [size.level(alpha_bar) for alpha_bar in schedule.alpha_bar]
-    np.testing.assert_allclose(found, np.arange(101), atol=1e-9)
+    result = [size.level(alpha_bar) for alpha_bar in schedule.alpha_bar]
+    np.testing.assert_allclose(result, np.arange(101), atol=1e-9)
     for steps in (7, 20, 50):
         some = schedule.strided(steps)
-        found = [size.level(alpha_bar) for alpha_bar in some.alpha_bar]
-        np.testing.assert_allclose(found, some.times, atol=1e-9)
+        result = [size.level(alpha_bar) for alpha_bar in some.alpha_bar]
+        np.testing.assert_allclose(result, some.times, atol=1e-9)
     between = [size.level(alpha_bar) for alpha_bar in np.linspace(1, schedule.alpha_bar[-1], 500)]
     assert (np.diff(between) >= 0).all()
     # Other schedules may start beyond the last level.
@@ -156,11 +156,11 @@ def test_network_depends_on_time_and_level(prior):
     x_t, cameras = noisy(prior, V=1), Cameras.ring(1)
     backwards = prior.denoise(np.ascontiguousarray(x_t[:, :, ::-1]), 0.4, cameras)[:, :, ::-1]
     assert abs(backwards - prior.denoise(x_t, 0.4, cameras)).max() > 1e-3
-    found = sinusoids(torch.tensor([0.0, 2.5]), 6)
+    result = sinusoids(torch.tensor([0.0, 2.5]), 6)
     rates = 10_000.0 ** (-np.arange(0, 6, 2) / 6)
     wanted = np.stack([np.sin(2.5 * rates), np.cos(2.5 * rates)], axis=-1).ravel()
-    np.testing.assert_allclose(found[1], wanted, atol=1e-6)
-    np.testing.assert_allclose(found[0], [0, 1, 0, 1, 0, 1])
+    np.testing.assert_allclose(result[1], wanted, atol=1e-6)
+    np.testing.assert_allclose(result[0], [0, 1, 0, 1, 0, 1])
 
 
 def test_covariance_product_is_the_adjoint_of_the_jacobian(prior):
@@ -181,8 +181,8 @@ def test_covariance_product_is_the_adjoint_of_the_jacobian(prior):
         tokens = network.enter(unit.flatten(2))
         first = network.level(sinusoids(level, network.width).double())[:, None]
         tokens = torch.cat([first, tokens], dim=1) + network.places[:13].double()
-        found = network.leave(network.encoder(tokens)[:, 1:]).unflatten(2, (4, 2))
-        return (mean + deviation * found).unflatten(0, (2, 2)).detach().numpy()
+        result = network.leave(network.encoder(tokens)[:, 1:]).unflatten(2, (4, 2))
+        return (mean + deviation * result).unflatten(0, (2, 2)).detach().numpy()
 
     np.testing.assert_allclose(prior.denoise(x_t, alpha_bar, cameras), denoise(x_t), atol=2e-5)
     step = 1e-6
@@ -225,9 +225,9 @@ def test_sizes_match_the_publication():
     ends = (32 * width + width) + (32 * width + 32) + 2 * (width**2 + width)
     assert parameters(DiffusionSettings.paper(), 16) == 6 * layer + ends
     # The authors' released code has 17.4 million parameters for 16 joints.
-    found = parameters(DiffusionSettings.reference_code(), 16)
-    assert found == 8 * layer + ends
-    assert found == pytest.approx(17.4e6, rel=0.01)
+    result = parameters(DiffusionSettings.reference_code(), 16)
+    assert result == 8 * layer + ends
+    assert result == pytest.approx(17.4e6, rel=0.01)
     assert DiffusionSettings.reference_code().schedule_power == 4
     assert parameters(DiffusionSettings.small(), 14) < 2e6
     assert parameters(DiffusionSettings.tiny(), 14) < 1e5
@@ -317,7 +317,7 @@ def learnt(gait, tmp_path_factory):
             for number, seen in enumerate(projections(gait, n, seed))
         ]
 
-    made = DiffusionTrainee(
+    trainee = DiffusionTrainee(
         tracks(2000, 1),
         tracks(50, 2),
         DiffusionSettings.tiny(gait.frames),
@@ -326,7 +326,7 @@ def learnt(gait, tmp_path_factory):
     settings = TrainingSettings(
         steps=600, batch=32, learning_rate=4e-3, warmup=50, ema=0.99, checkpoint_every=600
     )
-    result = train(made, settings, tmp_path_factory.mktemp("gait"), progress=False)
+    result = train(trainee, settings, tmp_path_factory.mktemp("gait"), progress=False)
     return MotionDiffusion.load(result.model)
 
 

@@ -34,7 +34,7 @@ def track(frames=10, seed=0, name="clip/0"):
     return KeypointTrack(keypoints, np.ones((frames, 4)), BODY, 20.0, name)
 
 
-def made(*tracks, size=SIZE, **options):
+def trainee_of(*tracks, size=SIZE, **options):
     return DiffusionTrainee(tracks, [track(seed=99, name="held-out/0")], size, **options)
 
 
@@ -64,7 +64,7 @@ class Constant(nn.Module):
 
 
 def test_loss_is_the_mean_squared_error_of_the_clean_motion():
-    trainee = made(track(), augmentation=NONE)
+    trainee = trainee_of(track(), augmentation=NONE)
     standards = trainee.standards
     moving = standards.deviation > 0
     clean = (track().keypoints - standards.mean) / np.where(moving, standards.deviation, 1)
@@ -83,7 +83,7 @@ def test_loss_is_the_mean_squared_error_of_the_clean_motion():
 
 def test_inputs_have_unit_variance_at_every_level():
     network = Constant()
-    network.loss(made(track(), augmentation=NONE), 4000)
+    network.loss(trainee_of(track(), augmentation=NONE), 4000)
     motions, levels, valid = network.inputs[0]
     assert valid.all()
     # t ~ U{1..100}: about 40 of each, Poisson deviation 6.3.
@@ -98,7 +98,7 @@ def test_inputs_have_unit_variance_at_every_level():
 
 
 def test_training_and_sampling_standardise_equally():
-    trainee = made(track(), augmentation=NONE)
+    trainee = trainee_of(track(), augmentation=NONE)
     network = Constant()
     trainee.training_loss(network, seeds.generator(5), 1, CPU)
     trained, levels, _ = network.inputs[0]
@@ -128,15 +128,15 @@ def test_joints_below_the_threshold_have_no_effect():
     wild[confidence < 0.3] += 1e3
     pair = [low, replace(low, keypoints=wild)]
     for seed in range(3):
-        ours, theirs = (loss_and_gradient(made(one), seed) for one in pair)
+        ours, theirs = (loss_and_gradient(trainee_of(one), seed) for one in pair)
         assert all(map(torch.equal, ours, theirs))
     # Neither have the network's outputs for them.
     network = Constant()
-    network.loss(made(low, augmentation=NONE), 4).backward()
+    network.loss(trainee_of(low, augmentation=NONE), 4).backward()
     gradient = network.output.grad.unflatten(1, (4, 2))
     assert (gradient[torch.tensor(confidence < 0.3)] == 0).all()
     assert (gradient[torch.tensor(confidence >= 0.3)][:, 0] != 0).sum() > 20
-    ours, theirs = (loss_and_gradient(made(one, threshold=0.05)) for one in pair)
+    ours, theirs = (loss_and_gradient(trainee_of(one, threshold=0.05)) for one in pair)
     assert ours[0] != theirs[0]
 
 
@@ -150,14 +150,14 @@ def test_padding_has_no_effect():
             motions = torch.where(valid[..., None], motions, 1e4)
             return torch.where(valid[..., None], self.network(motions, levels, valid), 1e4)
 
-    trainee = made(track(frames=6), track(frames=4, seed=1))
+    trainee = trainee_of(track(frames=6), track(frames=4, seed=1))
     wanted = loss_and_gradient(trainee)[0]
     loss = trainee.training_loss(Pads(trainee.network), np.random.default_rng(0), 8, CPU)
     torch.testing.assert_close(loss, wanted, rtol=1e-5, atol=0)
 
 
 def test_settings_describe_data_and_network():
-    trainee = made(track(), threshold=0.5, augmentation=Augmentation(shift=0.25))
+    trainee = trainee_of(track(), threshold=0.5, augmentation=Augmentation(shift=0.25))
     stored = json.loads(json.dumps(trainee.settings))
     assert stored["threshold"] == 0.5
     assert stored["augmentation"] == {"shortest": 0.5, "scale": 0.05, "shift": 0.25, "mirror": True}
@@ -168,8 +168,8 @@ def test_settings_describe_data_and_network():
 
 
 def test_validation_loss_is_deterministic_and_of_held_out_tracks():
-    trainee = made(track())
-    other = made(track(), track(seed=4, name="clip/1"), augmentation=NONE)
+    trainee = trainee_of(track())
+    other = trainee_of(track(), track(seed=4, name="clip/1"), augmentation=NONE)
     other.standards = trainee.standards
     with torch.no_grad():
         losses = [one.validation_loss(trainee.network.eval(), CPU) for one in 2 * [trainee, other]]
@@ -180,7 +180,7 @@ def test_run_with_dropout_resumes_bit_identically(tmp_path):
     settings = TrainingSettings(steps=12, batch=4, warmup=2, checkpoint_every=6)
 
     def run(folder, steps, seed=1):
-        trainee = made(track(frames=14), track(seed=seed), size=replace(SIZE, dropout=0.2))
+        trainee = trainee_of(track(frames=14), track(seed=seed), size=replace(SIZE, dropout=0.2))
         return train(trainee, replace(settings, steps=steps), tmp_path / folder, progress=False)
 
     whole = run("whole", 12)
@@ -215,7 +215,7 @@ def test_loss_of_shifted_still_people_has_unit_size():
     keypoints = keypoints + 0.002 * np.random.default_rng(0).normal(size=(10, 4, 2))
     keypoints -= keypoints[:, :1].mean(axis=0)
     still = replace(track(), keypoints=keypoints)
-    loss = Constant().loss(made(still, augmentation=replace(NONE, shift=0.1)), 2000)
+    loss = Constant().loss(trainee_of(still, augmentation=replace(NONE, shift=0.1)), 2000)
     assert loss.item() == pytest.approx(1, abs=0.1)
 
 
@@ -224,7 +224,7 @@ def test_joints_that_are_never_visible_are_rejected_in_training_tracks_only():
     confidence[:, [1, 3]] = 0.1
     low = replace(track(), confidence=confidence)
     with pytest.raises(ValueError, match=r"never got left_hand, head; choose"):
-        made(low, augmentation=NONE)
+        trainee_of(low, augmentation=NONE)
     trainee = DiffusionTrainee([track()], [low], SIZE)
     with torch.no_grad():
         assert math.isfinite(trainee.validation_loss(trainee.network.eval(), CPU))

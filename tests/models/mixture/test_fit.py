@@ -80,6 +80,13 @@ def test_fit_is_invariant_to_clip_headings():
     assert a.noise == pytest.approx(b.noise, rel=1e-9)
 
 
+def test_rotations_are_recovered_exactly():
+    target = np.random.default_rng(6).normal(size=(4, 3, 3))
+    motion = Motion(target, SIDES, 30.0)
+    turned = np.stack([motion.turned(angle).positions for angle in (-2.0, 0.4, 3.0)])
+    np.testing.assert_allclose(turn_to(turned, target), [target] * 3, atol=1e-12)
+
+
 def test_windows_are_centred_and_cover_each_clip():
     motion = make_gaits(1, styles={"walk": 1.0}, frames=50)[0]
     windows, clip_of = cut_windows([motion, motion], 20, stride=10)

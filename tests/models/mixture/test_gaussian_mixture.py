@@ -249,8 +249,10 @@ def test_completed_draws_of_theta_have_the_posterior_mean(prior, motions):
     assert (np.abs(X.mean(axis=0) - posterior.mean().ravel()) < 5 * error).all()
 
 
-def test_off_manifold_ratio_of_prior_draws_is_one(prior):
-    off = prior.off_manifold(prior.sample(np.random.default_rng(11), 20_000))
+def test_off_manifold_ratio_and_scale_match_prior_draws(prior):
+    draws = prior.sample(np.random.default_rng(11), 20_000)
+    assert np.sqrt((draws**2).mean()) == pytest.approx(prior.scale, rel=0.02)
+    off = prior.off_manifold(draws)
     # A few draws are assigned to a wrong component.
     assert off.mean() == pytest.approx(1.0, abs=5 * off.std() / np.sqrt(20_000) + 0.005)
 

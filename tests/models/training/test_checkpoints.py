@@ -28,7 +28,7 @@ CHECKPOINT = Checkpoint(
         "turned": torch.tensor(RNG.normal(size=(4, 2)), dtype=torch.float32).T,
         "step": torch.tensor(7.0),
         "order": torch.tensor([2, 0, 1]),
-        "kept": torch.tensor([True, False]),
+        "mask": torch.tensor([True, False]),
     },
 )
 

@@ -77,12 +77,12 @@ def test_joints_below_the_threshold_have_no_effect():
         variants.append(replace(low, keypoints=keypoints) if value == 1e6 else replace(
             low, keypoints=keypoints, confidence=np.where(confidence < 0.3, 0, confidence)
         ))  # fmt: skip
-    made = [batches(one, augmentation=Augmentation()) for one in variants]
-    for other in made[1:]:
-        for ours, theirs in zip(draw(made[0], 20), draw(other, 20), strict=True):
+    sources = [batches(one, augmentation=Augmentation()) for one in variants]
+    for other in sources[1:]:
+        for ours, theirs in zip(draw(sources[0], 20), draw(other, 20), strict=True):
             np.testing.assert_array_equal(ours, theirs)
-        np.testing.assert_array_equal(other.standards.mean, made[0].standards.mean)
-        np.testing.assert_array_equal(other.standards.deviation, made[0].standards.deviation)
+        np.testing.assert_array_equal(other.standards.mean, sources[0].standards.mean)
+        np.testing.assert_array_equal(other.standards.deviation, sources[0].standards.deviation)
     whole = draw(batches(low))
     assert not whole.seen[0, 3:9, 4].any()
     np.testing.assert_array_equal(whole.confidence[0, 5, 5:7], np.float32([1.0, 0.3]))
@@ -212,13 +212,17 @@ def test_batches_depend_on_the_generator_only():
 
 def test_descriptions_identify_the_data():
     tracks = [track(name="b/0"), track(seed=1, name="b/1"), track(seed=2, name="a/0")]
-    found = describe_tracks(tracks)
-    assert (found["tracks"], found["frames"], found["clips"]) == (3, 90, ["a", "b"])
-    assert found == describe_tracks([track(name="b/0"), *tracks[1:]])
+    description = describe_tracks(tracks)
+    assert (description["tracks"], description["frames"], description["clips"]) == (
+        3,
+        90,
+        ["a", "b"],
+    )
+    assert description == describe_tracks([track(name="b/0"), *tracks[1:]])
     changed = tracks[0].keypoints.copy()
     changed[4, 4, 1] += 1e-9
     other = [replace(tracks[0], keypoints=changed), *tracks[1:]]
-    assert describe_tracks(other)["sha256"] != found["sha256"]
+    assert describe_tracks(other)["sha256"] != description["sha256"]
 
 
 def test_windows_without_visible_joints_are_not_drawn():
@@ -247,11 +251,11 @@ def test_windows_record_their_frames_and_scale(scale):
 
 
 def test_validation_batches_are_not_augmented():
-    shown, kept = track(), track(seed=1, name="other/0")
+    shown, other = track(), track(seed=1, name="other/0")
     varied = Augmentation(mirror=False, shift=0.5)
-    training, held_out = learning_and_held_out([shown], [kept], 30, 0.25, varied)
+    training, held_out = learning_and_held_out([shown], [other], 30, 0.25, varied)
     drawn = draw(held_out, 8)
-    np.testing.assert_allclose(drawn.keypoints, np.stack([kept.keypoints] * 8), atol=1e-6)
+    np.testing.assert_allclose(drawn.keypoints, np.stack([other.keypoints] * 8), atol=1e-6)
     assert (draw(training, 50).valid.sum(axis=1) < 30).any()
     for one in (training, held_out):
         assert (one.frames, one.threshold, one.fps, one.skeleton) == (30, 0.25, 20.0, PERSON)

@@ -134,8 +134,8 @@ def test_regression_reaches_the_least_squares_solution(tmp_path):
     design = np.column_stack([line.x.numpy(), np.ones(50)]).astype(float)
     y = line.y.numpy().ravel().astype(float)
     solution, (residual,) = np.linalg.lstsq(design, y, rcond=None)[:2]
-    found = np.append(got["weight"].numpy().ravel(), got["bias"].numpy())
-    np.testing.assert_allclose(found, solution, atol=1e-4)
+    weights = np.append(got["weight"].numpy().ravel(), got["bias"].numpy())
+    np.testing.assert_allclose(weights, solution, atol=1e-4)
     assert result.history[-1]["validation_loss"] == pytest.approx(residual / 50, rel=1e-5)
 
 
@@ -383,12 +383,12 @@ def test_early_stopping_saves_the_best_model(tmp_path):
     losses = [row["validation_loss"] for row in whole.history]
     best = int(np.argmin(losses))
     assert whole.steps == len(losses) == best + 1 + 3 < 100
-    assert whole.kept == whole.history[best]
+    assert whole.saved == whole.history[best]
     saved = load_checkpoint(whole.model, "line")
     assert saved.settings["step"] == best + 1
     assert abs(float(saved.tensors["weight"]) - 0.4) == pytest.approx(min(losses))
     again = run(Overfits(), tmp_path / "run", EARLY)
-    assert (again.history, again.kept, again.steps) == (whole.history, whole.kept, 0)
+    assert (again.history, again.saved, again.steps) == (whole.history, whole.saved, 0)
     run(Overfits(), tmp_path / "parts", EARLY, steps=3)
     resumed = run(Overfits(), tmp_path / "parts", EARLY)
     assert [row["validation_loss"] for row in resumed.history] == losses

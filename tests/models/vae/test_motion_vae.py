@@ -321,7 +321,7 @@ def test_reduced_directions_span_the_largest_variation():
     overlap = np.linalg.svd(want.T @ reduced.directions)[1]
     assert overlap.min() > 0.99
     np.testing.assert_allclose(reduced.directions.T @ reduced.directions, np.eye(2), atol=1e-12)
-    assert reduced.kept == pytest.approx(13 / 13.14, abs=0.005)
+    assert reduced.explained == pytest.approx(13 / 13.14, abs=0.005)
     theta = codes(dim=2)
     np.testing.assert_allclose(
         reduced.motion(theta), prior.motion(theta @ reduced.directions.T), atol=1e-12
@@ -331,10 +331,10 @@ def test_reduced_directions_span_the_largest_variation():
 
 def test_all_directions_reproduce_the_prior(prior):
     reduced = ReducedLatent(prior, 3)
-    assert reduced.kept == pytest.approx(1.0)
+    assert reduced.explained == pytest.approx(1.0)
     theta = codes()
     np.testing.assert_allclose(reduced.motion(theta), prior.motion(reduced.latent(theta)))
     np.testing.assert_allclose(reduced.log_density(theta), prior.log_density(theta))
-    assert 0.3 < ReducedLatent(prior, 1).kept < ReducedLatent(prior, 2).kept < 1
+    assert 0.3 < ReducedLatent(prior, 1).explained < ReducedLatent(prior, 2).explained < 1
     with pytest.raises(ValueError, match="k must be at most the prior's 3 dimensions, got 4"):
         ReducedLatent(prior, 4)

@@ -129,7 +129,7 @@ def test_loss_selects_hypotheses_by_the_rest_pose_first(first, step):
 
 def test_second_phase_learns_with_a_fixed_teacher(learnt, poses, first):
     _, begun, result, prior = learnt
-    assert result.kept["validation_loss"] < 0.4 * begun
+    assert result.saved["validation_loss"] < 0.4 * begun
     kept = first.learnt(poses[0]).state_dict()
     for name, value in prior.model.pose.state_dict().items():
         np.testing.assert_array_equal(value, kept[name], err_msg=name)

@@ -83,7 +83,7 @@ def measured(truth, sampler, n):
 def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
     """The fast version of the slow test below, in reduced coordinates."""
     reduced, _ = gaits().reduced()
-    truth = Truth(reduced, draws=200)
+    truth = Truth(reduced, draws=100)
     ours = truth.measure(MultiViewPredictorCorrector(), 0)
     mas = truth.measure(MultiViewAncestral(steps=95), 0)
     assert ours["calls"] == mas["calls"] == 475

@@ -64,14 +64,14 @@ def bare(walks):
     states = BodyStates(BODY, rest_pose(BODY, [clip.positions for clip in walks]))
     trainee = DVAETrainee(walks[2:], walks[:2], DVAESettings.tiny(), states)
     return MotionDVAE(
-        trained(trainee, 40), trainee.size, states, 30.0, card={"network": trainee.settings}
+        trained(trainee, 30), trainee.size, states, 30.0, card={"network": trainee.settings}
     )
 
 
 @pytest.fixture(scope="module")
 def denoiser(bare, walks):
     trainee = DenoiserTrainee(walks[2:], walks[:2], bare)
-    return MotionDenoiser(trained(trainee, 40), bare, {"network": trainee.settings})
+    return MotionDenoiser(trained(trainee, 30), bare, {"network": trainee.settings})
 
 
 @pytest.fixture(scope="module")
@@ -155,9 +155,8 @@ def test_draws_are_more_accurate_than_the_observations(posterior, walks):
     truth = walks[0].window(10, WINDOW).positions
     visible = posterior.likelihood.entries.visible
     noisy = np.linalg.norm(posterior.likelihood.joints - truth, axis=-1)[visible].mean()
-    for sampler in (DVAEInference(), FIT):
-        found = run(sampler, posterior, draws=20).flat().mean(axis=0)
-        assert np.linalg.norm(found - truth, axis=-1)[visible].mean() < 0.9 * noisy
+    found = run(DVAEInference(), posterior, draws=20).flat().mean(axis=0)
+    assert np.linalg.norm(found - truth, axis=-1)[visible].mean() < 0.9 * noisy
 
 
 @pytest.mark.parametrize(
