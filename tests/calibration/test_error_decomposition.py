@@ -318,15 +318,6 @@ def test_gaits_have_a_manifold_measure_and_a_plot(tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_conditional_gaits():
-    problem = load_problem("gait-monocular", frames=4, components=3)
-    found = decompose(problem, steps=8, seeds=2, draws=40)
-    spread = means(found, "spread")
-    assert abs(spread["remainder"]) < 0.4
-    assert abs(means(found, "mean")["remainder"]) < 0.1
-    assert found.parts == ["remainder", "discretisation", "single view", "guidance"]
-
-
 def test_invalid_arguments():
     prior = centred(1, 1, 1)
     problem = problem_of(prior)

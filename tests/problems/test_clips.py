@@ -121,15 +121,15 @@ def test_problem_from_real_bvh_files():
     assert np.abs(image - problem.posterior.likelihood.keypoints).mean() < 0.1
 
 
-@pytest.mark.parametrize(("name", "sees"), [("cmu", False), ("cmu-monocular", True)])
-def test_cmu_problems_are_exact(real_data, name, sees):
+@pytest.mark.parametrize(("name", "observed"), [("cmu", False), ("cmu-monocular", True)])
+def test_cmu_problems_are_exact(real_data, name, observed):
     problem = load_problem(name)
     assert problem.exact is not None
-    assert (problem.truth is not None) == sees
+    assert (problem.truth is not None) == observed
     assert problem.simulate is not None
     walks = problem.posterior.prior
     assert walks.frames == 30
-    if sees:
+    if observed:
         # The observations reduce the error for a clip that was held out.
         known = problem.reference(0, 50)
         from_prior = problem.posterior.prior.sample(np.random.default_rng(0), 50)

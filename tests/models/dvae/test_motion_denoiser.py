@@ -60,12 +60,12 @@ def clip(prior, frames=L, seed=2):
     return prior.of(frames=frames).sample(np.random.default_rng(seed), 1)[0]
 
 
-def observed(prior, freedom=None, frames=L, noise=0.05, seed=2, hide=0.25, place=None):
+def observed(prior, freedom=None, frames=L, noise=0.05, seed=2, occluded=0.25, place=None):
     """Return noisy joints of a draw, some occluded (NaN); ``place`` transforms them."""
     rng = np.random.default_rng(seed)
     joints = clip(prior, frames, seed) + noise * rng.normal(size=(frames, J, 3))
-    shares = [hide, *[(1 - hide) / 3] * 3]
-    confidence = rng.choice([0.0, 0.5, 1.0, 2.0], (frames, J), p=shares)
+    proportions = [occluded, *[(1 - occluded) / 3] * 3]
+    confidence = rng.choice([0.0, 0.5, 1.0, 2.0], (frames, J), p=proportions)
     joints = joints if place is None else place(joints)
     joints[confidence == 0] = np.nan
     return Joints3D(joints, noise, confidence, freedom, prior.skeleton, 30.0)

@@ -65,12 +65,12 @@ def test_poses_match_the_network_on_windows(tracks, network, rest, mirror):
     found = TeacherForcedPoses(network.train(), batches, rest).of(drawn)
     seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
     with torch.no_grad():
-        asked = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
+        direct = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
     for name in ("rotation", "translation", "turns", "log_lengths"):
         torch.testing.assert_close(
-            getattr(found, name), getattr(asked, name), rtol=1e-4, atol=1e-5, msg=name
+            getattr(found, name), getattr(direct, name), rtol=1e-4, atol=1e-5, msg=name
         )
-    assert asked.log_lengths.std() > 0.01
+    assert direct.log_lengths.std() > 0.01
 
 
 @pytest.mark.parametrize(("distance", "tolerance"), [(None, 1e-6), (7.0, 0.02)])
@@ -114,20 +114,20 @@ def test_loss_ignores_the_trainer_s_autocast(tracks, network, body):
     learner, n, device = trainee.network, 8, torch.device("cpu")
     plain = trainee._loss(learner, trainee.batches, np.random.default_rng(0), n, device)
     with torch.autocast("cpu", torch.bfloat16):
-        asked = trainee.training_loss(learner, np.random.default_rng(0), n, device)
-    torch.testing.assert_close(asked, plain, rtol=0, atol=0)
+        direct = trainee.training_loss(learner, np.random.default_rng(0), n, device)
+    torch.testing.assert_close(direct, plain, rtol=0, atol=0)
 
 
 def test_teacher_is_evaluated_once_per_frame(tracks, network, body):
     trainee = MotionVAETrainee(tracks, tracks, SIZE, body, network, distance=7.0)
-    asked = []
-    network.register_forward_hook(lambda _, given, __: asked.append(len(given[0])))
+    direct = []
+    network.register_forward_hook(lambda _, given, __: direct.append(len(given[0])))
     for step in range(3):
         rng = np.random.default_rng(step)
         trainee.training_loss(trainee.network, rng, 4, torch.device("cpu"))
         with torch.no_grad():
             trainee.validation_loss(trainee.network, torch.device("cpu"))
-    assert sum(asked) == sum(
+    assert sum(direct) == sum(
         len(batches.all_frames()[0]) for batches in (trainee.batches, trainee.held_out)
     )
 

@@ -109,9 +109,9 @@ def test_loss_selects_hypotheses_by_the_rest_pose_first(first, step):
     with torch.no_grad():
         # Large bone rotations, so that the two criteria differ.
         network.bone_decoder.leave.weight.mul_(300)
-    asked = copy.copy(first)
-    asked.anneal(step)
-    loss = asked.training_loss(network, np.random.default_rng(0), 16, CPU)
+    trainee = copy.copy(first)
+    trainee.anneal(step)
+    loss = trainee.training_loss(network, np.random.default_rng(0), 16, CPU)
     drawn = first.batches.draw(np.random.default_rng(0), 16)
     keypoints, seen, rest = first._inputs(drawn, CPU)
     confidence = torch.as_tensor(drawn.confidence)
@@ -163,14 +163,14 @@ def test_second_phase_loss_is_the_weighted_sum_of_its_terms(learnt, monkeypatch)
     assert isinstance(network, MotionVAEModel)
     only = {"reconstruction": 0.0, "smoothness": 0.0, "ranges": 0.0, "teacher": 0.0}
     found = {}
-    taught = trainee._teacher_poses
+    teacher_poses = trainee._teacher_poses
 
     def with_default_weights(*given):
-        asked, trainee.size = trainee.size, TINY
+        weights, trainee.size = trainee.size, TINY
         try:
-            return taught(*given)
+            return teacher_poses(*given)
         finally:
-            trainee.size = asked
+            trainee.size = weights
 
     # The weights also select the hypothesis.
     monkeypatch.setattr(trainee, "_teacher_poses", with_default_weights)

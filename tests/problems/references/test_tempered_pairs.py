@@ -105,12 +105,12 @@ def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
     pose = prior.seed[0] + 0.1 * rng.standard_normal(prior.seed[0].shape)
     apart, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(views.near.shape[1])
     log_annotations(pose, view, body, views, logs)
-    picture = project_to_view(pose, view, body, views) @ [1, 1j]
-    picture -= picture.mean()
+    points = project_to_view(pose, view, body, views) @ [1, 1j]
+    points -= points.mean()
     for annotation, exact in zip(views.near[view], logs, strict=True):
         target = held.joints[annotation].T @ [1, 1j]
-        turn = np.vdot(picture, target)
-        error = picture * turn / abs(turn) - target
+        turn = np.vdot(points, target)
+        error = points * turn / abs(turn) - target
         if measure == "cartesian":
             known = math.sqrt(np.mean(np.abs(error) ** 2))
             assert exact == pytest.approx(-0.5 * (known / likelihood.noise) ** 2, rel=1e-9)
@@ -263,8 +263,8 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
     if cut:
         posterior = TruncatedPosterior(prior, likelihood, limit=1e3)
     sampler = TemperedPairs(levels=3, steps=30, warmup=20, thin=3)
-    asked = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
-    whole = sampler.sample(posterior, **asked)
+    options = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
+    whole = sampler.sample(posterior, **options)
     monkeypatch.setattr(chains, "_SECONDS", 0.0)
     save = StoredChain.save
 
@@ -276,7 +276,7 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(StoredChain, "save", stopping)
         with pytest.raises(KeyboardInterrupt):
-            sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
+            sampler.sample(posterior, **options, unfinished=tmp_path / "run")
     kept = sorted(tmp_path.iterdir())
     assert "run-0.npz" in [path.name for path in kept]
     walked = []
@@ -287,14 +287,14 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
         exchange(ladder, stop)
 
     monkeypatch.setattr(tempered_pairs._Ladder, "_exchange_after_walking", counted)
-    again = sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
+    again = sampler.sample(posterior, **options, unfinished=tmp_path / "run")
     assert len(walked) < 2 * (20 + 3 * 12) - 20
     assert np.array_equal(again.dataset["positions"], whole.dataset["positions"])
     for name in ("round_trips", "rejected_exchanges"):
         assert np.array_equal(again.dataset[name], whole.dataset[name])
     kept[0].write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"run-0.npz must contain a stored chain"):
-        sampler.sample(posterior, **asked, unfinished=tmp_path / "run")
+        sampler.sample(posterior, **options, unfinished=tmp_path / "run")
 
 
 def test_ctrl_c_stops_all_chains(prior, likelihood):
