@@ -69,8 +69,8 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel):
         for path in (ROOT / room).rglob("*.py*")
         if path.suffix in (".py", ".pyi")
     }
-    data = {"py.typed", "data/registry.csv", "plots/animation.js"}
-    data |= {"report/page.css", "report/animations.js", "report/tables.js"}
+    data = {"py.typed", "data/registry.csv", "plots/animation.css", "plots/animation.js"}
+    data |= {"report/page.css", "report/tables.js"}
     data |= {"comparison/measured.csv", "comparison/measured.json"}
     data |= {
         f"problems/references/{name}/{file}"
