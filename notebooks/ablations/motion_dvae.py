@@ -69,7 +69,7 @@ class Recording:
     """A held-out motion and its noisy joints."""
 
     truth: Motion
-    evidence: Joints3D
+    observed: Joints3D
     hidden: np.ndarray
 
 
@@ -137,14 +137,14 @@ class Study:
                 truth = replace(clip.window(int(start), frames), name=f"{clip.name}/{start}")
                 hidden = limb_occlusions(truth, cut_off=hides == "from the ends")
                 hidden &= hides != "nothing"
-                evidence = Joints3D.observe(
+                observed = Joints3D.observe(
                     truth,
                     noise,
                     seeds.integer(self.seed, kind, truth.name) % 2**31,
                     hidden=hidden,
                     degrees_of_freedom=freedom,
                 )
-                made.append(Recording(truth, evidence, hidden))
+                made.append(Recording(truth, observed, hidden))
         return made
 
     def posterior(
@@ -156,10 +156,10 @@ class Study:
         """
         prior = self.prior.of(
             frames=recording.truth.frames,
-            body=body_of(recording.evidence, self.prior),
+            body=body_of(recording.observed, self.prior),
             inference_network=network,
         )
-        return MotionPosterior(prior, recording.evidence)
+        return MotionPosterior(prior, recording.observed)
 
     def dvae(
         self, sampler: DVAEInference, network: MotionDenoiser | None = None, average: bool = True
@@ -175,21 +175,21 @@ class Study:
 
 def noisy(recording: Recording) -> np.ndarray:
     """Return the recording itself, occluded joints interpolated."""
-    return filled_between(recording.evidence.joints, ~recording.hidden)
+    return filled_between(recording.observed.joints, ~recording.hidden)
 
 
 def filtered(recording: Recording) -> np.ndarray:
     """Return a Savitzky-Golay filter's estimate."""
-    return savitzky_golay(recording.evidence.joints, ~recording.hidden, fps=recording.truth.fps)
+    return savitzky_golay(recording.observed.joints, ~recording.hidden, fps=recording.truth.fps)
 
 
 def smoothed(recording: Recording) -> np.ndarray:
     """Return a Kalman smoother's mean; heavy-tailed noise enters by its variance."""
-    evidence = recording.evidence
+    observed = recording.observed
     mean, _ = kalman_smooth(
-        evidence.joints,
-        evidence.entries.confidence,
-        noise=gaussian_noise(evidence),
+        observed.joints,
+        observed.entries.confidence,
+        noise=gaussian_noise(observed),
         fps=recording.truth.fps,
     )
     return mean
@@ -208,16 +208,16 @@ def mixture(study: Study) -> Estimate:
     root = known.skeleton.roots[0]
 
     def estimate(recording: Recording) -> np.ndarray:
-        evidence = recording.evidence
+        observed = recording.observed
         stitching = Stitching(recording.truth.frames, frames, frames // 3)
         found = []
         for joints, confidence in zip(
-            stitching.cut(evidence.joints), stitching.cut(evidence.entries.confidence), strict=True
+            stitching.cut(observed.joints), stitching.cut(observed.entries.confidence), strict=True
         ):
             # The mixture is of motions whose root is centred.
             seen = confidence[:, root] > 0
             centre = joints[seen, root].mean(axis=0)
-            here = Joints3D(joints - centre, gaussian_noise(evidence), confidence)
+            here = Joints3D(joints - centre, gaussian_noise(observed), confidence)
             found.append(known.exact_posterior(here).mean() + centre)
         return stitching.mean(np.stack(found))
 
@@ -382,10 +382,10 @@ def recording(study: Study) -> pd.DataFrame:
     for hides in (False, True):
         truth = Motion(found.filtered, found.skeleton, found.fps, name=found.name)
         hidden = (limb_occlusions(truth) & hides) | ~found.seen
-        evidence = Joints3D(
+        observed = Joints3D(
             found.joints, scale, (~hidden).astype(float), 4.0, found.skeleton, found.fps
         )
-        one = Recording(truth, evidence, hidden)
+        one = Recording(truth, observed, hidden)
         fit = DVAEInference(mode="optimization", iterations=50)
         ways = {
             "noisy input": noisy,
@@ -429,11 +429,11 @@ def posterior(study: Study) -> pd.DataFrame:
     frames = study.prior.settings.frames
     truth = recording.truth.window(0, frames)
     hidden = limb_occlusions(truth)
-    evidence = Joints3D.observe(truth, KINDS["occluded"][0], study.seed, hidden=hidden)
+    observed = Joints3D.observe(truth, KINDS["occluded"][0], study.seed, hidden=hidden)
     problem = Problem(
         "occluded",
         "a window of a held-out clip in which limbs hide",
-        study.posterior(Recording(truth, evidence, hidden)),
+        study.posterior(Recording(truth, observed, hidden)),
         truth=truth.positions,
     )
     fit = DVAEInference(mode="optimization", iterations=50 if study.quick else 200)

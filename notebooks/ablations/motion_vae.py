@@ -369,7 +369,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--quick", action="store_true", help="made walks and tiny networks")
+    parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
     parser.add_argument("--steps", type=int, help="of the second phase, in place of the size's own")
     parser.add_argument("--draws", type=int, help="sequences that are generated, 1400 by default")
     asked = parser.parse_args()

@@ -165,7 +165,7 @@ def _description(
     left_out = f" ({too_short} shorter than {frames} frames left out)" if too_short else ""
     prior = f"prior fitted to {clips} of {fitted[0].skeleton.n_joints} joints{left_out}"
     if how == "none":
-        return f"{prior}, without {hidden.name or 'the one held out'}; no evidence"
+        return f"{prior}, without {hidden.name or 'the one held out'}; no observations"
     return (
         f"{prior}; {how} keypoints (σ {100 * noise:g} cm) of {hidden.name or 'the one held out'}, "
         "which was held out"

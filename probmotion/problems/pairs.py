@@ -73,7 +73,7 @@ def pairs_problem(
     return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=first[None])
 
 
-_DANCE = "two made people who dance, 300 annotated 2D pairs and one 3D seed: coverage"
+_DANCE = "two synthetic dancers, 300 annotated 2D pairs and one 3D seed: coverage"
 _SALSA = "salsa (CMU 60 and 61), 5599 annotated 2D pairs of 7 clips and one 3D seed: coverage"
 
 

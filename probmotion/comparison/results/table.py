@@ -240,7 +240,9 @@ def _aligned(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     headings = [[header[0]]]
     for heading, *column in zip(header[1:], *(row[1:] for row in body), strict=True):
         width = max(_NARROWEST, *map(len, column))
-        headings.append(textwrap.wrap(heading, width, break_on_hyphens=False) or [""])
+        headings.append(
+            textwrap.wrap(heading, width, break_long_words=False, break_on_hyphens=False) or [""]
+        )
     height = max(map(len, headings))
     rows = [*zip(*([""] * (height - len(h)) + h for h in headings), strict=True), *body]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
