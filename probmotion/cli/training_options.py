@@ -86,7 +86,6 @@ def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: st
         print(f"{result.model} is finished: {before} of {settings.steps} steps{ended}")
         return
     print(
-        f"wrote {result.model}: step {saved['step']:.0f}, loss {saved['loss']:.4f}, validation loss "
-        f"{saved['validation_loss']:.4f}, "
-        f"{last['seconds']:.0f} s of steps{ended}"
+        f"wrote {result.model}: step {saved['step']:.0f}, loss {saved['loss']:.4f}, "
+        f"validation loss {saved['validation_loss']:.4f}, {last['seconds']:.0f} s of steps{ended}"
     )
