@@ -72,6 +72,14 @@ def test_only_principal_coordinates_are_monitored_in_high_dimension(rng):
     assert abs(np.corrcoef(monitored[..., 0].ravel(), theta[..., 0].ravel())[0, 1]) > 0.99
 
 
+@pytest.mark.parametrize(("varying", "expected"), [(0, 1), (1, 1), (2, 2)])
+def test_constant_coordinates_are_dropped_except_the_first(rng, varying, expected):
+    values = np.zeros((2, 50, 40))
+    values[..., :varying] = 1e6 * rng.normal(size=(2, 50, varying))
+    turned = values @ np.linalg.qr(rng.normal(size=(40, 40)))[0]
+    assert chains.principal_coordinates(turned).shape == (2, 50, expected)
+
+
 def test_ensembles_use_their_autocorrelation_time(rng):
     theta = rng.normal(size=(CHAINS, DRAWS, 2))
 
