@@ -22,11 +22,11 @@
 # seed:
 #
 # $$
-# p(x \mid \mathcal{A}) \propto p(x) \sum_{v} \sum_{a \in \mathcal{A}}
-#   \exp\!\left( - \frac{d_{IC}(P_v x, a)^2}{2 \sigma_l^2} \right),
+# p(x \mid \mathcal{A}) \propto p(x) \frac{1}{m} \sum_{i=1}^{m} \max_{a \in \mathcal{A}}
+#   \exp\!\left( - \frac{d_{IC}(P_{v_i} x, a)^2}{2 \sigma_l^2} \right),
 # $$
 #
-# with the prior $p(x)$ of physically possible poses, annotations $a$, views $v$ and the distance $d_{IC}$ in
+# with the prior $p(x)$ of physically possible poses, annotations $a$, views $v_i$ and the distance $d_{IC}$ in
 # interaction coordinates.
 #
 # On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
