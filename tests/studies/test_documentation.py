@@ -14,6 +14,7 @@ import nbformat
 import pytest
 
 from probmotion.citations import CITATIONS, OF_SETTINGS, POSE_PAIRS
+from probmotion.comparison.results.table import BLOCKS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -51,6 +52,13 @@ def test_readme_links_are_absolute_and_resolve():
         else:
             path = re.sub(r"^(raw|blob)/main/", "", target.removeprefix(REPOSITORY))
             assert (ROOT / path).exists(), target
+
+
+def test_every_metric_of_the_table_is_defined():
+    page = (ROOT / "docs" / "concepts" / "metrics.md").read_text(encoding="utf-8")
+    endings = ("_side", "_learnt", "_visible_mm", "_occluded_mm", "_evaluations")
+    for metric in {name for columns in BLOCKS.values() for name in columns}:
+        assert f"`{metric}`" in page or metric.endswith(endings), metric
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
