@@ -4,7 +4,7 @@ A mutant is one fault in one expression: another operator or constant, a lost si
 arguments. They are chosen at random, with a fixed seed, in metrics, priors, samplers and formats of
 the first revision; the same ones are looked for in the second, by function and expression, wherever
 that function is now. Each runs for at most 60 s of processor time against the test files that
-import its module, the closest in name first, slow tests left out.
+import its module, or else those of its room, the closest in name first, slow tests left out.
 
 ``mutants_caught_before``, ``mutants_caught_after``: share of the mutants that exist at both
 revisions whose tests fail in that time. ``mutants_gone``: those whose expression the second
@@ -150,7 +150,7 @@ def _replaced(source: str, node: ast.expr, new: str) -> str:
 
 
 def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
-    """Return the test files that import a module, or a public name that it defines."""
+    """Return the test files that import a module or a public name of it, or else its room's."""
     module = "probmotion." + ".".join(path.relative_to(package).with_suffix("").parts)
     public = {
         node.name
@@ -167,8 +167,11 @@ def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
             if node.module == module or (above and names & (public | {module.split(".")[-1]})):
                 found.append(test.relative_to(tests.parent).as_posix())
                 break
+    if not found:
+        room = tests / path.parent.relative_to(package)
+        found = [test.relative_to(tests.parent).as_posix() for test in room.rglob("test_*.py")]
     words = set(path.stem.split("_"))
-    return sorted(found, key=lambda test: -len(words & set(Path(test).stem.split("_"))))
+    return sorted(found, key=lambda test: (-len(words & set(Path(test).stem.split("_"))), test))
 
 
 def lay_out(revision: str, folder: Path) -> None:
