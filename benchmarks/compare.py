@@ -35,35 +35,35 @@ print(imported - start, time.perf_counter() - imported)
 """
 
 
-def seconds(workers: int, cells: int, thin: int) -> tuple[float, float]:
+def seconds(workers: int, runs: int, thin: int) -> tuple[float, float]:
     """Return the duration of a comparison, and the part of it spent within samplers."""
     sampler = MetropolisHastings(warmup=1000, thin=thin)
     start = time.perf_counter()
     found = compare(
-        "gait", sampler, draws=40, chains=4, seeds=cells, workers=workers, progress=False
+        "gait", sampler, draws=40, chains=4, seeds=runs, workers=workers, progress=False
     )
     taken = time.perf_counter() - start
-    if len(found.results) != cells or found.failures:
-        raise SystemExit("some cells failed, expected all to finish")
-    return taken, sum(cell.metrics["seconds"] for cell in found.results)
+    if len(found.results) != runs or found.failures:
+        raise SystemExit("some runs failed, expected all to finish")
+    return taken, sum(run.metrics["seconds"] for run in found.results)
 
 
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, default=32)
-    parser.add_argument("--cell-seconds", type=float, default=5.0)
+    parser.add_argument("--runs", type=int, default=32)
+    parser.add_argument("--run-seconds", type=float, default=5.0)
     given = parser.parse_args()
     # Here everything is imported and the problem made before the clock starts.
     thin = 2000
-    seconds(0, cells=1, thin=thin)
-    _, one = seconds(0, cells=1, thin=thin)
-    thin = max(1, round(thin * given.cell_seconds / one))
+    seconds(0, runs=1, thin=thin)
+    _, one = seconds(0, runs=1, thin=thin)
+    thin = max(1, round(thin * given.run_seconds / one))
     start = subprocess.check_output([sys.executable, "-c", _START], text=True).split()
     print(f"worker_import_seconds: {float(start[0]):.2f}")
     print(f"worker_problem_seconds: {float(start[1]):.2f}")
-    alone, within_one = seconds(0, given.cells, thin)
-    together, within_two = seconds(2, given.cells, thin)
+    alone, within_one = seconds(0, given.runs, thin)
+    together, within_two = seconds(2, given.runs, thin)
     print(f"seconds_in_one_process: {alone:.2f}")
     print(f"seconds_two_workers: {together:.2f}")
     print(f"seconds_beyond_half: {together - alone / 2:.2f}")

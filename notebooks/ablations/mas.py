@@ -248,11 +248,11 @@ def table(study: Study) -> pd.DataFrame:
     add("2D model", None, views, seconds / study.draws)
     drawn = {}
     found = study.compared("table", {"walks": study.problem}, samplers(study.iterations))
-    for cell in found.results:
-        rows.append(score_cell(study, cell.sampler, found, cell, real))
+    for run in found.results:
+        rows.append(score_run(study, run.sampler, found, run, real))
         print(rows[-1], flush=True)
-        if cell.failure is None:
-            drawn[cell.sampler] = found.draws(cell.problem, cell.sampler).flat()
+        if run.failure is None:
+            drawn[run.sampler] = found.draws(run.problem, run.sampler).flat()
     lifted = study.views("train", study.draws)
     with written_whole(study.out / "to_lift.npz") as path, open(path, "wb") as file:
         np.savez_compressed(file, keypoints=lifted, fps=FPS, joint_names=PERSON.joint_names)
@@ -311,14 +311,14 @@ def score(
     return row
 
 
-def score_cell(
-    study: Study, name: str, found: Comparison, cell: RunResult, real: np.ndarray
+def score_run(
+    study: Study, name: str, found: Comparison, run: RunResult, real: np.ndarray
 ) -> dict[str, object]:
     """Return the row of a sampler of the comparison, or of its failure."""
-    if cell.failure is not None:
-        return {"name": name, "failed": str(cell.failure)}
-    motions = found.draws(cell.problem, cell.sampler).flat()
-    return score(study, name, motions, None, real, cell.metrics["seconds"] / study.draws)
+    if run.failure is not None:
+        return {"name": name, "failed": str(run.failure)}
+    motions = found.draws(run.problem, run.sampler).flat()
+    return score(study, name, motions, None, real, run.metrics["seconds"] / study.draws)
 
 
 def bone_changes(motions: np.ndarray) -> float:
@@ -388,8 +388,8 @@ def strided(study: Study) -> pd.DataFrame:
     labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in ways.items()}
     found = study.compared("strided", {"walks": study.problem}, labelled)
     rows = []
-    for (steps, name), cell in zip(ways, found.results, strict=True):
-        rows.append({"steps": steps, **score_cell(study, name, found, cell, real)})
+    for (steps, name), run in zip(ways, found.results, strict=True):
+        rows.append({"steps": steps, **score_run(study, name, found, run, real)})
         print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
@@ -437,14 +437,14 @@ def exact(study: Study) -> pd.DataFrame:
     )
     rows = []
     # The two rows of a sampler one below the other.
-    for cell in sorted(found.results, key=lambda cell: cell.sampler):
-        row: dict[str, object] = {"sampler": cell.sampler, "denoiser": cell.problem}
-        if cell.failure is None:
+    for run in sorted(found.results, key=lambda run: run.sampler):
+        row: dict[str, object] = {"sampler": run.sampler, "denoiser": run.problem}
+        if run.failure is None:
             # The grid cannot compare the network's draws with exact ones: its posterior knows none.
-            measured = measure(problem, found.draws(cell.problem, cell.sampler), SEED)
+            measured = measure(problem, found.draws(run.problem, run.sampler), SEED)
             row |= {key: measured[key] for key in kept}
         else:
-            row["failed"] = str(cell.failure)
+            row["failed"] = str(run.failure)
         rows.append(row)
         print(row, flush=True)
     return pd.DataFrame(rows)

@@ -454,15 +454,15 @@ def posterior(study: Study) -> pd.DataFrame:
             workers=0,
             progress=not study.quick,
         )
-        for cell in found.results:
-            row: dict[str, object] = {"sampler": cell.sampler}
-            if cell.failure is None:
-                drawn = found.draws(cell.problem, cell.sampler)
+        for run in found.results:
+            row: dict[str, object] = {"sampler": run.sampler}
+            if run.failure is None:
+                drawn = found.draws(run.problem, run.sampler)
                 row |= honesty(drawn.flat(), truth, hidden)
                 row["log_density"] = float(drawn.dataset["log_density"].mean())
-                row["seconds"] = cell.metrics["seconds"]
+                row["seconds"] = run.metrics["seconds"]
             else:
-                row["failed"] = str(cell.failure)
+                row["failed"] = str(run.failure)
             rows.append(row)
             print(row, flush=True)
     return pd.DataFrame(rows)

@@ -299,7 +299,7 @@ def generation(study: Study) -> pd.DataFrame:
     other = load_problem("walk2d")
     longer = other.posterior
     per_motion = longer.frames // round(longer.fps / FPS) // FRAMES
-    # A cell of the grid has ten draws at least.
+    # A run of the grid has ten draws at least.
     n = max(10, study.draws // 10)
     ours = MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
     iterations = 50 if study.quick else 1000
@@ -324,14 +324,14 @@ def generation(study: Study) -> pd.DataFrame:
             workers=0,
             progress=not study.quick,
         )
-        for cell in found.results:
-            row: dict[str, Any] = {"way": cell.sampler}
-            if cell.failure is None:
-                motions = sequences(found.draws(cell.problem, cell.sampler))
-                row |= {"sequences": len(motions), "seconds": cell.metrics["seconds"]}
+        for run in found.results:
+            row: dict[str, Any] = {"way": run.sampler}
+            if run.failure is None:
+                motions = sequences(found.draws(run.problem, run.sampler))
+                row |= {"sequences": len(motions), "seconds": run.metrics["seconds"]}
                 row |= beside_real(study, motions)
             else:
-                row["failed"] = str(cell.failure)
+                row["failed"] = str(run.failure)
             rows.append(row)
             print(row, flush=True)
     rng = seeds.generator(study.seed, "real draws")

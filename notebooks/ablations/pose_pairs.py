@@ -75,7 +75,7 @@ class Runs:
 
     def draws(self, problem: str, sampler: str = "isotropic") -> MotionDraws | None:
         """Return the draws of a run; None if it failed."""
-        failed = {(cell.problem, cell.sampler) for cell in self.found.failures}
+        failed = {(run.problem, run.sampler) for run in self.found.failures}
         return None if (problem, sampler) in failed else self.found.draws(problem, sampler)
 
 
@@ -171,8 +171,8 @@ class Study:
             workers=0,
             progress=not self.quick,
         )
-        for cell in found.failures:
-            print(f"{part}: {cell.sampler} on {cell.problem} failed, {cell.failure}")
+        for run in found.failures:
+            print(f"{part}: {run.sampler} on {run.problem} failed, {run.failure}")
         return Runs(asked, found)
 
     @cached_property
@@ -194,23 +194,23 @@ class Study:
         ``also`` names further metrics of the comparison.
         """
         rows = []
-        for cell in runs.found.results:
-            about = dict(runs.asked[cell.problem])
+        for run in runs.found.results:
+            about = dict(runs.asked[run.problem])
             if len(runs.found.plan.samplers) > 1:
-                about["proposal"] = cell.sampler
+                about["proposal"] = run.sampler
             covered = {
-                (measure, runs.found.plan.draws): cell.metrics.get(f"coverage_{measure}", np.nan)
+                (measure, runs.found.plan.draws): run.metrics.get(f"coverage_{measure}", np.nan)
                 for measure in MEASURES
             }
-            draws = runs.draws(cell.problem, cell.sampler)
+            draws = runs.draws(run.problem, run.sampler)
             if draws is None:
-                about["failed"] = str(cell.failure)
+                about["failed"] = str(run.failure)
             else:
-                about |= {name: cell.metrics[name] for name in ("acceptance", *also)}
+                about |= {name: run.metrics[name] for name in ("acceptance", *also)}
                 about["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
                 about |= {
-                    "ess": cell.metrics.get("ess_bulk", np.nan),
-                    "seconds": cell.metrics["seconds"],
+                    "ess": run.metrics.get("ess_bulk", np.nan),
+                    "seconds": run.metrics["seconds"],
                 }
                 covered = self.covered(step_by_step(draws), fewer) | covered
             rows += [
