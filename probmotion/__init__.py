@@ -10,27 +10,15 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # Names from before the packages were regrouped. To be removed in 0.2.
 _RENAMED = {
-    "load_motion": "load",
-    "load_motions": "load_all",
-    "save_motion": "save",
-    "advice": "comparison",
-    "bias": "calibration",
-    "checks": "validation",
-    "diffusion": "posteriors.noise_schedule",
-    "draws": "posteriors.draws",
-    "formats": "io",
-    "cameras": "geometry.cameras",
-    "kinematics": "motion.kinematics",
-    "likelihoods": "posteriors.likelihoods",
-    "noisy_joints": "posteriors.noisy_joints",
-    "pictures": "plots",
-    "posterior": "posteriors.posterior",
-    "priors": "posteriors.protocols",
-    "retargeting": "motion.retargeting",
-    "rotations": "geometry.rotations",
-    "sampling": "posteriors.sampling",
-    "skeleton": "motion.skeleton",
-}
+    "load_motion": "load", "load_motions": "load_all", "save_motion": "save",
+    "advice": "comparison", "bias": "calibration", "checks": "validation",
+    "diffusion": "posteriors.noise_schedule", "draws": "posteriors.draws", "formats": "io",
+    "cameras": "geometry.cameras", "kinematics": "motion.kinematics",
+    "likelihoods": "posteriors.likelihoods", "noisy_joints": "posteriors.noisy_joints",
+    "pictures": "plots", "posterior": "posteriors.posterior", "priors": "posteriors.protocols",
+    "retargeting": "motion.retargeting", "rotations": "geometry.rotations",
+    "sampling": "posteriors.sampling", "skeleton": "motion.skeleton",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

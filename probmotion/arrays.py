@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace, device, is_jax_array, is_torch_array
 
-__all__ = [
-    "Array",
-    "array_namespace",
-    "constant",
-    "jax_from_torch",
-    "logsumexp",
-    "to_numpy",
-]
+__all__ = ["Array", "array_namespace", "constant", "jax_from_torch", "logsumexp", "to_numpy"]
 
 Array = Any
 """An array of any library that follows the Python Array API standard."""
@@ -24,9 +17,8 @@ Array = Any
 def constant(value: Any, like: Array) -> Array:
     """Return ``value`` as an array of the library, dtype and device of the float array ``like``."""
     xp = array_namespace(like)
-    if is_jax_array(like):
-        return xp.asarray(np.asarray(value), dtype=like.dtype)
-    return xp.asarray(np.asarray(value), dtype=like.dtype, device=device(like))
+    where = {} if is_jax_array(like) else {"device": device(like)}
+    return xp.asarray(np.asarray(value), dtype=like.dtype, **where)
 
 
 def to_numpy(x: Array) -> np.ndarray:
@@ -37,17 +29,15 @@ def to_numpy(x: Array) -> np.ndarray:
 
 
 def logsumexp(x: Array, axis: int = -1) -> Array:
-    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` for entries of ``-inf``
-    only.
-    """
+    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` if all entries are."""
     xp = array_namespace(x)
     top = xp.max(x, axis=axis, keepdims=True)
     top = xp.where(xp.isfinite(top), top, xp.zeros_like(top))
     total = xp.sum(xp.exp(x - top), axis=axis, keepdims=True)
     # NumPy would warn about log 0.
-    none = total == 0
-    log_total = xp.log(xp.where(none, xp.ones_like(total), total))
-    log_total = xp.where(none, xp.full_like(total, -float("inf")), log_total)
+    empty = total == 0
+    log_total = xp.log(xp.where(empty, xp.ones_like(total), total))
+    log_total = xp.where(empty, xp.full_like(total, -float("inf")), log_total)
     return xp.squeeze(log_total + top, axis=axis)
 
 
@@ -65,8 +55,7 @@ def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Arra
     words, real = jax.numpy.uint32, np.float64
 
     def value_and_gradient(theta: Array) -> tuple[np.ndarray, np.ndarray]:
-        at = np.asarray(theta).view(real)[:, 0]
-        point = torch.tensor(at, requires_grad=True)
+        point = torch.tensor(np.asarray(theta).view(real)[:, 0], requires_grad=True)
         value = function(point)
         (gradient,) = torch.autograd.grad(value, point)
         rows = (to_numpy(value).reshape(1), to_numpy(gradient)[:, None])
@@ -74,9 +63,9 @@ def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Arra
 
     def call(theta: Array) -> tuple[Array, Array]:
         shapes = [jax.ShapeDtypeStruct((*shape, 2), words) for shape in ((), theta.shape)]
-        sent = jax.lax.bitcast_convert_type(theta, words)
-        came = jax.pure_callback(value_and_gradient, shapes, sent, vmap_method="sequential")
-        return tuple(jax.lax.bitcast_convert_type(number, real) for number in came)
+        encoded = jax.lax.bitcast_convert_type(theta, words)
+        results = jax.pure_callback(value_and_gradient, shapes, encoded, vmap_method="sequential")
+        return tuple(jax.lax.bitcast_convert_type(result, real) for result in results)
 
     bridged = jax.custom_vjp(lambda theta: call(theta)[0])
     bridged.defvjp(call, lambda gradient, cotangent: (cotangent * gradient,))

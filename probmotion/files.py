@@ -16,12 +16,12 @@ __all__ = ["forget_killed", "writable_folder", "written_whole"]
 
 def _machine() -> str:
     """Return an identifier of this machine or container; host names alone may repeat."""
-    known = [platform.node()]
+    parts = [platform.node()]
     with suppress(OSError):
-        known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
     with suppress(OSError):
-        known.append(os.readlink("/proc/self/ns/pid"))
-    return f"{zlib.crc32(' '.join(known).encode()):08x}"
+        parts.append(os.readlink("/proc/self/ns/pid"))
+    return f"{zlib.crc32(' '.join(parts).encode()):08x}"
 
 
 _MACHINE = _machine()
@@ -56,20 +56,19 @@ def written_whole(path: Path) -> Iterator[Path]:
 def forget_killed(folder: Path) -> None:
     """Remove temporary files in ``folder`` left by killed processes of this machine.
 
-    Files of other machines that share the folder are left alone, since their processes may still
-    run.
+    The processes of other machines that share the folder may still run.
     """
     # Only POSIX can test for a process without affecting it.
     if os.name != "posix" or not folder.is_dir():
         return
     for path in folder.iterdir():
-        begun = _UNFINISHED.fullmatch(path.name)
-        if begun and not _lives(int(begun[1])):
+        match = _UNFINISHED.fullmatch(path.name)
+        if match and not _is_running(int(match[1])):
             with suppress(OSError):
                 path.unlink()
 
 
-def _lives(process: int) -> bool:
+def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
     except ProcessLookupError:

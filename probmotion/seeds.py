@@ -15,16 +15,9 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = [
-    "NormalStreams",
-    "RandomNumbers",
-    "generator",
-    "integer",
-    "jax_key",
-    "resumed_generator",
-    "sequence",
-    "state_words",
-    "torch_generator",
-]
+    "NormalStreams", "RandomNumbers", "generator", "integer", "jax_key", "resumed_generator",
+    "sequence", "state_words", "torch_generator",
+]  # fmt: skip
 
 Name = str | int
 _INTEGERS = (int, np.integer)
@@ -54,12 +47,9 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
     if isinstance(seed, bool) or not isinstance(seed, _INTEGERS) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
     # The type tag prevents a string and an integer from addressing the same node.
-    key: tuple[int, ...] = ()
+    key: list[int] = []
     for name in path:
-        if isinstance(name, str):
-            key += (1, zlib.crc32(name.encode()))
-        else:
-            key += (0, int(name))
+        key += (1, zlib.crc32(name.encode())) if isinstance(name, str) else (0, int(name))
     return np.random.SeedSequence(int(seed), spawn_key=key)
 
 
@@ -70,22 +60,21 @@ def generator(seed: int, *path: Name) -> np.random.Generator:
 
 def state_words(rng: np.random.Generator) -> np.ndarray:
     """Return the state of a PCG64 generator as ten 32-bit words, signed for netCDF."""
-    held: Any = rng.bit_generator.state
-    numbers = held["state"]
-    bits = numbers["state"] | numbers["inc"] << 128
-    bits |= held["uinteger"] << 256 | held["has_uint32"] << 288
+    state: Any = rng.bit_generator.state
+    bits = state["state"]["state"] | state["state"]["inc"] << 128
+    bits |= state["uinteger"] << 256 | state["has_uint32"] << 288
     return np.frombuffer(bits.to_bytes(40, "little"), dtype="<i4").astype(np.int32)
 
 
 def resumed_generator(words: np.ndarray) -> np.random.Generator:
     """Return the generator whose state is ``words`` (:func:`state_words`)."""
     bits = int.from_bytes(np.asarray(words).astype("<i4").tobytes(), "little")
-    low, word = (1 << 128) - 1, (1 << 32) - 1
+    mask = (1 << 128) - 1
     source = np.random.PCG64()
     source.state = {
         "bit_generator": "PCG64",
-        "state": {"state": bits & low, "inc": bits >> 128 & low},
-        "uinteger": bits >> 256 & word,
+        "state": {"state": bits & mask, "inc": bits >> 128 & mask},
+        "uinteger": bits >> 256 & 0xFFFFFFFF,
         "has_uint32": bits >> 288,
     }
     return np.random.Generator(source)
@@ -127,29 +116,26 @@ class NormalStreams:
 
     def normal(self, *shape: int) -> np.ndarray:
         """Return the next standard normal numbers, shape ``(B, *shape)``, float64."""
-        out = np.empty((len(self.generators), *shape))
-        for row, rng in enumerate(self.generators):
-            rng.standard_normal(out=out[row, ...])
-        return out
+        return self.standard_normal((len(self.generators), *shape))
 
     def uniform(self, *shape: int) -> np.ndarray:
         """Return the next numbers uniform on [0, 1), shape ``(B, *shape)``, float64."""
-        out = np.empty((len(self.generators), *shape))
-        for row, rng in enumerate(self.generators):
-            rng.random(out=out[row, ...])
-        return out
+        return self.random((len(self.generators), *shape))
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:
         """Return :meth:`uniform`; ``size`` begins with the number of draws."""
-        return self.uniform(*self._row(size))
+        return self._filled("random", size)
 
     def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
         """Return :meth:`normal`; ``size`` begins with the number of draws."""
-        return self.normal(*self._row(size))
+        return self._filled("standard_normal", size)
 
-    def _row(self, size: tuple[int, ...]) -> tuple[int, ...]:
+    def _filled(self, method: str, size: tuple[int, ...]) -> np.ndarray:
         if size[:1] != (len(self.generators),):
             raise ValueError(
                 f"size must begin with the number of draws, {len(self.generators)}, got {size}"
             )
-        return size[1:]
+        out = np.empty(size)
+        for row, rng in enumerate(self.generators):
+            getattr(rng, method)(out=out[row, ...])
+        return out

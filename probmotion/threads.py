@@ -121,11 +121,11 @@ def _per_thread_limits(torch: Any) -> Iterator[None]:
     """Limit the per-thread counts of OpenMP and torch."""
     from threadpoolctl import ThreadpoolController
 
-    own = torch.get_num_threads() if torch else 0
+    before = torch.get_num_threads() if torch else 0
     # A thread that loads torch while another one is inside inherits a count of 1 and would restore
     # that 1 on leaving.
-    if own == 1 and not only_one_thread():
-        own = _SHARED.torch_threads or own
+    if before == 1 and not only_one_thread():
+        before = _SHARED.torch_threads or before
     try:
         if torch:
             torch.set_num_threads(1)
@@ -133,4 +133,4 @@ def _per_thread_limits(torch: Any) -> Iterator[None]:
             yield
     finally:
         if torch:
-            torch.set_num_threads(own)
+            torch.set_num_threads(before)

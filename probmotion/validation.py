@@ -21,12 +21,12 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
     axes = expected[1:] if batch else expected
     shape = tuple(value.shape)
     fits = len(shape) >= len(axes) if batch else len(shape) == len(axes)
-    trailing = shape[len(shape) - len(axes) :] if fits else ()
+    trailing = shape[len(shape) - len(axes) :]
     if not fits or any(
-        isinstance(want, int) and want != got for want, got in zip(axes, trailing, strict=True)
+        isinstance(axis, int) and axis != size for axis, size in zip(axes, trailing, strict=True)
     ):
-        wanted = ", ".join(str(axis) for axis in expected)
-        raise ValueError(f"{name} must have shape ({wanted}), got {shape}")
+        sizes = ", ".join(map(str, expected))
+        raise ValueError(f"{name} must have shape ({sizes}), got {shape}")
 
 
 def check_finite(name: str, value: Any) -> None:

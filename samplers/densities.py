@@ -57,7 +57,7 @@ class Density:
         try:
             return np.asarray(function(theta))
         except NotConjugate as error:
-            raise not_conjugate(self.sampler, error) from error
+            raise not_conjugate(self.sampler.name, error) from error
 
     def at_start(
         self,
@@ -85,10 +85,10 @@ def _below_infinity(value: np.ndarray, theta: np.ndarray) -> np.ndarray:
     return value
 
 
-def not_conjugate(sampler: Sampler, error: NotConjugate) -> UnsupportedPosterior:
+def not_conjugate(sampler: str, error: NotConjugate) -> UnsupportedPosterior:
     """Return the error for a marginal likelihood without a closed form."""
     return UnsupportedPosterior(
-        sampler.name,
+        sampler,
         f"cannot evaluate the log density: {error}; use a prior with coordinates='positions'",
         word="not-conjugate",
     )

@@ -32,8 +32,7 @@ def pytest_runtest_setup() -> None:
     """Limit torch to one thread in every test and its fixtures.
 
     Numba's first parallel kernel sets the number of OpenMP threads, and thereby torch's, regardless
-    of
-    OMP_NUM_THREADS; on small tensors, synchronisation makes torch ten times slower.
+    of OMP_NUM_THREADS; on small tensors, synchronisation makes torch ten times slower.
     """
     torch = sys.modules.get("torch")
     if torch is not None:

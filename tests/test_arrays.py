@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from probmotion.arrays import constant, jax_from_torch, logsumexp, to_numpy
+from probmotion.arrays import constant, jax_from_torch, logsumexp
 
 
 def test_constant_has_the_library_and_dtype_of_like(library):
@@ -19,16 +19,9 @@ def test_logsumexp_agrees_with_scipy(library):
     for axis in (0, 1):
         got = library.compiled(lambda x, axis=axis: logsumexp(x, axis=axis))(library.array(values))
         library.assert_close(got / 100, special.logsumexp(values, axis=axis) / 100)
-    nothing = logsumexp(library.array(np.full((2, 3), -np.inf)))
-    assert (np.asarray(nothing) == -np.inf).all()
+    impossible = logsumexp(library.array(np.full((2, 3), -np.inf)))
+    assert (np.asarray(impossible) == -np.inf).all()
     assert logsumexp(library.array(np.zeros((0, 3)))).shape == (0,)
-
-
-def test_to_numpy_detaches_gradients():
-    import torch
-
-    point = torch.ones(3, requires_grad=True)
-    assert isinstance(to_numpy(2 * point), np.ndarray)
 
 
 def test_jax_from_torch_agrees_with_jax_under_jit_grad_and_vmap():
@@ -38,11 +31,14 @@ def test_jax_from_torch_agrees_with_jax_under_jit_grad_and_vmap():
 
     with jax.enable_x64(True):
         bridged = jax_from_torch(lambda x: torch.sum(torch.sin(x) * x))
-        own = lambda x: jnp.sum(jnp.sin(x) * x)  # noqa: E731
+
+        def native(x):
+            return jnp.sum(jnp.sin(x) * x)
+
         point = jnp.asarray(np.random.default_rng(0).standard_normal(5))
-        assert float(jax.jit(bridged)(point)) == pytest.approx(float(own(point)), abs=1e-12)
+        assert float(jax.jit(bridged)(point)) == pytest.approx(float(native(point)), abs=1e-12)
         np.testing.assert_allclose(
-            jax.jit(jax.grad(bridged))(point), jax.grad(own)(point), rtol=0, atol=1e-12
+            jax.jit(jax.grad(bridged))(point), jax.grad(native)(point), rtol=0, atol=1e-12
         )
         batch = jnp.stack([point, 2 * point])
-        np.testing.assert_allclose(jax.vmap(bridged)(batch), jax.vmap(own)(batch), atol=1e-12)
+        np.testing.assert_allclose(jax.vmap(bridged)(batch), jax.vmap(native)(batch), atol=1e-12)

@@ -1,8 +1,9 @@
-"""The public names of `import probmotion as pm`."""
+"""Public names of ``import probmotion as pm``."""
 
 from __future__ import annotations
 
 import importlib
+from importlib.metadata import version
 
 import pytest
 
@@ -10,7 +11,7 @@ import probmotion as pm
 
 
 @pytest.mark.parametrize("old", list(pm._RENAMED))
-def test_renamed_names_say_what_to_use(old):
+def test_renamed_names_name_their_replacement(old):
     new = f"probmotion.{pm._RENAMED[old]}"
     with pytest.raises(AttributeError, match=rf"^probmotion\.{old} is now {new}$"):
         getattr(pm, old)
@@ -21,10 +22,7 @@ def test_renamed_names_say_what_to_use(old):
         assert hasattr(importlib.import_module(module), name)
 
 
-def test_unknown_names_are_refused():
+def test_unknown_names_are_refused_and_the_version_is_that_of_the_package():
     with pytest.raises(AttributeError, match="no_such_name"):
         pm.no_such_name  # noqa: B018
-
-
-def test_version_is_that_of_the_installed_package():
-    assert importlib.import_module("importlib.metadata").version("probmotion") == pm.__version__
+    assert version("probmotion") == pm.__version__

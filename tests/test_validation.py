@@ -8,15 +8,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 
 @pytest.mark.parametrize(
     ("shape", "expected"),
-    [
-        ((4, 3), ("L", 3)),
-        ((0, 3), ("L", 3)),
-        ((4, 3), ("…", 3)),
-        ((3,), ("…", 3)),
-        ((2, 5, 4, 3), ("…", "L", 3)),
-        ((), ()),
-        ((7,), ("n",)),
-    ],
+    [((0, 3), ("L", 3)), ((3,), ("…", 3)), ((2, 5, 4, 3), ("…", "L", 3)), ((), ())],
 )
 def test_valid_shapes_are_accepted(shape, expected):
     check_shape("x", np.zeros(shape), expected)
@@ -29,7 +21,6 @@ def test_valid_shapes_are_accepted(shape, expected):
         ((2, 4, 3), ("L", 3), r"x must have shape \(L, 3\), got \(2, 4, 3\)"),
         ((3,), ("…", "L", 3), r"x must have shape \(…, L, 3\), got \(3,\)"),
         ((), ("…", 3), r"x must have shape \(…, 3\), got \(\)"),
-        ((2, 2), ("…", 2, 3), r"x must have shape \(…, 2, 3\), got \(2, 2\)"),
     ],
 )
 def test_invalid_shapes_are_refused(shape, expected, message):
@@ -47,17 +38,12 @@ def test_nonfinite_values_are_counted_and_located(library):
         check_finite("x", library.array(values))
 
 
-def test_check_positive():
+def test_invalid_numbers_are_refused():
     check_positive("x", 1e-300)
-    for bad in (0, -1, np.nan, np.inf, True, "1"):
+    for value in (0, -1, np.nan, np.inf, True, "1"):
         with pytest.raises(ValueError, match=r"x must be a finite number above 0, got .*"):
-            check_positive("x", bad)
-
-
-def test_check_count():
-    check_count("n", 1)
+            check_positive("x", value)
     check_count("n", np.int64(3), least=3)
-    check_count("n", 0, least=0)
-    for bad, least in ((0, 1), (1.0, 1), (True, 1), ("3", 1), (None, 1), (2, 3)):
+    for value, least in ((0, 1), (1.0, 1), (True, 1), ("3", 1), (None, 1), (2, 3)):
         with pytest.raises(ValueError, match=f"n must be an integer of at least {least}, got "):
-            check_count("n", bad, least)
+            check_count("n", value, least)

@@ -17,7 +17,7 @@ from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.bodies.body_states import check_bones, check_single_root, trunk_joints
 from probmotion.models.bodies.joint_ranges import range_of
 from probmotion.motion.kinematics import forward_kinematics
-from probmotion.motion.rest_poses import is_four_legged
+from probmotion.motion.rest_poses import is_four_legged, joint_positions
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_shape
 
@@ -104,12 +104,7 @@ class ArticulatedBody:
     @property
     def rest_positions(self) -> np.ndarray:
         """Joint positions of the rest pose relative to the root, (J, 3), metres."""
-        positions = np.zeros_like(self.rest)
-        for joint in self.skeleton.topological_order:
-            parent = self.skeleton.parents[joint]
-            if parent >= 0:
-                positions[joint] = positions[parent] + self.rest[joint]
-        return positions
+        return joint_positions(self.skeleton, self.rest)
 
     @property
     def lower(self) -> np.ndarray:
@@ -144,8 +139,7 @@ class ArticulatedBody:
         check_shape("turns", turns, ("…", len(self.bones), 3))
         xp = array_namespace(turns)
         lower, upper = constant(self.lower, turns), constant(self.upper, turns)
-        none = xp.zeros_like(turns)
-        excess = xp.where(turns > upper, turns - upper, none)
+        excess = xp.where(turns > upper, turns - upper, xp.zeros_like(turns))
         excess = xp.where(turns < lower, lower - turns, excess)
         return xp.sum(excess**2, axis=(-2, -1))
 
@@ -179,18 +173,18 @@ class ArticulatedBody:
         batch = [turns.shape[:-2], root_rotation.shape[:-2], root_translation.shape[:-1]]
         if log_lengths is not None:
             check_shape("log_lengths", log_lengths, ("…", self.n_groups))
-            longer = [xp.exp(log_lengths[..., group]) for group in self.length_groups]
-            offsets = offsets * xp.stack(longer, axis=-1)[..., None]
+            factors = [xp.exp(log_lengths[..., group]) for group in self.length_groups]
+            offsets = offsets * xp.stack(factors, axis=-1)[..., None]
             batch.append((*log_lengths.shape[:-1], 1))
         shape = np.broadcast_shapes(*(tuple(axes) for axes in batch))
-        more = xp.zeros_like(offsets[..., :1, :])
-        n_more = self._rig.n_joints - self.skeleton.n_joints
+        zero = xp.zeros_like(offsets[..., :1, :])
+        n_trunks = self._rig.n_joints - self.skeleton.n_joints
         rotations = self._rotations(xp, vector_to_matrix(turns), root_rotation, shape)
         joints, _ = forward_kinematics(
             self._rig,
             rotations,
             xp.broadcast_to(root_translation, (*shape, 3))[..., None, :],
-            xp.concat([offsets, *[more] * n_more], axis=-2),
+            xp.concat([offsets, *[zero] * n_trunks], axis=-2),
         )
         return joints[..., : self.skeleton.n_joints, :]
 
@@ -198,11 +192,11 @@ class ArticulatedBody:
         self, xp: Any, turned: Array, root_rotation: Array, shape: tuple[int, ...]
     ) -> Array:
         """Return the rotations of the rig's joints, (…, L, J', 3, 3)."""
-        still = xp.broadcast_to(constant(np.eye(3), turned), (*shape, 3, 3))
-        which = {joint: turned[..., at, :, :] for at, joint in enumerate(self._turning)}
-        which[self.skeleton.roots[0]] = root_rotation
+        identity = constant(np.eye(3), turned)
+        rotations = {joint: turned[..., at, :, :] for at, joint in enumerate(self._turning)}
+        rotations[self.skeleton.roots[0]] = root_rotation
         each = [
-            xp.broadcast_to(which[joint], (*shape, 3, 3)) if joint in which else still
+            xp.broadcast_to(rotations.get(joint, identity), (*shape, 3, 3))
             for joint in range(self._rig.n_joints)
         ]
         return xp.stack(each, axis=-3)

@@ -21,15 +21,9 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
 __all__ = [
-    "BodyStates",
-    "check_bones",
-    "check_single_root",
-    "heading_of",
-    "rest_pose",
-    "to_world",
-    "trunk_joints",
-    "turned_about_vertical",
-]
+    "BodyStates", "check_bones", "check_single_root", "heading_of", "rest_pose", "to_world",
+    "trunk_joints", "turned_about_vertical",
+]  # fmt: skip
 
 _GUIDE = 0.07
 """Position of a trunk's guide joint, as a fraction of the trunk's length."""
@@ -231,9 +225,8 @@ def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array
     """
     xp = array_namespace(positions)
     turned = turned_about_vertical(positions, heading)
-    moved = constant(ground, positions)
-    zero = xp.zeros_like(moved[..., 0])
-    return turned + xp.stack([moved[..., 0], zero, moved[..., 1]], axis=-1)[..., None, None, :]
+    x, z = (constant(ground[..., axis], positions) for axis in (0, 1))
+    return turned + xp.stack([x, xp.zeros_like(x), z], axis=-1)[..., None, None, :]
 
 
 def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
@@ -259,11 +252,9 @@ def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
     offsets = np.zeros((skeleton.n_joints, 3))
     for joint, parent in skeleton.bones:
         bones = upright[:, joint] - upright[:, parent]
-        length = np.linalg.norm(bones, axis=-1).mean()
-        mean = bones.mean(axis=0)
+        length, mean = np.linalg.norm(bones, axis=-1).mean(), bones.mean(axis=0)
         if not length > 0:
-            raise ValueError(
-                f"motions must have bones longer than 0, got 0 m to {skeleton.joint_names[joint]}"
-            )
+            name = skeleton.joint_names[joint]
+            raise ValueError(f"motions must have bones longer than 0, got 0 m to {name}")
         offsets[joint] = mean * length / np.linalg.norm(mean)
     return offsets

@@ -38,15 +38,9 @@ _ANIMALS: Mapping[str, Box] = {
     "wrist": ((-1.8, 1.8), (-0.5, 0.5), (-0.5, 0.5)),
 }
 _SAME = {
-    "lower_spine": "spine",
-    "chest": "spine",
-    "upper_neck": "neck",
-    "lower_neck": "neck",
-    "head": "neck",
-    "nose": "neck",
-    "palm": "wrist",
-    "foot": "ankle",
-}
+    "lower_spine": "spine", "chest": "spine", "upper_neck": "neck", "lower_neck": "neck",
+    "head": "neck", "nose": "neck", "palm": "wrist", "foot": "ankle",
+}  # fmt: skip
 # Hinges: direction of the human lower limb along Z, and the maximum angle from straight.
 _HINGES: Mapping[str, tuple[float, float]] = {"knee": (-1.0, 2.7), "elbow": (1.0, 2.7)}
 _SIDEWAYS = 0.5

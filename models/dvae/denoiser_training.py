@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -61,15 +61,8 @@ class DenoiserTrainee(WindowTrainee):
         annealing: int = 0,
         seed: int = 0,
     ) -> None:
-        super().__init__(
-            clips,
-            validation,
-            prior.states,
-            prior.settings.frames,
-            weight=latent_weight,
-            annealing=annealing,
-            seed=seed,
-        )
+        options = {"weight": latent_weight, "annealing": annealing, "seed": seed}
+        super().__init__(clips, validation, prior.states, prior.settings.frames, **options)
         self.prior = prior
         self.noise = JointNoise() if noise is None else noise
         self.network = DenoisingNetworks(prior, seed)
@@ -101,14 +94,12 @@ class DenoiserTrainee(WindowTrainee):
         noisy_windows = NoisyWindows.of(*noisy, windows.bodies, skeleton).to(device)
         self.prior.model.to(device)
         denoiser = Denoiser(self.prior, network)
-        numbers, shape = denoiser.noise_numbers(clean.shape[1])
-        drawn = rng.standard_normal((len(clean), numbers), dtype=np.float32)
-        further = rng.standard_normal((len(clean), *shape), dtype=np.float32)
-        inferred = denoiser.infer(
-            noisy_windows,
-            torch.as_tensor(drawn, device=device),
-            torch.as_tensor(further, device=device),
+        first, shape = denoiser.noise_numbers(clean.shape[1])
+        numbers = (
+            torch.as_tensor(rng.standard_normal((len(clean), *size), dtype=np.float32))
+            for size in ((first,), shape)
         )
+        inferred = denoiser.infer(noisy_windows, *(part.to(device) for part in numbers))
         bound = denoiser.bound(noisy_windows, inferred, first=True)
         return -bound.total(weight).mean() / clean.shape[1]
 
@@ -117,32 +108,13 @@ def usual_denoiser_training(size: str) -> tuple[TrainingSettings, int]:
     """Return the training settings of a size and its KL annealing steps.
 
     ``paper``: up to 500 epochs with a patience of 10 (E.2); an epoch of AMASS is 1000 steps here.
-
-    Raises
-    ------
-    ValueError
-        If the size is unknown.
+    Raises ``ValueError`` for an unknown size.
     """
-    known = {
-        "tiny": (TrainingSettings(steps=400, batch=32, learning_rate=3e-3, ema=0.98), 100),
-        "small": (
-            TrainingSettings(
-                steps=6000, batch=32, learning_rate=1e-3, ema=0.998, halve_at=(3000, 4500, 5300)
-            ),
-            500,
-        ),
-        "paper": (
-            TrainingSettings(
-                steps=500_000,
-                learning_rate=1e-4,
-                optimiser="adamax",
-                ema=0.0,
-                checkpoint_every=1000,
-                patience=10,
-            ),
-            50_000,
-        ),
-    }
+    tiny = TrainingSettings(steps=400, batch=32, learning_rate=3e-3, ema=0.98)
+    small = replace(tiny, steps=6000, learning_rate=1e-3, ema=0.998, halve_at=(3000, 4500, 5300))
+    paper = TrainingSettings(steps=500_000, learning_rate=1e-4, optimiser="adamax", ema=0.0)
+    paper = replace(paper, checkpoint_every=1000, patience=10)
+    known = {"tiny": (tiny, 100), "small": (small, 500), "paper": (paper, 50_000)}
     if size not in known:
         raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
     return known[size]

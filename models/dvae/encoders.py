@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -52,12 +53,12 @@ class JointEncoder(nn.Module):
         return _JointPosterior(self, _read_backwards(self.reader, inputs))
 
 
+@dataclass(frozen=True)
 class _JointPosterior:
     """A :class:`JointEncoder` conditioned on observations."""
 
-    def __init__(self, encoder: JointEncoder, read: torch.Tensor) -> None:
-        self.encoder = encoder
-        self.read = read
+    encoder: JointEncoder
+    read: torch.Tensor
 
     def start(self, initial: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return e_ini(x₀)."""
@@ -98,13 +99,13 @@ class TrackingEncoder(nn.Module):
         return _TrackingPosterior(self, inputs, _read_backwards(self.reader, inputs))
 
 
+@dataclass(frozen=True)
 class _TrackingPosterior:
     """A :class:`TrackingEncoder` conditioned on observations."""
 
-    def __init__(self, encoder: TrackingEncoder, inputs: EncoderInputs, read: torch.Tensor) -> None:
-        self.encoder = encoder
-        self.inputs = inputs
-        self.read = read
+    encoder: TrackingEncoder
+    inputs: EncoderInputs
+    read: torch.Tensor
 
     def start(self, initial: torch.Tensor) -> None:
         """Return None: the encoder has no recurrent state."""
@@ -112,10 +113,10 @@ class _TrackingPosterior:
     def posterior(self, state: None, frame: int, moved: State) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log scale of q(z_t | …)."""
         trust = self.inputs.trust[:, frame]
-        apart = (self.inputs.joints[:, frame] - self.inputs.pose(moved.motion)) / _STEP
-        apart = torch.where(trust[..., None] > 0, apart, torch.zeros_like(apart))
-        seen = [moved.hidden, self.read[:, frame - 1], moved.motion, apart.flatten(-2), trust]
-        return mean_and_log_scale(self.encoder.latents(torch.cat(seen, dim=-1)))
+        innovation = (self.inputs.joints[:, frame] - self.inputs.pose(moved.motion)) / _STEP
+        innovation = torch.where(trust[..., None] > 0, innovation, 0.0).flatten(-2)
+        parts = [moved.hidden, self.read[:, frame - 1], moved.motion, innovation, trust]
+        return mean_and_log_scale(self.encoder.latents(torch.cat(parts, dim=-1)))
 
     def step(self, state: None, latent: torch.Tensor) -> None:
         """Return None: the encoder has no recurrent state."""

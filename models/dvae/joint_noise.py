@@ -70,9 +70,8 @@ class JointNoise:
         freedom = np.exp(rng.uniform(np.log(2.0), np.log(8.0), n))
         error = rng.standard_normal(joints.shape)
         # A Student-t variable is a normal one divided by the root of χ²/ν.
-        square = (
-            rng.chisquare(freedom[:, None, None, None], joints.shape) / freedom[:, None, None, None]
-        )
+        nu = freedom[:, None, None, None]
+        square = rng.chisquare(nu, joints.shape) / nu
         error = np.where(heavy[:, None, None, None], error / np.sqrt(square), error)
         seen = np.stack([self._seen(rng, frames, skeleton) for _ in range(n)])
         noise = np.broadcast_to(scale[:, None, None], (n, frames, count))

@@ -73,8 +73,8 @@ def rollout(
         return Rollout(states[1:], torch.stack(latents, 1), noise, noise.new_zeros(len(noise)))
     q_state, moments = inference.start(initial), []
     for frame in range(1, noise.shape[1] + 1):
-        moments.append(inference.posterior(q_state, frame, states[-1]))
-        mean, log_scale = moments[-1]
+        mean, log_scale = inference.posterior(q_state, frame, states[-1])
+        moments.append((mean, log_scale))
         latents.append(mean + torch.exp(log_scale) * noise[:, frame - 1])
         states.append(generative.step(states[-1], latents[-1]))
         q_state = inference.step(q_state, latents[-1])

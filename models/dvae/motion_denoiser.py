@@ -21,6 +21,7 @@ from probmotion.models.training.checkpoints import (
     load_checkpoint,
     load_weights,
     save_checkpoint,
+    valid_settings,
     weights_digest,
 )
 from probmotion.posteriors.likelihoods import Joints3D
@@ -56,23 +57,14 @@ class MotionDenoiser:
     def load(cls, source: str | Path, prior: MotionDVAE) -> MotionDenoiser:
         """Load a trained denoiser of a prior: a file, the folder of a run or a shipped name.
 
-        Raises
-        ------
-        CheckpointError
-            If the file is damaged, not a denoiser of this version, or of another prior.
-        FileNotFoundError
-            If there is no such file or name.
-        ValueError
-            If the prior is not a Motion-DVAE.
+        Raises ``CheckpointError`` for a damaged file, another kind of network or the denoiser of
+        another prior, ``FileNotFoundError`` for a missing file, and ``ValueError`` unless the prior
+        is a Motion-DVAE.
         """
         _check_kind(prior)
         checkpoint = load_checkpoint(source, KIND)
-        try:
+        with valid_settings(source, "denoiser"):
             digest = checkpoint.settings["network"]["prior_weights"]
-        except (KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"{source} does not contain valid denoiser settings: {error}"
-            ) from error
         if digest != weights_digest(prior.model):
             raise CheckpointError(f"{source} must be a denoiser of the given prior, got another's")
         networks = DenoisingNetworks(prior)
@@ -122,8 +114,9 @@ class MotionDenoiser:
         same = prior.model is self.prior.model
         if not same and weights_digest(prior.model) != weights_digest(self.prior.model):
             raise ValueError("prior must be the one that the denoiser was trained for")
-        own = likelihood.entries.degrees_of_freedom
-        freedom = own if degrees_of_freedom is None else degrees_of_freedom
+        freedom = degrees_of_freedom
+        if freedom is None:
+            freedom = likelihood.entries.degrees_of_freedom
         tails = 0.0 if freedom is None or math.isinf(freedom) else 1 / freedom
         window = self.prior.settings.frames
         check_count("overlap", overlap, least=0)
@@ -143,6 +136,8 @@ class NoisyMotion:
         self.denoiser = denoiser
         self.windows = windows
         self.stitching = stitching
+        self._first, self._shape = denoiser.noise_numbers(stitching.length)
+        self._total = self._first + math.prod(self._shape)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         """Enable gradients and return the trainable parameters."""
@@ -163,19 +158,18 @@ class NoisyMotion:
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Return draws (n, L, J, 3), metres, and their θ for a single window."""
         count = len(self.windows)
-        first, shape = self.denoiser.noise_numbers(self.stitching.length)
-        drawn = streams.standard_normal((n, count, first + math.prod(shape)))
+        drawn = streams.standard_normal((n, count, self._total))
         positions, thetas = [], []
         # Fixed batch shapes make the rounding, and so the draws, independent of n.
-        whole = max(1, _ROWS // count)
-        for at in range(0, n, whole):
-            rows = np.zeros((whole, *drawn.shape[1:]), dtype=np.float32)
-            some = drawn[at : at + whole]
-            rows[: len(some)] = some
+        batch = max(1, _ROWS // count)
+        for at in range(0, n, batch):
+            part = drawn[at : at + batch]
+            rows = np.zeros((batch, count, self._total), dtype=np.float32)
+            rows[: len(part)] = part
             inferred = self._inferred_from(rows)
-            positions.append(self._apart(inferred.positions)[: len(some)])
+            positions.append(self._by_window(inferred.positions)[: len(part)])
             if count == 1:
-                thetas.append(self._theta(inferred)[: len(some)])
+                thetas.append(self._theta(inferred)[: len(part)])
         windows = np.concatenate(positions)
         if count == 1:
             theta = np.concatenate(thetas)
@@ -193,53 +187,44 @@ class NoisyMotion:
         decoded joints where occluded. Frame 0 is M_β(μ_ω). ``average=False`` decodes the means of q
         once instead ("NN output").
         """
-        decoded = self._apart(self._inferred_from(self._still(1)).positions)[0]
+        zeros = np.zeros((1, len(self.windows), self._total), dtype=np.float32)
+        decoded = self._by_window(self._inferred_from(zeros).positions)[0]
         if not average:
             return self.stitching.mean(decoded)
-        inferred = self.denoiser.infer(
-            self.windows.repeated(_AVERAGED), *self._numbers(rng, _AVERAGED)
-        )
-        square = self.denoiser.prior.joint_scale**2
         windows = self.windows.repeated(_AVERAGED)
+        inferred = self.denoiser.infer(windows, *self._numbers(rng, _AVERAGED))
+        square = self.denoiser.prior.joint_scale**2
         v = self.denoiser.drawn_variance(windows, inferred, rng)
         between = (v * inferred.positions + square * windows.joints) / (v + square)
         seen = windows.seen[..., None]
-        mean = self._apart(torch.where(seen, between, inferred.positions)).mean(axis=0)
+        mean = self._by_window(torch.where(seen, between, inferred.positions)).mean(axis=0)
         mean[:, 0] = decoded[:, 0]
         return self.stitching.mean(mean)
 
     def _numbers(self, rng: np.random.Generator, n: int) -> tuple[torch.Tensor, torch.Tensor]:
         rows = n * len(self.windows)
-        first, shape = self.denoiser.noise_numbers(self.stitching.length)
         return (
-            torch.as_tensor(rng.standard_normal((rows, first), dtype=np.float32)),
-            torch.as_tensor(rng.standard_normal((rows, *shape), dtype=np.float32)),
+            torch.as_tensor(rng.standard_normal((rows, self._first), dtype=np.float32)),
+            torch.as_tensor(rng.standard_normal((rows, *self._shape), dtype=np.float32)),
         )
 
-    def _still(self, n: int) -> np.ndarray:
-        first, shape = self.denoiser.noise_numbers(self.stitching.length)
-        return np.zeros((n, len(self.windows), first + math.prod(shape)), dtype=np.float32)
-
+    @torch.no_grad()
     def _inferred_from(self, numbers: np.ndarray) -> InferenceDraw:
         """Return draws from random numbers (n, B, …) without gradients."""
-        first, shape = self.denoiser.noise_numbers(self.stitching.length)
-        flat = torch.as_tensor(numbers).flatten(0, 1)
+        first, noise = torch.as_tensor(numbers).flatten(0, 1).tensor_split([self._first], dim=1)
         windows = self.windows.repeated(len(numbers))
-        with torch.no_grad():
-            return self.denoiser.infer(
-                windows, flat[:, :first], flat[:, first:].unflatten(1, shape)
-            )
+        return self.denoiser.infer(windows, first, noise.unflatten(1, self._shape))
 
-    def _apart(self, positions: torch.Tensor) -> np.ndarray:
+    def _by_window(self, positions: torch.Tensor) -> np.ndarray:
         """Reshape (n B, …) to (n, B, …) in double precision."""
         result = positions.detach().double().numpy()
         return result.reshape(-1, len(self.windows), *result.shape[1:])
 
+    @torch.no_grad()
     def _mean_of_windows(self) -> np.ndarray:
-        with torch.no_grad():
-            numbers = self._numbers(seeds.generator(0, "means of windows"), _MEANS)
-            inferred = self.denoiser.infer(self.windows.repeated(_MEANS), *numbers)
-        return self._apart(inferred.positions).mean(axis=0)
+        numbers = self._numbers(seeds.generator(0, "means of windows"), _MEANS)
+        inferred = self.denoiser.infer(self.windows.repeated(_MEANS), *numbers)
+        return self._by_window(inferred.positions).mean(axis=0)
 
     def _theta(self, inferred: InferenceDraw) -> np.ndarray:
         parts = (inferred.ground, inferred.heading, inferred.first, inferred.rolled.innovations)

@@ -25,10 +25,10 @@ from probmotion.models.latent.row_decoding import decode_rows
 from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.models.training.checkpoints import (
     Checkpoint,
-    CheckpointError,
     load_checkpoint,
     load_weights,
     save_checkpoint,
+    valid_settings,
 )
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import InferenceNetwork
@@ -112,34 +112,20 @@ class MotionDVAE(StandardNormalPrior):
 
     @classmethod
     def load(cls, source: str | Path = "body-dvae", **options: Any) -> MotionDVAE:
-        """Load a trained prior.
+        """Load a trained prior: a checkpoint file, the folder of a run or a shipped name.
 
-        Parameters
-        ----------
-        source : str or Path
-            Checkpoint file, folder of a training run, or name of a shipped prior.
-        **options
-            ``frames``, ``body`` and ``spread`` of :class:`MotionDVAE`.
-
-        Raises
-        ------
-        CheckpointError
-            If the file is damaged or not a Motion-DVAE of this version.
-        FileNotFoundError
-            If there is no such file or name.
+        ``options`` are ``frames``, ``body`` and ``spread`` of :class:`MotionDVAE`. Raises
+        ``CheckpointError`` for a damaged file or another kind of network, and ``FileNotFoundError``
+        for a missing one.
         """
         checkpoint = load_checkpoint(source, KIND)
-        try:
+        with valid_settings(source, "Motion-DVAE"):
             stored = checkpoint.settings["network"]
             settings = DVAESettings(**stored["size"])
             skeleton = Skeleton(stored["joint_names"], stored["parents"])
             states = BodyStates(skeleton, np.array(stored["rest"]))
             model = DVAEModel(settings, states.dim, skeleton.n_joints, stored["rank"])
             fps = stored["fps"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                f"{source} does not contain valid Motion-DVAE settings: {error}"
-            ) from error
         load_weights(model, checkpoint.tensors)
         return cls(model, settings, states, fps, card=checkpoint.settings, **options)
 
@@ -206,7 +192,8 @@ class MotionDVAE(StandardNormalPrior):
 
     def _motion(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, J, 3)``."""
-        model = self._model_in(theta.dtype)
+        # Densities need double precision.
+        model = self.model if theta.dtype == torch.float32 else self._double
         ground = self.spread * theta[:, :2]
         heading = torch.atan2(theta[:, 3], theta[:, 2])
         start = model.first_states(theta[:, _PLACE : _PLACE + self.rank])
@@ -216,10 +203,6 @@ class MotionDVAE(StandardNormalPrior):
         result = turned_about_vertical(self.states.positions(states, self.body), heading)
         moved = torch.stack([ground[:, 0], torch.zeros_like(heading), ground[:, 1]], dim=-1)
         return result + moved[:, None, None, :]
-
-    def _model_in(self, dtype: torch.dtype) -> DVAEModel:
-        """Return the networks in a precision: double for densities, single for training."""
-        return self.model if dtype == torch.float32 else self._double
 
     @cached_property
     def _double(self) -> DVAEModel:

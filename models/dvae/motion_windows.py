@@ -31,10 +31,7 @@ class Windows(NamedTuple):
 class MotionWindows:
     """All windows of ``frames`` frames of some clips and of their mirror images.
 
-    Raises
-    ------
-    ValueError
-        If no clip is long enough, or clips differ in skeleton or frame rate.
+    Raises ``ValueError`` if no clip is long enough, or clips differ in skeleton or frame rate.
     """
 
     def __init__(self, clips: Sequence[Motion], states: BodyStates, frames: int) -> None:
@@ -56,9 +53,7 @@ class MotionWindows:
         poses = [clip.positions for clip in long]
         poses += [clip[:, order] * np.array([-1.0, 1.0, 1.0]) for clip in poses]
         self._bodies = np.stack([states.body(clip) for clip in poses])
-        self._states = [
-            states.states(clip, body) for clip, body in zip(poses, self._bodies, strict=True)
-        ]
+        self._states = list(map(states.states, poses, self._bodies))
         # Index all windows, so that draws are uniform over windows rather than clips.
         counts = [len(clip) - frames + 1 for clip in poses]
         self._clip = np.repeat(np.arange(len(poses)), counts)
@@ -72,14 +67,12 @@ class MotionWindows:
         """Return n windows drawn with replacement, each at a random tempo of 0.8 to 1.25."""
         numbers = rng.integers(0, len(self), n)
         tempo = np.exp(rng.uniform(-1, 1, n) * math.log(_TEMPO))
-        segments = []
-        for clip, start, factor in zip(
-            self._clip[numbers], self._start[numbers], tempo, strict=True
-        ):
+        clips, segments = self._clip[numbers], []
+        for clip, start, factor in zip(clips, self._start[numbers], tempo, strict=True):
             states = self._states[clip]
             last = min(start + factor * (self.frames - 1), len(states) - 1)
             segments.append(_between(states, np.linspace(start, last, self.frames)))
-        return Windows(canonical_windows(np.stack(segments)), self._bodies[self._clip[numbers]])
+        return Windows(canonical_windows(np.stack(segments)), self._bodies[clips])
 
     def spread(self, n: int) -> Windows:
         """Return n evenly spaced windows; deterministic."""

@@ -36,7 +36,10 @@ class DVAENetwork(nn.Module):
         self.cumulative = size.decoder == "cumulative"
         if self.cumulative:
             self.straight = nn.Linear(size.latent, dim, bias=False)
-            _shrink_output(self.decoder)
+            # Consecutive frames initially barely differ.
+            with torch.no_grad():
+                self.decoder[-1].weight.mul_(0.1)
+                self.decoder[-1].bias.zero_()
         self.log_scales = nn.Parameter(torch.full((parts,), math.log(0.1)))
 
     def start(self, initial: torch.Tensor) -> State:
@@ -116,7 +119,7 @@ class DVAEModel(nn.Module):
         Gaussian noise.
         """
         visible = (joints - self.joint_mean) / self.joint_deviation
-        visible = torch.where(trust[..., None] > 0, visible, torch.zeros_like(visible))
+        visible = torch.where(trust[..., None] > 0, visible, 0.0)
         tail = tails[..., None, None].expand(*trust.shape[:-1], 1)
         return torch.cat([visible.flatten(-2), trust, tail], dim=-1)
 
@@ -131,17 +134,10 @@ class DVAEModel(nn.Module):
         """Return the encoder inputs of B windows; ``bodies`` (B, J, 3): rest offsets, metres."""
 
         def pose(motion: torch.Tensor) -> torch.Tensor:
-            own = self.state_mean + self.state_deviation * motion
-            return states.positions(own[:, None], bodies)[:, 0]
+            state = self.state_mean + self.state_deviation * motion
+            return states.positions(state[:, None], bodies)[:, 0]
 
         return EncoderInputs(self.observed(joints, trust, tails), joints, trust, pose)
-
-
-def _shrink_output(network: nn.Sequential) -> None:
-    """Scale the last layer so that consecutive frames initially barely differ."""
-    with torch.no_grad():
-        network[-1].weight.mul_(0.1)
-        network[-1].bias.zero_()
 
 
 def _over_frames(network: nn.Module, states: list[State]) -> torch.Tensor:

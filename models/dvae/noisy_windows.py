@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,19 +49,10 @@ class NoisyWindows:
     ) -> NoisyWindows:
         """Build windows from arrays in the shapes above and estimate their placement."""
         heading, ground = rough_placement(joints, seen, skeleton)
-
-        def single(values: np.ndarray) -> torch.Tensor:
-            return torch.tensor(values, dtype=torch.float32)
-
-        return cls(
-            single(np.where(seen[..., None], joints, 0.0)),
-            single(np.where(seen, noise, 1.0)),
-            torch.tensor(seen),
-            single(tails),
-            single(heading),
-            single(ground),
-            single(bodies),
-        )
+        joints, noise = np.where(seen[..., None], joints, 0.0), np.where(seen, noise, 1.0)
+        single = partial(torch.tensor, dtype=torch.float32)
+        placement = map(single, (tails, heading, ground, bodies))
+        return cls(single(joints), single(noise), torch.tensor(seen), *placement)
 
     def __len__(self) -> int:
         """Number of windows."""
@@ -94,14 +86,10 @@ def rough_placement(
 
     The heading comes from left-right joint pairs in the first frames with a visible pair. The
     ground point is the root, or the mean visible joint, in the first frames where it is visible.
-    Takes world positions (B, L, J, 3), ignored where occluded, and visibility (B, L, J).
-
-    Raises
-    ------
-    ValueError
-        If no joint of a window is visible.
+    Takes world positions (B, L, J, 3), ignored where occluded, and visibility (B, L, J). Raises
+    ``ValueError`` for a window without a visible joint.
     """
-    empty = np.flatnonzero(seen.sum(axis=(1, 2)) == 0)
+    empty = np.flatnonzero(~seen.any(axis=(1, 2)))
     if len(empty):
         raise ValueError(
             f"every window of joints must have a visible joint, got none in window {empty[0]} of "
@@ -109,8 +97,8 @@ def rough_placement(
         )
     left, right = (list(side) for side in zip(*skeleton.mirrored_pairs, strict=True))
     both = seen[:, :, left] & seen[:, :, right]
-    apart = np.where(both[..., None], joints[:, :, left] - joints[:, :, right], 0.0).sum(axis=2)
-    across = _over_first(apart, both.any(axis=2)).sum(axis=1)
+    offsets = np.where(both[..., None], joints[:, :, left] - joints[:, :, right], 0.0).sum(axis=2)
+    across = _over_first(offsets, both.any(axis=2)).sum(axis=1)
     heading = np.arctan2(-across[:, 2], across[:, 0])
     root = skeleton.roots[0]
     count = seen.sum(axis=2)
@@ -133,14 +121,9 @@ def _over_first(values: np.ndarray, there: np.ndarray) -> np.ndarray:
 class Stitching:
     """Segmentation of a motion into overlapping windows, and its inverse.
 
-    Parameters
-    ----------
-    frames : int
-        L, length of the motion.
-    window : int
-        Frames of a window; a shorter motion is one window.
-    overlap : int
-        Minimum overlap of neighbouring windows; the last window ends with the motion.
+    A motion of ``frames`` frames L is cut into windows of ``window`` frames, or is one window if it
+    is shorter. Neighbours overlap by at least ``overlap`` frames; the last window ends with the
+    motion.
     """
 
     frames: int

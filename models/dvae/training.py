@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import nn
 
 from probmotion import seeds
 from probmotion.models.bodies.body_states import BodyStates
-from probmotion.models.dvae.latent_rollouts import Rollout, rollout
+from probmotion.models.dvae.latent_rollouts import rollout
 from probmotion.models.dvae.motion_dvae import KIND, MotionDVAE, description_of
 from probmotion.models.dvae.motion_windows import (
     VALIDATION_BATCH,
@@ -89,9 +90,12 @@ class DVAETrainee(WindowTrainee):
     def _learn_standards(self, windows: Windows, factor: np.ndarray) -> None:
         states = windows.states
         joints = self.states.positions(states, windows.bodies)
+        deviation = states.std(axis=(0, 1))
+        # Bounded below, or standardisation would amplify nearly constant dimensions.
+        least = 0.05 * float(np.median(deviation)) or 1.0
         statistics = {
             "state_mean": states.mean(axis=(0, 1)),
-            "state_deviation": np.maximum(states.std(axis=(0, 1)), _least(states)),
+            "state_deviation": np.maximum(deviation, least),
             "joint_mean": joints.mean(axis=(0, 1)),
             "joint_deviation": np.maximum(joints.std(axis=(0, 1)), 0.05),
             "initial_mean": states[:, 0].mean(axis=0),
@@ -109,37 +113,20 @@ class DVAETrainee(WindowTrainee):
         device: torch.device,
     ) -> torch.Tensor:
         assert isinstance(network, DVAEModel)
-        states, joints, (decoded, bodies, rolled) = _reconstruct(
-            network, self.states, windows, rng, device
-        )
-        errors = [(decoded - states[:, 1:])[..., first:end] for _, first, end in self.states.groups]
-        errors.append(self.states.positions(decoded, bodies) - joints[:, 1:])
-        fitted = self._misfit(network, errors)
-        return (fitted + weight * rolled.kl.mean()) / (self.size.frames - 1)
+        state_error, joint_error, kl = _reconstruct(network, self.states, windows, rng, device)
+        errors = [state_error[..., first:end] for _, first, end in self.states.groups]
+        misfit = self._misfit(network, [*errors, joint_error])
+        return (misfit + weight * kl.mean()) / (self.size.frames - 1)
 
     def _misfit(self, network: DVAEModel, errors: list[torch.Tensor]) -> torch.Tensor:
         """Return the reconstruction error, mean over windows."""
-        n = len(errors[0])
-        scales = network.generative.log_scales
+        n, scales = len(errors[0]), torch.exp(network.generative.log_scales)
         if self.size.decoder_scale == "unit":
             squares = sum((error**2).sum() for error in errors) / n
             # Trains only the joint scale, which eq. 11 needs; hence the detached error.
-            own = -log_normal(errors[-1].detach(), torch.exp(scales[-1])).mean()
-            return torch.as_tensor(squares + own)
-        return -torch.stack(
-            [
-                log_normal(error, torch.exp(scale)).sum() / n
-                for error, scale in zip(errors, scales, strict=True)
-            ]
-        ).sum()
-
-
-class _Reconstruction(NamedTuple):
-    """Decoded states (B, T, D), bodies (B, J, 3) and rollout."""
-
-    decoded: torch.Tensor
-    bodies: torch.Tensor
-    rolled: Rollout
+            return squares - log_normal(errors[-1].detach(), scales[-1]).mean()
+        densities = [log_normal(*pair).sum() / n for pair in zip(errors, scales, strict=True)]
+        return -torch.stack(densities).sum()
 
 
 def _reconstruct(
@@ -148,12 +135,11 @@ def _reconstruct(
     windows: Windows,
     rng: np.random.Generator,
     device: torch.device,
-) -> tuple[torch.Tensor, torch.Tensor, _Reconstruction]:
-    """Return states (B, L, D) and joints (B, L, J, 3) of windows, and their reconstruction."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return errors of states (B, T, D) and joints (B, T, J, 3), and the KL (B,)."""
     states = torch.as_tensor(windows.states, dtype=torch.float32, device=device)
     bodies = torch.as_tensor(windows.bodies, dtype=torch.float32, device=device)
-    latent = network.generative.recurrent.input_size
-    shape = (len(states), states.shape[1] - 1, latent)
+    shape = (len(states), states.shape[1] - 1, network.generative.recurrent.input_size)
     noise = torch.as_tensor(rng.standard_normal(shape, dtype=np.float32), device=device)
     joints = body_states.positions(states, bodies)
     trusted = torch.ones_like(joints[..., 0])
@@ -161,7 +147,9 @@ def _reconstruct(
     inputs = network.encoder_inputs(joints, trusted, tails, body_states, bodies)
     encoder = network.encoder.conditioned(inputs)
     rolled = rollout(network.generative, network.standardised(states[:, 0]), noise, encoder)
-    return states, joints, _Reconstruction(network.decoded(rolled), bodies, rolled)
+    decoded = network.decoded(rolled)
+    joint_error = body_states.positions(decoded, bodies) - joints[:, 1:]
+    return decoded - states[:, 1:], joint_error, rolled.kl
 
 
 def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0) -> float:
@@ -179,11 +167,9 @@ def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0)
         Seed of the encoder draws.
     """
     windows = MotionWindows(clips, prior.states, prior.settings.frames).spread(VALIDATION_BATCH)
+    rng, device = seeds.generator(seed, "scale"), torch.device("cpu")
     with torch.no_grad():
-        _, joints, rebuilt = _reconstruct(
-            prior.model, prior.states, windows, seeds.generator(seed, "scale"), torch.device("cpu")
-        )
-        error = prior.states.positions(rebuilt.decoded, rebuilt.bodies) - joints[:, 1:]
+        _, error, _ = _reconstruct(prior.model, prior.states, windows, rng, device)
         scale = float((error**2).mean().sqrt())
         prior.model.generative.log_scales[-1] = math.log(scale)
     return scale
@@ -193,39 +179,14 @@ def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
     """Return the training settings of a size and its KL annealing steps.
 
     ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4); an epoch of AMASS is
-    1000 steps here.
-
-    Raises
-    ------
-    ValueError
-        If the size is unknown.
+    1000 steps here. Raises ``ValueError`` for an unknown size.
     """
-    known = {
-        "tiny": (TrainingSettings(steps=600, batch=32, learning_rate=3e-3, ema=0.98), 200),
-        "small": (
-            TrainingSettings(
-                steps=4500,
-                batch=32,
-                learning_rate=1e-3,
-                ema=0.998,
-                weight_decay=0.05,
-                halve_at=(2000, 3000, 3800),
-                checkpoint_every=250,
-                patience=6,
-            ),
-            1000,
-        ),
-        "paper": (
-            TrainingSettings(
-                steps=200_000,
-                learning_rate=1e-4,
-                optimiser="adamax",
-                ema=0.0,
-                halve_at=(50_000, 80_000, 140_000),
-            ),
-            50_000,
-        ),
-    }
+    tiny = TrainingSettings(steps=600, batch=32, learning_rate=3e-3, ema=0.98)
+    small = replace(tiny, steps=4500, learning_rate=1e-3, ema=0.998, halve_at=(2000, 3000, 3800))
+    small = replace(small, weight_decay=0.05, checkpoint_every=250, patience=6)
+    paper = TrainingSettings(steps=200_000, learning_rate=1e-4, optimiser="adamax", ema=0.0)
+    paper = replace(paper, halve_at=(50_000, 80_000, 140_000))
+    known = {"tiny": (tiny, 200), "small": (small, 1000), "paper": (paper, 50_000)}
     if size not in known:
         raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
     return known[size]
@@ -233,16 +194,10 @@ def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
 
 def _first_poses(states: np.ndarray) -> np.ndarray:
     """Return the principal directions of first states times their deviations, (D, r)."""
-    centred = states - states.mean(axis=0)
-    _, size, directions = np.linalg.svd(centred, full_matrices=False)
+    _, size, directions = np.linalg.svd(states - states.mean(axis=0), full_matrices=False)
     explained = np.cumsum(size**2) / (size**2).sum()
     rank = int(np.searchsorted(explained, _EXPLAINED_VARIANCE)) + 1
     return (directions[:rank] * (size[:rank, None] / math.sqrt(len(states)))).T
-
-
-def _least(states: np.ndarray) -> float:
-    # Bound deviations below, or standardisation would amplify nearly constant dimensions.
-    return 0.05 * float(np.median(states.std(axis=(0, 1)))) or 1.0
 
 
 def _description(clips: Sequence[Motion], windows: int) -> dict[str, Any]:

@@ -1,12 +1,11 @@
 """Feature extractor for the comparison of generated and real 2D motions.
 
-It is the encoder of a variational autoencoder trained on 2D data (MAS, section 6.3, after Guo et
-al. 2020); the decoder is only used in training.
+The encoder of a variational autoencoder trained on 2D data (MAS, section 6.3, after Guo et al.
+2020); the decoder is only used in training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +29,9 @@ _OFF_ORIGIN = 1e-6
 class TrackEvaluator(TrackNetwork):
     """Features of 2D motions: the latent mean of a variational autoencoder.
 
-    They are used to compare *sets* of 2D motions, see :mod:`probmotion.metrics.generation`. They
-    only represent variation in the training data. Features are comparable if they are from the same
-    file, frame rate, centring and camera distance. Parameters are those of
+    Used to compare sets of 2D motions (:mod:`probmotion.metrics.generation`). Features represent
+    only the variation in the training data, and are comparable for the same file, frame rate,
+    centring and camera distance. Parameters are those of
     :class:`~probmotion.models.training.track_network.TrackNetwork`.
     """
 
@@ -105,17 +104,25 @@ class TrackEvaluator(TrackNetwork):
         if not 1 <= L <= self.frames:
             raise ValueError(f"views must have 1 to {self.frames} frames, got {L}")
         valid = _valid_frames(lengths, N, L)
-        shown = np.where(valid[..., None, None], views, 0.0)
-        check_finite("views", shown)
-        self._check_centred(shown)
-        moves = self.standards.deviation > 0
-        scale = np.where(moves, self.standards.deviation, 1.0)
-        standardised = np.where(moves, (shown - self.standards.mean) / scale, 0.0)
+        views = np.where(valid[..., None, None], views, 0.0)
+        check_finite("views", views)
+        self._check_centred(views)
+        varies = self.standards.deviation > 0
+        scale = np.where(varies, self.standards.deviation, 1.0)
+        standardised = np.where(varies, (views - self.standards.mean) / scale, 0.0)
         features = np.empty((N, self.settings.latent))
-        for rows, motions, seen in self._chunks(standardised, valid):
+        n = max(1, (_TOKENS if self._device == "cpu" else _GPU_TOKENS) // (self.frames + 2))
+        for start in range(0, N, n):
+            chunk = slice(start, min(start + n, N))
+            size = chunk.stop - start
+            motions = np.zeros((n, self.frames, 2 * self.skeleton.n_joints), np.float32)
+            mask = np.zeros((n, self.frames), bool)
+            motions[:size, :L] = standardised[chunk].reshape(size, L, -1)
+            mask[:size, :L] = valid[chunk]
+            inputs = (torch.as_tensor(array, device=self._device) for array in (motions, mask))
             with torch.inference_mode():
-                mean, _ = self._network(motions, seen)
-            features[rows] = mean[: len(features[rows])].cpu().numpy()
+                mean, _ = self._network(*inputs)
+            features[chunk] = mean[:size].cpu().numpy()
         return features
 
     def _check_centred(self, views: np.ndarray) -> None:
@@ -127,26 +134,6 @@ class TrackEvaluator(TrackNetwork):
             raise ValueError(
                 f"views must have the {self.skeleton.joint_names[root]} at the origin, as in the "
                 f"training data, got {off:.3g} m from it"
-            )
-
-    def _chunks(
-        self, motions: np.ndarray, valid: np.ndarray
-    ) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
-        """Yield rows, motions (n, frames, 2J) and validity (n, frames), padded to one shape."""
-        tokens = _TOKENS if self._device == "cpu" else _GPU_TOKENS
-        n = max(1, tokens // (self.frames + 2))
-        N, L = valid.shape
-        for start in range(0, N, n):
-            rows = slice(start, min(start + n, N))
-            numbers = np.zeros((n, self.frames, 2 * self.skeleton.n_joints), np.float32)
-            seen = np.zeros((n, self.frames), bool)
-            some = rows.stop - start
-            numbers[:some, :L] = motions[rows].reshape(some, L, -1)
-            seen[:some, :L] = valid[rows]
-            yield (
-                rows,
-                torch.as_tensor(numbers, device=self._device),
-                torch.as_tensor(seen, device=self._device),
             )
 
 

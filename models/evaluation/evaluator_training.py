@@ -54,17 +54,16 @@ class EvaluatorTrainee(TrackTrainee):
         device: torch.device,
     ) -> torch.Tensor:
         drawn = batches.draw(rng, n)
-        noise = rng.standard_normal((n, self.size.latent), dtype=np.float32)
-        moves = self.standards.deviation > 0
-        scale = np.where(moves, self.standards.deviation, 1.0)
-        counted = drawn.seen[..., None] & moves
+        unit = rng.standard_normal((n, self.size.latent), dtype=np.float32)
+        varies = self.standards.deviation > 0
+        scale = np.where(varies, self.standards.deviation, 1.0)
+        counted = drawn.seen[..., None] & varies
         standardised = np.where(counted, (drawn.keypoints - self.standards.mean) / scale, 0.0)
-
-        def moved(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, device=device)
-
-        wanted = moved(standardised.astype(np.float32)).flatten(2)
-        weight = moved(counted).flatten(2)
-        decoded, divergence = network(wanted, moved(drawn.valid), moved(noise))
-        error = (weight * (decoded.float() - wanted) ** 2).sum() / weight.sum().clamp(min=1)
+        target, weight, valid, noise = (
+            torch.as_tensor(array, device=device)
+            for array in (standardised.astype(np.float32), counted, drawn.valid, unit)
+        )
+        target, weight = target.flatten(2), weight.flatten(2)
+        decoded, divergence = network(target, valid, noise)
+        error = (weight * (decoded.float() - target) ** 2).sum() / weight.sum().clamp(min=1)
         return error + self.size.kl_weight * divergence.mean()

@@ -53,11 +53,6 @@ class LifterSettings:
         seen from below have nearly the same 2D projection.
     distance : float
         Distance from the camera to the root, metres.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
     """
 
     width: int = 256
@@ -97,7 +92,6 @@ class LifterNetwork(nn.Module):
         super().__init__()
         self.settings = settings
         self.joints = [joint for joint in range(n_joints) if joint != root]
-        self.n_joints = n_joints
         D = 2 * len(self.joints)
         self.register_buffer("mean", torch.zeros(D))
         self.register_buffer("deviation", torch.ones(D))
@@ -110,12 +104,12 @@ class LifterNetwork(nn.Module):
     def forward(self, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return depths, metres, and elevations, radians: ``(N, J, 2) → (N, J), (N,)``."""
         flat = (poses[:, self.joints].flatten(1) - self.mean) / self.deviation
-        entered = self.entry(flat)
-        most = self.settings.deepest
+        hidden = self.entry(flat)
+        deepest = self.settings.deepest
         depth = poses.new_zeros(poses.shape[:2])
-        depth[:, self.joints] = most * torch.tanh(self.depth(entered) / most)
+        depth[:, self.joints] = deepest * torch.tanh(self.depth(hidden) / deepest)
         # The initial elevation is half of the steepest one.
-        elevation = self.settings.steepest * torch.sigmoid(self.elevation(entered)[:, 0])
+        elevation = self.settings.steepest * torch.sigmoid(self.elevation(hidden)[:, 0])
         return depth, elevation
 
 
@@ -134,7 +128,8 @@ class _Block(nn.Module):
 
 def _branch(settings: LifterSettings, outputs: int) -> nn.Sequential:
     blocks = [_Block(settings.width) for _ in range(settings.blocks)]
-    last = nn.Linear(settings.width, outputs)  # near 0 at first: flat poses
+    # Small initial weights: the initial poses are almost flat.
+    last = nn.Linear(settings.width, outputs)
     nn.init.normal_(last.weight, std=0.01)
     nn.init.zeros_(last.bias)
     return nn.Sequential(*blocks, nn.SiLU(), last)
@@ -153,18 +148,18 @@ def raise_points(
     (N,), as in :meth:`probmotion.geometry.cameras.Cameras.around`.
     """
     plane = poses * (1 + depth[..., None] / distance)
-    return torch.cat([plane, depth[..., None]], dim=-1) @ _turn(azimuth, elevation)
+    return torch.cat([plane, depth[..., None]], dim=-1) @ _world_to_camera(azimuth, elevation)
 
 
 def project_points(
     points: torch.Tensor, azimuth: torch.Tensor, elevation: torch.Tensor, distance: float
 ) -> torch.Tensor:
-    """Return perspective projections of points (N, J, 3), a camera each: (N, J, 2), metres."""
-    seen = points @ _turn(azimuth, elevation).mT
-    return seen[..., :2] / (1 + seen[..., 2:] / distance)
+    """Return the perspective projections of points (N, J, 3) by N cameras: (N, J, 2), metres."""
+    camera = points @ _world_to_camera(azimuth, elevation).mT
+    return camera[..., :2] / (1 + camera[..., 2:] / distance)
 
 
-def _turn(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Tensor:
+def _world_to_camera(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Tensor:
     """Return rotations from world to camera coordinates, (N, 3, 3)."""
     ca, sa, ce, se = azimuth.cos(), azimuth.sin(), elevation.cos(), elevation.sin()
     zero = torch.zeros_like(ca)
@@ -217,27 +212,20 @@ class PoseLifter:
         ValueError
             If the shape is wrong or a number is not finite.
         """
-        poses, depth, elevation = self._seen(views)
-        L, J = views.shape[1:3]
-        heights = torch.as_tensor(np.repeat(elevation, L))
-        points = raise_points(
-            torch.from_numpy(poses),
-            torch.from_numpy(depth),
-            torch.zeros_like(heights),
-            heights,
-            self.settings.distance,
-        )
-        return points.numpy().reshape(len(views), L, J, 3)
+        poses, depth, elevation = self._estimates(views)
+        elevation = np.repeat(elevation, views.shape[1])
+        parts = (poses, depth, np.zeros_like(elevation), elevation)
+        points = raise_points(*map(torch.from_numpy, parts), distance=self.settings.distance)
+        return points.numpy().reshape(*views.shape[:3], 3)
 
     def elevations(self, views: np.ndarray) -> np.ndarray:
         """Return the camera elevation of each motion, radians: ``(N, L, J, 2) → (N,)``.
 
-        It is the mean over frames: the camera is assumed to be static, so differences between
-        frames are errors.
+        The mean over frames, since the camera is assumed to be static.
         """
-        return self._seen(views)[2]
+        return self._estimates(views)[2]
 
-    def _seen(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _estimates(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return centred poses (N L, J, 2), depths (N L, J) and elevations (N,), float64."""
         J = self.skeleton.n_joints
         check_shape("views", views, ("N", "L", J, 2))
@@ -249,11 +237,11 @@ class PoseLifter:
         poses = poses - poses[:, root : root + 1]
         depth, elevation = np.empty(poses.shape[:2]), np.empty(len(poses))
         for start in range(0, len(poses), _CHUNK):
-            some = poses[start : start + _CHUNK]
-            full = np.zeros((_CHUNK, J, 2), np.float32)
-            full[: len(some)] = some
+            n = min(_CHUNK, len(poses) - start)
+            chunk = slice(start, start + n)
+            padded = np.zeros((_CHUNK, J, 2), np.float32)
+            padded[:n] = poses[chunk]
             with torch.inference_mode():
-                estimate = self._network(torch.from_numpy(full).to(self._device))
-            rows = slice(start, start + len(some))
-            depth[rows], elevation[rows] = (part.cpu().numpy()[: len(some)] for part in estimate)
+                estimate = self._network(torch.from_numpy(padded).to(self._device))
+            depth[chunk], elevation[chunk] = (part.cpu().numpy()[:n] for part in estimate)
         return poses, depth, elevation.reshape(views.shape[:2]).mean(axis=1)

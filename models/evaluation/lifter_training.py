@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,8 +29,8 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["LifterTrainee", "LossWeights", "bone_sizes", "lifting_losses"]
 
-# Quantile of a bone's 2D length taken as its length: most bones are at times parallel to the image,
-# and the very longest are detection errors.
+# Quantile of the 2D lengths of a bone that estimates its length: most bones are parallel to the
+# image in some frames, and the largest 2D lengths are detection errors.
 _QUANTILE = 0.9
 
 
@@ -47,11 +48,6 @@ class LossWeights:
         Weight of the squared distance of the final projection from the input, metres².
     bones : float
         Weight of the squared relative error of bone lengths.
-
-    Raises
-    ------
-    ValueError
-        If a weight is below 0.
     """
 
     likelihood: float = 1.0
@@ -134,16 +130,15 @@ class LifterTrainee(PoseTrainee):
         size: LifterSettings,
         *,
         weights: LossWeights | None = None,
-        threshold: float = 0.3,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(tracks, validation, size, threshold=threshold, seed=seed)
+        super().__init__(tracks, validation, size, **options)
         skeleton = self.skeleton
         if flow.skeleton != skeleton:
             raise ValueError("flow must have the same skeleton as tracks")
         self.weights = LossWeights() if weights is None else weights
         self.sizes = bone_sizes(skeleton, self.poses.astype(np.float64))
-        self.network = LifterNetwork(size, skeleton.n_joints, skeleton.roots[0], seed)
+        self.network = LifterNetwork(size, skeleton.n_joints, skeleton.roots[0], self._seed)
         flat = self.poses[:, self.network.joints].reshape(len(self.poses), -1).astype(np.float64)
         self.network.mean.copy_(torch.from_numpy(flat.mean(axis=0)))
         self.network.deviation.copy_(torch.from_numpy(np.maximum(flat.std(axis=0), 1e-3)))

@@ -1,9 +1,9 @@
 """Normalising flow over 2D poses.
 
-It is the pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
-Joints are so strongly correlated that a flow over their coordinates is nearly singular. As in the
-paper, the flow acts on the leading principal components. Unlike there, the remaining components are
-Gaussian, so that the density covers whole poses.
+Pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR 2022). Joints are so
+strongly correlated that a flow over their coordinates is almost singular. As in the paper, the flow
+acts on the leading principal components; unlike there, the remaining ones are Gaussian, so that the
+density covers all coordinates.
 """
 
 from __future__ import annotations
@@ -45,11 +45,6 @@ class FlowSettings:
     blur : float
         Standard deviation of the noise added to coordinates in training, metres. It smooths the
         density so that its gradients are useful further from the data.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
     """
 
     couplings: int = 8
@@ -91,21 +86,19 @@ class CouplingFlow(nn.Module):
         changed = dimensions - self.fixed
         rng = seeds.generator(seed, "permutations")
         # Every second permutation swaps the halves, so that two couplings change all coordinates.
-        turns = np.roll(np.arange(dimensions), -self.fixed)
-        orders = [turns if n % 2 else rng.permutation(dimensions) for n in range(couplings)]
+        swap = np.roll(np.arange(dimensions), -self.fixed)
+        orders = [swap if n % 2 else rng.permutation(dimensions) for n in range(couplings)]
         self.register_buffer("orders", torch.tensor(np.array(orders)))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
             self.networks = nn.ModuleList(
                 nn.Sequential(
-                    nn.Linear(self.fixed, width),
-                    nn.SiLU(),
-                    nn.Linear(width, width),
-                    nn.SiLU(),
+                    nn.Linear(self.fixed, width), nn.SiLU(),
+                    nn.Linear(width, width), nn.SiLU(),
                     nn.Linear(width, 2 * changed),
                 )
                 for _ in range(couplings)
-            )
+            )  # fmt: skip
         for network in self.networks:
             last: Any = network[-1]
             nn.init.zeros_(last.weight)
@@ -116,15 +109,11 @@ class CouplingFlow(nn.Module):
         log_determinant = x.new_zeros(len(x))
         for order, network in zip(self.orders, self.networks, strict=True):
             fixed, changed = x[:, order].split([self.fixed, x.shape[1] - self.fixed], dim=1)
-            log_scale, shift = _scale_and_shift(network, fixed)
+            log_scale, shift = network(fixed).chunk(2, dim=1)
+            log_scale = _MOST * torch.tanh(log_scale / _MOST)
             x = torch.cat([fixed, changed * log_scale.exp() + shift], dim=1)
             log_determinant = log_determinant + log_scale.sum(dim=1)
         return x, log_determinant
-
-
-def _scale_and_shift(network: nn.Module, fixed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    log_scale, shift = network(fixed).chunk(2, dim=1)
-    return _MOST * torch.tanh(log_scale / _MOST), shift
 
 
 class PoseFlow(nn.Module):
@@ -148,8 +137,6 @@ class PoseFlow(nn.Module):
         root = skeleton.roots[0]
         self.joints = [joint for joint in range(skeleton.n_joints) if joint != root]
         D = 2 * len(self.joints)
-        if not components <= D:
-            raise ValueError(f"components must be at most {D}, got {components}")
         self.register_buffer("mean", torch.zeros(D))
         self.register_buffer("basis", torch.eye(D))
         self.register_buffer("deviation", torch.ones(D))
@@ -160,8 +147,7 @@ class PoseFlow(nn.Module):
         cls, skeleton: Skeleton, settings: FlowSettings, poses: np.ndarray, seed: int = 0
     ) -> PoseFlow:
         """Return an untrained flow with the principal components of poses, (N, J, 2), metres."""
-        root = skeleton.roots[0]
-        flat = np.delete(poses, root, axis=1).reshape(len(poses), -1)
+        flat = np.delete(poses, skeleton.roots[0], axis=1).reshape(len(poses), -1)
         mean = flat.mean(axis=0)
         covariance = np.cov(flat, rowvar=False, bias=True)
         covariance = covariance + settings.blur**2 * np.eye(len(covariance))

@@ -21,23 +21,19 @@ __all__ = ["PoseFlowTrainee", "PoseTrainee", "whole_poses"]
 def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray:
     """Return the fully visible poses and their mirror images, root-centred: (N, J, 2), metres.
 
-    Every joint must have at least the threshold's confidence.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, skeletons differ, or no frame is fully visible.
+    Every joint must have a confidence of at least ``threshold``. Raises ``ValueError`` if there is
+    no track, skeletons differ, or no frame is fully visible.
     """
     if not tracks:
         raise ValueError("tracks must contain at least one track, got none")
     skeleton = tracks[0].skeleton
-    visible = []
+    chosen = []
     for track in tracks:
         if track.skeleton != skeleton:
             raise ValueError(f"tracks must have one skeleton, {track.name!r} has other joints")
-        whole = ((track.confidence >= threshold) & (track.confidence > 0)).all(axis=1)
-        visible.append(track.keypoints[whole])
-    poses = np.concatenate(visible)
+        visible = (track.confidence >= threshold) & (track.confidence > 0)
+        chosen.append(track.keypoints[visible.all(axis=1)])
+    poses = np.concatenate(chosen)
     if len(poses) == 0:
         raise ValueError(
             f"tracks must contain a frame with every joint at confidence {threshold:g} or more, "
@@ -131,12 +127,11 @@ class PoseFlowTrainee(PoseTrainee):
         tracks: Sequence[KeypointTrack],
         validation: Sequence[KeypointTrack],
         size: FlowSettings,
-        *,
-        threshold: float = 0.3,
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(tracks, validation, size, threshold=threshold, seed=seed)
-        self.network = PoseFlow.of_poses(self.skeleton, size, self.poses.astype(np.float64), seed)
+        super().__init__(tracks, validation, size, **options)
+        poses = self.poses.astype(np.float64)
+        self.network = PoseFlow.of_poses(self.skeleton, size, poses, self._seed)
         self.settings = {**self.settings, "components": self.network.components}
 
     def _loss(

@@ -1,6 +1,6 @@
 """Variational autoencoder of 2D motions.
 
-It follows the released code of MAS: transformers with the latent of ACTOR (Petrovich et al. 2021).
+Follows the released code of MAS: transformers with the latent of ACTOR (Petrovich et al. 2021).
 """
 
 from __future__ import annotations
@@ -30,11 +30,6 @@ class EvaluatorSettings(TransformerSettings):
     kl_weight : float
         Weight of the Kullback-Leibler divergence from N(0, I), summed over the latent, relative to
         the mean squared error in standardised units.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
     """
 
     width: int = 256
@@ -90,10 +85,10 @@ class TrackEncoder(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log variance: ``(N, L, 2J), (N, L) → (N, latent), (N, latent)``."""
         frames = self.enter(motions) + self.places[: motions.shape[1]]
-        tokens = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
-        ignored = torch.cat([torch.zeros_like(valid[:, :2]), ~valid], dim=1)
-        tokens = torch.cat([tokens, frames], dim=1)
-        encoded = self.transformer(tokens, src_key_padding_mask=ignored)
+        learnt = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
+        padding = torch.cat([torch.zeros_like(valid[:, :2]), ~valid], dim=1)
+        tokens = torch.cat([learnt, frames], dim=1)
+        encoded = self.transformer(tokens, src_key_padding_mask=padding)
         return self.mean(encoded[:, 0]), self.log_variance(encoded[:, 1])
 
 
@@ -135,8 +130,5 @@ class TrackAutoencoder(nn.Module):
 
 
 def divergence_from_normal(mean: torch.Tensor, log_variance: torch.Tensor) -> torch.Tensor:
-    """Return KL(N(mean, variance) ‖ N(0, I)), nats: ``(N, D), (N, D) → (N,)``.
-
-    Source: Kingma and Welling 2014, appendix B.
-    """
+    """Return KL(N(mean, variance) ‖ N(0, I)), nats: ``(N, D), (N, D) → (N,)``."""
     return 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum(dim=-1)

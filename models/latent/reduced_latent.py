@@ -60,9 +60,9 @@ class ReducedLatent(StandardNormalPrior):
         values, vectors = np.linalg.eigh(_mean_square(prior, seeds.generator(seed, "directions")))
         leading = np.argsort(values)[::-1][:k]
         # Fix the sign of each eigenvector: its largest entry is positive.
-        chosen = vectors[:, leading]
-        largest = np.abs(chosen).argmax(axis=0)
-        self.directions = chosen * np.sign(chosen[largest, np.arange(k)])
+        vectors = vectors[:, leading]
+        largest = np.abs(vectors).argmax(axis=0)
+        self.directions = vectors * np.sign(vectors[largest, np.arange(k)])
 
     @cached_property
     def explained(self) -> float:
@@ -100,8 +100,8 @@ def _mean_square(prior: Any, rng: np.random.Generator) -> np.ndarray:
         z = torch.as_tensor(rng.standard_normal((rows, prior.dim)), dtype=torch.float32)
         z.requires_grad_(True)
         motion = prior.motion(z)
-        across = torch.as_tensor(rng.standard_normal(tuple(motion.shape)), dtype=motion.dtype)
-        (pulled,) = torch.autograd.grad(motion, z, across)
-        rows_of_j = pulled.double().numpy()
-        total += rows_of_j.T @ rows_of_j
+        v = torch.as_tensor(rng.standard_normal(tuple(motion.shape)), dtype=motion.dtype)
+        (product,) = torch.autograd.grad(motion, z, v)
+        products = product.double().numpy()
+        total += products.T @ products
     return total / n

@@ -37,12 +37,12 @@ def decode_rows(
         kind = "JAX array" if is_jax_array(theta) else type(theta).__name__
         raise TypeError(f"theta must be a NumPy or torch array, got a {kind}")
     check_shape("theta", theta, ("…", dim))
-    whole = (*theta.shape[:-1], *shape)
+    full = (*theta.shape[:-1], *shape)
     if is_torch_array(theta):
-        return decode(theta.reshape(-1, dim)).reshape(whole)
+        return decode(theta.reshape(-1, dim)).reshape(full)
     check_finite("theta", theta)
     dtype = theta.dtype if theta.dtype == np.float32 else np.float64
     with torch.no_grad():
         flat = torch.as_tensor(np.ascontiguousarray(theta, dtype)).reshape(-1, dim)
         parts = [to_numpy(decode(part)) for part in flat.split(rows)]
-    return np.concatenate(parts).reshape(whole)
+    return np.concatenate(parts).reshape(full)

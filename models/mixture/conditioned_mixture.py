@@ -51,8 +51,6 @@ class ConditionedMixture:
         self.scale = prior.scale
         self.dim = prior.means[0].size
         self._posterior = prior.exact_posterior(likelihood)
-        self._information = self._posterior.information
-        self._shift = self._posterior.shift
         self._turns = turning_coefficients(prior.yaws)
 
     def motion(self, theta: Array) -> Array:
@@ -95,7 +93,7 @@ class ConditionedMixture:
         if not 0 < alpha_bar < 1:
             raise ValueError(f"alpha_bar must be between 0 and 1 (exclusive), got {alpha_bar!r}")
         precision = alpha_bar / ((1 - alpha_bar) * scale**2)
-        information = self._information + precision * axes.T @ axes
+        information = self._posterior.information + precision * axes.T @ axes
         shrink = np.linalg.inv(np.eye(3) + variance * information)
         fields = prior.base_fields
         K, width, _, F, _ = fields.shape
@@ -105,7 +103,9 @@ class ConditionedMixture:
         gram = (flat @ moved.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
         gram = np.einsum("kicjd,ac,ad->kaij", gram, turns, turns, optimize=True)
         # The arrays below have one row per draw.
-        shift = self._shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (seen @ axes)
+        shift = self._posterior.shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (
+            seen @ axes
+        )
         pull = np.einsum("fij,bfj->bfi", shrink, shift)
         products = pull.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T
         linear = products.reshape(len(seen), K, width, 3) @ turns.T
@@ -127,8 +127,8 @@ class ConditionedMixture:
         logits = logits + linear[..., 0] + 0.5 * (slope * latent).sum(axis=-1)
         weights = np.exp(logits - logits.max(axis=(1, 2), keepdims=True))
         weights /= weights.sum(axis=(1, 2), keepdims=True)
-        whole = np.concatenate([np.ones((*latent.shape[:-1], 1)), latent], axis=-1)
-        base = (whole * weights[..., None]).swapaxes(2, 3) @ self._turns
+        extended = np.concatenate([np.ones((*latent.shape[:-1], 1)), latent], axis=-1)
+        base = (extended * weights[..., None]).swapaxes(2, 3) @ self._turns
         fields = prior.base_fields
         clean = base.reshape(len(base), -1) @ fields.reshape(-1, fields[0, 0, 0].size)
         clean = clean.reshape(shift.shape) + prior.noise**2 * shift

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from probmotion import seeds
+from probmotion.models.bodies.body_states import turned_about_vertical
 from probmotion.motion.motion import Motion
 from probmotion.validation import check_count
 
@@ -32,9 +33,7 @@ def fit_styles(
     windows = _common_heading(windows, motions[0])
     flat = windows.reshape(len(windows), -1)
     if np.ptp(flat, axis=0).max() < 1e-9:
-        raise ValueError(
-            f"motions must contain windows that differ, got {len(windows)} identical ones"
-        )
+        raise ValueError(f"motions must contain windows that differ, got {len(windows)} equal ones")
     if isinstance(styles, int):
         check_count("styles", styles)
         labels = _cluster(flat, styles, rank, seed)
@@ -57,20 +56,16 @@ def fit_styles(
             )
         members = _turned_to_mean(members)
         mean = members.mean(axis=0)
-        _, size, axes = np.linalg.svd(
-            (members - mean).reshape(len(members), -1), full_matrices=False
-        )
+        centred = (members - mean).reshape(len(members), -1)
+        _, size, axes = np.linalg.svd(centred, full_matrices=False)
         means.append(mean)
         spectra.append(size**2 / (len(members) - 1))
         directions.append(axes[:rank])
     proportions = np.bincount(labels, minlength=len(names)) / len(labels)
-    left_over = np.array([spectrum[rank:].sum() for spectrum in spectra])
-    variance = float(proportions @ left_over) / (flat.shape[1] - rank)
+    remainder = np.array([spectrum[rank:].sum() for spectrum in spectra])
+    variance = float(proportions @ remainder) / (flat.shape[1] - rank)
     if not variance > 0:
-        raise ValueError(
-            f"rank must be below the dimension that the windows span, got {rank}, which leaves no "
-            "noise"
-        )
+        raise ValueError(f"rank must be below the dimension of the windows' span, got {rank}")
     factors = [
         np.sqrt(np.maximum(spectrum[:rank] - variance, 0.0))[:, None] * axes
         for spectrum, axes in zip(spectra, directions, strict=True)
@@ -134,13 +129,7 @@ def turn_to(motions: np.ndarray, target: np.ndarray) -> np.ndarray:
     x, z = motions[..., 0], motions[..., 2]
     along = (x * target[..., 0] + z * target[..., 2]).sum(axis=(1, 2))
     across = (z * target[..., 0] - x * target[..., 2]).sum(axis=(1, 2))
-    return _turned(motions, np.arctan2(across, along))
-
-
-def _turned(motions: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    c, s = np.cos(yaw)[:, None, None], np.sin(yaw)[:, None, None]
-    x, y, z = motions[..., 0], motions[..., 1], motions[..., 2]
-    return np.stack([c * x + s * z, y, c * z - s * x], axis=-1)
+    return turned_about_vertical(motions, np.arctan2(across, along))
 
 
 def _common_heading(windows: np.ndarray, motion: Motion) -> np.ndarray:
@@ -154,7 +143,7 @@ def _common_heading(windows: np.ndarray, motion: Motion) -> np.ndarray:
     left, right = np.array(pairs).T
     side = (windows[:, :, right] - windows[:, :, left]).mean(axis=(1, 2))
     # With +Y up, a body that faces +Z has its right side at −X.
-    return _turned(windows, np.arctan2(-side[:, 2], -side[:, 0]))
+    return turned_about_vertical(windows, np.arctan2(-side[:, 2], -side[:, 0]))
 
 
 def _turned_to_mean(windows: np.ndarray, sweeps: int = 5) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 from weakref import WeakKeyDictionary
@@ -91,10 +91,9 @@ class GaussianMixtureMotion:
         names = tuple(self.styles) or tuple(f"style-{k}" for k in range(K))
         if len(names) != K:
             raise ValueError(f"styles must contain {K} names, one per mean, got {len(names)}")
-        if self.coordinates not in ("latent", "positions"):
-            raise ValueError(
-                f"coordinates must be 'latent' or 'positions', got {self.coordinates!r}"
-            )
+        kind = self.coordinates
+        if kind not in ("latent", "positions"):
+            raise ValueError(f"coordinates must be 'latent' or 'positions', got {kind!r}")
         object.__setattr__(self, "styles", names)
 
     def __getstate__(self) -> dict:
@@ -151,13 +150,8 @@ class GaussianMixtureMotion:
         fitted = fit_styles(motions, frames, rank, styles, stride, seed)
         if weights is not None:
             fitted["weights"] = np.asarray(weights, dtype=np.float64)
-        return cls(
-            skeleton=motions[0].skeleton,
-            fps=motions[0].fps,
-            azimuths=azimuths,
-            coordinates=coordinates,
-            **fitted,
-        )
+        fitted |= {"azimuths": azimuths, "coordinates": coordinates}
+        return cls(skeleton=motions[0].skeleton, fps=motions[0].fps, **fitted)
 
     @property
     def frames(self) -> int:
@@ -189,8 +183,13 @@ class GaussianMixtureMotion:
     @cached_property
     def base_fields(self) -> np.ndarray:
         """The three base fields of each mean and factor, metres, (K, 1 + r, 3, L·J, 3)."""
+        return turning_fields(self._fields)
+
+    @property
+    def _fields(self) -> np.ndarray:
+        """Mean and factors of each style, metres, (K, 1 + r, L·J, 3)."""
         fields = np.concatenate([self.means[:, None], self.factors], axis=1)
-        return turning_fields(fields.reshape(*fields.shape[:2], -1, 3))
+        return fields.reshape(*fields.shape[:2], -1, 3)
 
     # Protocols of probmotion.posteriors.protocols.
 
@@ -252,14 +251,9 @@ class GaussianMixtureMotion:
         """
         key = self if likelihood is None else likelihood
         if key not in self._posteriors:
-            self._posteriors[key] = MixturePosterior(
-                self.base_fields,
-                self.yaws,
-                self.weights,
-                self.noise,
-                self.means.shape[1:],
-                likelihood,
-            )
+            parameters = (self.base_fields, self.yaws, self.weights, self.noise)
+            posterior = MixturePosterior(*parameters, self.means.shape[1:], likelihood)
+            self._posteriors[key] = posterior
         return self._posteriors[key]
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
@@ -282,8 +276,10 @@ class GaussianMixtureMotion:
         """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
         out = np.empty_like(vectors)
         for view, mixture in enumerate(self._seen_by(cameras, x_t)):
-            noisy = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
-            flat = np.ascontiguousarray(vectors[:, view]).reshape(len(x_t), mixture.dim)
+            noisy, flat = (
+                np.ascontiguousarray(values[:, view]).reshape(len(x_t), mixture.dim)
+                for values in (x_t, vectors)
+            )
             product = mixture.covariance_product(noisy, alpha_bar, flat)
             out[:, view] = product.reshape(out[:, view].shape)
         return out
@@ -343,23 +339,17 @@ class GaussianMixtureMotion:
         basis : ndarray, (L·J, M)
             Orthonormal; the coordinates of a motion are ``basis.T @ motion.reshape(-1, 3)``.
         """
-        K, L, J, _ = self.means.shape
-        fields = np.concatenate([self.means[:, None], self.factors], axis=1)
-        scalars = fields.reshape(K, 1 + self.rank, L * J, 3).transpose(2, 0, 1, 3)
-        basis, size, _ = np.linalg.svd(scalars.reshape(L * J, -1), full_matrices=False)
+        fields = self._fields
+        scalars = fields.transpose(2, 0, 1, 3).reshape(fields.shape[2], -1)
+        basis, size, _ = np.linalg.svd(scalars, full_matrices=False)
         basis = basis[:, size > 1e-12 * size[0]]
         M = basis.shape[1]
-        small = np.einsum("fm,kifc->kimc", basis, fields.reshape(K, 1 + self.rank, L * J, 3))
-        prior = GaussianMixtureMotion(
+        small = np.einsum("fm,kifc->kimc", basis, fields)
+        prior = replace(
+            self,
             skeleton=Skeleton([f"field-{m}" for m in range(M)], [-1] * M),
-            fps=self.fps,
             means=small[:, :1],
             factors=small[:, 1:, None],
-            weights=self.weights,
-            noise=self.noise,
-            azimuths=self.azimuths,
-            styles=self.styles,
-            coordinates=self.coordinates,
         )
         # The denoiser's normalised unit must be that of the full prior.
         prior.__dict__["scale"] = self.scale

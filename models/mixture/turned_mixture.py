@@ -22,11 +22,8 @@ from probmotion.arrays import Array, array_namespace, constant, logsumexp
 __all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
 
 _BLOCK = 64
-"""Points per block, along the last axis, so that products stay in a core's cache.
-
-The last block is padded with zeros: rounding of a point must not depend on the batch size, because
-a sampler's many steps amplify small differences.
-"""
+"""Points per block, so that products stay in a core's cache. The last block is padded with zeros:
+rounding of a point must not depend on the batch size, as a sampler's steps amplify differences."""
 
 
 def turning_fields(fields: np.ndarray) -> np.ndarray:
@@ -110,15 +107,15 @@ class TurnedMixture:
     def denoise(self, x: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[x₀ | x_t]: ``(n, D) → (n, D)``, with x_t = √ᾱ x₀ + √(1−ᾱ) ε."""
         level = self._level(alpha_bar)
-        own_factor = level.signal * self.variance / level.total
         out = np.empty_like(x)
+        noise_factor = level.signal * self.variance / level.total
         latent_factor = level.signal / level.total
         for rows, n in _blocks(len(x)):
             weight, latent = self._condition(_filled(x[rows]), level)
             weight *= level.shrink
             latent *= weight[:, :, None]
             means = np.matmul(*self._combined(weight, latent, latent_factor, level))
-            np.add(means[:n], own_factor * x[rows], out=out[rows])
+            np.add(means[:n], noise_factor * x[rows], out=out[rows])
         return out
 
     def covariance_product(self, x: np.ndarray, alpha_bar: float, v: np.ndarray) -> np.ndarray:
@@ -146,10 +143,10 @@ class TurnedMixture:
             out[rows] = weight[..., :n].transpose(2, 0, 1)
         return out
 
-    def log_density(self, x: Array, alpha_bar: float = 1.0) -> Array:
-        """Return the normalised log density of x_t: ``(…, D) → (…)``, for any array library."""
+    def log_density(self, x: Array) -> Array:
+        """Return the normalised log density of x₀: ``(…, D) → (…)``, for any array library."""
         xp = array_namespace(x)
-        level = self._level(alpha_bar)
+        level = self._level(1.0)
         K, A = self.shape
         batch = x.shape[:-1]
         n = math.prod(batch)

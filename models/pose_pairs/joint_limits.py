@@ -68,10 +68,8 @@ class JointLimits:
     def __post_init__(self) -> None:
         for name in ("bin_rings", "cell_rings"):
             check_count(name, getattr(self, name), 2)
-        n_bins, n_cells = (
-            len(sphere_rings(rings)[1]) for rings in (self.bin_rings, self.cell_rings)
-        )
-        check_shape("allowed", self.allowed, (len(PARTS), n_bins, n_cells))
+        sizes = [len(sphere_rings(rings)[1]) for rings in (self.bin_rings, self.cell_rings)]
+        check_shape("allowed", self.allowed, (len(PARTS), *sizes))
         check_shape("rest", self.rest, (len(PARTS), 3))
         check_finite("rest", self.rest)
         if not np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max() < 1e-9:
@@ -128,17 +126,28 @@ class JointLimits:
     @cached_property
     def trees(self) -> np.ndarray:
         """Joints of each person in the order of ``person17``, (K, 17)."""
-        return _people(self.skeleton)
+        skeleton, people = self.skeleton, []
+        for root in skeleton.roots:
+            tree = [j for j in range(skeleton.n_joints) if root in (j, *skeleton.ancestors(j))]
+            joints = {skeleton.canonical_names[j].rpartition(":")[2]: j for j in tree}
+            person = [joints.get(name, -1) for name in _PERSON.joint_names]
+            parents = [skeleton.parents[j] for j in person]
+            wanted = [-1 if parent < 0 else person[parent] for parent in _PERSON.parents]
+            if len(tree) != _PERSON.n_joints or -1 in person or parents != wanted:
+                raise ValueError(
+                    "skeleton must have trees with the joints and parents of 'person17', got "
+                    f"{', '.join(skeleton.joint_names[j] for j in tree)}"
+                )
+            people.append(person)
+        return np.array(people)
 
     @cached_property
     def arrays(self) -> LimitArrays:
         """Arrays for compiled code."""
-        cell_rings, centres = sphere_rings(self.cell_rings)
         return LimitArrays(
-            allowed=np.ascontiguousarray(self.allowed, dtype=np.bool_),
-            bin_rings=sphere_rings(self.bin_rings)[0],
-            cell_rings=cell_rings,
-            centres=centres,
+            np.ascontiguousarray(self.allowed, dtype=np.bool_),
+            sphere_rings(self.bin_rings)[0],
+            *sphere_rings(self.cell_rings),
             rest=np.ascontiguousarray(self.rest, dtype=np.float64),
             tilt=float(np.sin(self.tilt)),
         )
@@ -180,14 +189,9 @@ class JointLimits:
 def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a partition of the sphere into ``n_rings`` rings of nearly square cells.
 
-    Cells are mirror-symmetric in the first axis.
-
-    Returns
-    -------
-    rings : ndarray of int, (n_rings, 2)
-        Number of cells and index of the first cell of each ring, from the positive second axis.
-    centres : ndarray, (cells, 3)
-        Unit vectors.
+    Cells are mirror-symmetric in the first axis. ``rings`` (n_rings, 2) contains the number of
+    cells and the index of the first cell of each ring, from the positive second axis; ``centres``
+    (cells, 3) are unit vectors.
     """
     heights = (np.arange(n_rings) + 0.5) * np.pi / n_rings
     counts = 2 * np.round(n_rings * np.sin(heights)).astype(np.int64)
@@ -199,26 +203,3 @@ def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
         [np.sin(height) * np.sin(turn), np.cos(height), np.sin(height) * np.cos(turn)], axis=1
     )
     return rings, centres
-
-
-def _people(skeleton: Skeleton) -> np.ndarray:
-    """Return the joints of each person in the order of ``person17``, (K, 17)."""
-    people = []
-    for root in skeleton.roots:
-        joints = [root, *(j for j in range(skeleton.n_joints) if root in skeleton.ancestors(j))]
-        names = {skeleton.canonical_names[j].rpartition(":")[2]: j for j in joints}
-        parents = {
-            name: skeleton.canonical_names[skeleton.parents[j]].rpartition(":")[2]
-            for name, j in names.items()
-            if j != root
-        }
-        wanted = {
-            _PERSON.joint_names[j]: _PERSON.joint_names[parent] for j, parent in _PERSON.bones
-        }
-        if len(joints) != _PERSON.n_joints or parents != wanted:
-            raise ValueError(
-                "skeleton must have trees with the joints and parents of 'person17', got "
-                f"{', '.join(skeleton.joint_names[j] for j in joints)}"
-            )
-        people.append([names[name] for name in _PERSON.joint_names])
-    return np.array(people)

@@ -9,18 +9,9 @@ import numba
 import numpy as np
 
 __all__ = [
-    "NO_LENGTH",
-    "Frame",
-    "Vector",
-    "cell_of",
-    "closeness_of",
-    "from_frame",
-    "in_frame",
-    "least_rotation",
-    "line_frame",
-    "product",
-    "unit",
-]
+    "NO_LENGTH", "Frame", "Vector", "cell_of", "closeness_of", "from_frame", "in_frame",
+    "least_rotation", "line_frame", "product", "unit",
+]  # fmt: skip
 
 Vector = tuple[float, float, float]
 Frame = tuple[Vector, Vector, Vector]
@@ -115,11 +106,7 @@ def _dot(a: Vector, b: Vector) -> float:
 
 @numba.njit(cache=True)
 def _cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @numba.njit(cache=True)

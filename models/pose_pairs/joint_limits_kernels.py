@@ -22,19 +22,19 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
     line_frame,
     product,
     unit,
-)
+)  # fmt: skip
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["PARTS", "LimitArrays", "local_directions", "project_poses"]
 
 PARTS = ("hip", "knee", "ankle", "chest", "shoulder", "elbow", "wrist", "neck", "head")
 """Bones with a table, by end joint; shared by both sides."""
-HIP, KNEE, ANKLE, CHEST, SHOULDER, ELBOW, WRIST, NECK, HEAD = range(9)
+# NumPy integers, as Numba compiles a function once for each literal argument.
+HIP, KNEE, ANKLE, CHEST, SHOULDER, ELBOW, WRIST, NECK, HEAD = np.arange(9)
 
 # Joints of `person17`, and the last descendant of the spine.
-PELVIS, SPINE, CHEST_JOINT, NECK_JOINT, HEAD_JOINT = range(5)
-LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_HIP, RIGHT_HIP = 5, 8, 11, 14
-LAST_OF_TRUNK = 10
+SPINE, CHEST_JOINT, NECK_JOINT, HEAD_JOINT = np.arange(1, 5)
+LEFT_SHOULDER, RIGHT_SHOULDER, LAST_OF_TRUNK, LEFT_HIP, RIGHT_HIP = np.array([5, 8, 10, 11, 14])
 N_JOINTS = 17
 _PARENTS = np.array(Skeleton.preset("person17").parents)
 
@@ -43,19 +43,14 @@ _BISECTIONS = 12
 
 
 class LimitArrays(NamedTuple):
-    """Arrays of :class:`~.joint_limits.JointLimits`.
+    """Arrays of :class:`~.joint_limits.JointLimits`; rings and centres from ``sphere_rings``."""
 
-    ``allowed`` (parts, bins, cells) bool; ``bin_rings`` and ``cell_rings`` (rings, 2) and
-    ``centres`` (cells, 3) from ``sphere_rings``; ``rest`` (parts, 3); ``tilt``, the sine of the
-    maximum tilt of the spine.
-    """
-
-    allowed: np.ndarray
-    bin_rings: np.ndarray
-    cell_rings: np.ndarray
-    centres: np.ndarray
-    rest: np.ndarray
-    tilt: float
+    allowed: np.ndarray  # (parts, bins, cells), bool
+    bin_rings: np.ndarray  # (rings, 2)
+    cell_rings: np.ndarray  # (rings, 2)
+    centres: np.ndarray  # (cells, 3)
+    rest: np.ndarray  # (parts, 3)
+    tilt: float  # sine of the maximum tilt of the spine
 
 
 class Walk(NamedTuple):
@@ -103,11 +98,11 @@ def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) ->
 
 
 @numba.njit(cache=True)
-def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) -> Vector:
+def _nearest_allowed(u: Vector, part: int, row: int, limits: LimitArrays) -> Vector:
     """Return the point at which the path from ``u`` to the nearest allowed centre becomes valid."""
     best, closest = 0, -2.0
     for cell in range(len(limits.centres)):
-        if limits.allowed[part, condition, cell]:
+        if limits.allowed[part, row, cell]:
             x, y, z = _row(limits.centres, cell)
             c = u[0] * x + u[1] * y + u[2] * z
             if c > closest:
@@ -118,7 +113,7 @@ def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) 
         middle = 0.5 * (outside + inside)
         between = _between(u, centre, middle)
         cell = cell_of(between, limits.cell_rings)
-        if between != NO_LENGTH and limits.allowed[part, condition, cell]:
+        if between != NO_LENGTH and limits.allowed[part, row, cell]:
             inside = middle
         else:
             outside = middle
@@ -126,13 +121,13 @@ def _nearest_allowed(u: Vector, part: int, condition: int, limits: LimitArrays) 
 
 
 @numba.njit(cache=True)
-def _between(a: Vector, b: Vector, share: float) -> Vector:
+def _between(a: Vector, b: Vector, fraction: float) -> Vector:
     """Return the normalised linear interpolation of two unit vectors."""
     return unit(
         (
-            (1.0 - share) * a[0] + share * b[0],
-            (1.0 - share) * a[1] + share * b[1],
-            (1.0 - share) * a[2] + share * b[2],
+            (1.0 - fraction) * a[0] + fraction * b[0],
+            (1.0 - fraction) * a[1] + fraction * b[1],
+            (1.0 - fraction) * a[2] + fraction * b[2],
         )
     )
 
@@ -151,10 +146,10 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
         _set_and_turn(directions, joint, from_frame(frame, u), last)
     else:
         u = in_frame(frame, direction)
-        met = cell_of(condition, limits.bin_rings)
-        valid[joint] = limits.allowed[part, met, cell_of(u, limits.cell_rings)]
+        row = cell_of(condition, limits.bin_rings)
+        valid[joint] = limits.allowed[part, row, cell_of(u, limits.cell_rings)]
         if correct and not valid[joint]:
-            u = _nearest_allowed(u, part, met, limits)
+            u = _nearest_allowed(u, part, row, limits)
             _set_and_turn(directions, joint, from_frame(frame, u), last)
     _put(local[joint], 0, condition)
     _put(local[joint], 1, u)
@@ -177,7 +172,8 @@ def _walk_person(walk: Walk) -> None:
     # In this frame the hips are mirror images: check one, correct both.
     hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, walk)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
-    local[RIGHT_HIP] = local[LEFT_HIP]
+    for i in range(2):
+        _put(local[RIGHT_HIP], i, _row(local[LEFT_HIP], i))
     if correct and not valid[LEFT_HIP]:
         _set_and_turn(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
     for side in range(2):
@@ -237,11 +233,11 @@ def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) ->
 def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
     """Write the unit vector of each bone; 0 for bones of length 0."""
     for joint in range(1, N_JOINTS):
-        here, above = tree[joint], tree[_PARENTS[joint]]
+        end, start = tree[joint], tree[_PARENTS[joint]]
         bone = (
-            pose[here, 0] - pose[above, 0],
-            pose[here, 1] - pose[above, 1],
-            pose[here, 2] - pose[above, 2],
+            pose[end, 0] - pose[start, 0],
+            pose[end, 1] - pose[start, 1],
+            pose[end, 2] - pose[start, 2],
         )
         _put(directions, joint, unit(bone))
 
@@ -257,26 +253,26 @@ def project_poses(
     n = len(poses)
     nearest = poses.copy()
     valid = np.ones(poses.shape[:2], dtype=np.bool_)
-    directions, before = np.zeros((N_JOINTS, 3)), np.zeros((N_JOINTS, 3))
-    judged, local = np.ones(N_JOINTS, dtype=np.bool_), np.zeros((N_JOINTS, 2, 3))
+    directions, local = np.zeros((N_JOINTS, 3)), np.zeros((N_JOINTS, 2, 3))
+    of_person = np.ones(N_JOINTS, dtype=np.bool_)
     for pose in range(n):
         for tree in trees:
             _directions(poses[pose], tree, directions)
-            before[:] = directions
-            _walk_person(Walk(limits, True, directions, judged, local))
-            if judged.all():
+            before = directions.copy()
+            _walk_person(Walk(limits, True, directions, of_person, local))
+            if of_person.all():
                 continue
             for joint in range(1, N_JOINTS):
-                here, above = tree[joint], tree[_PARENTS[joint]]
-                valid[pose, here] = judged[joint]
+                end, start = tree[joint], tree[_PARENTS[joint]]
+                valid[pose, end] = of_person[joint]
                 length = 0.0
                 for i in range(3):
-                    length += (poses[pose, here, i] - poses[pose, above, i]) ** 2
+                    length += (poses[pose, end, i] - poses[pose, start, i]) ** 2
                 # Add only the change of direction, so that unchanged bones are not rounded.
                 for i in range(3):
                     turned = np.sqrt(length) * (directions[joint, i] - before[joint, i])
-                    moved = nearest[pose, above, i] - poses[pose, above, i]
-                    nearest[pose, here, i] = poses[pose, here, i] + moved + turned
+                    moved = nearest[pose, start, i] - poses[pose, start, i]
+                    nearest[pose, end, i] = poses[pose, end, i] + moved + turned
     return valid, nearest
 
 
@@ -284,9 +280,9 @@ def project_poses(
 def local_directions(poses: np.ndarray, limits: LimitArrays) -> np.ndarray:
     """Return the parent's and the bone's direction in each bone's frame, (n, 17, 2, 3)."""
     local = np.zeros((len(poses), N_JOINTS, 2, 3))
-    directions, judged = np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.bool_)
+    directions, of_person = np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.bool_)
     tree = np.arange(N_JOINTS)
     for pose in range(len(poses)):
         _directions(poses[pose], tree, directions)
-        _walk_person(Walk(limits, False, directions, judged, local[pose]))
+        _walk_person(Walk(limits, False, directions, of_person, local[pose]))
     return local

@@ -8,7 +8,7 @@ The shipped limits are reproduced from CMU clips in DATA/cmu_single and DATA/cmu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,18 @@ import numpy as np
 
 from probmotion.io.files import load
 from probmotion.models.pose_pairs.joint_limits import JointLimits, sphere_rings
-from probmotion.models.pose_pairs.joint_limits_frames import cell_of, closeness_of
+from probmotion.models.pose_pairs.joint_limits_frames import closeness_of
 from probmotion.models.pose_pairs.joint_limits_kernels import (
     HIP,
     PARTS,
     LimitArrays,
     local_directions,
-)
+)  # fmt: skip
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["HELD_OUT", "clips_of_people", "learn_limits", "main", "rejected_fractions"]
+__all__ = ["HELD_OUT", "clips_of_people", "learn_limits", "main"]
 
 HELD_OUT = (
     "cmu_01_07", "cmu_02_05", "cmu_02_09", "cmu_131_02",
@@ -39,8 +39,8 @@ HELD_OUT = (
 _PERSON = Skeleton.preset("person17")
 # The hips must keep their sides, or a correction would flip the frame of the pelvis.
 _LEAST_LEFT_OF_HIP = 0.1
-# Quantile of the spine's tilt, robust to outlier frames.
-_TILTS_KEPT = 0.999
+# Robust to outlier frames.
+_TILT_QUANTILE = 0.999
 
 
 def learn_limits(
@@ -81,7 +81,7 @@ def learn_limits(
         allowed[part] = closeness >= np.cos(dilation)
     allowed[HIP] &= centres[:, 0] > _LEAST_LEFT_OF_HIP
     tilts = np.arcsin(np.clip(np.abs(local[:, _PERSON.index("spine"), 1, 0]), 0.0, 1.0))
-    tilt = np.quantile(tilts, _TILTS_KEPT) + dilation
+    tilt = np.quantile(tilts, _TILT_QUANTILE) + dilation
     return JointLimits(
         allowed=_without_empty_rows(allowed, bin_centres),
         rest=rest,
@@ -95,54 +95,15 @@ def clips_of_people(path: Path) -> list[np.ndarray]:
     """Return the positions of each person in a clip, (L, 17, 3), without suspect frames."""
     motion = load(path)
     with np.load(path) as archive:
-        kept = ~archive["suspect"] if "suspect" in archive else np.ones(motion.frames, bool)
+        usable = ~archive["suspect"] if "suspect" in archive else np.ones(motion.frames, bool)
     skeleton, people = motion.skeleton, []
     for root in skeleton.roots:
         joints = [j for j in range(skeleton.n_joints) if root in (j, *skeleton.ancestors(j))]
         tree = skeleton.subset(joints)
         names = [name.rpartition(":")[2] for name in tree.joint_names]
         person = Motion(motion.positions[:, joints], Skeleton(names, tree.parents), motion.fps)
-        people.append(person.retarget(_PERSON).positions[kept])
+        people.append(person.retarget(_PERSON).positions[usable])
     return people
-
-
-def rejected_fractions(limits: JointLimits, poses: np.ndarray) -> dict[str, dict[str, float]]:
-    """Return the fractions of real, random and backward-bent bones that are rejected.
-
-    Parameters
-    ----------
-    limits : JointLimits
-        Limits of ``person17``.
-    poses : ndarray, (n, 17, 3)
-        Real poses, metres.
-
-    Returns
-    -------
-    dict
-        Per bone, both sides together: ``real`` bones; ``random`` directions, uniform on the sphere
-        given the real parents; and ``backwards``, ankles and wrists flexed by over 40° and rotated
-        by half a turn about their parent.
-    """
-    valid = limits.is_valid(poses)
-    local = _local(poses, limits.rest, limits.bin_rings, limits.cell_rings)
-    arrays = limits.arrays
-    names = [name.removeprefix("left_") for name in _PERSON.joint_names]
-    tilted = float(np.sin(limits.tilt))
-    # For a uniform direction on the sphere, |left| is uniform on [0, 1].
-    fractions = {"spine": {"real": 1.0 - valid[:, 0].mean(), "random": 1.0 - tilted}}
-    for part, name in enumerate(PARTS):
-        bones = [j - 1 for j, other in enumerate(names) if other.removeprefix("right_") == name]
-        parents, directions = _samples(local, part)
-        rows = arrays.allowed[part, [cell_of(parent, arrays.bin_rings) for parent in parents]]
-        fractions[name] = {"real": 1.0 - valid[:, bones].mean(), "random": 1.0 - rows.mean()}
-        if name in ("ankle", "wrist"):
-            parent = limits.rest[part - 1]
-            along = directions @ parent
-            bent = along < np.cos(np.deg2rad(40.0))
-            turned = 2.0 * along[bent, None] * parent - directions[bent]
-            cells = [cell_of(direction, arrays.cell_rings) for direction in turned]
-            fractions[name]["backwards"] = 1.0 - rows[bent][np.arange(len(cells)), cells].mean()
-    return {name: {k: float(value) for k, value in row.items()} for name, row in fractions.items()}
 
 
 def main(data: Path, out: Path, dilation: float = 10.0, bin_dilation: float = 20.0) -> None:
@@ -185,18 +146,9 @@ def main(data: Path, out: Path, dilation: float = 10.0, bin_dilation: float = 20
         overall = 1.0 - limits.is_valid(poses).mean()
         rejected[name] = round(float(overall), 5)
         print(f"{name}: {len(poses)} held-out poses, {overall:.2%} of bones rejected")
-        _print_table(rejected_fractions(limits, poses))
     provenance["rejected_of_held_out"] = rejected
     replace(limits, provenance=provenance).save(out)
     print(f"{out}: {out.stat().st_size} bytes")
-
-
-def _print_table(fractions: Mapping[str, Mapping[str, float]]) -> None:
-    columns = ("real", "random", "backwards")
-    print("  " + "bone".ljust(10) + "".join(column.rjust(11) for column in columns))
-    for name, row in fractions.items():
-        cells = [f"{row[column]:.1%}" if column in row else "" for column in columns]
-        print("  " + name.ljust(10) + "".join(cell.rjust(11) for cell in cells))
 
 
 def _poses(motions: Iterable[Motion | np.ndarray]) -> np.ndarray:
@@ -217,13 +169,12 @@ def _poses(motions: Iterable[Motion | np.ndarray]) -> np.ndarray:
 def _samples(local: np.ndarray, part: int) -> tuple[np.ndarray, np.ndarray]:
     """Return parent and bone directions of a part, (n, 3): both sides, or mirrored."""
     if PARTS[part] in _PERSON.joint_names:
-        seen = local[:, _PERSON.index(PARTS[part])]
-        both = np.concatenate([seen, seen * np.array([-1.0, 1.0, 1.0])])
+        middle = local[:, _PERSON.index(PARTS[part])]
+        sides = [middle, middle * np.array([-1.0, 1.0, 1.0])]
     else:
-        both = np.concatenate(
-            [local[:, _PERSON.index(f"{side}_{PARTS[part]}")] for side in ("left", "right")]
-        )
-    return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
+        sides = [local[:, _PERSON.index(f"{side}_{PARTS[part]}")] for side in ("left", "right")]
+    parents, directions = np.concatenate(sides).swapaxes(0, 1).copy()
+    return parents, directions
 
 
 def _local(poses: np.ndarray, rest: np.ndarray, bin_rings: int, cell_rings: int) -> np.ndarray:

@@ -7,13 +7,12 @@ to parent.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import combinations
 from math import prod
 from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.models.pose_pairs.penetration_kernels import depths_of_pairs, total_depths
+from probmotion.models.pose_pairs.penetration_kernels import capsule_depth, total_depths
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
@@ -21,14 +20,11 @@ __all__ = ["Capsules", "capsules_of", "penetrating_bones", "penetration_depth"]
 
 
 class Capsules(NamedTuple):
-    """Arrays for compiled code.
+    """Arrays for compiled code."""
 
-    ``bones`` (B, 2), joints; ``radii`` (B,), metres; ``pairs`` (P, 2), indices of the bones tested.
-    """
-
-    bones: np.ndarray
-    radii: np.ndarray
-    pairs: np.ndarray
+    bones: np.ndarray  # (B, 2), joints
+    radii: np.ndarray  # (B,), metres
+    pairs: np.ndarray  # (P, 2), indices of the bones tested
 
 
 def capsules_of(skeleton: Skeleton) -> Capsules:
@@ -74,34 +70,25 @@ def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, s
     Each is (joint, joint, depth in metres), named by end joints; the depths sum to
     :func:`penetration_depth`.
     """
-    capsules = capsules_of(skeleton)
+    bones, radii, pairs = capsules_of(skeleton)
     given = np.ascontiguousarray(pose, dtype=np.float64)
     check_shape("pose", given, (skeleton.n_joints, 3))
     check_finite("pose", given)
-    depths = depths_of_pairs(given, *capsules)
-    found = []
-    for pair in np.argsort(-depths, kind="stable")[: np.count_nonzero(depths)]:
-        first, second = (skeleton.joint_names[j] for j in capsules.bones[capsules.pairs[pair], 0])
-        found.append((first, second, float(depths[pair])))
-    return found
+    depths = np.array([capsule_depth(given, bones, radii, a, b) for a, b in pairs])
+    deepest = np.argsort(-depths, kind="stable")[: np.count_nonzero(depths)]
+    ends = bones[pairs[deepest], 0]
+    names = skeleton.joint_names
+    return [(names[a], names[b], float(d)) for (a, b), d in zip(ends, depths[deepest], strict=True)]
 
 
 @lru_cache(maxsize=64)
 def _capsules(bones: tuple[tuple[int, int], ...], radii: tuple[float, ...]) -> Capsules:
-    all_pairs = combinations(range(len(bones)), 2)
-    touching = {pair: bool(set(bones[pair[0]]) & set(bones[pair[1]])) for pair in all_pairs}
-    beside: list[set[int]] = [set() for _ in bones]
-    for (first, second), shared in touching.items():
-        if shared:
-            beside[first].add(second)
-            beside[second].add(first)
-    apart = [
-        pair
-        for pair, shared in touching.items()
-        if not (shared or beside[pair[0]] & beside[pair[1]])
-    ]
+    ends = np.array(bones, dtype=np.int64).reshape(-1, 2)
+    touching = (ends[:, None, :, None] == ends[None, :, None, :]).any(axis=(-2, -1))
+    # A bone touches itself, so the product contains touching bones and those with a neighbour.
+    tested = ~(touching @ touching)
     return Capsules(
-        bones=np.array(bones, dtype=np.int64).reshape(-1, 2),
+        bones=ends,
         radii=np.array([radii[joint] for joint, _ in bones]),
-        pairs=np.array(apart, dtype=np.int64).reshape(-1, 2),
+        pairs=np.argwhere(np.triu(tested)),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-__all__ = ["depths_of_pairs", "segment_distance", "total_depths"]
+__all__ = ["capsule_depth", "segment_distance", "total_depths"]
 
 _TINY = 1e-18
 
@@ -51,24 +51,13 @@ def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray)
 
 
 @numba.njit(cache=True)
-def _depth(
+def capsule_depth(
     pose: np.ndarray, bones: np.ndarray, radii: np.ndarray, first: int, second: int
 ) -> float:
     """Return the penetration depth of two capsules, metres; 0 if they are apart."""
     p, q = pose[bones[first, 0]], pose[bones[first, 1]]
     r, s = pose[bones[second, 0]], pose[bones[second, 1]]
     return max(0.0, radii[first] + radii[second] - segment_distance(p, q, r, s))
-
-
-@numba.njit(cache=True)
-def depths_of_pairs(
-    pose: np.ndarray, bones: np.ndarray, radii: np.ndarray, pairs: np.ndarray
-) -> np.ndarray:
-    """Return the depth of each pair of bones, (pairs,)."""
-    depths = np.empty(len(pairs))
-    for k in range(len(pairs)):
-        depths[k] = _depth(pose, bones, radii, pairs[k, 0], pairs[k, 1])
-    return depths
 
 
 @numba.njit(cache=True)
@@ -83,9 +72,9 @@ def total_depths(
         for bone in range(len(bones)):
             square = 0.0
             for i in range(3):
-                here, there = pose[bones[bone, 0], i], pose[bones[bone, 1], i]
-                middles[bone, i] = 0.5 * (here + there)
-                square += (here - there) ** 2
+                end, start = pose[bones[bone, 0], i], pose[bones[bone, 1], i]
+                middles[bone, i] = 0.5 * (end + start)
+                square += (end - start) ** 2
             reach[bone] = 0.5 * np.sqrt(square) + radii[bone]
         for k in range(len(pairs)):
             first, second = pairs[k, 0], pairs[k, 1]
@@ -93,5 +82,5 @@ def total_depths(
             for i in range(3):
                 square += (middles[first, i] - middles[second, i]) ** 2
             if square < (reach[first] + reach[second]) ** 2:
-                total[n] += _depth(pose, bones, radii, first, second)
+                total[n] += capsule_depth(pose, bones, radii, first, second)
     return total

@@ -83,13 +83,13 @@ class PoseChart:
         vectors = (xp.exp(stretches)[..., None] * constant(self._bones, theta))[..., None]
         frames = vector_to_matrix(turns)
         joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
-        found = [joints]
+        positions = [joints]
         # Process one generation of bones at a time, for few large matrix products.
         for bones, above in self._generations:
             frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
             joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
-            found.append(joints)
-        return xp.concat(found, axis=-2)[..., self._places, :]
+            positions.append(joints)
+        return xp.concat(positions, axis=-2)[..., self._places, :]
 
     def coordinates(self, positions: np.ndarray) -> np.ndarray:
         """Return coordinates θ of poses: ``(…, J, 3) → (…, dim)``.

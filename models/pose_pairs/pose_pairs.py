@@ -124,9 +124,8 @@ class PosePairPrior:
         inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
         log_f = np.full(len(flat), -np.inf)
         log_f[inside] = self.log_plausibility(positions[inside])
-        return np.where(log_f > -np.inf, log_measure.reshape(-1), 0.0).reshape(
-            log_measure.shape
-        ) + log_f.reshape(log_measure.shape)
+        log_f = log_f.reshape(log_measure.shape)
+        return np.where(log_f > -np.inf, log_measure, 0.0) + log_f
 
     def log_measure(self, theta: Array) -> np.ndarray:
         """Return the log base measure: ``(…, dim) → (…)``."""
@@ -138,8 +137,8 @@ class PosePairPrior:
         check_shape("positions", positions, ("…", 1, self.skeleton.n_joints, 3))
         poses = np.ascontiguousarray(positions.reshape(-1, self.skeleton.n_joints, 3))
         valid, nearest = self.joint_limits.project(poses)
-        apart = ((poses - nearest) ** 2).sum(axis=(-2, -1))
-        energy = apart + self.penetration_weight * penetration_depth(poses, self.skeleton) ** 2
+        squared = ((poses - nearest) ** 2).sum(axis=(-2, -1))
+        energy = squared + self.penetration_weight * penetration_depth(poses, self.skeleton) ** 2
         allowed = (~valid).sum(axis=-1) <= self.max_invalid
         log_f = np.where(allowed, -0.5 * energy / self.position_noise**2, -np.inf)
         return log_f.reshape(positions.shape[:-3])
@@ -153,10 +152,6 @@ class PosePairPrior:
 
     def invalid_joints(self, pose: np.ndarray) -> list[str]:
         """Return the names of the joints of a pose (J, 3) beyond the limits."""
-        valid, _ = self.joint_limits.project(np.asarray(pose, dtype=np.float64)[None])
-        ends = [joint for joint, _ in self.skeleton.bones]
-        return [
-            self.skeleton.joint_names[joint]
-            for joint, fine in zip(ends, valid[0], strict=True)
-            if not fine
-        ]
+        valid = self.joint_limits.is_valid(pose)
+        names = [self.skeleton.joint_names[joint] for joint, _ in self.skeleton.bones]
+        return [name for name, is_valid in zip(names, valid, strict=True) if not is_valid]

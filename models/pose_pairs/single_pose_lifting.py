@@ -22,8 +22,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 
 __all__ = ["lift_people"]
 
-_STEP = 1e-5
-"""Step of central differences, radians and metres."""
+_STEP = 1e-5  # of central differences, radians and metres
 
 
 def lift_people(
@@ -81,65 +80,53 @@ def lift_people(
     keypoints = np.where(visible[:, None], keypoints, 0.0)
     check_finite("keypoints", keypoints)
     limits = JointLimits.shipped() if limits is None else limits
-    positions = _initial_pose(
-        np.asarray(seed, dtype=np.float64), keypoints, visible, skeleton, view
-    )
-    for root in skeleton.roots:
-        joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
-        person = skeleton.subset(joints)
-        lifting = _Lifting(PoseChart(positions[joints], person), keypoints[joints], visible[joints])
-        positions[joints] = lifting.solve(
-            limits.on(person), validity_weight**0.5, seed_weight**0.5, rounds
-        )
-    return positions
-
-
-def _initial_pose(
-    seed: np.ndarray,
-    keypoints: np.ndarray,
-    visible: np.ndarray,
-    skeleton: Skeleton,
-    view: np.ndarray,
-) -> np.ndarray:
-    """Return the seed in image axes, aligned in the image plane to the visible joints."""
+    seed = np.asarray(seed, dtype=np.float64)
+    # The seed in image axes, aligned in the image plane to the visible joints.
     right, up = image_axes(pair_frames(seed[None], skeleton), np.asarray(view)[None])[0, :, 0].T
     turned = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
     moved = align_rigidly(turned[:, :2], keypoints, visible)
-    return np.concatenate([moved, turned[:, 2:]], axis=-1)
+    positions = np.concatenate([moved, turned[:, 2:]], axis=-1)
+    weights = (validity_weight**0.5, seed_weight**0.5)
+    for root in skeleton.roots:
+        joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
+        person = skeleton.subset(joints)
+        chart, observed = PoseChart(positions[joints], person), (keypoints[joints], visible[joints])
+        positions[joints] = _lift_person(chart, *observed, limits.on(person), weights, rounds)
+    return positions
 
 
-class _Lifting:
-    """Least-squares problem over the joint angles and position of one person."""
+def _lift_person(
+    chart: PoseChart,
+    keypoints: np.ndarray,
+    visible: np.ndarray,
+    limits: JointLimits,
+    weights: tuple[float, float],
+    rounds: int,
+) -> np.ndarray:
+    """Return the pose of one person in image axes, (J, 3)."""
+    # θ: the root's turn (3) and place (3), then two angles and a log length per bone.
+    # The depth and the bone lengths are fixed.
+    free = np.delete(np.arange(chart.dim), [5, *range(6 + 2, chart.dim, 3)])
 
-    def __init__(self, chart: PoseChart, keypoints: np.ndarray, visible: np.ndarray) -> None:
-        self.chart, self.keypoints, self.visible = chart, keypoints, visible
-        # θ: the root's turn (3) and place (3), then two angles and a log length per bone.
-        kept = [5, *range(6 + 2, chart.dim, 3)]
-        self.free = np.delete(np.arange(chart.dim), kept)
+    def pose_at(point: np.ndarray) -> np.ndarray:
+        theta = np.zeros((*point.shape[:-1], chart.dim))
+        theta[..., free] = point
+        return chart.positions(theta)
 
-    def solve(
-        self, limits: JointLimits, validity: float, closeness: float, rounds: int
-    ) -> np.ndarray:
-        """Return the person's pose, (J, 3)."""
-        point = np.zeros(len(self.free))
-        for _ in range(rounds):
-            valid = limits.nearest_valid(self.positions(point))
+    def residuals(point: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        pose = pose_at(point)
+        difference = (pose[..., :2] - keypoints)[..., visible, :]
+        parts = (difference, weights[0] * (pose - valid), weights[1] * point[..., 5:])
+        return np.concatenate([p.reshape(*point.shape[:-1], -1) for p in parts], axis=-1)
 
-            def residuals(at: np.ndarray, valid: np.ndarray = valid) -> np.ndarray:
-                pose = self.positions(at)
-                apart = (pose[..., :2] - self.keypoints)[..., self.visible, :]
-                parts = (apart, validity * (pose - valid), closeness * at[..., 5:])
-                return np.concatenate([p.reshape(*at.shape[:-1], -1) for p in parts], axis=-1)
+    def slopes(point: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        steps = _STEP * np.eye(len(point))
+        return ((residuals(point + steps, valid) - residuals(point - steps, valid)) / (2 * _STEP)).T
 
-            def slopes(at: np.ndarray) -> np.ndarray:
-                steps = _STEP * np.eye(len(at))
-                return ((residuals(at + steps) - residuals(at - steps)) / (2 * _STEP)).T
-
-            point = least_squares(residuals, point, slopes, method="lm", xtol=1e-9, ftol=1e-9).x
-        return self.positions(point)
-
-    def positions(self, point: np.ndarray) -> np.ndarray:
-        """Return poses in image axes: ``(…, free) → (…, J, 3)``."""
-        theta = np.zeros((*point.shape[:-1], self.chart.dim))
-        theta[..., self.free] = point
-        return self.chart.positions(theta)
+    point = np.zeros(len(free))
+    for _ in range(rounds):
+        valid = limits.nearest_valid(pose_at(point))
+        point = least_squares(
+            residuals, point, slopes, method="lm", xtol=1e-9, ftol=1e-9, args=(valid,)
+        ).x
+    return pose_at(point)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ __all__ = [
     "load_checkpoint",
     "load_weights",
     "save_checkpoint",
+    "valid_settings",
     "weights_digest",
 ]
 
@@ -105,9 +107,9 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     path = _find(source, kind)
     try:
         with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_ENTRY)
+            text = (file.metadata() or {}).get(_ENTRY)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        header = json.loads(words) if words is not None else None
+        header = None if text is None else json.loads(text)
     except (SafetensorError, json.JSONDecodeError, OSError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
@@ -121,15 +123,25 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     settings = header.get("settings", {})
     if header.get("sha256") != _digest(settings, tensors):
         raise CheckpointError(f"{path} is damaged: the checksum does not match")
-    single = {
-        name: tensor.float() if tensor.dtype == torch.float16 else tensor
-        for name, tensor in tensors.items()
-    }
-    return Checkpoint(kind, settings, single)
+    for name, tensor in tensors.items():
+        if tensor.dtype == torch.float16:
+            tensors[name] = tensor.float()
+    return Checkpoint(kind, settings, tensors)
+
+
+@contextmanager
+def valid_settings(source: str | Path, network: str) -> Iterator[None]:
+    """Convert errors of missing or invalid settings to ``CheckpointError``."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{source} does not contain valid {network} settings: {error}"
+        ) from error
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Load tensors into a network; raise ``CheckpointError`` if they are of another network."""
+    """Load tensors into a network; raise ``CheckpointError`` if they do not fit."""
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:

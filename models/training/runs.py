@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +28,7 @@ __all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run",
 STATE, LOSSES = "state.safetensors", "losses.csv"
 """File names of the state to resume from and of the losses, in the folder of a run."""
 
-_READABLE = 200
+_LONGEST_DIFFERENCE = 200
 
 
 @dataclass(eq=False)
@@ -78,27 +79,23 @@ def steps_taken(folder: Path, kind: str) -> int:
 def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> None:
     """Restore a run from its folder, and its model from the state if missing or damaged.
 
-    Raises
-    ------
-    CheckpointError
-        If the run is of another kind of network, or its state is damaged.
-    ValueError
-        If the run has other settings or data; nothing is written.
+    Raises ``CheckpointError`` for a damaged state or another kind of network, and ``ValueError``
+    for other settings or data.
     """
     saved = load_checkpoint(folder / STATE, _state_of(kind))
     check_same_run(saved.settings, described, folder)
-    parts: dict[str, dict[str, torch.Tensor]] = {}
+    parts: defaultdict[str, dict[str, torch.Tensor]] = defaultdict(dict)
     for name, tensor in saved.tensors.items():
         part, _, rest = name.partition(".")
-        parts.setdefault(part, {})[rest] = tensor
+        parts[part][rest] = tensor
     run.network.load_state_dict(parts["network"])
     run.average.load_state_dict(parts["average"])
-    moments: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in parts.get("optimiser", {}).items():
+    moments: defaultdict[int, dict[str, torch.Tensor]] = defaultdict(dict)
+    for name, tensor in parts["optimiser"].items():
         number, _, rest = name.partition(".")
-        moments.setdefault(int(number), {})[rest] = tensor
+        moments[int(number)][rest] = tensor
     groups = run.optimiser.state_dict()["param_groups"]
-    run.optimiser.load_state_dict({"state": moments, "param_groups": groups})
+    run.optimiser.load_state_dict({"state": dict(moments), "param_groups": groups})
     run.step = int(saved.settings["step"])
     run.seconds = float(saved.settings["seconds"])
     run.history = list(saved.settings["history"])
@@ -113,19 +110,16 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
 def check_same_run(
     saved: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> None:
-    """Raise ``ValueError`` unless the saved settings of a run are as described.
-
-    ``described`` contains the expected parts: ``network``, ``training`` or both.
-    """
+    """Raise ``ValueError`` unless the parts of saved settings are as described."""
     # A run saved before a setting existed used what is now the default.
     defaults = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part, settings in described.items():
         for name, wanted in settings.items():
             got = saved[part].get(name, defaults[part].get(name))
-            # These two do not change any step.
+            # These two settings do not change any step.
             if got != wanted and name not in ("steps", "checkpoint_every"):
                 difference = f"{name} {got}, expected {wanted}"
-                if len(difference) > _READABLE:
+                if len(difference) > _LONGEST_DIFFERENCE:
                     difference = f"another {name}, expected the same"
                 raise ValueError(
                     f"out is {folder}, which contains a run with {difference}; use another folder"

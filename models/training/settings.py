@@ -65,12 +65,12 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every"):
             check_count(name, getattr(self, name))
-        if self.optimiser not in ("adamw", "adamax"):
-            raise ValueError(f"optimiser must be adamw or adamax, got {self.optimiser!r}")
-        for step in self.halve_at:
-            check_count("halve_at", step)
         for name in ("warmup", "seed", "patience"):
             check_count(name, getattr(self, name), least=0)
+        for step in self.halve_at:
+            check_count("halve_at", step)
+        if self.optimiser not in ("adamw", "adamax"):
+            raise ValueError(f"optimiser must be adamw or adamax, got {self.optimiser!r}")
         check_positive("learning_rate", self.learning_rate)
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be at least 0 and below 1, got {self.ema}")
@@ -83,8 +83,8 @@ class TrainingSettings:
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step, counted from 1."""
-        halved = 0.5 ** sum(step > mark for mark in self.halve_at)
-        return self.learning_rate * halved * min(1.0, step / max(1, self.warmup))
+        halvings = sum(step > last for last in self.halve_at)
+        return self.learning_rate * 0.5**halvings * min(1.0, step / max(1, self.warmup))
 
     def decay(self, step: int) -> float:
         """Return the decay of the moving average: min(ema, (1 + k)/(10 + k)), as in TensorFlow."""

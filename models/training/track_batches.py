@@ -80,8 +80,7 @@ class Batch(NamedTuple):
 class TrackBatches:
     """Random windows of tracks.
 
-    Tracks are drawn in proportion to their length. Frames near the ends of a track are in fewer
-    windows than the others.
+    Tracks are drawn in proportion to their length.
 
     Parameters
     ----------
@@ -139,30 +138,22 @@ class TrackBatches:
         self._order = list(self.skeleton.mirrored_order)
         self.description = describe_tracks(tracks)
 
-    @property
-    def never_seen(self) -> tuple[str, ...]:
-        """Names of the joints that no window shows, including mirrored ones."""
-        seen = np.any([track.any(axis=0) for track in self._seen], axis=0)
-        if self.augmentation.mirror:
-            seen = seen | seen[self._order]
-        return tuple(
-            name for name, there in zip(self.skeleton.joint_names, seen, strict=True) if not there
-        )
-
     def check_all_seen(self) -> None:
         """Raise ``ValueError`` if a joint is never visible: its position could not be learnt."""
-        if unseen := self.never_seen:
+        seen = self.all_frames()[1].any(axis=0)
+        if not seen.all():
+            never = np.array(self.skeleton.joint_names)[~seen]
             raise ValueError(
                 f"tracks must show every joint with a confidence of {self.threshold:g} or more, "
-                f"never got {', '.join(unseen)}; choose a skeleton without them"
+                f"never got {', '.join(never)}; choose a skeleton without them"
             )
 
     @property
     def standards(self) -> Standards:
         """Mean and standard deviation of visible joints, including mirroring and translation.
 
-        Scaling is left out. With the usual factors of .95 to 1.05 its deviation is 3 % of a joint's
-        mean, which increases the variance of projected walks by a seventh.
+        Scaling is ignored: with factors of .95 to 1.05 it increases the variance of projected walks
+        by a seventh.
         """
         points, seen = self.all_frames()
         points = points.astype(np.float64)
@@ -197,10 +188,10 @@ class TrackBatches:
             np.ones(n, np.float32),
         )
         for row, track in enumerate(rng.choice(len(self._probability), n, p=self._probability)):
-            self._show(rng, int(track), batch, row)
+            self._write_window(rng, int(track), batch, row)
         return batch
 
-    def _show(self, rng: np.random.Generator, track: int, batch: Batch, row: int) -> None:
+    def _write_window(self, rng: np.random.Generator, track: int, batch: Batch, row: int) -> None:
         """Write a random window of a track into a row of a batch."""
         keypoints, confidence = self._keypoints[track], self._confidence[track]
         longest = min(self.frames, len(keypoints))
@@ -215,8 +206,8 @@ class TrackBatches:
         frames = self._first[track] + start + np.arange(length)
         factor = 1 + self.augmentation.scale * rng.uniform(-1, 1)
         moved = self.augmentation.shift * rng.uniform(-1, 1, 2)
-        turned = rng.random() < 0.5
-        if self.augmentation.mirror and turned:
+        mirrored = rng.random() < 0.5
+        if self.augmentation.mirror and mirrored:
             keypoints, confidence = self._mirrored(keypoints), confidence[:, self._order]
             frames += self._first[-1]
         seen = confidence > 0
@@ -237,12 +228,9 @@ def learning_and_held_out(
     threshold: float,
     augmentation: Augmentation,
 ) -> tuple[TrackBatches, TrackBatches]:
-    """Return training batches and, without augmentation, validation batches.
+    """Return batches for training and, without augmentation, for validation.
 
-    Raises
-    ------
-    ValueError
-        If either cannot be batched, or they differ in skeleton or frame rate.
+    Raises ``ValueError`` if they differ in skeleton or frame rate.
     """
     batches = TrackBatches(tracks, frames, threshold, augmentation)
     held_out = TrackBatches(validation, frames, threshold, Augmentation.none())
@@ -262,12 +250,8 @@ def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
         digest.update(np.nan_to_num(track.keypoints, nan=0.0).tobytes())
         digest.update(track.confidence.tobytes())
     clips = sorted({track.name.rpartition("/")[0] or track.name for track in tracks})
-    return {
-        "tracks": len(tracks),
-        "frames": sum(track.frames for track in tracks),
-        "clips": clips,
-        "sha256": digest.hexdigest(),
-    }
+    frames = sum(track.frames for track in tracks)
+    return {"tracks": len(tracks), "frames": frames, "clips": clips, "sha256": digest.hexdigest()}
 
 
 def _check_alike(tracks: Sequence[KeypointTrack]) -> None:

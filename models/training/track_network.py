@@ -21,29 +21,10 @@ Size = TypeVar("Size")
 
 
 class TrackNetwork:
-    """Trained network with the description of its data.
+    """Trained network in standardised units, with its size ``settings`` and training ``card``.
 
-    Parameters
-    ----------
-    network : Module
-        Network in standardised units.
-    settings : dataclass
-        Size of the network.
-    standards : Standards
-        Standards of the training data.
-    skeleton : Skeleton
-        The J joints.
-    fps : float
-        Frames per second.
-    device : str
-        ``cpu`` or ``cuda``.
-    card : mapping, optional
-        Description of the training.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, a number is out of range or the device is not available.
+    Raises ``ValueError`` if shapes are inconsistent, ``fps`` is not positive or the device is not
+    available.
     """
 
     def __init__(

@@ -24,29 +24,12 @@ _VALIDATION_BATCH = 256
 
 
 class TrackTrainee:
-    """Data, standards and settings of a network trained on windows of 2D tracks.
+    """Base class: data, standards and settings of a network trained on windows of 2D tracks.
 
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Prepared tracks of one skeleton and frame rate: metres, centred.
-    validation : sequence of KeypointTrack
-        Tracks of other clips.
-    size : dataclass
-        Settings of the network, with its ``frames``.
-    threshold : float
-        Minimum confidence of a joint to contribute to the loss. Design of the data sets,
-        section 6.1: .3 for people, .5 for horses, .01 with a ball.
-    augmentation : Augmentation, optional
-        Augmentation of ``tracks``.
-    seed : int
-        Seed of the initial weights and of the validation batch.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, tracks differ in skeleton or frame rate, or none has a confident
-        joint.
+    Takes prepared tracks of one skeleton and frame rate (metres, centred), tracks of held-out
+    clips, and the network's settings with its ``frames``. ``threshold`` is the minimum confidence
+    of a joint in the loss (design of the data sets, section 6.1: .3 for people, .5 for horses, .01
+    with a ball). Raises ``ValueError`` as :class:`TrackBatches`.
     """
 
     network: nn.Module
@@ -61,7 +44,7 @@ class TrackTrainee:
         augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
-        varied = Augmentation() if augmentation is None else augmentation
+        varied = augmentation or Augmentation()
         self.size = size
         self.batches, self.held_out = learning_and_held_out(
             tracks, validation, size.frames, threshold, varied

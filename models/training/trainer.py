@@ -28,14 +28,7 @@ from probmotion.models.training.runs import STATE, Run, keep_run, resume_run
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.posteriors.sampling import progress_bar
 
-__all__ = [
-    "Anneals",
-    "Diverged",
-    "Trainee",
-    "TrainingResult",
-    "check_device",
-    "train",
-]
+__all__ = ["Anneals", "Diverged", "Trainee", "TrainingResult", "check_device", "train"]
 
 
 class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
@@ -43,7 +36,7 @@ class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
 
 
 class Trainee(Protocol):
-    """A network with its loss and data.
+    """Interface of a network with its loss and data.
 
     ``kind`` names its checkpoints. ``settings`` is JSON data that rebuilds the network and
     describes its data, so that a run is not resumed with other data.
@@ -141,11 +134,10 @@ def train(
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     run = _start(trainee, settings, target)
-    described = {"network": dict(trainee.settings), "training": asdict(settings)}
     # As JSON represents them.
-    described["training"]["halve_at"] = list(settings.halve_at)
-    if math.isinf(settings.clip):
-        described["training"]["clip"] = None
+    clip = None if math.isinf(settings.clip) else settings.clip
+    training = asdict(settings) | {"halve_at": list(settings.halve_at), "clip": clip}
+    described = {"network": dict(trainee.settings), "training": training}
     if (folder / STATE).exists():
         resume_run(run, folder, trainee.kind, described)
     with (
@@ -208,8 +200,8 @@ def _take_step(
     size = nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
     value = float(loss.detach())
     if not (math.isfinite(value) and math.isfinite(float(size))):
-        what = "the gradient is not finite" if math.isfinite(value) else f"the loss is {value:g}"
-        raise _diverged(step, what, folder)
+        problem = "the gradient is not finite" if math.isfinite(value) else f"the loss is {value:g}"
+        raise _diverged(step, problem, folder)
     run.optimiser.step()
     decay = settings.decay(step) if settings.ema else 0.0
     with torch.no_grad():
@@ -231,13 +223,13 @@ def _out_of_patience(run: Run, settings: TrainingSettings) -> bool:
     return 0 < settings.patience <= len(run.history) and _since_best(run) >= settings.patience
 
 
-def _diverged(step: int, what: str, folder: Path) -> Diverged:
+def _diverged(step: int, problem: str, folder: Path) -> Diverged:
     last, where = "there is no checkpoint yet", ""
     if (folder / STATE).exists():
         # A run in a folder cannot change its learning rate.
         last, where = f"the last good checkpoint is {folder / MODEL}", " in another folder"
     return Diverged(
-        f"training diverged at step {step}: {what}; {last}; try a smaller learning_rate{where}"
+        f"training diverged at step {step}: {problem}; {last}; try a smaller learning_rate{where}"
     )
 
 
@@ -266,18 +258,18 @@ def _dropout_of(seed: int, step: int, device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def _stop_requested() -> Iterator[Any]:
-    """Yield a function that tells whether Ctrl-C or SIGTERM arrived; a second one raises."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM arrived; a second one raises."""
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
 
-    def note(number: int, frame: Any) -> None:
+    def handle(number: int, frame: Any) -> None:
         if received:
             raise KeyboardInterrupt("stopped within a step; the last checkpoint remains")
         received.append(number)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(received)
     finally:

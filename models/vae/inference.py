@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 
-from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.observed_views import observed_view
-from probmotion.models.vae.rigid_paths import RigidPath
-from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.protocols import Likelihood
 from probmotion.seeds import RandomNumbers
@@ -21,22 +18,6 @@ from probmotion.seeds import RandomNumbers
 __all__ = ["EncodedLatent", "VAEEncoder"]
 
 _AVERAGED = 64
-
-
-@runtime_checkable
-class EncodesKeypoints(Protocol):
-    """Interface of :class:`~probmotion.models.vae.motion_vae.MotionVAE` used by the encoder."""
-
-    skeleton: Skeleton
-    frames: int
-    dim: int
-    body: ArticulatedBody
-    model: MotionVAEModel
-    rigid: RigidPath
-
-    def motion(self, theta: Any) -> Any: ...
-
-    def row_by_row(self, theta: np.ndarray) -> np.ndarray: ...
 
 
 class VAEEncoder:
@@ -56,7 +37,7 @@ class VAEEncoder:
 
     def on(
         self,
-        prior: EncodesKeypoints,
+        prior: Any,
         likelihood: Keypoints2D,
         *,
         degrees_of_freedom: float | None = None,
@@ -65,15 +46,11 @@ class VAEEncoder:
         """Return the inference of one track.
 
         ``degrees_of_freedom`` overrides those of the likelihood (``inf``: Gaussian noise);
-        ``overlap`` is ignored, as a motion is one window.
-
-        Raises
-        ------
-        ValueError
-            If the prior is not a motion VAE, the observations are unsuitable, a whole frame is
-            occluded, or the rigid path is beside or behind the camera.
+        ``overlap`` is ignored, as a motion is one window. Raises ``ValueError`` if the prior is not
+        a motion VAE, the observations are unsuitable, a whole frame is occluded, or the rigid path
+        is beside or behind the camera.
         """
-        if not isinstance(prior, EncodesKeypoints):
+        if not isinstance(getattr(prior, "model", None), MotionVAEModel):
             raise ValueError(f"prior must be a MotionVAE, got {type(prior).__name__}")
         if degrees_of_freedom is not None:
             freedom = None if math.isinf(degrees_of_freedom) else degrees_of_freedom
@@ -89,7 +66,7 @@ class EncodedLatent:
 
     def __init__(
         self,
-        prior: EncodesKeypoints,
+        prior: Any,
         likelihood: Keypoints2D,
         mean: torch.Tensor,
         log_deviation: torch.Tensor,
@@ -136,7 +113,7 @@ class EncodedLatent:
         return self.prior.motion(self.mean.detach().numpy())
 
 
-def _encoded(prior: EncodesKeypoints, likelihood: Keypoints2D) -> tuple[torch.Tensor, torch.Tensor]:
+def _encoded(prior: Any, likelihood: Keypoints2D) -> tuple[torch.Tensor, torch.Tensor]:
     """Return μ and log σ of q(z | keypoints), (Z,), in double precision."""
     camera = likelihood.cameras
     distance = None
@@ -149,13 +126,8 @@ def _encoded(prior: EncodesKeypoints, likelihood: Keypoints2D) -> tuple[torch.Te
             f"likelihood must have the prior's {prior.frames} frames, got {view.keypoints.shape[0]}"
         )
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=torch.float32)
-
+    inputs = (view.keypoints[None], view.confidence[None], prior.body.rest_positions)
+    tensors = (torch.as_tensor(values, dtype=torch.float32) for values in inputs)
     with torch.no_grad():
-        mean, log_variance = prior.model.vae.encode(
-            tensor(view.keypoints)[None],
-            tensor(view.confidence)[None],
-            tensor(prior.body.rest_positions),
-        )
+        mean, log_variance = prior.model.vae.encode(*tensors)
     return mean[0].double(), 0.5 * log_variance[0].double()

@@ -30,9 +30,9 @@ def project_to_image(positions: torch.Tensor, distance: float | None) -> torch.T
 
     The subject is at Z = 0, ``distance`` metres from the camera; orthographic for None.
     """
-    right, up, near = positions.unbind(-1)
-    seen = torch.stack([right, -up], dim=-1)
-    return seen if distance is None else seen * (distance / (distance - near))[..., None]
+    x, y, z = positions.unbind(-1)
+    plane = torch.stack([x, -y], dim=-1)
+    return plane if distance is None else plane * (distance / (distance - z))[..., None]
 
 
 def reconstruction(
@@ -98,13 +98,7 @@ def best_hypothesis(hypotheses: PoseHypotheses, losses: torch.Tensor) -> PoseHyp
     The choice is not differentiated.
     """
     rows = torch.arange(len(losses), device=losses.device)
-    best = losses.detach().argmin(dim=1)
-    return PoseHypotheses(
-        hypotheses.rotation[rows, best],
-        hypotheses.translation[rows, best],
-        hypotheses.turns[rows, best],
-        hypotheses.log_lengths[rows, best],
-    )
+    return hypotheses.at((rows, losses.detach().argmin(dim=1)))
 
 
 @torch.no_grad()

@@ -19,13 +19,20 @@ from probmotion.arrays import Array
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.latent.row_decoding import decode_rows
 from probmotion.models.latent.standard_normal import StandardNormalPrior
-from probmotion.models.training.checkpoints import Checkpoint, save_checkpoint
+from probmotion.models.training.checkpoints import (
+    Checkpoint,
+    load_checkpoint,
+    load_weights,
+    save_checkpoint,
+    valid_settings,
+)
 from probmotion.models.vae.inference import VAEEncoder
-from probmotion.models.vae.model import KIND, MotionVAEModel, read_model
+from probmotion.models.vae.model import KIND, MotionVAEModel
 from probmotion.models.vae.network import MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.rigid_paths import RigidPath, estimate_body
 from probmotion.models.vae.settings import MotionVAESettings
+from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.protocols import InferenceNetwork, Likelihood
 from probmotion.validation import check_finite, check_positive, check_shape
@@ -107,32 +114,23 @@ class MotionVAE(StandardNormalPrior):
 
     @classmethod
     def load(cls, source: str | Path, **options: Any) -> MotionVAE:
-        """Load a trained prior.
+        """Load a trained prior: a checkpoint file, the folder of a run or a shipped name.
 
-        Parameters
-        ----------
-        source : str or Path
-            Checkpoint file, folder of a training run, or name of a shipped prior.
-        **options
-            ``rigid``, ``log_lengths`` and ``inference_network`` of :class:`MotionVAE`.
-
-        Raises
-        ------
-        CheckpointError
-            If the file is damaged or not a motion VAE of this version.
-        FileNotFoundError
-            If there is no such file or name.
+        ``options`` are ``rigid``, ``log_lengths`` and ``inference_network`` of :class:`MotionVAE`.
+        Raises ``CheckpointError`` for a damaged file or another kind of network, and
+        ``FileNotFoundError`` for a missing one.
         """
-        result = read_model(source)
-        return cls(
-            result.model.vae,
-            result.model.pose,
-            result.settings,
-            result.body,
-            result.fps,
-            card=result.card,
-            **options,
-        )
+        checkpoint = load_checkpoint(source, KIND)
+        with valid_settings(source, "motion VAE"):
+            stored = checkpoint.settings["network"]
+            settings = MotionVAESettings(**stored["size"])
+            skeleton = Skeleton(stored["joint_names"], stored["parents"])
+            body = ArticulatedBody(skeleton, np.array(stored["rest"], dtype=np.float64))
+            model = MotionVAEModel.of(settings, body)
+            fps = stored["fps"]
+        load_weights(model, checkpoint.tensors)
+        card = checkpoint.settings
+        return cls(model.vae, model.pose, settings, body, fps, card=card, **options)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:
         """Save the prior as a checkpoint for :meth:`load`, optionally in half precision.
@@ -162,12 +160,8 @@ class MotionVAE(StandardNormalPrior):
 
         Path and bone lengths are those of the best view hypothesis
         (:func:`~probmotion.models.vae.rigid_paths.estimate_body`); z sets the bone rotations.
-
-        Raises
-        ------
-        ValueError
-            If the likelihood is not keypoints of one view with matching frames, frame rate and
-            joints, or a whole frame is occluded.
+        Raises ``ValueError`` unless the likelihood is keypoints of one view with matching frames,
+        frame rate and joints, and a visible joint in every frame.
         """
         if not isinstance(likelihood, Keypoints2D):
             raise ValueError(f"likelihood must be Keypoints2D, got {type(likelihood).__name__}")
@@ -214,13 +208,9 @@ class MotionVAE(StandardNormalPrior):
 
         The rounding of a product depends on its shape, so all batches have the same shape.
         """
-        result = []
-        for at in range(0, len(theta), _ROWS):
-            some = theta[at : at + _ROWS]
-            rows = np.zeros((_ROWS, self.dim), dtype=theta.dtype)
-            rows[: len(some)] = some
-            result.append(self.motion(rows)[: len(some)])
-        return np.concatenate(result)
+        padding = -len(theta) % _ROWS
+        rows = np.pad(theta, [(0, padding), (0, 0)])
+        return self.motion(rows)[: len(theta)]
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n motions, (n, L, J, 3), metres; decoded in single precision."""
@@ -228,23 +218,16 @@ class MotionVAE(StandardNormalPrior):
 
     def _turns(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, bones, 3)``."""
+        # Densities need double precision.
         model = self.model if theta.dtype == torch.float32 else self._double
         return model.vae.decode(theta)
 
     def _motion(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, J, 3)``."""
-
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=theta.dtype)
-
-        return self.body.positions(
-            self._turns(theta),
-            tensor(self.rigid.rotations),
-            tensor(self.rigid.translations),
-            tensor(self.log_lengths),
-        )
+        fixed = (self.rigid.rotations, self.rigid.translations, self.log_lengths)
+        tensors = (torch.as_tensor(values, dtype=theta.dtype) for values in fixed)
+        return self.body.positions(self._turns(theta), *tensors)
 
     @cached_property
     def _double(self) -> MotionVAEModel:
-        # Densities use double precision.
         return copy.deepcopy(self.model).double()

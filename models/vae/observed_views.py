@@ -87,14 +87,9 @@ def observed_view(
     """Convert observations of one view to a network's normalised view.
 
     Joints below .3 of the largest confidence are masked, as in training by default. An occluded
-    root is interpolated in time; it only centres the view. ``distance`` is the depth of the subject
-    in a perspective camera, metres; the default 1 gives slopes.
-
-    Raises
-    ------
-    ValueError
-        If there are several views or other joints, a frame without a visible joint, or no frame
-        with a visible root.
+    root is interpolated in time. ``distance`` is the depth of the subject in a perspective camera,
+    metres; the default 1 gives slopes. Raises ``ValueError`` for several views, other joints, a
+    frame without a visible joint, or a root that is never visible.
     """
     _check_observations(likelihood, skeleton)
     camera, root = likelihood.cameras, skeleton.roots[0]

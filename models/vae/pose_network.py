@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -42,6 +43,10 @@ class PoseHypotheses:
     turns: torch.Tensor
     log_lengths: torch.Tensor
 
+    def at(self, index: Any) -> PoseHypotheses:
+        """Return the poses at an index of the leading axes."""
+        return PoseHypotheses(*(part[index] for part in vars(self).values()))
+
 
 class PoseNetwork(nn.Module):
     """Predicts the pose of a frame from its 2D joints, for each view hypothesis.
@@ -74,7 +79,9 @@ class PoseNetwork(nn.Module):
             self.rigid = nn.Sequential(nn.Linear(width, width), nn.GELU(), Readout(width, 8))
             self.bone_decoder = BoneDecoder(settings, n_bones)
             self.log_lengths = Readout(width, n_groups)
-        self.register_buffer("quarters", _quarters(settings.hypotheses), persistent=False)
+        angles = math.pi / 4 + math.pi / 2 * torch.arange(settings.hypotheses)
+        quarters = vector_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]))
+        self.register_buffer("quarters", quarters, persistent=False)
 
     def forward(
         self,
@@ -98,9 +105,3 @@ class PoseNetwork(nn.Module):
             identity = rigid.new_tensor([1.0, 0, 0, 0, 1, 0])
             rotation = rotation_6d_to_matrix(identity + rigid[..., :6]) @ self.quarters[:, None]
         return PoseHypotheses(rotation, rigid[..., 6:], turns, log_lengths)
-
-
-def _quarters(hypotheses: int) -> torch.Tensor:
-    """Return rotations about Y by π/4 + h π/2, (H, 3, 3)."""
-    angles = math.pi / 4 + math.pi / 2 * torch.arange(hypotheses)
-    return vector_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]))

@@ -111,11 +111,8 @@ def estimate_body(
     size matches the image; distances per frame would be noisy. A larger body is therefore placed
     too close, with the same projection.
 
-    Raises
-    ------
-    ValueError
-        If there are several views, other joints or a frame without a visible joint, or the
-        estimated body is beside or behind the camera.
+    Raises ``ValueError`` for several views, other joints or a frame without a visible joint, and if
+    the estimated body is beside or behind the camera.
     """
     view = observed_view(likelihood, body.skeleton)
     if view.distance is not None:
@@ -126,8 +123,7 @@ def estimate_body(
             view = view.at(view.distance * _size_ratio(best, body, view))
     best, losses = _best_hypothesis(network, settings, body, view)
     rotation, place, turns, log_lengths = (
-        part[0].double().numpy()
-        for part in (best.rotation, best.translation, best.turns, best.log_lengths)
+        part.double().numpy() for part in vars(best.at(0)).values()
     )
     path = RigidPath(view.world_rotations(rotation), view.world_roots(place))
     return BodyEstimate(path, turns, log_lengths, losses, view.distance)
@@ -137,8 +133,8 @@ def _best_hypothesis(
     network: PoseNetwork, settings: MotionVAESettings, body: ArticulatedBody, view: ObservedView
 ) -> tuple[PoseHypotheses, np.ndarray]:
     """Return the best hypothesis of one track and the losses of all, (H,)."""
-    shown = (view.keypoints[None], view.confidence[None], view.distance)
-    hypotheses, losses = predicted_hypotheses(network, settings, body, *shown)
+    observed = (view.keypoints[None], view.confidence[None], view.distance)
+    hypotheses, losses = predicted_hypotheses(network, settings, body, *observed)
     return best_hypothesis(hypotheses, losses), losses[0].double().numpy()
 
 

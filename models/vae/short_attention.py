@@ -20,18 +20,8 @@ def short_attention(
 ) -> torch.Tensor:
     """Return softmax(Q Kᵀ/√d) V (Vaswani et al. 2017, eq. 1) with a single-precision softmax.
 
-    Parameters
-    ----------
-    packed : Tensor, (N, K, 3 · heads · d)
-        Concatenated Q, K and V, each with concatenated heads.
-    heads : int
-        Number of heads.
-    seen : Tensor of bool, (N, K), optional
-        Mask of the tokens to attend to, at least one; all by default.
-
-    Returns
-    -------
-    Tensor, (N, K, heads · d)
+    ``packed`` (N, K, 3 · heads · d) contains Q, K and V, each with concatenated heads. ``seen``
+    (N, K) masks the tokens to attend to, at least one. The result is (N, K, heads · d).
     """
     return _ShortAttention.apply(packed, heads, seen)
 

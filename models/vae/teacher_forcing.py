@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from probmotion.models.training.track_batches import Batch, TrackBatches
@@ -27,36 +29,25 @@ class TeacherForcedPoses:
                 f"{batches.augmentation.shift:g}"
             )
         keypoints, seen = (
-            torch.as_tensor(values, device=rest.device) for values in batches.all_frames()
+            torch.as_tensor(values, dtype=torch.float32, device=rest.device)[:, None]
+            for values in batches.all_frames()
         )
+        parts = zip(keypoints.split(FRAMES_AT_ONCE), seen.split(FRAMES_AT_ONCE), strict=True)
         network.eval()
         # Full precision, even if the first training step uses autocast.
         with torch.autocast(rest.device.type, enabled=False):
-            outputs = [
-                network(some[:, None], looked_at[:, None].to(some.dtype), rest)
-                for some, looked_at in zip(
-                    keypoints.split(FRAMES_AT_ONCE), seen.split(FRAMES_AT_ONCE), strict=True
-                )
-            ]
-        self._poses = PoseHypotheses(
-            torch.cat([some.rotation[:, :, 0] for some in outputs]),
-            torch.cat([some.translation[:, :, 0] for some in outputs]),
-            torch.cat([some.turns[:, :, 0] for some in outputs]),
-            torch.cat([some.log_lengths for some in outputs]),
-        )
+            outputs = [vars(network(*part, rest)).values() for part in parts]
+        *poses, log_lengths = (torch.cat(part) for part in zip(*outputs, strict=True))
+        self._poses = PoseHypotheses(*(part[:, :, 0] for part in poses), log_lengths)
 
     def of(self, drawn: Batch) -> PoseHypotheses:
         """Return the teacher poses of drawn windows, before scaling; none may be padded."""
         if (drawn.frames < 0).any():
             raise ValueError("drawn must not contain padded windows")
         frames = torch.as_tensor(drawn.frames, device=self._poses.turns.device)
-        return PoseHypotheses(
-            self._poses.rotation[frames].transpose(1, 2),
-            self._poses.translation[frames].transpose(1, 2),
-            self._poses.turns[frames].transpose(1, 2),
-            # The network predicts lengths linearly from the mean over frames.
-            self._poses.log_lengths[frames].mean(dim=1),
-        )
+        *poses, log_lengths = vars(self._poses.at(frames)).values()
+        # The network predicts lengths linearly from the mean over frames.
+        return PoseHypotheses(*(part.transpose(1, 2) for part in poses), log_lengths.mean(dim=1))
 
 
 def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:
@@ -67,9 +58,8 @@ def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:
     """
     factor = scale.reshape(-1, *[1] * (hypotheses.translation.ndim - 1))
     longer = scale.log().reshape(-1, *[1] * (hypotheses.log_lengths.ndim - 1))
-    return PoseHypotheses(
-        hypotheses.rotation,
-        factor * hypotheses.translation,
-        hypotheses.turns,
-        hypotheses.log_lengths + longer,
+    return replace(
+        hypotheses,
+        translation=factor * hypotheses.translation,
+        log_lengths=hypotheses.log_lengths + longer,
     )

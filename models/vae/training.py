@@ -7,7 +7,7 @@ code per sequence, with the pose network as teacher.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,18 +16,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from probmotion import seeds
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.dvae.variational_terms import gaussian_kl
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
 from probmotion.models.training.runs import check_same_run
 from probmotion.models.training.settings import TrainingSettings
-from probmotion.models.training.track_batches import (
-    Augmentation,
-    Batch,
-    TrackBatches,
-    learning_and_held_out,
-)
+from probmotion.models.training.track_batches import Augmentation, Batch, TrackBatches
+from probmotion.models.training.track_trainee import TrackTrainee
 from probmotion.models.vae.losses import (
     best_hypothesis,
     hypothesis_losses,
@@ -45,7 +40,6 @@ from probmotion.validation import check_positive
 
 __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 
-_VALIDATION_BATCH = 256
 # Loss weight of all hypotheses, so that none stops learning.
 _OTHERS = 0.05
 # Tolerance of the root position for rounding, metres.
@@ -54,13 +48,8 @@ _CENTRED = 1e-3
 _AT_REST = 500
 
 
-class _TrackTrainee:
+class _VAETrainee(TrackTrainee):
     """Data and checks shared by both phases."""
-
-    kind: str
-    network: nn.Module
-    settings: Mapping[str, Any]
-    _loss: Callable[..., torch.Tensor]
 
     def __init__(
         self,
@@ -73,8 +62,6 @@ class _TrackTrainee:
         threshold: float = CONFIDENCE_THRESHOLD,
         seed: int = 0,
     ) -> None:
-        # An asymmetric body cannot be mirrored.
-        whole = Augmentation(shortest=1.0, mirror=body.symmetric)
         if size.image_features:
             raise ValueError(
                 "size must have image_features=0 for training on tracks, got "
@@ -89,16 +76,16 @@ class _TrackTrainee:
                 raise ValueError(
                     f"distance must exceed the body's reach of {reach:.2g} m, got {distance:g} m"
                 )
-        self.size = size
-        self.body = body
-        self.distance = distance
-        self.batches, self.held_out = learning_and_held_out(
+        super().__init__(
             _long_enough("tracks", tracks, size.frames),
             _long_enough("validation", validation, size.frames),
-            size.frames,
-            threshold,
-            whole,
+            size,
+            threshold=threshold,
+            # An asymmetric body cannot be mirrored.
+            augmentation=Augmentation(shortest=1.0, mirror=body.symmetric),
+            seed=seed,
         )
+        self.body, self.distance = body, distance
         if self.batches.skeleton != body.skeleton:
             raise ValueError(
                 f"tracks must have the body's joints {', '.join(body.skeleton.joint_names)}, "
@@ -113,7 +100,6 @@ class _TrackTrainee:
                 "mirrored",
                 stacklevel=3,
             )
-        self._seed = seed
         self.settings = {
             **description_of(size, body, self.batches.fps),
             "distance": distance,
@@ -130,12 +116,7 @@ class _TrackTrainee:
         Networks use the precision of their settings; kinematics and losses use single precision.
         """
         with torch.autocast(device.type, enabled=False):
-            return self._loss(network, self.batches, rng, batch, device)
-
-    def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss of fixed held-out sequences."""
-        rng = seeds.generator(self._seed, "validation")
-        return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
+            return super().training_loss(network, rng, batch, device)
 
     def _inputs(
         self, drawn: Batch, device: torch.device
@@ -151,7 +132,7 @@ class _TrackTrainee:
         )
 
 
-class PoseTrainee(_TrackTrainee):
+class PoseTrainee(_VAETrainee):
     """First phase: rigid poses and bone rotations per frame under several view hypotheses.
 
     The loss of a sequence is that of its best hypothesis: reprojection error, smoothness, joint
@@ -208,14 +189,8 @@ class PoseTrainee(_TrackTrainee):
     def learnt(self, folder: str | Path) -> PoseNetwork:
         """Load the network of a training run.
 
-        Raises
-        ------
-        CheckpointError
-            If the file is damaged or contains another network.
-        FileNotFoundError
-            If there is none.
-        ValueError
-            If the run had other settings or data.
+        Raises ``CheckpointError`` for a damaged file, ``FileNotFoundError`` for a missing one, and
+        ``ValueError`` for a run with other settings or data.
         """
         network = self._fresh_network()
         checkpoint = load_checkpoint(folder, self.kind)
@@ -260,7 +235,7 @@ class PoseTrainee(_TrackTrainee):
         return weighted_sum(terms, self.size)
 
 
-class MotionVAETrainee(_TrackTrainee):
+class MotionVAETrainee(_VAETrainee):
     """Second phase: one latent code for the bone rotations of a sequence (equations 2 to 7).
 
     E_s and D_s start from the pose network's weights. The pose network stays fixed and provides
@@ -292,21 +267,20 @@ class MotionVAETrainee(_TrackTrainee):
     ) -> None:
         super().__init__(tracks, validation, size, body, **options)
         vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), self._seed)
-        own, theirs = (
+        wanted, given = (
             (one.width, one.layers, one.heads, one.feedforward, one.image_features)
             for one in (size, pose_network.settings)
         )
-        if own != theirs:
+        if wanted != given:
             raise ValueError(
                 "pose_network must have the width, layers, heads, feedforward and image_features "
-                f"of size, {own}, got {theirs}"
+                f"of size, {wanted}, got {given}"
             )
         counts = (body.skeleton.n_joints, len(body.bones), body.n_groups)
-        given = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
-        if counts != given:
+        got = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
+        if counts != got:
             raise ValueError(
-                f"pose_network must have the body's joints, bones and lengths, {counts}, "
-                f"got {given}"
+                f"pose_network must have the body's joints, bones and lengths, {counts}, got {got}"
             )
         teacher = pose_network.eval().requires_grad_(False)
         if size.spatial:
@@ -370,17 +344,10 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
     """Return the training settings of both phases of a size: ``tiny``, ``small`` or ``paper``.
 
     The paper trains for 120 and 180 epochs of its data; ``paper`` counts 1000 steps per epoch.
-
-    Raises
-    ------
-    ValueError
-        If the size is unknown.
+    Raises ``ValueError`` for an unknown size.
     """
     known = {
-        "tiny": (
-            TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
-            TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),
-        ),
+        "tiny": (TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),) * 2,
         "small": (
             TrainingSettings(steps=2000, batch=32, learning_rate=1e-3, ema=0.995),
             TrainingSettings(steps=2500, batch=32, learning_rate=1e-3, ema=0.995),

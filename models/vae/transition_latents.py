@@ -74,23 +74,23 @@ def long_motion(
     allowed = max(greatest_acceleration(_positions(prior, part)) for part in segments)
     parts = [segments[0]]
     for neighbours, codes in zip(pairwise(segments), pairwise(z), strict=True):
-        found = []
+        candidates = []
         for count in range(1, _MOST + 1) if transitions is None else [transitions]:
             between = np.linspace(*codes, count + 2)[1:-1]
-            whole = _transition(prior, *neighbours, between, iterations, prior_weight)
+            transition = _transition(prior, *neighbours, between, iterations, prior_weight)
             # Include one frame of each segment to measure the acceleration at the seams.
-            around = torch.cat([neighbours[0][-3:-2], whole, neighbours[1][2:3]])
-            found.append((greatest_acceleration(_positions(prior, around)), whole))
-            if found[-1][0] <= allowed:
+            around = torch.cat([neighbours[0][-3:-2], transition, neighbours[1][2:3]])
+            candidates.append((greatest_acceleration(_positions(prior, around)), transition))
+            if candidates[-1][0] <= allowed:
                 break
-        least, whole = min(found, key=lambda one: one[0])
+        least, transition = min(candidates, key=lambda candidate: candidate[0])
         if least > allowed:
             warnings.warn(
                 f"the transition after segment {len(parts) // 2} has {least / allowed:.2f} times "
                 "the largest acceleration of the segments; no smoother one was found",
                 stacklevel=2,
             )
-        parts += [whole[_SHARED:-_SHARED], neighbours[1]]
+        parts += [transition[_SHARED:-_SHARED], neighbours[1]]
     return _positions(prior, torch.cat(parts))
 
 
@@ -141,9 +141,9 @@ def _transition(
 
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
-        whole, missed = _joined(vector_to_matrix(prior.turns(codes)), before, after)
-        acceleration = 0.5 * (whole.diff(n=2, dim=0) ** 2).sum()
-        total = missed + _SMOOTH * acceleration + prior_weight * (codes**2).sum()
+        joined, mismatch = _joined(vector_to_matrix(prior.turns(codes)), before, after)
+        acceleration = 0.5 * (joined.diff(n=2, dim=0) ** 2).sum()
+        total = mismatch + _SMOOTH * acceleration + prior_weight * (codes**2).sum()
         total.backward()
         return total
 
@@ -159,17 +159,17 @@ def _joined(
 
     Also returns the summed squared angle mismatch before correction.
     """
-    whole, missed = motions[0], motions[0].new_zeros(())
+    joined, mismatch = motions[0], motions[0].new_zeros(())
     for motion in motions[1:]:
-        ends = torch.cat([whole[-_SHARED:], motion[-_SHARED:]])
-        missed = missed + _missed(motion, ends)
-        whole = torch.cat([whole, _corrected(motion, ends)[_SHARED:]])
+        ends = torch.cat([joined[-_SHARED:], motion[-_SHARED:]])
+        mismatch = mismatch + _mismatch(motion, ends)
+        joined = torch.cat([joined, _corrected(motion, ends)[_SHARED:]])
     # Spread this correction over the whole transition.
     ends = torch.cat([before[-_SHARED:], after[:_SHARED]])
-    return _corrected(whole, ends), missed + _missed(whole, ends)
+    return _corrected(joined, ends), mismatch + _mismatch(joined, ends)
 
 
-def _missed(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+def _mismatch(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
     """Return half the squared difference of shared frames: squared angles to second order."""
     return 0.5 * ((rotations[_shared_frames(len(rotations))] - ends) ** 2).sum()
 

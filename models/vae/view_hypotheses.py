@@ -95,36 +95,36 @@ def evaluate_hypotheses(
         If no clip is as long as a sequence.
     """
     check_count("n", n)
-    shot = Filming() if filming is None else filming
-    detector = DetectorNoise(share=0.0) if noise is None else noise
+    filming, noise = filming or Filming(), noise or DetectorNoise(share=0.0)
     rng = seeds.generator(seed, "hypotheses")
     sequences = _sequences(clips, body, fps, settings.frames)
     chosen = sequences[rng.integers(0, len(sequences), n)]
-    cameras = shot.cameras(rng, n)
-    seen = [detector.detect(rng, cameras.view(i).project(some)[0]) for i, some in enumerate(chosen)]
-    keypoints = np.nan_to_num(np.stack([one for one, _ in seen]))
+    cameras = filming.cameras(rng, n)
+    detected = [noise.detect(rng, cameras.view(i).project(x)[0]) for i, x in enumerate(chosen)]
+    keypoints, confidence = (np.stack(part) for part in zip(*detected, strict=True))
+    keypoints = np.nan_to_num(keypoints)
     hypotheses, losses = predicted_hypotheses(
         network.eval(),
         settings,
         body,
         (keypoints - keypoints[:, :, [body.skeleton.roots[0]]]).astype(np.float32),
         # As in training, the networks read visibility rather than confidence.
-        (np.stack([one for _, one in seen]) >= CONFIDENCE_THRESHOLD).astype(np.float32),
-        shot.distance if shot.perspective else None,
+        (confidence >= CONFIDENCE_THRESHOLD).astype(np.float32),
+        filming.distance if filming.perspective else None,
     )
-    still = torch.zeros_like(hypotheses.translation[..., :1]).expand(*[-1] * 3, 3)
-    found = body.positions(
+    still = torch.zeros_like(hypotheses.rotation[..., 0])
+    estimates = body.positions(
         hypotheses.turns, hypotheses.rotation, still, hypotheses.log_lengths
     ).numpy()
     truth = np.einsum("nij,nlkj->nlki", cameras.rotation, chosen) * _TO_Y_UP
-    errors = np.linalg.norm(found - truth[:, None], axis=-1).mean(axis=(2, 3))
-    mirrored = np.linalg.norm(found * [1, 1, -1] - truth[:, None], axis=-1).mean(axis=(2, 3))
+    errors = np.linalg.norm(estimates - truth[:, None], axis=-1).mean(axis=(2, 3))
+    mirrored = np.linalg.norm(estimates * [1, 1, -1] - truth[:, None], axis=-1).mean(axis=(2, 3))
     rows, best = np.arange(n), losses.numpy().argmin(axis=1)
-    ours = errors[rows, best]
+    selected = errors[rows, best]
     return HypothesisAccuracy(
-        right=float((ours <= _AS_GOOD * errors.min(axis=1)).mean()),
-        depth_right=float((ours < mirrored[rows, best]).mean()),
-        error=float(ours.mean()),
+        right=float((selected <= _AS_GOOD * errors.min(axis=1)).mean()),
+        depth_right=float((selected < mirrored[rows, best]).mean()),
+        error=float(selected.mean()),
         least_error=float(errors.min(axis=1).mean()),
         proportions=tuple((np.bincount(best, minlength=errors.shape[1]) / n).tolist()),
     )

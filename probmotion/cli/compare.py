@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -18,7 +18,7 @@ __all__ = ["Clips", "Compare"]
 
 @dataclass(frozen=True)
 class Clips:
-    """Clips of your own to compare on, one of which is held out and observed."""
+    """Your clips, one of which is held out and observed."""
 
     clips: Annotated[tuple[str, ...], arg(metavar="FILE ...")] = ()
     """Motion files (.npz, .bvh) or quoted patterns.
@@ -115,7 +115,6 @@ class Compare:
         self._check_calibrate(problems)
         options = self._options()
         comparison = compare(problems, samplers, seeds=self.seeds, **options)
-        comparison.write(self.out)
         print(comparison.table())
         print(f"\ntable and draws are in {self.out}")
         calibration = self._calibration(problems, samplers, options) if self.calibrate else None
@@ -131,14 +130,12 @@ class Compare:
         from probmotion.comparison.quick import QUICK_BUDGET, QUICK_DRAWS, QUICK_LIMIT
         from probmotion.comparison.results.budgets import Budget
 
-        usual = (QUICK_DRAWS, QUICK_BUDGET, QUICK_LIMIT) if self.quick else (200, None, None)
-        draws, budget, limit = usual
-        if self.draws is not None:
-            draws = self.draws
+        draws, budget, limit = (
+            (QUICK_DRAWS, QUICK_BUDGET, QUICK_LIMIT) if self.quick else (200, None, None)
+        )
         if self.evaluations is not None or self.seconds is not None:
             budget = Budget(evaluations=self.evaluations, seconds=self.seconds)
-        if self.time_limit is not None:
-            limit = self.time_limit
+        draws = draws if self.draws is None else self.draws
         fitting = max(n for n in (1, 2, 3, 4) if draws % n == 0)
         return {
             "draws": draws,
@@ -146,7 +143,7 @@ class Compare:
             "workers": self.workers,
             "out": self.out,
             "budget": budget,
-            "time_limit": limit,
+            "time_limit": limit if self.time_limit is None else self.time_limit,
         }
 
     def _calibration(
@@ -166,15 +163,11 @@ class Compare:
 
     def _check_calibrate(self, problems: list[Problem]) -> None:
         """Raise early what would fail after the comparison."""
-        from probmotion.calibration.grid import FEWEST_SIMULATIONS
+        from probmotion.calibration.grid import FEWEST_SIMULATIONS as FEWEST
 
-        if not self.calibrate:
-            return
-        if self.calibrate < FEWEST_SIMULATIONS:
-            raise ValueError(
-                f"calibrate must be at least {FEWEST_SIMULATIONS}, got {self.calibrate}"
-            )
-        if all(problem.simulate is None for problem in problems):
+        if self.calibrate and self.calibrate < FEWEST:
+            raise ValueError(f"calibrate must be at least {FEWEST}, got {self.calibrate}")
+        if self.calibrate and all(problem.simulate is None for problem in problems):
             raise ValueError("calibrate requires a problem that can be simulated")
 
     def _samplers(self) -> dict[str, Any]:
@@ -218,20 +211,14 @@ class Compare:
         return tuple(available)
 
 
-def _problem_of_clips(own: Clips) -> Problem:
+def _problem_of_clips(user_clips: Clips) -> Problem:
     from probmotion.io.files import load_all
     from probmotion.problems.clips import clips_problem
 
-    return clips_problem(
-        load_all(own.clips),
-        observe=own.observe,
-        fps=own.fps,
-        frames=own.frames,
-        rank=own.rank,
-        styles=own.styles,
-        noise=own.noise,
-        held_out=-1 if own.held_out is None else own.held_out,
-    )
+    options = asdict(user_clips)
+    clips = load_all(options.pop("clips"))
+    held_out = options.pop("held_out")
+    return clips_problem(clips, held_out=-1 if held_out is None else held_out, **options)
 
 
 def _problem_of_prior(source: str) -> Problem:

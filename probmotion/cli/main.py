@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any
 
 from probmotion.cli.compare import Compare
@@ -71,7 +71,9 @@ def _print_list(title: str, entries: dict[str, str]) -> None:
 
 
 def _first_line(kind: Any) -> str:
-    return (kind.__doc__ or "").strip().partition("\n")[0]
+    from probmotion.cli.settings_options import without_markup
+
+    return without_markup(kind.__doc__).strip().partition("\n")[0]
 
 
 _COMMANDS: dict[str, type[Any]] = {
@@ -134,13 +136,18 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     kind = _COMMANDS[name]
     if kind is not Compare:
         return tyro.cli(kind, prog=prog, args=words)
-    from probmotion.cli.settings_options import objects_as_words, settings_of_samplers
+    from probmotion.cli.settings_options import (
+        objects_as_words,
+        plain_docstrings,
+        settings_of_samplers,
+    )
 
     settings = settings_of_samplers(quick="--quick" in words)
     entry = ("settings", settings, field(default_factory=settings))
     with_settings = make_dataclass("Compare", [entry], bases=(Compare,), frozen=True)
     with_settings.__doc__ = Compare.__doc__
-    return tyro.cli(with_settings, prog=prog, args=words, registry=objects_as_words())
+    with plain_docstrings(entry.type for entry in fields(settings)):
+        return tyro.cli(with_settings, prog=prog, args=words, registry=objects_as_words())
 
 
 def _note(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -1,6 +1,6 @@
 """Command-line options for the settings of samplers, generated from their dataclasses.
 
-Numbers and words are options of their own. Objects (a guidance, a proposal) are written as in
+Numbers and words are separate options. Objects (a guidance, a proposal) are written as in
 Python: ``DPS`` or ``DPS(strength=0.5)``.
 """
 
@@ -10,7 +10,8 @@ import ast
 import re
 import sys
 import types
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import field, fields, is_dataclass, make_dataclass
 from functools import partial
 from inspect import Parameter, signature
@@ -27,7 +28,14 @@ from probmotion.posteriors.sampling import (
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-__all__ = ["objects_as_words", "presets_of", "sampler_called", "settings_of_samplers"]
+__all__ = [
+    "objects_as_words",
+    "plain_docstrings",
+    "presets_of",
+    "sampler_called",
+    "settings_of_samplers",
+    "without_markup",
+]
 
 
 def _option_name(sampler: str) -> str:
@@ -59,12 +67,34 @@ def _same(value: Any) -> Any:
     return value
 
 
+_MARKUP = re.compile(r"\s*\(:\w+:`[^`]*`\)|:\w+:`~?(?:[\w.]+\.)?(\w+)`|`+([^`]+)`+")
+"""References in parentheses, roles and literals of reStructuredText."""
+
+
+def without_markup(text: str | None) -> str:
+    """Return a docstring as plain text."""
+    return _MARKUP.sub(lambda match: match[1] or match[2] or "", text or "")
+
+
+@contextmanager
+def plain_docstrings(kinds: Iterable[Any]) -> Iterator[None]:
+    """Remove the markup from the docstrings of classes while tyro reads them."""
+    docstrings = {kind: kind.__doc__ for kind in kinds}
+    for kind, text in docstrings.items():
+        kind.__doc__ = without_markup(text)
+    try:
+        yield
+    finally:
+        for kind, text in docstrings.items():
+            kind.__doc__ = text
+
+
 def presets_of(kind: type) -> list[str]:
     """Return the names of a sampler's presets: public class methods without required arguments."""
     return [
         name
-        for name, held in vars(kind).items()
-        if isinstance(held, classmethod)
+        for name, member in vars(kind).items()
+        if isinstance(member, classmethod)
         and not name.startswith("_")
         and all(
             parameter.default is not Parameter.empty

@@ -60,7 +60,7 @@ def learning_tracks(
 ) -> LearningTracks:
     """Return the selected tracks, prepared and split, and print what was dropped.
 
-    ``threshold`` is the least confidence of a detection, ``shortest`` the least duration of a
+    ``threshold`` is the minimum confidence of a detection, ``shortest`` the minimum duration of a
     track in seconds.
     """
     from probmotion.data.projections import Filming
@@ -77,10 +77,10 @@ def learning_tracks(
             raise ValueError(f"{name} requires --tracks FILE…")
     if data.tracks and data.views is not None:
         raise ValueError("views applies to 3D clips only, got tracks")
-    own = data.skeleton == "own"
-    if own and not data.tracks:
+    joints_of_files = data.skeleton == "own"
+    if joints_of_files and not data.tracks:
         raise ValueError("skeleton 'own' requires --tracks FILE…")
-    skeleton = None if own else Skeleton.preset(data.skeleton)
+    skeleton = None if joints_of_files else Skeleton.preset(data.skeleton)
     if skeleton is None or data.tracks:
         prepared = read_tracks(
             data.tracks,

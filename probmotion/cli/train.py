@@ -28,7 +28,7 @@ class _TrackTraining:
     """Output folder."""
 
     threshold: float = 0.3
-    """Least confidence of a joint: 0.3 for people, 0.5 for horses, 0.01 with a ball."""
+    """Minimum confidence of a joint: 0.3 for people, 0.5 for horses, 0.01 with a ball."""
 
     data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
@@ -55,7 +55,7 @@ class TrainDiffusion(_TrackTraining):
     """Network size; tiny trains in seconds, small in minutes on two cores, others on a GPU."""
 
     frames: int | None = None
-    """Greatest number of frames of a motion; set by the size by default."""
+    """Maximum number of frames of a motion; set by the size by default."""
 
     def run(self) -> None:
         from probmotion.models.diffusion.settings import DiffusionSettings
@@ -88,7 +88,7 @@ class TrainEvaluator(_TrackTraining):
     """Network size; tiny trains in seconds, small in minutes on two cores, others on a GPU."""
 
     frames: int | None = None
-    """Greatest number of frames of a motion; set by the size by default."""
+    """Maximum number of frames of a motion; set by the size by default."""
 
     def run(self) -> None:
         from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee

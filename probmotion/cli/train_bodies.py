@@ -48,10 +48,10 @@ class Noise:
     """Noise of the synthetic recordings."""
 
     least: float = 0.01
-    """Least standard deviation of the noise, metres."""
+    """Minimum standard deviation of the noise, metres."""
 
     most: float = 0.08
-    """Greatest standard deviation of the noise, metres."""
+    """Maximum standard deviation of the noise, metres."""
 
     outliers: float = 0.4
     """Fraction of windows with outliers (Student-t noise)."""

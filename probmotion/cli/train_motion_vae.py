@@ -38,7 +38,7 @@ class TrainMotionVAE:
     """Weight of the KL divergence from N(0, I); 0.001 by default, as published (walk-vae: 0.01)."""
 
     threshold: float = 0.3
-    """Least confidence of a joint: 0.3 for people, 0.5 for horses."""
+    """Minimum confidence of a joint: 0.3 for people, 0.5 for horses."""
 
     rest: Path | None = None
     """Motion file whose first frame is the rest pose, facing +Z with hanging limbs.

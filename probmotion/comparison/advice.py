@@ -15,6 +15,7 @@ from probmotion.comparison.results.headline_metrics import (
     HEADLINE_METRICS,
     best_of,
     headline_metric,
+    seed_values,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class Advice:
     worse : tuple of Standing
         Samplers that are significantly worse.
     without_draws : dict of str
-        Reason for missing draws by sampler, in a word.
+        One-word reason for missing draws, by sampler.
     """
 
     problem: str
@@ -143,9 +144,9 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
     if metric is None:
         raise ValueError(f"problem must have a headline metric, got {problem!r} without")
     values = {
-        str(name): group.set_index("seed")["value"]
-        for name, group in rows[rows["metric"] == metric].groupby("sampler", sort=False)
-        if group["value"].notna().any()
+        name: row
+        for (name, _), row in seed_values(rows[rows["metric"] == metric]).items()
+        if row.notna().any()
     }
     # A single sampler is tied with itself.
     tied = best_of(metric, values, range(measurements.seeds))[1] or set(values)
@@ -186,21 +187,21 @@ def _error(metric: str, value: float) -> float:
 
 
 def _standing(rows: pd.DataFrame, sampler: str, metric: str, measurements: Measured) -> Standing:
-    own = rows[rows["sampler"] == sampler].groupby("metric")["value"]
-    means = own.mean()
+    metrics = rows[rows["sampler"] == sampler].groupby("metric")["value"]
+    means = metrics.mean()
     warnings = [
         words.format(float(means[name]))
         for name, low, high, words in _WARNINGS
         if name in means.index and not low <= float(means[name]) <= high
     ]
     if "rhat" in means.index:
-        warnings += _rhat_warning(own.get_group("rhat"), measurements.rhat_at_most)
-    if (finished := int(own.count()[metric])) < measurements.seeds:
+        warnings += _rhat_warning(metrics.get_group("rhat"), measurements.rhat_at_most)
+    if (finished := int(metrics.count()[metric])) < measurements.seeds:
         warnings.append(f"draws at {finished} of {measurements.seeds} seeds")
     return Standing(
         sampler,
         float(means[metric]),
-        float(own.std()[metric]),
+        float(metrics.std()[metric]),
         float(means["seconds"]),
         tuple(warnings),
     )

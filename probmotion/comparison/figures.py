@@ -32,8 +32,8 @@ def draw_comparison(
 ) -> list[Path]:
     """Write ``quality_against_cost.png`` and ``skeletons_<problem>.png``; return their paths.
 
-    The plot is left out if no headline metric was measured. Skeletons with observations are seen
-    from the side of the first camera, which leaves that view open, with the truth in grey.
+    The plot is omitted if no headline metric was measured. Skeletons with observations are viewed
+    at a right angle to the first camera, with the truth in grey.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ def compare(
 
     The random numbers of a run depend only on its problem, sampler and seed, so the results do not
     depend on ``workers`` or ``executor``. Each run is stored as soon as it is finished; repeating
-    the call after an interruption runs only what is missing.
+    the call after an interruption runs only the missing ones.
 
     Parameters
     ----------
@@ -107,10 +107,10 @@ def compare(
     ------
     ValueError
         If a problem or sampler is unknown, names are not unique, a number is out of range,
-        ``out`` holds runs made with other settings or by another version, or another process is
+        ``out`` contains runs made with other settings or by another version, or another process is
         running one of the problems there.
     OSError
-        If ``out`` cannot be written to; finished runs are kept.
+        If ``out`` cannot be written to; finished runs remain stored.
     KeyboardInterrupt
         At Ctrl-C; the message states how many runs are finished.
     """
@@ -135,11 +135,10 @@ def compare(
             seed = addressed.integer(0, "exact", name)
             try:
                 store_problem(problem, folder / "problems" / name, seed=seed)
-            except OSError:
-                raise
-            except Exception:
-                # Reference draws failed; every run of the problem will record the same error.
-                continue
+            except Exception as error:
+                # If reference draws failed, every run of the problem records the same error.
+                if isinstance(error, OSError):
+                    raise
         plan.save(folder)
         run_grid(grid, workers, executor, progress)
         # A grid of other problems in the same folder may have overwritten the plan.

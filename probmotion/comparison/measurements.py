@@ -1,6 +1,6 @@
 """Measurements of every sampler on every problem, shipped with the package.
 
-``measured.csv`` holds the rows of a comparison's table that advice needs, ``measured.json`` the
+``measured.csv`` contains the rows of a table that advice needs, ``measured.json`` the
 settings, problem descriptions and reasons for missing values.
 """
 
@@ -58,7 +58,7 @@ class Measured:
     samplers : list of str
         Names.
     words : dict of str
-        Reason for missing draws by ``problem/sampler``, in a word.
+        One-word reason for missing draws, by ``problem/sampler``.
     """
 
     rows: pd.DataFrame

@@ -36,8 +36,7 @@ class Cameras:
     ------
     ValueError
         If shapes disagree, a value is not finite, a focal length is not positive, or a rotation is
-        not
-        orthonormal with determinant 1 (to 1e-6).
+        not orthonormal with determinant 1 (to 1e-6).
     """
 
     rotation: np.ndarray
@@ -47,32 +46,34 @@ class Cameras:
     orthographic: bool = True
 
     def __post_init__(self) -> None:
-        rotation = np.asarray(self.rotation, dtype=np.float64)
+        rotation, translation, focal = (
+            np.asarray(value, dtype=np.float64)
+            for value in (self.rotation, self.translation, self.focal)
+        )
         check_shape("rotation", rotation, ("V", 3, 3))
         n_views = len(rotation)
         if n_views == 0:
             raise ValueError("rotation must contain at least one camera, got none")
-        translation = np.asarray(self.translation, dtype=np.float64)
-        focal = np.asarray(self.focal, dtype=np.float64)
         centre = np.zeros((n_views, 2)) if self.centre is None else self.centre
         centre = np.asarray(centre, dtype=np.float64)
         check_shape("translation", translation, (n_views, 3))
         check_shape("focal", focal, (n_views,))
         check_shape("centre", centre, (n_views, 2))
-        for name, value in (("rotation", rotation), ("translation", translation)):
-            check_finite(name, value)
+        check_finite("rotation", rotation)
+        check_finite("translation", translation)
         check_finite("centre", centre)
         for value in focal:
             check_positive("focal", float(value))
-        gap = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
-        if gap > 1e-6:
-            raise ValueError(f"rotation must be orthonormal to 1e-6, got a deviation of {gap:.2g}")
+        deviation = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
+        if deviation > 1e-6:
+            raise ValueError(
+                f"rotation must be orthonormal to 1e-6, got a deviation of {deviation:.2g}"
+            )
         if (np.linalg.det(rotation) < 0).any():
             raise ValueError("rotation must have determinant 1, got a reflection")
-        object.__setattr__(self, "rotation", rotation)
-        object.__setattr__(self, "translation", translation)
-        object.__setattr__(self, "focal", focal)
-        object.__setattr__(self, "centre", centre)
+        fields = {"rotation": rotation, "translation": translation, "focal": focal}
+        for name, value in (fields | {"centre": centre}).items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def ring(
@@ -93,9 +94,8 @@ class Cameras:
         elevation : float
             Radians above the horizon.
         distance : float
-            Metres from the origin. Perspective cameras have the same number as focal length, so
-            that
-            both kinds project the origin's plane at one image unit per metre (MAS, appendix C).
+            Metres from the origin, and focal length of perspective cameras: both kinds project the
+            origin's plane at one image unit per metre (MAS, appendix C).
         start : float
             Azimuth of the first camera, radians; 0 is the +Z axis.
         perspective : bool
@@ -119,9 +119,9 @@ class Cameras:
         """Return cameras at azimuths and elevations (V,), radians, facing the origin."""
         check_positive("distance", distance)
         azimuth = np.atleast_1d(np.asarray(azimuth, dtype=np.float64))
-        check_finite("azimuth", azimuth)
-        check_finite("elevation", np.atleast_1d(np.asarray(elevation, dtype=np.float64)))
         elevation = np.broadcast_to(np.asarray(elevation, dtype=np.float64), azimuth.shape)
+        check_finite("azimuth", azimuth)
+        check_finite("elevation", elevation)
         ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
         zero = np.zeros_like(ca)
         right = np.stack([ca, zero, -sa], axis=-1)
@@ -166,15 +166,9 @@ class Cameras:
 
     def view(self, index: int) -> Cameras:
         """Return one camera as a batch of one."""
-        one = slice(index, index + 1) if index >= 0 else slice(index, index + 1 or None)
         assert self.centre is not None
-        return Cameras(
-            self.rotation[one],
-            self.translation[one],
-            self.focal[one],
-            self.centre[one],
-            self.orthographic,
-        )
+        parts = (self.rotation, self.translation, self.focal, self.centre)
+        return Cameras(*(part[[index]] for part in parts), self.orthographic)
 
     def as_orthographic(self) -> Cameras:
         """Return orthographic cameras with the same scale at the depth of the world origin."""
@@ -188,8 +182,8 @@ class Cameras:
         forward = constant(self.rotation[:, 2], points)
         depth = constant(self.translation[:, 2], points)
         xp = array_namespace(points)
-        moved = xp.sum(points[..., None, :, :, :] * forward[:, None, None, :], axis=-1)
-        return moved + depth[:, None, None]
+        along = xp.sum(points[..., None, :, :, :] * forward[:, None, None, :], axis=-1)
+        return along + depth[:, None, None]
 
     def project(self, points: Array) -> Array:
         """Return image points: ``(…, L, J, 3) → (…, V, L, J, 2)``, image units.
@@ -215,10 +209,10 @@ class Cameras:
     def _refuse_behind(self, depth: Array) -> None:
         if type(depth).__name__.endswith("Tracer"):
             return
-        nearest = to_numpy(depth)
-        if nearest.size and nearest.min() <= 0:
-            view = int(np.argwhere(nearest <= 0)[0][-3])
+        depth = to_numpy(depth)
+        if depth.size and depth.min() <= 0:
+            view = int(np.argwhere(depth <= 0)[0][-3])
             raise ValueError(
-                f"points must be in front of every camera, got depth {nearest.min():.3g} m in "
+                f"points must be in front of every camera, got depth {depth.min():.3g} m in "
                 f"camera {view}; move the cameras away or centre the motion"
             )

@@ -13,20 +13,11 @@ from probmotion.arrays import Array, array_namespace, constant
 from probmotion.validation import check_shape
 
 __all__ = [
-    "euler_to_matrix",
-    "geodesic_angle",
-    "matrix_to_euler",
-    "matrix_to_quaternion",
-    "matrix_to_rotation_6d",
-    "matrix_to_vector",
-    "quaternion_product",
-    "quaternion_to_matrix",
-    "quaternion_to_vector",
-    "rotation_6d_to_matrix",
-    "slerp",
-    "vector_to_matrix",
+    "euler_to_matrix", "geodesic_angle", "matrix_to_euler", "matrix_to_quaternion",
+    "matrix_to_rotation_6d", "matrix_to_vector", "quaternion_product", "quaternion_to_matrix",
+    "quaternion_to_vector", "rotation_6d_to_matrix", "slerp", "vector_to_matrix",
     "vector_to_quaternion",
-]
+]  # fmt: skip
 
 # Squared angle below which the series are exact in float64; the first omitted term is 1e-19.
 _SMALL = 1e-6
@@ -78,8 +69,9 @@ def quaternion_to_vector(quaternion: Array) -> Array:
     small = square < _SMALL
     sine = _safe_sqrt(square, small)
     # 2 atan(s/w)/s; the series in s/w is used only for w close to 1.
-    tangent = xp.where(small, square / xp.where(small, real, xp.ones_like(real)) ** 2, square)
-    series = 2 * (1 - tangent / 3 + tangent**2 / 5) / xp.where(small, real, xp.ones_like(real))
+    cosine = xp.where(small, real, xp.ones_like(real))
+    tangent = square / cosine**2
+    series = 2 * (1 - tangent / 3 + tangent**2 / 5) / cosine
     return xp.where(small, series, 2 * xp.atan2(sine, real) / sine) * imaginary
 
 
@@ -140,8 +132,7 @@ def rotation_6d_to_matrix(numbers: Array) -> Array:
     """Return the rotation matrix of a 6D vector by Gram-Schmidt: ``(…, 6) → (…, 3, 3)``.
 
     Entries 0:3 and 3:6 are the first two columns and must not be parallel (Zhou et al. 2019, "On
-    the
-    continuity of rotation representations in neural networks", eq. 15).
+    the continuity of rotation representations in neural networks", eq. 15).
     """
     check_shape("numbers", numbers, ("…", 6))
     xp = array_namespace(numbers)
@@ -168,8 +159,7 @@ def euler_to_matrix(angles: Array, order: str) -> Array:
         Radians, in the order of ``order``.
     order : str
         Three of ``X``, ``Y``, ``Z`` with different neighbours: ``"ZXY"`` is ``R_z R_x R_y``, the
-        BVH
-        channels ``Zrotation Xrotation Yrotation``.
+        BVH channels ``Zrotation Xrotation Yrotation``.
 
     Raises
     ------
@@ -212,10 +202,8 @@ def matrix_to_euler(matrix: Array, order: str) -> Array:
     first = xp.atan2(xp.where(locked, zero, sine), xp.where(locked, one, cosine))
     # After undoing the first turn, this row depends on the last angle only. It has length 1 even
     # if the first angle is ill-conditioned.
-    row = (
-        xp.cos(first)[..., None] * matrix[..., j, :]
-        + parity * xp.sin(first)[..., None] * matrix[..., k, :]
-    )
+    row = xp.cos(first)[..., None] * matrix[..., j, :]
+    row = row + parity * xp.sin(first)[..., None] * matrix[..., k, :]
     if last == i:
         middle = xp.atan2(radius, matrix[..., i, i])
         third = xp.atan2(-parity * row[..., k], row[..., j])
@@ -276,12 +264,9 @@ def _turn(angle: Array, axis: int) -> Array:
     fixed[axis, axis] = 1
     cosine[j, j] = cosine[k, k] = 1
     sine[j, k], sine[k, j] = -1, 1
-    grown = angle[..., None, None]
-    return (
-        constant(fixed, angle)
-        + xp.cos(grown) * constant(cosine, angle)
-        + xp.sin(grown) * constant(sine, angle)
-    )
+    turned = xp.cos(angle)[..., None, None] * constant(cosine, angle)
+    turned = constant(fixed, angle) + turned
+    return turned + xp.sin(angle)[..., None, None] * constant(sine, angle)
 
 
 def _cross_matrix(vector: Array) -> Array:

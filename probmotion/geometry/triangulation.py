@@ -25,7 +25,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["triangulate"]
 
-_POOR = 1e3
+_WARN_CONDITION = 1e3
 """Condition number of the normal equations above which to warn: two views 3.6° apart."""
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -72,10 +72,8 @@ def triangulate(
     ------
     ValueError
         If there are fewer than two views, shapes disagree, a keypoint is not finite, the views do
-        not
-        determine some point, or a point is behind a perspective camera. Conditions on values are
-        not
-        checked under JAX tracing.
+        not determine some point, or a point is behind a perspective camera. Conditions on values
+        are not checked under JAX tracing.
     """
     V = cameras.n_views
     if V < 2:
@@ -84,16 +82,16 @@ def triangulate(
     check_count("iterations", iterations)
     xp = array_namespace(keypoints)
     *batch, _, L, J, _ = keypoints.shape
-    points = (*batch, L, J)
+    shape = (*batch, L, J)
     if initial is not None:
-        check_shape("initial", initial, (*points, 3))
-    if 0 in points:
-        return constant(np.zeros((*points, 3)), keypoints)
-    seen = _views_first(keypoints, 1)
+        check_shape("initial", initial, (*shape, 3))
+    if 0 in shape:
+        return constant(np.zeros((*shape, 3)), keypoints)
+    seen = _views_first(keypoints)
     weight = None
     if weights is not None:
         weights = _full_weights(weights, keypoints)
-        weight = _views_first(weights, 0)
+        weight = _views_first(weights[..., None])[0, ...]
         seen = xp.where(weight > 0, seen, xp.zeros_like(seen))
     equations = _equations(cameras, keypoints)
     ones = xp.ones_like(seen[0, :1, :])
@@ -102,24 +100,24 @@ def triangulate(
         if cameras.orthographic or initial is None:
             normal, pull = _on_rays(xp, equations, seen, weight)
             factors = _factor(normal)
-            found = xp.stack(_solve(factors, pull))
+            points = xp.stack(_solve(factors, pull))
         else:
-            found = xp.permute_dims(xp.reshape(initial, (-1, 3)), (1, 0))
+            points = xp.permute_dims(xp.reshape(initial, (-1, 3)), (1, 0))
         inverse_depth = None
         for iteration in range(0 if cameras.orthographic else iterations):
-            x, y, z = found[0, :], found[1, :], found[2, :]
+            x, y, z = points[0, :], points[1, :], points[2, :]
             image = equations.projection @ xp.stack([x, y, z, ones[0, :]])
             inverse_depth = 1 / image[2 * V :, :]
             image = xp.reshape(image[: 2 * V, :], seen.shape) * inverse_depth
             if iteration == 0:
                 normal = _normal(xp, equations, inverse_depth, image, weight)
                 factors = _factor(normal)
-            pull = _pull(xp, equations, inverse_depth, image, seen, weight)
+            pull = _pull(xp, equations, (seen - image) * inverse_depth, image, weight)
             dx, dy, dz = _solve(factors, pull)
-            found = xp.stack([x + dx, y + dy, z + dz])
-        if not type(found).__name__.endswith("Tracer"):
-            _refuse_unfit(xp, keypoints, weights, points, found, normal, factors, inverse_depth)
-    return xp.reshape(xp.permute_dims(found, (1, 0)), (*points, 3))
+            points = xp.stack([x + dx, y + dy, z + dz])
+        if not type(points).__name__.endswith("Tracer"):
+            _check_solution(xp, keypoints, weights, shape, points, normal, factors, inverse_depth)
+    return xp.reshape(xp.permute_dims(points, (1, 0)), (*shape, 3))
 
 
 class _Equations(NamedTuple):
@@ -134,21 +132,14 @@ class _Equations(NamedTuple):
 
 
 def _equations(cameras: Cameras, like: Array) -> _Equations:
-    found = _numpy_equations(cameras)
-    if isinstance(like, np.ndarray) and like.dtype == np.float64:
-        return found
-    return _Equations(*(constant(matrix, like) for matrix in found))
+    return _Equations(*(constant(matrix, like) for matrix in _numpy_equations(cameras)))
 
 
 @lru_cache(maxsize=8)
 def _numpy_equations(cameras: Cameras) -> _Equations:
     assert cameras.centre is not None
     metric = np.concatenate([cameras.rotation, cameras.translation[:, :, None]], axis=2)
-    c = (
-        metric[:, 2]
-        if not cameras.orthographic
-        else np.tile([0.0, 0.0, 0.0, 1.0], (len(metric), 1))
-    )
+    c = np.tile([0.0, 0.0, 0.0, 1.0], (len(metric), 1)) if cameras.orthographic else metric[:, 2]
     a, b = (
         cameras.focal[:, None] * metric[:, axis] + cameras.centre[:, axis, None] * c
         for axis in (0, 1)
@@ -182,15 +173,9 @@ def _normal(
 
 
 def _pull(
-    xp: Any,
-    equations: _Equations,
-    inverse_depth: Array,
-    image: Array,
-    seen: Array,
-    weight: Array | None,
+    xp: Any, equations: _Equations, residual: Array, image: Array, weight: Array | None
 ) -> Array:
-    """Return Σ_v w Jᵀ (seen − image), (3, N)."""
-    residual = (seen - image) * inverse_depth
+    """Return Σ_v w Jᵀ residual with J c = [a' − u c', b' − v c'] at ``image``, (3, N)."""
     if weight is not None:
         residual = residual * weight
     along = residual * image
@@ -205,14 +190,10 @@ def _on_rays(
 
     For c' = 0 they are exact.
     """
-    _, V, N = seen.shape
+    V = seen.shape[1]
     origin = equations.projection[:, 3:]
     residual = seen * origin[2 * V :, :] - xp.reshape(origin[: 2 * V, :], (2, V, 1))
-    if weight is not None:
-        residual = residual * weight
-    along = residual * seen
-    across = equations.pull @ xp.reshape(residual, (2 * V, N))
-    pull = across + equations.pull_depth @ (along[0, ...] + along[1, ...])
+    pull = _pull(xp, equations, residual, seen, weight)
     return _normal(xp, equations, xp.ones_like(seen[0, ...]), seen, weight), pull
 
 
@@ -237,14 +218,12 @@ def _solve(factors: tuple[Array, ...], right: Array) -> tuple[Array, Array, Arra
     return p * inverse_1 - l21 * y - l31 * z, y, z
 
 
-def _views_first(values: Array, trailing: int) -> Array:
-    """Move the views to the front and flatten the points: ``(…, V, L, J[, 2]) → ([2,] V, N)``."""
+def _views_first(values: Array) -> Array:
+    """Move the views to the front and flatten the points: ``(…, V, L, J, C) → (C, V, N)``."""
     xp = array_namespace(values)
-    V, L, J = values.shape[len(values.shape) - trailing - 3 :][:3]
-    if trailing:
-        stacked = xp.permute_dims(xp.reshape(values, (-1, V, L * J, 2)), (3, 1, 0, 2))
-        return xp.reshape(stacked, (2, V, -1))
-    return xp.reshape(xp.permute_dims(xp.reshape(values, (-1, V, L * J)), (1, 0, 2)), (V, -1))
+    V, L, J, C = values.shape[-4:]
+    moved = xp.permute_dims(xp.reshape(values, (-1, V, L * J, C)), (3, 1, 0, 2))
+    return xp.reshape(moved, (C, V, -1))
 
 
 def _full_weights(weights: Array, keypoints: Array) -> Array:
@@ -261,29 +240,29 @@ def _full_weights(weights: Array, keypoints: Array) -> Array:
     return xp.broadcast_to(weights, full)
 
 
-def _refuse_unfit(
+def _check_solution(
     xp: Any,
     keypoints: Array,
     weights: Array | None,
-    points: tuple[int, ...],
-    found: Array,
+    shape: tuple[int, ...],
+    points: Array,
     normal: Array,
     factors: tuple[Array, ...],
     inverse_depth: Array | None,
 ) -> None:
     """Warn about ill-conditioned views; raise if there is no solution."""
-    if weights is None and not np.isfinite(_number(xp.sum(found))):
+    if weights is None and not np.isfinite(_number(xp.sum(points))):
         check_finite("keypoints", keypoints)
     if weights is not None and not _number(xp.min(weights)) >= 0:
         raise ValueError(f"weights must be 0 or more, got {_number(xp.min(weights)):g}")
     # trace³/determinant is a cheap upper bound of the condition number.
     trace = normal[0, ...] + normal[3, ...] + normal[5, ...]
     bound = trace * trace * trace * (factors[0] * factors[1] * factors[2])
-    if not (_number(xp.max(bound)) < _POOR and _number(xp.min(bound)) > 0):
-        _report_condition(to_numpy(normal), points)
+    if not (_number(xp.max(bound)) < _WARN_CONDITION and _number(xp.min(bound)) > 0):
+        _report_condition(to_numpy(normal), shape)
     if inverse_depth is not None and not _number(xp.min(inverse_depth)) > 0:
         view, point = np.argwhere(~(to_numpy(inverse_depth) > 0))[0]
-        *_, frame, joint = np.unravel_index(point, points)
+        *_, frame, joint = np.unravel_index(point, shape)
         raise ValueError(
             f"keypoints must lie in front of every camera, got joint {joint} of frame {frame} "
             f"behind camera {view}; check the cameras or pass initial"
@@ -294,7 +273,7 @@ def _number(value: Array) -> float:
     return float(to_numpy(value))
 
 
-def _report_condition(normal: np.ndarray, points: tuple[int, ...]) -> None:
+def _report_condition(normal: np.ndarray, shape: tuple[int, ...]) -> None:
     matrices = np.empty((normal.shape[1], 3, 3))
     for entry, (i, j) in zip(normal, _PAIRS, strict=True):
         matrices[:, i, j] = matrices[:, j, i] = entry
@@ -302,13 +281,13 @@ def _report_condition(normal: np.ndarray, points: tuple[int, ...]) -> None:
     with np.errstate(divide="ignore", invalid="ignore"):
         condition = np.where(values[:, 0] > 0, values[:, 2] / values[:, 0], np.inf)
     worst = int(condition.argmax())
-    *_, frame, joint = (int(i) for i in np.unravel_index(worst, points))
+    *_, frame, joint = (int(i) for i in np.unravel_index(worst, shape))
     if not condition[worst] < 0.01 / np.finfo(normal.dtype).eps:
         raise ValueError(
             f"keypoints of joint {joint} in frame {frame} do not determine a point (condition "
             f"number {condition[worst]:.2g}); at least two non-parallel views are needed"
         )
-    if condition[worst] > _POOR:
+    if condition[worst] > _WARN_CONDITION:
         warnings.warn(
             f"the views are nearly parallel (condition number {condition[worst]:.3g} at joint "
             f"{joint} of frame {frame}), so depths are uncertain",

@@ -111,12 +111,7 @@ class AnnotatedPairs:
         **settings
             The other parameters of the class.
         """
-        if np.shape(seed_pose) != (annotations.skeleton.n_joints, 3):
-            raise ValueError(
-                f"seed_pose must have shape ({annotations.skeleton.n_joints}, 3), as the "
-                f"annotations of {len(annotations.skeleton.roots)} people, got "
-                f"{np.shape(seed_pose)}"
-            )
+        check_shape("seed_pose", np.asarray(seed_pose), (annotations.skeleton.n_joints, 3))
         views = annotation_views(annotations, seed_pose)
         known = ~np.isnan(views).any(axis=-1)
         if not known.any():
@@ -127,8 +122,8 @@ class AnnotatedPairs:
         dropped = dict(annotations.dropped)
         if not known.all():
             dropped["view not estimated"] = int((~known).sum())
-        kept = replace(annotations, views=views).subset(np.flatnonzero(known))
-        return cls(replace(kept, dropped=dropped), **settings)  # type: ignore[arg-type]
+        usable = replace(annotations, views=views, dropped=dropped).subset(known)
+        return cls(usable, **settings)  # type: ignore[arg-type]
 
     @property
     def skeleton(self) -> Skeleton:
@@ -179,8 +174,12 @@ class AnnotatedPairs:
             projected = project_to_views(poses, self.views, self.skeleton)
             distances, closest = self.comparer.nearest(projected, self.near)
         else:
-            pairs = zip(poses, generators, strict=True)
-            results = [self._with_fresh_views(pose, rng) for pose, rng in pairs]
+            results = []
+            for pose, rng in zip(poses, generators, strict=True):
+                views = self.distribution.sample(rng, self.n_views)
+                projected = project_to_views(pose[None], views, self.skeleton)
+                near = self.distribution.near(views, self.n_near)
+                results.append(self.comparer.nearest(projected, near))
             distances, closest = (np.concatenate(rows) for rows in zip(*results, strict=True))
         log_terms = -0.5 * (distances / self.noise) ** 2
         log_density = logsumexp(log_terms, axis=-1) - math.log(self.n_views)
@@ -226,13 +225,6 @@ class AnnotatedPairs:
         )
         return replace(self, annotations=drawn)
 
-    def _with_fresh_views(
-        self, pose: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        views = self.distribution.sample(rng, self.n_views)
-        projected = project_to_views(pose[None], views, self.skeleton)
-        return self.comparer.nearest(projected, self.distribution.near(views, self.n_near))
-
     @cached_property
     def _squared_differences(self) -> np.ndarray:
         """Squared turn and stretch of every joint in every annotation, (n, J, 2)."""
@@ -242,17 +234,15 @@ class AnnotatedPairs:
 
 def _check_metres(annotations: Annotations) -> None:
     """Raise ``ValueError`` if the bone lengths are not those of people in metres."""
+    shortest, longest = 0.05, 2.0
     ends, starts = np.array(annotations.skeleton.bones).T
     bones = annotations.keypoints[:, ends] - annotations.keypoints[:, starts]
     seen = annotations.visible[:, ends] & annotations.visible[:, starts]
     if not seen.any():
         return
     length = float(np.quantile(np.linalg.norm(bones[seen], axis=-1), 0.9))
-    if not _BONES[0] < length < _BONES[1]:
+    if not shortest < length < longest:
         raise ValueError(
-            f"annotations must have bones of {_BONES[0]:g} to {_BONES[1]:g} m (0.9 quantile), got "
+            f"annotations must have bones of {shortest:g} to {longest:g} m (0.9 quantile), got "
             f"{length:.3g}: keypoints must be in metres"
         )
-
-
-_BONES = (0.05, 2.0)

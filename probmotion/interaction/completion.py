@@ -19,20 +19,14 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
-    "BANDWIDTH",
-    "CompletionResult",
-    "blend",
-    "complete",
-    "complete_keypoints",
-    "nearest_annotation_completion",
-    "occluded_joint_error",
-]
+    "BANDWIDTH", "CompletionResult", "blend", "complete", "complete_keypoints",
+    "nearest_annotation_completion", "occluded_joint_error",
+]  # fmt: skip
 
 BANDWIDTH = 0.3
 """Default bandwidth of :func:`blend`, metres."""
 
-_FEWEST = 4
-"""Minimum number of visible joints: a tetrahedron."""
+_FEWEST = 4  # minimum number of visible joints: a tetrahedron
 
 
 class CompletionResult(NamedTuple):
@@ -111,13 +105,9 @@ def complete_keypoints(
     """
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
     nearest = retrieve(keypoints, draws, skeleton, views=views, visible=visible, n=n_nearest)
-    projections = np.stack(
-        [
-            project_to_views(draws[index][None], view[None], skeleton)[0, 0]
-            for index, view in zip(nearest.indices, nearest.views, strict=True)
-        ]
-    )
-    return _deformed_median(projections, nearest.indices, keypoints, visible, bandwidth)
+    pairs = zip(draws[nearest.indices], nearest.views, strict=True)
+    projections = [project_to_views(d[None], view[None], skeleton)[0, 0] for d, view in pairs]
+    return _deformed_median(np.stack(projections), nearest.indices, keypoints, visible, bandwidth)
 
 
 def nearest_annotation_completion(
@@ -144,10 +134,9 @@ def nearest_annotation_completion(
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
     annotated = np.asarray(annotated, dtype=np.float64)
     check_shape("annotated", annotated, ("n", skeleton.n_joints, 2))
-    known = np.ones(annotated.shape[:2], dtype=bool)
-    if annotated_visible is not None:
-        known = np.asarray(annotated_visible, dtype=bool)
-        check_shape("annotated_visible", known, annotated.shape[:2])
+    known = np.ones(annotated.shape[:2]) if annotated_visible is None else annotated_visible
+    known = np.asarray(known, dtype=bool)
+    check_shape("annotated_visible", known, annotated.shape[:2])
     candidates = np.flatnonzero(known[:, ~visible].all(axis=1))
     if len(candidates) == 0:
         raise ValueError("annotated must contain a pair with every occluded joint, got none")
@@ -167,19 +156,12 @@ def blend(
 
         Δ_h = Σ_v w_hv (target_v − median_v) / Σ_v w_hv,   w_hv = exp(−‖median_h − median_v‖²/2b²).
 
-    Parameters
-    ----------
-    median, target : ndarray, (J, D)
-        Metres; occluded joints of ``target`` are ignored.
-    visible : ndarray of bool, (J,)
-        Mask of visible joints; at least one.
-    bandwidth : float
-        b, metres.
+    ``median`` and ``target`` (J, D) and the bandwidth b in metres; at least one joint is visible.
     """
     check_positive("bandwidth", bandwidth)
     hidden = ~visible
-    apart = median[hidden, None] - median[None, visible]
-    exponents = -np.sum(apart**2, axis=-1) / (2 * bandwidth**2)
+    difference = median[hidden, None] - median[None, visible]
+    exponents = -np.sum(difference**2, axis=-1) / (2 * bandwidth**2)
     # Subtract the maximum, so that the weights of distant joints do not underflow.
     weights = np.exp(exponents - exponents.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)

@@ -13,8 +13,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["RetrievalResult", "retrieve", "view_grid", "views_around"]
 
-_BLOCK = 4096
-"""Projections compared at once; has no effect on the result."""
+_BLOCK = 4096  # projections compared at once; has no effect on the result
 
 
 class RetrievalResult(NamedTuple):
@@ -39,7 +38,7 @@ def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
     check_count("n_heights", n_heights)
     azimuths = np.arange(n_azimuths) * (2 * np.pi / n_azimuths) - np.pi
     low, high = np.radians((50.0, 100.0))
-    heights = np.linspace(low, high, n_heights) if n_heights > 1 else [np.pi / 2]
+    heights = np.linspace(low, high, n_heights) if n_heights > 1 else np.array([np.pi / 2])
     return np.stack(np.meshgrid(azimuths, heights, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
@@ -48,8 +47,7 @@ def views_around(view: np.ndarray) -> np.ndarray:
     check_shape("view", view, (2,))
     check_finite("view", np.asarray(view))
     turns, tilts = np.radians((-30.0, -15.0, 0.0, 15.0, 30.0)), np.radians((-15.0, 0.0, 15.0))
-    offsets = np.stack(np.meshgrid(turns, tilts, indexing="ij"), axis=-1).reshape(-1, 2)
-    return view + offsets
+    return view + np.stack(np.meshgrid(turns, tilts, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def retrieve(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from probmotion.io.errors import MotionFileError, decoded_lines, is_number, read_bytes, shortened
+from probmotion.io.errors import MotionFileError, decoded_lines, number, read_bytes
 
 __all__ = ["AcclaimText", "Line"]
 
@@ -26,24 +26,19 @@ class AcclaimText:
     def of(cls, path: Path) -> AcclaimText:
         """Read a file."""
         raw = decoded_lines(read_bytes(path).rstrip(b"\r\n"))
-        split = ((number, line.partition("#")[0].split()) for number, line in enumerate(raw, 1))
-        found = cls(str(path), [(number, words) for number, words in split if words], len(raw))
-        if not found.lines:
-            found.fail(found.length, "expected a line that begins with ':', got nothing")
-        return found
+        split = ((line, text.partition("#")[0].split()) for line, text in enumerate(raw, 1))
+        text = cls(str(path), [(line, words) for line, words in split if words], len(raw))
+        if not text.lines:
+            text.fail(text.length, "expected a line that begins with ':', got nothing")
+        return text
 
-    def fail(self, number: int, problem: str) -> NoReturn:
+    def fail(self, line: int, problem: str) -> NoReturn:
         """Raise a :class:`MotionFileError` for a line."""
-        raise MotionFileError(f"{self.file}, line {number}: {problem}")
+        raise MotionFileError(f"{self.file}, line {line}: {problem}")
 
-    def numbers(self, number: int, what: str, words: list[str], count: int) -> list[float]:
+    def numbers(self, line: int, name: str, words: list[str], count: int) -> list[float]:
         """Return ``count`` finite numbers of moderate size from ``words``."""
         if len(words) != count:
-            self.fail(number, f"{what}: expected {count} values, got {len(words)}")
-        for word in words:
-            if not is_number(word):
-                self.fail(
-                    number,
-                    f"{what}: expected a number between -1e9 and 1e9, got {shortened(word)}",
-                )
-        return [float(word) for word in words]
+            self.fail(line, f"{name}: expected {count} values, got {len(words)}")
+        where = f"{self.file}, line {line}: {name}"
+        return [number(word, where) for word in words]

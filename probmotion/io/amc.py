@@ -20,7 +20,6 @@ from probmotion.validation import check_positive
 
 __all__ = ["read_amc"]
 
-_DECLARATIONS = (":FULLY-SPECIFIED", ":DEGREES")
 _RATE = ":SAMPLES-PER-SECOND"
 
 
@@ -44,8 +43,7 @@ def read_amc(
     -------
     motion : Motion
         Motion in metres, without rotations: sibling bones rotate independently, which joint
-        rotations
-        cannot express.
+        rotations cannot express.
 
     Raises
     ------
@@ -61,8 +59,8 @@ def read_amc(
     text = AcclaimText.of(path)
     _check_declarations(text, fps)
     body = read_asf(_beside(path) if skeleton_path is None else skeleton_path)
-    values = _values(text, body)
-    return Motion(_world_positions(body, values), body.skeleton, fps, name=path.stem)
+    positions = _world_positions(body, _frames(text, body))
+    return Motion(positions, body.skeleton, fps, name=path.stem)
 
 
 def _beside(path: Path) -> Path:
@@ -81,70 +79,64 @@ def _beside(path: Path) -> Path:
 def _check_declarations(text: AcclaimText, fps: float) -> None:
     """Refuse files of other formats, units or rates, from the lines before the first frame."""
     declared = set()
-    for number, words in text.lines:
+    for line, words in text.lines:
         if not words[0].startswith(":"):
             break
         declared.add(words[0].upper())
-        if words[0].upper() == _RATE and text.numbers(number, _RATE, words[1:], 1) != [fps]:
-            text.fail(number, f"{_RATE}: expected fps={fps:g}, got {words[1]}")
+        if words[0].upper() == _RATE and text.numbers(line, _RATE, words[1:], 1) != [fps]:
+            text.fail(line, f"{_RATE}: expected fps={fps:g}, got {words[1]}")
     else:
         text.fail(text.length, "expected at least one frame, got the end of the file")
-    for wanted in _DECLARATIONS:
-        if wanted not in declared:
-            text.fail(number, f"expected {wanted} first, got {shortened(words[0])}")
+    for keyword in (":FULLY-SPECIFIED", ":DEGREES"):
+        if keyword not in declared:
+            text.fail(line, f"expected {keyword} first, got {shortened(words[0])}")
 
 
-def _values(text: AcclaimText, body: AcclaimSkeleton) -> np.ndarray:
-    """Return the channel values of all frames, (L, C), joints in order."""
-    columns: dict[str, slice] = {}
-    width = 0
-    for name, channels in zip(body.skeleton.joint_names, body.channels, strict=True):
-        if channels:
-            columns[name] = slice(width, width + len(channels))
-            width += len(channels)
-    rows: list[list[float]] = []
-    awaited: set[str] = set()
-    frame = 0
-    for number, words in text.lines:
+def _frames(text: AcclaimText, body: AcclaimSkeleton) -> list[dict[str, list[float]]]:
+    """Return the channel values of every frame by joint."""
+    names = body.skeleton.joint_names
+    counts = {
+        name: len(channels) for name, channels in zip(names, body.channels, strict=True) if channels
+    }
+    frames: list[dict[str, list[float]]] = []
+    number = 0
+
+    def check_last(line: int) -> None:
+        missing = counts.keys() - frames[-1].keys() if frames else set()
+        if missing:
+            name = shortened(min(missing))
+            text.fail(line, f"expected all moving bones in frame {number}, got no {name}")
+
+    for line, words in text.lines:
         name = words[0]
-        if name.startswith(":") and not rows:
+        if name.startswith(":") and not frames:
             continue
         if len(words) == 1 and name.isascii() and name.isdigit() and len(name) < 10:
-            _check_whole(text, number, awaited, frame)
-            if rows and int(name) != frame + 1:
-                text.fail(number, f"expected frame {frame + 1}, got {name}")
-            frame, awaited = int(name), set(columns)
-            rows.append([0.0] * width)
-        elif not rows or name not in awaited:
-            wanted = "each moving bone once in a frame" if rows else "the number of a frame"
-            text.fail(number, f"expected {wanted}, got {shortened(name)}")
+            check_last(line)
+            if frames and int(name) != number + 1:
+                text.fail(line, f"expected frame {number + 1}, got {name}")
+            number = int(name)
+            frames.append({})
+        elif not frames or name not in counts or name in frames[-1]:
+            wanted = "each moving bone once in a frame" if frames else "the number of a frame"
+            text.fail(line, f"expected {wanted}, got {shortened(name)}")
         else:
-            place = columns[name]
-            count = place.stop - place.start
-            rows[-1][place] = text.numbers(number, shortened(name), words[1:], count)
-            awaited.remove(name)
-    _check_whole(text, text.length, awaited, frame)
-    return np.array(rows).reshape(len(rows), width)
+            frames[-1][name] = text.numbers(line, shortened(name), words[1:], counts[name])
+    check_last(text.length)
+    return frames
 
 
-def _check_whole(text: AcclaimText, number: int, awaited: set[str], frame: int) -> None:
-    if awaited:
-        text.fail(
-            number, f"expected all moving bones in frame {frame}, got no {shortened(min(awaited))}"
-        )
-
-
-def _world_positions(body: AcclaimSkeleton, values: np.ndarray) -> np.ndarray:
+def _world_positions(body: AcclaimSkeleton, frames: list[dict[str, list[float]]]) -> np.ndarray:
     """Return positions (L, J, 3), metres."""
-    L, J = len(values), body.skeleton.n_joints
+    L, J = len(frames), body.skeleton.n_joints
     positions = np.zeros((L, J, 3))
     world = np.empty((J, L, 3, 3))
-    starts = np.cumsum([0, *map(len, body.channels)])
     for joint in body.skeleton.topological_order:
-        channels = body.channels[joint]
-        moved = dict(zip(channels, values[:, starts[joint] : starts[joint + 1]].T, strict=True))
+        name, channels = body.skeleton.joint_names[joint], body.channels[joint]
+        values = np.array([frame.get(name, ()) for frame in frames], dtype=np.float64).T
+        moved = dict(zip(channels, values, strict=True))
         C = body.axes[joint]
-        world[joint] = C @ _turns(moved, L) @ C.T
+        world[joint] = C @ _rotations(moved, L) @ C.T
         parent = body.skeleton.parents[joint]
         if parent < 0:
             for axis, channel in enumerate(("TX", "TY", "TZ")):
@@ -155,10 +147,10 @@ def _world_positions(body: AcclaimSkeleton, values: np.ndarray) -> np.ndarray:
     return positions
 
 
-def _turns(moved: dict[str, np.ndarray], frames: int) -> np.ndarray:
+def _rotations(moved: dict[str, np.ndarray], frames: int) -> np.ndarray:
     """Return M (L, 3, 3) of the channels of one joint."""
     order = [channel[1] for channel in moved if channel.startswith("R")]
-    order += [axis for axis in "XYZ" if axis not in order]
+    order = [*order, *(axis for axis in "XYZ" if axis not in order)][::-1]
     still = np.zeros(frames)
-    angles = [np.deg2rad(moved.get(f"R{axis}", still)) for axis in reversed(order)]
-    return np.asarray(euler_to_matrix(np.stack(angles, axis=-1), "".join(reversed(order))))
+    angles = [np.deg2rad(moved.get(f"R{axis}", still)) for axis in order]
+    return np.asarray(euler_to_matrix(np.stack(angles, axis=-1), "".join(order)))

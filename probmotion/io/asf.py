@@ -16,15 +16,15 @@ import numpy as np
 
 from probmotion.geometry.rotations import euler_to_matrix
 from probmotion.io.acclaim_text import AcclaimText, Line
-from probmotion.io.errors import MotionFileError, shortened
+from probmotion.io.errors import errors_in, shortened
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["AcclaimSkeleton", "read_asf"]
 
 _INCH = 0.0254
 _ROOT = "root"
-_TURNS = ("RX", "RY", "RZ")
-_SHIFTS = ("TX", "TY", "TZ")
+_ROTATIONS = ("RX", "RY", "RZ")
+_TRANSLATIONS = ("TX", "TY", "TZ")
 _LENGTHS = (1e-3, 1e3)  # plausible values of the unit
 _ENTRIES = ("id", "name", "direction", "length", "axis", "dof", "limits", "bodymass", "cofmass")
 
@@ -68,33 +68,25 @@ class _Bone:
 def read_asf(path: str | Path) -> AcclaimSkeleton:
     """Read a skeleton from an ASF file.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file. Its unit of length is an inch divided by the ``length`` of ``:units``; angles are
-        in
-        degrees; keywords are case-insensitive.
+    The unit of length is an inch divided by the ``length`` of ``:units``; angles are in degrees;
+    keywords are case-insensitive.
 
     Raises
     ------
     MotionFileError
         If the file is truncated, damaged or of another format, or uses unsupported features:
-        radians,
-        a root away from the origin, another axis order than XYZ, or translating bones.
+        radians, a root away from the origin, another axis order than XYZ, or translating bones.
     """
     text = AcclaimText.of(Path(path))
     sections = _sections(text)
-    unit = _unit(text, sections[":units"])
-    bones = {_ROOT: _root(text, sections[":root"])}
+    unit = _unit(text, _entries(text, sections, ":units", ("length", "angle")))
+    bones = {_ROOT: _root(text, _entries(text, sections, ":root", ("order",)))}
     _add_bones(text, sections[":bonedata"], bones)
     parents = _parents(text, sections[":hierarchy"], bones)
     names = list(parents)
-    try:
-        skeleton = Skeleton(
-            names, [names.index(parents[name]) if name != _ROOT else -1 for name in names]
-        )
-    except ValueError as error:  # a cycle
-        raise MotionFileError(f"{path}: {error}") from error
+    indices = [-1 if name == _ROOT else names.index(parents[name]) for name in names]
+    with errors_in(path):  # a cycle
+        skeleton = Skeleton(names, indices)
     return AcclaimSkeleton(
         skeleton,
         np.array([bones[name].offset for name in names]) * unit,
@@ -107,130 +99,134 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
 def _sections(text: AcclaimText) -> dict[str, list[Line]]:
     """Return the lines below each keyword that begins with a colon."""
     sections: dict[str, list[Line]] = {}
-    number, words = text.lines[0]
+    line, words = text.lines[0]
     if not words[0].startswith(":"):
-        text.fail(number, f"expected :version, :name or :units, got {shortened(words[0])}")
-    for number, words in text.lines:
+        text.fail(line, f"expected :version, :name or :units, got {shortened(words[0])}")
+    for line, words in text.lines:
         if words[0].startswith(":"):
             keyword = words[0].lower()
             if keyword in sections:
-                text.fail(number, f"expected {shortened(words[0])} once, got it again")
+                text.fail(line, f"expected {shortened(words[0])} once, got it again")
             sections[keyword] = []
         else:
-            sections[keyword].append((number, words))
+            sections[keyword].append((line, words))
     for keyword in (":units", ":root", ":bonedata", ":hierarchy"):
         if keyword not in sections:
             text.fail(text.length, f"expected {keyword}, got the end of the file")
     return sections
 
 
-def _unit(text: AcclaimText, lines: list[Line]) -> float:
-    """Return metres per unit of length."""
-    entries = {words[0].lower(): (number, words[1:]) for number, words in lines}
-    for name in ("length", "angle"):
+def _entries(
+    text: AcclaimText, sections: dict[str, list[Line]], section: str, needed: tuple[str, ...]
+) -> dict[str, Line]:
+    """Return the lines of a section by their first word."""
+    lines = sections[section]
+    entries = {words[0].lower(): (line, words[1:]) for line, words in lines}
+    for name in needed:
         if name not in entries:
-            text.fail(lines[-1][0] if lines else text.length, f"expected {name} in :units")
-    number, words = entries["angle"]
+            text.fail(lines[-1][0] if lines else text.length, f"expected {name} in {section}")
+    return entries
+
+
+def _unit(text: AcclaimText, entries: dict[str, Line]) -> float:
+    """Return metres per unit of length."""
+    line, words = entries["angle"]
     if [word.lower() for word in words] not in (["deg"], ["degrees"]):
-        text.fail(number, f"angle must be deg, got {shortened(' '.join(words))}")
-    number, words = entries["length"]
-    (length,) = text.numbers(number, "length", words, 1)
+        text.fail(line, f"angle must be deg, got {shortened(' '.join(words))}")
+    line, words = entries["length"]
+    (length,) = text.numbers(line, "length", words, 1)
     least, most = _LENGTHS
     if not least <= length <= most:
-        text.fail(number, f"length must be between {least:g} and {most:g}, got {length:g}")
+        text.fail(line, f"length must be between {least:g} and {most:g}, got {length:g}")
     return _INCH / length
 
 
-def _root(text: AcclaimText, lines: list[Line]) -> _Bone:
+def _root(text: AcclaimText, entries: dict[str, Line]) -> _Bone:
     """Return the root, a bone of length 0 at the origin."""
-    entries = {words[0].lower(): (number, words[1:]) for number, words in lines}
-    if "order" not in entries:
-        text.fail(lines[-1][0] if lines else text.length, "expected order in :root")
     for name in ("position", "orientation"):
         # Readers disagree whether motions are relative to these.
-        number, words = entries.get(name, (0, ["0"] * 3))
-        if any(text.numbers(number, name, words, 3)):
-            text.fail(number, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
-    number, words = entries["order"]
-    channels = _channels(text, number, words, _SHIFTS + _TURNS)
-    return _Bone(number, np.zeros(3), np.eye(3), channels)
+        line, words = entries.get(name, (0, ["0"] * 3))
+        if any(text.numbers(line, name, words, 3)):
+            text.fail(line, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
+    line, words = entries["order"]
+    channels = _channels(text, line, words, _TRANSLATIONS + _ROTATIONS)
+    return _Bone(line, np.zeros(3), np.eye(3), channels)
 
 
 def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> None:
     """Add the bones of ``:bonedata`` by name."""
     begun: int | None = None
     entries: dict[str, Line] = {}
-    for number, words in lines:
+    for line, words in lines:
         keyword = words[0].lower()
         if keyword == "begin" and begun is None:
-            begun, entries = number, {}
+            begun, entries = line, {}
         elif keyword == "end" and begun is not None:
             for needed in ("name", "direction", "length", "axis"):
                 if needed not in entries:
-                    text.fail(number, f"expected {needed} in the bone of line {begun}")
-            name = " ".join(entries["name"][1])
+                    text.fail(line, f"expected {needed} in the bone of line {begun}")
+            name_line, names = entries["name"]
+            name = " ".join(names)
             if not name or name in bones:
-                text.fail(entries["name"][0], f"name must be unique, got {shortened(name)}")
+                text.fail(name_line, f"name must be unique, got {shortened(name)}")
             bones[name] = _bone(text, begun, entries)
             begun = None
         elif begun is None or not (keyword in _ENTRIES or keyword.startswith("(")):
             wanted = "begin" if begun is None else f"{', '.join(_ENTRIES)} or end"
-            text.fail(number, f"expected {wanted}, got {shortened(words[0])}")
+            text.fail(line, f"expected {wanted}, got {shortened(words[0])}")
         elif keyword in entries:
-            text.fail(number, f"expected {keyword} once in the bone of line {begun}")
+            text.fail(line, f"expected {keyword} once in the bone of line {begun}")
         elif not keyword.startswith("("):  # further limits
-            entries[keyword] = (number, words[1:])
+            entries[keyword] = (line, words[1:])
     if begun is not None:
         text.fail(lines[-1][0], f"expected end of the bone of line {begun}")
 
 
 def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
     """Return the bone that begins at line ``begun``."""
-    number, words = entries["direction"]
-    direction = np.array(text.numbers(number, "direction", words, 3))
-    (length,) = text.numbers(entries["length"][0], "length", entries["length"][1], 1)
+    line, words = entries["length"]
+    (length,) = text.numbers(line, "length", words, 1)
     if length < 0:
-        text.fail(entries["length"][0], f"length must be 0 or more, got {length:g}")
+        text.fail(line, f"length must be 0 or more, got {length:g}")
+    line, words = entries["direction"]
+    direction = np.array(text.numbers(line, "direction", words, 3))
     if length > 0 and abs(np.linalg.norm(direction) - 1) > 1e-3:
-        text.fail(number, f"direction must be a unit vector, got {' '.join(words)[:60]}")
-    number, words = entries["axis"]
+        text.fail(line, f"direction must be a unit vector, got {' '.join(words)[:60]}")
+    line, words = entries["axis"]
     if [word.upper() for word in words[3:]] != ["XYZ"]:
-        text.fail(number, f"axis must be three angles and XYZ, got {shortened(' '.join(words))}")
-    angles = np.deg2rad(text.numbers(number, "axis", words[:3], 3))
-    number, words = entries.get("dof", (begun, []))
-    channels = _channels(text, number, words, _TURNS)
+        text.fail(line, f"axis must be three angles and XYZ, got {shortened(' '.join(words))}")
+    angles = np.deg2rad(text.numbers(line, "axis", words[:3], 3))
+    line, words = entries.get("dof", (begun, []))
+    channels = _channels(text, line, words, _ROTATIONS)
     # Rotation about X first, about Z last.
     return _Bone(begun, direction * length, euler_to_matrix(angles[::-1], "ZYX"), channels)
 
 
 def _channels(
-    text: AcclaimText, number: int, words: list[str], known: tuple[str, ...]
+    text: AcclaimText, line: int, words: list[str], known: tuple[str, ...]
 ) -> tuple[str, ...]:
     channels = tuple(word.upper() for word in words)
-    for place, channel in enumerate(channels):
-        if channel not in known or channel in channels[:place]:
-            text.fail(
-                number,
-                f"expected channels {', '.join(known)}, each at most once, got "
-                f"{shortened(words[place])}",
-            )
+    for index, channel in enumerate(channels):
+        if channel not in known or channel in channels[:index]:
+            got = shortened(words[index])
+            text.fail(line, f"expected channels {', '.join(known)}, each at most once, got {got}")
     return channels
 
 
 def _parents(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> dict[str, str]:
     """Return the parent's name of each joint, the root first with itself as parent."""
-    for place, wanted in ((0, "begin"), (-1, "end")):
-        if not lines or [word.lower() for word in lines[place][1]] != [wanted]:
-            number = lines[place][0] if lines else text.length
-            text.fail(number, f"expected {wanted} around the hierarchy")
+    for index, keyword in ((0, "begin"), (-1, "end")):
+        line, words = lines[index] if lines else (text.length, [])
+        if [word.lower() for word in words] != [keyword]:
+            text.fail(line, f"expected {keyword} around the hierarchy")
     parents = {_ROOT: _ROOT}
-    for number, words in lines[1:-1]:
+    for line, words in lines[1:-1]:
         for name in words:
             if name not in bones:
-                text.fail(number, f"expected a bone of :bonedata, got {shortened(name)}")
+                text.fail(line, f"expected a bone of :bonedata, got {shortened(name)}")
         for name in words[1:]:
             if name in parents:
-                text.fail(number, f"expected one parent of {shortened(name)}, got a second")
+                text.fail(line, f"expected one parent of {shortened(name)}, got a second")
             parents[name] = words[0]
     for name, bone in bones.items():
         if name not in parents:

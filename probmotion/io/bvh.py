@@ -41,10 +41,8 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
         The file.
     scale : float, optional
         Metres per unit of the file. Default: the unit among metres, centimetres, millimetres and
-        the
-        CMU database's 1/0.45 inch that brings the longest chain of bones closest to 2.4 m, foot to
-        hand
-        of an adult. Units other than metres issue a :class:`MotionFileWarning`.
+        the CMU database's 1/0.45 inch that brings the longest chain of bones closest to 2.4 m, foot
+        to hand of an adult. Units other than metres issue a :class:`MotionFileWarning`.
     end_sites : bool
         Whether to include End Sites as joints, named after their parent with ``_end``.
 
@@ -52,10 +50,8 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     -------
     motion : Motion
         Motion in metres at the file's rate, joints in the file's order. A rounded frame time is
-        read
-        as the integer rate. Rotations are dropped if a joint other than a root translates relative
-        to
-        its parent.
+        read as the integer rate. Rotations are dropped if a joint other than a root translates
+        relative to its parent.
 
     Raises
     ------
@@ -92,8 +88,8 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
 
 def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:
     """Return the skeleton of ``joints``, with parents as indices into ``every``."""
-    place = {id(joint): index for index, joint in enumerate(joints)}
-    parents = [-1 if joint.parent < 0 else place[id(every[joint.parent])] for joint in joints]
+    index = {id(joint): i for i, joint in enumerate(joints)}
+    parents = [-1 if joint.parent < 0 else index[id(every[joint.parent])] for joint in joints]
     taken = {joint.name for joint in joints if not joint.end_site}
     names = []
     for joint in joints:

@@ -22,22 +22,13 @@ _TOLERANCE = 1e-6
 
 
 def write_bvh(motion: Motion, path: str | Path) -> None:
-    """Write a motion to a BVH file, in metres.
+    """Write a motion to a BVH file, in metres and atomically.
 
     Rotations are the motion's own, or else fitted to its positions. If rotations and constant
-    offsets
-    reproduce all positions to 1e-6 m, joints have rotation channels only. Otherwise every joint
-    also
-    has position channels, which replace its offset, as in Blender. In both cases positions read
-    back
-    to 1e-6 m with ``scale=1``. Joints are written depth first.
-
-    Parameters
-    ----------
-    motion : Motion
-        Motion to write. Several roots become several ``ROOT`` blocks.
-    path : str or Path
-        The file, written atomically.
+    offsets reproduce all positions to 1e-6 m, joints have rotation channels only. Otherwise every
+    joint also has position channels, which replace its offset, as in Blender. In both cases
+    positions read back to 1e-6 m with ``scale=1``. Joints are written depth first; several roots
+    become several ``ROOT`` blocks.
 
     Raises
     ------
@@ -85,10 +76,10 @@ def _channels(motion: Motion) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndar
     offsets[list(skeleton.roots)] = 0.0
     # Compare with the positions that a reader reconstructs from the rounded angles.
     roots = motion.positions[:, list(skeleton.roots)]
-    turns = euler_to_matrix(np.deg2rad(angles), _ORDER)
-    reached, world = forward_kinematics(skeleton, turns, roots, offsets)
+    rounded = euler_to_matrix(np.deg2rad(angles), _ORDER)
+    positions, world = forward_kinematics(skeleton, rounded, roots, offsets)
     translations = {root: motion.positions[:, root] for root in skeleton.roots}
-    if np.abs(reached - motion.positions).max() > _TOLERANCE:
+    if np.abs(positions - motion.positions).max() > _TOLERANCE:
         for joint, parent in skeleton.bones:
             bone = motion.positions[:, joint] - motion.positions[:, parent]
             translations[joint] = np.einsum("lji,lj->li", world[:, parent], bone)
@@ -107,10 +98,8 @@ def _hierarchy(skeleton: Skeleton, offsets: np.ndarray, moving: set[int]) -> lis
         open_blocks = depth + 1
         outer, inner = "\t" * depth, "\t" * (depth + 1)
         offset = " ".join(f"{value:.{_DECIMALS}f}" for value in offsets[joint] + 0.0)
-        rotation = " ".join(f"{axis}rotation" for axis in _ORDER)
-        channels = f"3 {rotation}"
-        if joint in moving:
-            channels = f"6 Xposition Yposition Zposition {rotation}"
+        channels = "6 Xposition Yposition Zposition" if joint in moving else "3"
+        channels += "".join(f" {axis}rotation" for axis in _ORDER)
         lines += [
             f"{outer}{'ROOT' if parent < 0 else 'JOINT'} {skeleton.joint_names[joint]}",
             f"{outer}{{",

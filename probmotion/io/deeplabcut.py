@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.io.errors import MotionFileError, read_bytes, shortened
+from probmotion.io.errors import MotionFileError, number, read_bytes, shortened
 from probmotion.io.keypoint_tracks import Detection, frame_number, tracks_of
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
@@ -26,15 +26,13 @@ from probmotion.validation import check_positive
 
 __all__ = ["read_deeplabcut"]
 
-_LARGEST = 1e9
 _NO_ANIMAL = "single"
-_COORDINATES = {"x": 0, "y": 1, "likelihood": 2}
 _MISSING = frozenset(("", "nan", "NaN"))
 
 Rows = list[tuple[int, list[str]]]
 """Line numbers and cells of the nonempty rows."""
-Columns = tuple[int, int, int | None]
-"""Columns of x, y and likelihood of a body part."""
+Columns = dict[str, int]
+"""Columns of ``x``, ``y`` and, if present, ``likelihood`` of a body part."""
 
 
 def read_deeplabcut(
@@ -73,26 +71,27 @@ def read_deeplabcut(
             f"{path}: expected a CSV table, got HDF5; export it with DeepLabCut's save_as_csv=True"
         )
     index_columns, animals, rows = _header(_rows(path), path)
-    places = [(line, *_place(cells[:index_columns], line, path)) for line, cells in rows]
+    images = [(line, *_image(cells[:index_columns], line, path)) for line, cells in rows]
     tracks: list[KeypointTrack] = []
     for animal, parts in animals.items():
         joints = Skeleton(list(parts), [-1] * len(parts))
-        chosen = list(range(len(parts)))
+        chosen: Sequence[int] = range(len(parts))
         if wanted is not None:
-            found = _chosen(joints, wanted)
-            if isinstance(found, str):
+            matches = _matches(joints, wanted)
+            if None in matches:
                 if animal == _NO_ANIMAL and len(animals) > 1:
                     continue
-                who = f"individual {shortened(animal)}" if animal else "the table"
+                missing = wanted.joint_names[matches.index(None)]
+                owner = f"individual {shortened(animal)}" if animal else "the table"
                 raise MotionFileError(
-                    f"{path}: expected the joint {found!r} of skeleton among the body parts of "
-                    f"{who}, got {', '.join(parts)}"
+                    f"{path}: expected the joint {missing!r} of skeleton among the body parts of "
+                    f"{owner}, got {', '.join(parts)}"
                 )
-            joints, chosen = wanted, found
+            joints, chosen = wanted, [part for part in matches if part is not None]
         values = _values(rows, [list(parts.values())[part] for part in chosen], path)
         detections = [
             Detection(video, frame, animal or None, values[row], f"{path}, line {line}")
-            for row, (line, video, frame) in enumerate(places)
+            for row, (line, video, frame) in enumerate(images)
         ]
         tracks += tracks_of(detections, None, joints, float(fps), path)
     return tracks
@@ -111,7 +110,7 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[str, dict[str, Columns]],
     """Return the number of index columns, the columns of body parts by animal, and the body."""
     names = [row[0].strip().lower() for _, row in rows[:4]]
     several = names[1:2] == ["individuals"]
-    expected = ["scorer", *(["individuals"] if several else []), "bodyparts", "coords"]
+    expected = ["scorer", *["individuals"] * several, "bodyparts", "coords"]
     if names[: len(expected)] != expected:
         raise MotionFileError(
             f"{path}: expected the rows scorer, individuals (for several), bodyparts and coords, "
@@ -126,36 +125,33 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[str, dict[str, Columns]],
             raise MotionFileError(
                 f"{path}, line {line}: expected {width} cells as in the first row, got {len(row)}"
             )
+    columns_by_animal: dict[str, dict[str, Columns]] = {}
     coordinates = [cell.strip().lower() for cell in rows[len(expected) - 1][1]]
     first = next((column for column in range(1, width) if coordinates[column]), width)
-    found: dict[str, dict[str, dict[str, int]]] = {}
     for column in range(first, width):
         animal = rows[1][1][column].strip() if several else ""
         part = rows[len(expected) - 2][1][column].strip()
-        columns = found.setdefault(animal, {}).setdefault(part, {})
+        columns = columns_by_animal.setdefault(animal, {}).setdefault(part, {})
         coordinate = coordinates[column]
-        if coordinate not in _COORDINATES or coordinate in columns or not part:
+        if coordinate not in ("x", "y", "likelihood") or coordinate in columns or not part:
             raise MotionFileError(
                 f"{path}, column {column + 1}: expected x, y and likelihood once for each body "
                 f"part, got {shortened(coordinate)} of {shortened(part)}"
             )
         columns[coordinate] = column
-    animals: dict[str, dict[str, Columns]] = {}
-    for animal, parts in found.items():
-        animals[animal] = {}
+    for parts in columns_by_animal.values():
         for part, columns in parts.items():
-            if "x" not in columns or "y" not in columns:
+            if not {"x", "y"} <= set(columns):
                 raise MotionFileError(
                     f"{path}: expected x and y of the body part {shortened(part)}, got "
                     f"{', '.join(columns)}"
                 )
-            animals[animal][part] = columns["x"], columns["y"], columns.get("likelihood")
-    if not animals:
+    if not columns_by_animal:
         raise MotionFileError(f"{path}: expected at least one body part, got none")
-    return first, animals, body
+    return first, columns_by_animal, body
 
 
-def _place(cells: Sequence[str], line: int, path: Path) -> tuple[str, int]:
+def _image(cells: Sequence[str], line: int, path: Path) -> tuple[str, int]:
     """Return the video and the frame number of a row, from its index columns."""
     image = "/".join(cell.strip() for cell in cells if cell.strip()).replace("\\", "/")
     where = f"{path}, line {line}, column 1"
@@ -166,48 +162,32 @@ def _place(cells: Sequence[str], line: int, path: Path) -> tuple[str, int]:
     return frame_number(image, where)
 
 
-def _chosen(joints: Skeleton, wanted: Skeleton) -> list[int] | str:
-    """Return the index of each wanted joint, or the name of a missing one."""
-    chosen = []
+def _matches(joints: Skeleton, wanted: Skeleton) -> list[int | None]:
+    """Return the index of each wanted joint by its own or canonical name, None if missing."""
+    indices: list[int | None] = []
     for name, canonical in zip(wanted.joint_names, wanted.canonical_names, strict=True):
         try:
-            chosen.append(joints.index(name if name in joints.joint_names else canonical))
+            indices.append(joints.index(name if name in joints.joint_names else canonical))
         except ValueError:
-            return name
-    return chosen
+            indices.append(None)
+    return indices
 
 
-def _values(rows: Rows, columns: list[Columns], path: Path) -> np.ndarray:
-    """Return x, y and confidence of every frame and joint, (L, J, 3); 0 if missing."""
-    values = np.zeros((len(rows), len(columns), 3))
+def _values(rows: Rows, parts: list[Columns], path: Path) -> np.ndarray:
+    """Return x, y and confidence of every frame and body part, (L, J, 3); 0 if missing."""
+    values = np.zeros((len(rows), len(parts), 3))
     for row, (line, cells) in enumerate(rows):
-        for joint, (x, y, likelihood) in enumerate(columns):
-            numbers = [
-                1.0 if column is None else _number(cells[column], line, column, path)
-                for column in (x, y, likelihood)
-            ]
-            if not np.isnan(numbers).any():
-                values[row, joint] = numbers
-            if numbers[2] < 0:
+        for joint, columns in enumerate(parts):
+            entry = [1.0] * 3
+            for axis, name in enumerate(("x", "y", "likelihood")):
+                if name in columns:
+                    where = f"{path}, line {line}, column {columns[name] + 1}"
+                    text = cells[columns[name]].strip()
+                    entry[axis] = np.nan if text in _MISSING else number(text, where)
+            if entry[2] < 0:  # of the last column that was read
                 raise MotionFileError(
-                    f"{path}, line {line}, column {(likelihood or 0) + 1}: expected a likelihood "
-                    f"of 0 or more, got {numbers[2]:g}"
+                    f"{where}: expected a likelihood of 0 or more, got {entry[2]:g}"
                 )
+            if not np.isnan(entry).any():
+                values[row, joint] = entry
     return values
-
-
-def _number(cell: str, line: int, column: int, path: Path) -> float:
-    """Return the number of a cell, NaN if it is missing."""
-    text = cell.strip()
-    if text in _MISSING:
-        return np.nan
-    try:
-        number = float(text)
-    except ValueError:
-        number = np.inf
-    if not abs(number) <= _LARGEST:
-        raise MotionFileError(
-            f"{path}, line {line}, column {column + 1}: expected a number between -1e9 and 1e9, "
-            f"got {shortened(text)}"
-        )
-    return number

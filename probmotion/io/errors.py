@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 __all__ = [
+    "LARGEST",
     "MotionFileError",
     "MotionFileWarning",
     "decoded_lines",
-    "is_number",
+    "errors_in",
+    "number",
     "read_bytes",
     "shortened",
 ]
 
-_LARGEST = 1e9
+LARGEST = 1e9
+"""Largest magnitude of a number in a motion file."""
+
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -36,6 +42,17 @@ class MotionFileWarning(UserWarning):
 def _on_one_line(message: str) -> str:
     """Escape unprintable characters, such as line ends in names of damaged files."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)
+
+
+@contextmanager
+def errors_in(where: object) -> Iterator[None]:
+    """Turn a ``ValueError`` of the block into a :class:`MotionFileError` about ``where``."""
+    try:
+        yield
+    except MotionFileError:
+        raise
+    except ValueError as error:
+        raise MotionFileError(f"{where}: {error}") from error
 
 
 def read_bytes(path: Path) -> bytes:
@@ -59,9 +76,13 @@ def decoded_lines(content: bytes) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def is_number(word: str) -> bool:
-    """Return whether a word is a plain decimal number between -1e9 and 1e9."""
-    return _NUMBER.fullmatch(word) is not None and abs(float(word)) <= _LARGEST
+def number(word: str, where: str) -> float:
+    """Return a plain decimal number between -1e9 and 1e9; ``where`` locates it in the error."""
+    if _NUMBER.fullmatch(word) is None or abs(float(word)) > LARGEST:
+        raise MotionFileError(
+            f"{where}: expected a number between -1e9 and 1e9, got {shortened(word)}"
+        )
+    return float(word)
 
 
 _short = reprlib.Repr()

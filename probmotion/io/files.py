@@ -49,7 +49,7 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
         :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
     """
     path = Path(path)
-    readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": _read_amc_at_usual_rate}
+    readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": read_amc}
     if path.suffix.lower() not in readers:
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
@@ -58,19 +58,14 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
             "read_keypoints for 2D keypoints"
         )
     motion = readers[path.suffix.lower()](path)
+    if path.suffix.lower() == ".amc":
+        warnings.warn(
+            f"{path}: assuming {motion.fps:g} frames per second, as in most of the CMU database; "
+            "set it with read_amc(path, fps=…)",
+            MotionFileWarning,
+            stacklevel=2,
+        )
     return motion if fps is None else motion.resample(fps)
-
-
-def _read_amc_at_usual_rate(path: Path) -> Motion:
-    """Read an AMC file at the default rate, with a warning."""
-    motion = read_amc(path)
-    warnings.warn(
-        f"{path}: assuming {motion.fps:g} frames per second, as in most of the CMU database; set "
-        "it with read_amc(path, fps=…)",
-        MotionFileWarning,
-        stacklevel=4,
-    )
-    return motion
 
 
 def save(motion: Motion, path: str | Path) -> None:
@@ -102,8 +97,7 @@ def read_keypoints(
     ----------
     path : str or Path
         COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, a DeepLabCut ``.csv`` table,
-        or
-        an ``.npz`` archive.
+        or an ``.npz`` archive.
     fps : float, optional
         Frames per second; required for JSON files and tables, which do not contain it.
     skeleton : Skeleton or str, optional
@@ -127,11 +121,10 @@ def read_keypoints(
         raise FileNotFoundError(f"there is no file {path}")
     archive = path.suffix.lower() == ".npz"
     table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
-    for name, value, applies in (
-        ("people", people, not archive and not table),
-        ("skeleton", skeleton, not archive),
-    ):
-        if value is not None and not applies:
+    unused = {"people": people} if archive or table else {}
+    unused |= {"skeleton": skeleton} if archive else {}
+    for name, value in unused.items():
+        if value is not None:
             raise ValueError(f"{name} must be None for {path.suffix} files, got {value!r}")
     if archive:
         return read_keypoint_npz(path, fps)
@@ -163,18 +156,11 @@ def load_all(
 
 
 def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files of paths or patterns such as ``"walks/*.bvh"``, sorted.
-
-    Raises
-    ------
-    FileNotFoundError
-        If a pattern matches no file.
-    """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
-    found: list[str] = []
-    for pattern in map(str, given):
-        matches = glob(pattern) if has_magic(pattern) else [pattern]
+    """Return the files of paths or patterns, sorted; see :func:`load_all`."""
+    files: list[str] = []
+    for pattern in [paths] if isinstance(paths, str | Path) else paths:
+        matches = glob(str(pattern)) if has_magic(str(pattern)) else [str(pattern)]
         if not matches:
-            raise FileNotFoundError(f"paths must match a file, got {pattern!r}")
-        found += matches
-    return [Path(path) for path in sorted(found)]
+            raise FileNotFoundError(f"paths must match a file, got {str(pattern)!r}")
+        files += matches
+    return [Path(path) for path in sorted(files)]

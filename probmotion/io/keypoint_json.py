@@ -89,39 +89,32 @@ def read_keypoint_json(
     check_positive("fps", fps)
     given = Skeleton.preset(skeleton) if isinstance(skeleton, str) else skeleton
     frames: Frames | None = None
+    content = None if path.is_dir() else _load(path)
     if path.is_dir():
         detections, frames = _folder(path)
+    elif isinstance(content, dict) and "annotations" in content:
+        detections, frames = _annotations(content, path)
+        given = given or _category_skeleton(content, path)
+    elif isinstance(content, dict) and "people" in content:
+        detections, frames = _people(content, "", 0, f"{path}"), {"": range(1)}
+    elif isinstance(content, list) and _all_have(content, "people"):
+        detections, frames = [], {"": range(len(content))}
+        for index, frame in enumerate(content):
+            detections += _people(frame, "", index, f"{path}, frame {index}")
+    elif isinstance(content, list) and _all_have(content, "keypoints"):
+        detections = _results(content, path)
+    elif isinstance(content, dict) and (
+        _all_have(content.values(), "people") or _all_have(content.values(), "bodies")
+    ):
+        detections = []
+        for image, frame in content.items():
+            video, index = frame_number(image, f"{path}, image")
+            detections += _people(frame, video, index, f"{path}, {shortened(image)}")
     else:
-        content = _load(path)
-        if isinstance(content, dict) and "annotations" in content:
-            detections, frames = _annotations(content, path)
-            given = given or _category_skeleton(content, path)
-        elif isinstance(content, dict) and "people" in content:
-            detections, frames = _people(content, "", 0, f"{path}"), {"": range(1)}
-        elif isinstance(content, list) and _all_hold(content, "people"):
-            detections = [
-                found
-                for number, frame in enumerate(content)
-                for found in _people(frame, "", number, f"{path}, frame {number}")
-            ]
-            frames = {"": range(len(content))}
-        elif isinstance(content, list) and _all_hold(content, "keypoints"):
-            detections = _results(content, path)
-        elif isinstance(content, dict) and (
-            _all_hold(content.values(), "people") or _all_hold(content.values(), "bodies")
-        ):
-            detections = [
-                found
-                for image, frame in content.items()
-                for found in _people(
-                    frame, *frame_number(image, f"{path}, image"), f"{path}, {shortened(image)}"
-                )
-            ]
-        else:
-            raise MotionFileError(
-                f"{path}: expected keypoints of COCO (annotations, or a list with image_id and "
-                f"keypoints), AlphaPose or OpenPose (people), got {_described(content)}"
-            )
+        raise MotionFileError(
+            f"{path}: expected keypoints of COCO (annotations, or a list with image_id and "
+            f"keypoints), AlphaPose or OpenPose (people), got {_described(content)}"
+        )
     counts = sorted({len(detection.values) for detection in detections})
     if len(counts) > 1:
         raise MotionFileError(f"{path}: expected the same keypoints of all people, got {counts}")
@@ -140,22 +133,22 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
         (key for key in ("frame_id", "file_name", "id") if all(key in image for image in images)),
         "id",
     )
-    in_order = sorted(images, key=lambda image: natural(_identity(image, (order,), where) or ""))
-    places: dict[Any, tuple[str, int]] = {}
+    images = sorted(images, key=lambda image: natural(_identity(image, (order,), where) or ""))
+    locations: dict[Any, tuple[str, int]] = {}
     length: dict[str, int] = {}
-    for image in in_order:
+    for image in images:
         video = _identity(image, ("video_id", "vid_id"), where) or ""
         image_id = _identity(image, ("id",), where)
-        if image_id is None or image_id in places:
+        if image_id is None or image_id in locations:
             raise MotionFileError(f"{where}: expected unique ids, got {shortened(image_id)}")
         length[video] = length.get(video, 0) + 1
-        places[image_id] = video, length[video] - 1
+        locations[image_id] = video, length[video] - 1
 
     detections = []
     for number, person in enumerate(_dicts(content["annotations"], f"{path}, annotations")):
         where = f"{path}, annotations[{number}]"
         image_id = _identity(person, ("image_id",), where)
-        if image_id not in places:
+        if image_id not in locations:
             raise MotionFileError(
                 f"{where}: image_id must be the id of an image, got {shortened(image_id)}"
             )
@@ -164,7 +157,7 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
             raise MotionFileError(f"{where}: expected visibilities 0, 1 or 2, got others")
         values[:, 2] /= 2
         track_id = _identity(person, ("track_id", "instance_id"), where)
-        detections.append(Detection(*places[image_id], track_id, values, where))
+        detections.append(Detection(*locations[image_id], track_id, values, where))
     return detections, {video: range(count) for video, count in length.items()}
 
 
@@ -173,10 +166,10 @@ def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
     detections = []
     for number, person in enumerate(content):
         where = f"{path}, [{number}]"
-        place = frame_number(person.get("image_id"), f"{where}, image_id")
+        location = frame_number(person.get("image_id"), f"{where}, image_id")
         values = keypoint_values(person["keypoints"], where)
         track_id = _identity(person, ("track_id", "idx"), where)
-        detections.append(Detection(*place, track_id, values, where))
+        detections.append(Detection(*location, track_id, values, where))
     return detections
 
 
@@ -185,14 +178,14 @@ def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[
     key = "people" if "people" in frame else "bodies"
     detections = []
     for index, person in enumerate(_dicts(frame[key], f"{where}, {key}")):
-        place = f"{where}, {key}[{index}]"
+        location = f"{where}, {key}[{index}]"
         names = ("pose_keypoints_2d", "pose_keypoints", "joints")
         keypoints = next((person[name] for name in names if name in person), None)
         if keypoints == []:  # a face or a hand without a body
             continue
-        track_id = _identity(person, ("person_id", "idx", "track_id"), place)
-        values = keypoint_values(keypoints, place)
-        detections.append(Detection(video, number, track_id, values, place))
+        track_id = _identity(person, ("person_id", "idx", "track_id"), location)
+        values = keypoint_values(keypoints, location)
+        detections.append(Detection(video, number, track_id, values, location))
     return detections
 
 
@@ -213,15 +206,15 @@ def _folder(path: Path) -> tuple[list[Detection], Frames]:
         numbers.setdefault(video, []).append(number)
         detections += _people(content, video, number, str(file))
     frames = {}
-    for video, found in numbers.items():
-        found.sort()
-        step = found[1] - found[0] if len(found) > 1 else 1
-        for before, after in pairwise(found):
+    for video, present in numbers.items():
+        present.sort()
+        step = present[1] - present[0] if len(present) > 1 else 1
+        for before, after in pairwise(present):
             if after - before != step or step == 0:
                 raise MotionFileError(
                     f"{path}: expected frames in steps of {max(step, 1)}, got {before} and {after}"
                 )
-        frames[video] = range(found[0], found[-1] + 1, step)
+        frames[video] = range(present[0], present[-1] + 1, step)
     return detections, frames
 
 
@@ -240,7 +233,7 @@ def _dicts(value: Any, where: str) -> list[dict[str, Any]]:
     return value
 
 
-def _all_hold(items: Iterable[Any], key: str) -> bool:
+def _all_have(items: Iterable[Any], key: str) -> bool:
     """Return whether ``items`` is nonempty and consists of objects with ``key``."""
     listed = list(items)
     return bool(listed) and all(isinstance(item, dict) and key in item for item in listed)
@@ -267,23 +260,20 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
     edges, since these generally form no tree.
     """
     where = f"{path}, categories"
-    key = ("category_id",)
-    used = {_identity(person, key, where) for person in content["annotations"]}
-    categories = content.get("categories", [])
-    found: Skeleton | None = None
-    for category in _dicts(categories, where):
+    used = {_identity(person, ("category_id",), where) for person in content["annotations"]}
+    skeletons: list[Skeleton] = []
+    for category in _dicts(content.get("categories", []), where):
         names = category.get("keypoints")
         if _identity(category, ("id",), where) not in used or not names:
             continue
         where = f"{path}, category {shortened(category.get('name'))}"
         try:
-            skeleton = _named_skeleton(names, category.get("skeleton") or [])
+            skeletons.append(_named_skeleton(names, category.get("skeleton") or []))
         except (ValueError, TypeError) as error:
             raise MotionFileError(f"{where}: {str(error)[:200]}") from error
-        if found is not None and skeleton != found:
+        if skeletons[-1] != skeletons[0]:
             raise MotionFileError(f"{where}: expected the keypoints of the previous category")
-        found = skeleton
-    return found
+    return skeletons[0] if skeletons else None
 
 
 def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
@@ -293,27 +283,24 @@ def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
     for preset in map(Skeleton.preset, PRESETS):
         if preset.canonical_names == rootless.canonical_names:
             return Skeleton(names, preset.parents)
-    parents: dict[int, int] = {}
-    neighbours: dict[int, list[int]] = {}
+    neighbours: list[list[int]] = [[] for _ in names]
     for first, second in edges:
         if not {first, second} <= set(range(1, len(names) + 1)):
             raise ValueError(
                 f"skeleton must have edges between keypoints 1 to {len(names)}, got "
                 f"{shortened([first, second])}"
             )
-        neighbours.setdefault(first - 1, []).append(second - 1)
-        neighbours.setdefault(second - 1, []).append(first - 1)
+        neighbours[int(first) - 1].append(int(second) - 1)
+        neighbours[int(second) - 1].append(int(first) - 1)
+    parents: dict[int, int] = {}
     for root in range(len(names)):
-        if root in parents:
-            continue
-        parents[root] = -1
-        waiting = [root]
-        while waiting:
-            joint = waiting.pop(0)
-            for neighbour in neighbours.get(joint, []):
+        queue = [] if root in parents else [root]
+        parents.setdefault(root, -1)
+        for joint in queue:  # grows: breadth first
+            for neighbour in neighbours[joint]:
                 if neighbour not in parents:
                     parents[neighbour] = joint
-                    waiting.append(neighbour)
+                    queue.append(neighbour)
     return Skeleton(names, [parents[joint] for joint in range(len(names))])
 
 

@@ -16,11 +16,10 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
     """Return the detections of ``people`` people, with track ids ``"0"``, ``"1"``, …
 
     Tracking starts at a video's first image with at least that many people, where the most
-    confident
-    ones are numbered from left to right, and proceeds forwards and backwards. In every other image,
-    detections are assigned to people by the minimum total keypoint distance from their expected
-    positions (Hungarian method), extrapolated with constant velocity. Other detections are dropped.
-    People who swap places during occlusion may be confused.
+    confident ones are numbered from left to right, and proceeds forwards and backwards. In every
+    other image, detections are assigned to people by the minimum total keypoint distance from their
+    expected positions (Hungarian method), extrapolated with constant velocity. Other detections are
+    dropped. People who swap places during occlusion may be confused.
     """
     videos: dict[str, dict[int, list[Detection]]] = {}
     for detection in detections:
@@ -30,45 +29,40 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
         order = sorted(frames)
         full = [number for number in order if len(frames[number]) >= people]
         if not full:
-            most = max(len(found) for found in frames.values())
+            most = max(map(len, frames.values()))
             raise ValueError(f"people must be at most {most}, as in one image, got {people}")
-        confident = sorted(frames[full[0]], key=lambda found: -found.values[:, 2].mean())[:people]
-        first = sorted(confident, key=lambda found: float(_middle(found.values)[0]))
-        named = {full[0]: dict(enumerate(first))}
-        at = order.index(full[0])
-        for way in (order[at + 1 :], order[:at][::-1]):
-            followed = [_Person(found) for found in first]
-            for number in way:
-                named[number] = _assigned(frames[number], followed, number)
-                for person, found in named[number].items():
-                    followed[person] = _Person(found, followed[person].last)
+        confident = sorted(frames[full[0]], key=lambda one: -one.values[:, 2].mean())[:people]
+        first = sorted(confident, key=lambda one: float(_middle(one.values)[0]))
+        tracked = {full[0]: dict(enumerate(first))}
+        start = order.index(full[0])
+        for numbers in (order[start + 1 :], order[:start][::-1]):
+            followed: list[tuple[Detection, Detection | None]] = [(one, None) for one in first]
+            for number in numbers:
+                expected = [_expected(*pair, number) for pair in followed]
+                tracked[number] = _assigned(frames[number], expected)
+                for person, one in tracked[number].items():
+                    followed[person] = one, followed[person][0]
         for number in order:
-            linked += [replace(found, person=str(k)) for k, found in sorted(named[number].items())]
+            linked += [replace(one, person=str(k)) for k, one in sorted(tracked[number].items())]
     return linked
 
 
-class _Person:
-    """Last detection of a person and the velocity of its mean keypoint."""
-
-    def __init__(self, last: Detection, before: Detection | None = None) -> None:
-        self.last = last
-        self.step = np.zeros(2)
-        if before is not None:
-            self.step = _middle(last.values) - _middle(before.values)
-            self.step /= last.frame - before.frame
-
-    def expected(self, frame: int) -> np.ndarray:
-        values = self.last.values.copy()
-        values[:, :2] += self.step * (frame - self.last.frame)
-        return values
+def _expected(last: Detection, before: Detection | None, frame: int) -> np.ndarray:
+    """Return a person's keypoints in ``frame``, moved at the velocity of their mean."""
+    values = last.values.copy()
+    if before is not None:
+        step = _middle(last.values) - _middle(before.values)
+        step /= last.frame - before.frame
+        values[:, :2] += step * (frame - last.frame)
+    return values
 
 
-def _assigned(found: list[Detection], followed: list[_Person], frame: int) -> dict[int, Detection]:
+def _assigned(detections: list[Detection], expected: list[np.ndarray]) -> dict[int, Detection]:
+    """Return the detection of each person in the image, if there is one."""
     from scipy.optimize import linear_sum_assignment
 
-    where = [person.expected(frame) for person in followed]
-    cost = np.array([[_distance(expected, one.values) for one in found] for expected in where])
-    return {int(k): found[int(one)] for k, one in zip(*linear_sum_assignment(cost), strict=True)}
+    cost = np.array([[_distance(where, one.values) for one in detections] for where in expected])
+    return {int(k): detections[i] for k, i in zip(*linear_sum_assignment(cost), strict=True)}
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> float:

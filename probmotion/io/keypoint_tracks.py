@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.io.errors import MotionFileError, shortened
+from probmotion.io.errors import LARGEST, MotionFileError, errors_in, shortened
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["Detection", "Frames", "frame_number", "keypoint_values", "natural", "tracks_of"]
 
-_LARGEST = 1e9
 _LONGEST_TRACK = 500_000
 
 
@@ -45,11 +44,8 @@ def keypoint_values(value: Any, where: str) -> np.ndarray:
             f"{where}: expected a list of x, y, confidence per keypoint, got {shortened(value)}"
         )
     for number in value:
-        if (
-            isinstance(number, bool)
-            or not isinstance(number, int | float)
-            or abs(number) > _LARGEST
-        ):
+        real = isinstance(number, int | float) and not isinstance(number, bool)
+        if not real or abs(number) > LARGEST:
             raise MotionFileError(
                 f"{where}: expected numbers between -1e9 and 1e9, got {shortened(number)}"
             )
@@ -69,24 +65,17 @@ def frame_number(image: Any, where: str) -> tuple[str, int]:
 
     The frame is the last number in the image's name; the rest of it names the video.
     """
-    if isinstance(image, int) and not isinstance(image, bool):
-        return "", _frame(str(image), where)
+    if isinstance(image, int) and not isinstance(image, bool) and image >= 0:
+        image = str(image)
     stem = re.sub(r"\.[A-Za-z]\w*$", "", image) if isinstance(image, str) else ""
     numbers = list(re.finditer(r"[0-9]+", stem))
-    if not numbers:
+    if not numbers or len(numbers[-1][0]) > 18:
         raise MotionFileError(
-            f"{where}: expected a name with a frame number, got {shortened(image)}"
+            f"{where}: expected a name with a frame number of at most 18 digits, got "
+            f"{shortened(image)}"
         )
     last = numbers[-1]
-    return stem[: last.start()] + stem[last.end() :], _frame(last[0], where)
-
-
-def _frame(number: str, where: str) -> int:
-    if not number.isdecimal() or len(number) > 18:
-        raise MotionFileError(
-            f"{where}: expected a frame number of at most 18 digits, got {shortened(number)}"
-        )
-    return int(number)
+    return stem[: last.start()] + stem[last.end() :], int(last[0])
 
 
 def natural(text: str) -> tuple[tuple[str, int], ...]:
@@ -105,8 +94,7 @@ def tracks_of(
     """Return one track per video and person, sorted by both.
 
     Tracks span all frames of their video, by default from the first to the last detection;
-    keypoints of
-    missing detections are NaN with confidence 0.
+    keypoints of missing detections are NaN with confidence 0.
     """
     unnamed = sum(detection.person is None for detection in detections)
     if 0 < unnamed < len(detections):
@@ -120,12 +108,12 @@ def tracks_of(
         seen.setdefault(detection.video, []).append(detection.frame)
         track = grouped.setdefault((detection.video, detection.person or ""), {})
         if detection.frame in track:
-            who = "two people without track ids"
+            got = "two people without track ids"
             if detection.person is not None:
-                who = f"person {shortened(detection.person)} twice"
+                got = f"person {shortened(detection.person)} twice"
             raise MotionFileError(
                 f"{detection.where}: expected unique track ids (track_id, idx or person_id), got "
-                f"{who} in frame {detection.frame}; set people to follow people without ids"
+                f"{got} in frame {detection.frame}; set people to follow people without ids"
             )
         track[detection.frame] = detection
     if frames is None:
@@ -145,8 +133,6 @@ def tracks_of(
         words = [file.stem, video if len(seen) > 1 else "", person]
         name = " ".join(word for word in words if word)
         keypoints = np.where(confidence[..., np.newaxis] > 0, values[..., :2], np.nan)
-        try:
+        with errors_in(file):
             tracks.append(KeypointTrack(keypoints, confidence, skeleton, fps, name))
-        except ValueError as error:
-            raise MotionFileError(f"{file}: {error}") from error
     return tracks

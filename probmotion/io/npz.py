@@ -32,13 +32,20 @@ from typing import Any, NoReturn
 import numpy as np
 
 from probmotion.files import written_whole
-from probmotion.io.errors import MotionFileError, MotionFileWarning, read_bytes, shortened
+from probmotion.io.errors import (
+    LARGEST,
+    MotionFileError,
+    MotionFileWarning,
+    errors_in,
+    read_bytes,
+    shortened,
+)
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_shape
 
 __all__ = ["Archive", "read_keypoint_npz", "read_npz", "write_npz"]
 
-_LARGEST = 1e9
 # Rotation from Z up to Y up: (x, y, z) becomes (x, z, -y).
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -49,11 +56,6 @@ def read_npz(path: str | Path) -> Motion:
     Several people become one skeleton with one root each and joints named ``person:joint``. Z-up
     worlds are rotated to Y up about the x axis. Joints without a position in any frame are dropped
     with a :class:`MotionFileWarning`.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def read_npz(path: str | Path) -> Motion:
     skeleton = archive.skeleton(positions.shape[-2])
     fps = archive.frame_rate()
     turn = archive.turn_to_y_up()
-    try:
+    with errors_in(archive.path):
         if positions.ndim == 4:
             skeleton = _crowd(skeleton, archive.names("persons", "person", positions.shape[1]))
             positions = positions.reshape(len(positions), -1, 3)
@@ -81,27 +83,10 @@ def read_npz(path: str | Path) -> Motion:
             rest_offsets=rest_offsets,
             name=archive.word("name", archive.path.stem),
         )
-    except MotionFileError:
-        raise
-    except ValueError as error:
-        raise MotionFileError(f"{archive.path}: {error}") from error
 
 
 def write_npz(motion: Motion, path: str | Path) -> None:
-    """Write a motion to an ``.npz`` archive, without loss.
-
-    Parameters
-    ----------
-    motion : Motion
-        Motion to write.
-    path : str or Path
-        The file, written atomically.
-
-    Raises
-    ------
-    OSError
-        If the folder is missing or not writable.
-    """
+    """Write a motion to an ``.npz`` archive, without loss and atomically."""
     skeleton = motion.skeleton
     arrays: dict[str, Any] = {
         "positions": motion.positions,
@@ -123,12 +108,7 @@ def write_npz(motion: Motion, path: str | Path) -> None:
 def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[KeypointTrack]:
     """Read the keypoint tracks of an ``.npz`` archive, one per camera.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    fps : float, optional
-        Frames per second; the file's own by default.
+    ``fps`` replaces the file's frame rate.
 
     Raises
     ------
@@ -148,13 +128,11 @@ def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[Keypoi
         names = [f"{archive.path.stem} {camera}" for camera in cameras]
     else:
         keypoints, confidence = keypoints[np.newaxis], confidence[np.newaxis]
-    try:
+    with errors_in(archive.path):
         return [
             KeypointTrack(points, weights, skeleton, rate, name=name)
             for points, weights, name in zip(keypoints, confidence, names, strict=True)
         ]
-    except ValueError as error:
-        raise MotionFileError(f"{archive.path}: {error}") from error
 
 
 class Archive:
@@ -169,20 +147,18 @@ class Archive:
         except Exception as error:  # damaged zip files raise many types, including MemoryError
             raise MotionFileError(f"{path}: expected an npz archive ({str(error)[:80]})") from error
 
-    def fail(self, problem: str) -> NoReturn:
-        raise MotionFileError(f"{self.path}: {problem}")
+    def fail(self, problem: str, cause: Exception | None = None) -> NoReturn:
+        raise MotionFileError(f"{self.path}: {problem}") from cause
 
     def array(self, key: str) -> np.ndarray:
         if key not in self.keys:
-            found = ", ".join(name[:40] for name in self.keys[:12]) or "none"
-            self.fail(f"expected the key {key}, got {found}")
+            present = ", ".join(name[:40] for name in self.keys[:12]) or "none"
+            self.fail(f"expected the key {key}, got {present}")
         try:
             member = io.BytesIO(self.zip.read(f"{key}.npy"))
             return np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # see __init__; pickled object arrays raise ValueError
-            raise MotionFileError(
-                f"{self.path}: expected numbers or strings in {key} ({str(error)[:80]})"
-            ) from error
+            self.fail(f"expected numbers or strings in {key} ({str(error)[:80]})", error)
 
     def numbers(self, key: str) -> np.ndarray:
         """Return an array as float64; NaN is accepted, infinite and huge numbers are not."""
@@ -190,9 +166,9 @@ class Archive:
         if array.dtype.kind not in "fiu":
             self.fail(f"{key} must contain real numbers, got {shortened(array.dtype)}")
         array = array.astype(np.float64)
-        absurd = np.abs(array) > _LARGEST
-        if absurd.any():
-            self.fail(f"{key} must be between -1e9 and 1e9, got {array[absurd][0]:g}")
+        huge = np.abs(array) > LARGEST
+        if huge.any():
+            self.fail(f"{key} must be between -1e9 and 1e9, got {array[huge][0]:g}")
         return array
 
     def points(self, key: str, shapes: str) -> np.ndarray:
@@ -202,18 +178,14 @@ class Archive:
             self.fail(f"{key} must have shape {shapes}, none of it 0, got {array.shape}")
         return array
 
-    def names(self, key: str, kind: str, count: int) -> list[str]:
-        """Return ``count`` names; ``person0``, ``person1``, … if ``key`` is missing."""
-        if key not in self.keys:
+    def names(self, key: str, kind: str | None, count: int) -> list[str]:
+        """Return ``count`` names, by default ``person0``, ``person1``, … if a kind is given."""
+        if kind is not None and key not in self.keys:
             return [f"{kind}{index}" for index in range(count)]
         array = self.array(key)
         if array.dtype.kind != "U" or array.shape != (count,):
             self.fail(f"{key} must be {count} strings, got {array.dtype} of shape {array.shape}")
         return array.tolist()
-
-    def joint_names(self, count: int) -> list[str]:
-        self.array("joint_names")  # required, unlike other names
-        return self.names("joint_names", "joint", count)
 
     def word(self, key: str, default: str) -> str:
         """Return the string of ``key``, ``default`` if it is missing."""
@@ -231,15 +203,13 @@ class Archive:
         return fps.item()
 
     def skeleton(self, n_joints: int) -> Skeleton:
-        names = self.joint_names(n_joints)
+        names = self.names("joint_names", None, n_joints)
         parents = self.numbers("parents")
         if parents.shape != (n_joints,) or (parents != np.round(parents)).any():
             self.fail(f"parents must be {n_joints} integers, got shape {parents.shape}")
-        sizes = self.numbers("radii").ravel().tolist() if "radii" in self.keys else None
-        try:
-            return Skeleton(names, [int(parent) for parent in parents], sizes)
-        except ValueError as error:
-            raise MotionFileError(f"{self.path}: {error}") from error
+        radii = self.numbers("radii").ravel().tolist() if "radii" in self.keys else None
+        with errors_in(self.path):
+            return Skeleton(names, [int(parent) for parent in parents], radii)
 
     def turn_to_y_up(self) -> np.ndarray | None:
         """Return the rotation from the file's world to Y up, None for the identity."""
@@ -255,12 +225,8 @@ class Archive:
         if "rotations" not in self.keys:
             return None, None
         rotations, rest_offsets = self.numbers("rotations"), self.numbers("rest_offsets")
-        for key, array, expected in (
-            ("rotations", rotations, (frames, n_joints, 3, 3)),
-            ("rest_offsets", rest_offsets, (n_joints, 3)),
-        ):
-            if array.shape != expected:
-                self.fail(f"{key} must have shape {expected}, got {array.shape}")
+        check_shape("rotations", rotations, (frames, n_joints, 3, 3))
+        check_shape("rest_offsets", rest_offsets, (n_joints, 3))
         return rotations, rest_offsets
 
 
@@ -283,11 +249,10 @@ def _without_unseen(
     unseen = np.isnan(positions).all(axis=(0, 2))
     if not unseen.any() or unseen.all():
         return positions, skeleton
-    left_out = ", ".join(np.array(skeleton.joint_names)[unseen])
+    dropped = ", ".join(np.array(skeleton.joint_names)[unseen])
     warnings.warn(
-        f"{path}: dropping the joints {left_out}, which have no position in any frame",
+        f"{path}: dropping the joints {dropped}, which have no position in any frame",
         MotionFileWarning,
         stacklevel=4,
     )
-    kept = np.flatnonzero(~unseen)
-    return positions[:, kept], skeleton.subset(kept.tolist())
+    return positions[:, ~unseen], skeleton.subset(np.flatnonzero(~unseen).tolist())

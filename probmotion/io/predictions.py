@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.io.errors import MotionFileError
+from probmotion.io.errors import errors_in
 from probmotion.io.npz import Archive
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -59,8 +59,9 @@ def read_predictions(
     if fps is not None:
         check_positive("fps", fps)
     archive = Archive(Path(path))
-    motions = [_on(motion, skeleton, fps, archive) for motion in _motions(archive)]
-    positions = np.stack(motions)
+    with errors_in(archive.path):
+        motions = [motion.retarget(skeleton) for motion in _motions(archive)]
+    positions = np.stack([(m if fps is None else m.resample(fps)).positions for m in motions])
     root = skeleton.roots[0]
     positions = positions - positions[:, :, root : root + 1]
     if frames is None:
@@ -78,25 +79,10 @@ def _motions(archive: Archive) -> list[Motion]:
     """Return the file's motions, Y up, on a skeleton without bones."""
     positions = archive.points("positions", "(L, J, 3) or (N, L, J, 3)")
     n_joints = positions.shape[-2]
-    names = archive.joint_names(n_joints)
+    boneless = Skeleton(archive.names("joint_names", None, n_joints), [-1] * n_joints)
     rate = archive.frame_rate()
     turn = archive.turn_to_y_up()
-    try:
-        check_finite("positions", positions)
-        if turn is not None:
-            positions = positions @ turn.T
-        boneless = Skeleton(names, [-1] * n_joints)
-        return [
-            Motion(clip, boneless, rate) for clip in positions.reshape(-1, *positions.shape[-3:])
-        ]
-    except ValueError as error:
-        raise MotionFileError(f"{archive.path}: {error}") from error
-
-
-def _on(motion: Motion, skeleton: Skeleton, fps: float | None, archive: Archive) -> np.ndarray:
-    """Return the positions of a motion on ``skeleton`` at ``fps``."""
-    try:
-        found = motion.retarget(skeleton)
-    except ValueError as error:
-        raise MotionFileError(f"{archive.path}: {error}") from error
-    return (found if fps is None else found.resample(fps)).positions
+    check_finite("positions", positions)
+    if turn is not None:
+        positions = positions @ turn.T
+    return [Motion(clip, boneless, rate) for clip in positions.reshape(-1, *positions.shape[-3:])]

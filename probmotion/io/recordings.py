@@ -14,6 +14,7 @@ import numpy as np
 
 from probmotion.geometry.cameras import Cameras
 from probmotion.geometry.triangulation import triangulate
+from probmotion.io.errors import errors_in
 from probmotion.io.npz import Archive
 from probmotion.motion.occlusion import joints_at_rate, joints_on_skeleton
 from probmotion.motion.skeleton import Skeleton
@@ -53,8 +54,7 @@ class Recording:
         """Where joints are triangulated, (L, J).
 
         Detection confidence is no further indicator of quality: its correlation with the distance
-        between
-        triangulated and filtered joints is -0.02.
+        between triangulated and filtered joints is -0.02.
         """
         return np.isfinite(self.joints).all(axis=-1)
 
@@ -99,21 +99,18 @@ def read_recording(
     source = archive.skeleton(keypoints.shape[2])
     target = Skeleton.preset("person14") if skeleton is None else skeleton
     weights = _weights(archive, keypoints, confidence, threshold)
-    cameras, matrix, distortion = _calibration(archive, len(keypoints))
-    pixels = undistorted(keypoints, matrix, distortion, cameras)
+    cameras, K, distortion = _calibration(archive, len(keypoints))
+    pixels = undistorted(keypoints, K, distortion, cameras)
     joints = triangulate_seen(pixels, cameras, weights)
     turn = archive.turn_to_y_up()
     if turn is not None:
         joints, filtered = joints @ turn.T, filtered @ turn.T
     rate = archive.frame_rate()
-    wanted = rate if fps is None else float(fps)
-    return Recording(
-        _converted(joints, source, target, rate, wanted),
-        _converted(filtered, source, target, rate, wanted),
-        target,
-        wanted,
-        archive.word("name", archive.path.stem),
+    new_rate = rate if fps is None else float(fps)
+    joints, filtered = (
+        _converted(points, source, target, rate, new_rate) for points in (joints, filtered)
     )
+    return Recording(joints, filtered, target, new_rate, archive.word("name", archive.path.stem))
 
 
 def _weights(
@@ -136,17 +133,13 @@ def _weights(
 def _calibration(archive: Archive, n_views: int) -> tuple[Cameras, np.ndarray, np.ndarray]:
     """Return the cameras, K and distortion."""
     shapes = {"K": (3, 3), "R": (3, 3), "t": (3,), "distortion": (4,)}
-    found = {key: archive.numbers(key) for key in shapes}
-    try:
-        for key, array in found.items():
-            check_shape(key, array, (n_views, *shapes[key]))
+    K, R, t, distortion = (archive.numbers(key) for key in shapes)
+    with errors_in(f"{archive.path}: K, R, t and distortion must describe cameras"):
+        for (key, shape), array in zip(shapes.items(), (K, R, t, distortion), strict=True):
+            check_shape(key, array, (n_views, *shape))
             check_finite(key, array)
-        matrix = found["K"]
-        focal, centre = matrix[:, [0, 1], [0, 1]].mean(axis=1), matrix[:, :2, 2]
-        cameras = Cameras(found["R"], found["t"], focal, centre, orthographic=False)
-    except ValueError as error:
-        archive.fail(f"K, R, t and distortion must describe cameras: {error}")
-    return cameras, matrix, found["distortion"]
+        focal, centre = K[:, [0, 1], [0, 1]].mean(axis=1), K[:, :2, 2]
+        return Cameras(R, t, focal, centre, orthographic=False), K, distortion
 
 
 def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarray) -> np.ndarray:
@@ -155,52 +148,44 @@ def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarra
     Keypoints of weight 0, (V, L, J), are ignored.
     """
     seen = (weights > 0).sum(axis=0) >= 2
-    found = np.full((*seen.shape, 3), np.nan)
+    points = np.full((*seen.shape, 3), np.nan)
     if seen.any():
         # All joints of all frames, as one frame.
-        points = triangulate(keypoints[:, None, seen], cameras, weights[:, None, seen])
-        found[seen] = points[0]
-    return found
+        points[seen] = triangulate(keypoints[:, None, seen], cameras, weights[:, None, seen])[0]
+    return points
 
 
 def undistorted(
-    keypoints: np.ndarray, matrix: np.ndarray, distortion: np.ndarray, cameras: Cameras
+    keypoints: np.ndarray, K: np.ndarray, distortion: np.ndarray, cameras: Cameras
 ) -> np.ndarray:
-    """Return pixels (V, L, J, 2) as projected by pinhole cameras with the intrinsics of
-    ``cameras``.
+    """Return pixels (V, L, J, 2) as projected by pinhole cameras with the intrinsics of `cameras`.
 
     A lens with intrinsics K (V, 3, 3) and coefficients k₁, k₂, p₁, p₂ (V, 4) maps slopes (x, y),
-    with
-    r² = x² + y², to
+    with r² = x² + y², to
 
         x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²), and with y and x, p₁ and p₂ exchanged,
 
-    which is inverted by fixed-point iteration. (Source: OpenCV's documentation of the pinhole
-    model.)
+    which is inverted by fixed-point iteration. Source: OpenCV's documentation of the pinhole model.
     """
     assert cameras.centre is not None
-    focal, centre = matrix[:, None, None, [0, 1], [0, 1]], matrix[:, None, None, :2, 2]
-    bent = (keypoints - centre) / focal
+    focal, centre = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
+    distorted = (keypoints - centre) / focal
     k1, k2, p1, p2 = distortion.T[:, :, None, None]
-    straight = bent
+    slopes = distorted
     for _ in range(_FIXED_POINT_STEPS):
-        x, y = straight[..., 0], straight[..., 1]
+        x, y = slopes[..., 0], slopes[..., 1]
         square = x**2 + y**2
-        aside = np.stack(
-            [
-                2 * p1 * x * y + p2 * (square + 2 * x**2),
-                2 * p2 * x * y + p1 * (square + 2 * y**2),
-            ],
-            axis=-1,
-        )
-        straight = (bent - aside) / (1 + k1 * square + k2 * square**2)[..., None]
-    return straight * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
+        along_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
+        along_y = 2 * p2 * x * y + p1 * (square + 2 * y**2)
+        tangential = np.stack([along_x, along_y], axis=-1)
+        slopes = (distorted - tangential) / (1 + k1 * square + k2 * square**2)[..., None]
+    return slopes * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
 
 
 def _converted(
-    joints: np.ndarray, source: Skeleton, target: Skeleton, rate: float, wanted: float
+    joints: np.ndarray, source: Skeleton, target: Skeleton, rate: float, new_rate: float
 ) -> np.ndarray:
     """Return joints (L, J, 3), NaN where occluded, on another skeleton and at another rate."""
     weights = np.isfinite(joints).all(axis=-1).astype(np.float64)
     joints, weights = joints_on_skeleton(joints, weights, source, target)
-    return joints if wanted == rate else joints_at_rate(joints, weights, rate, wanted)[0]
+    return joints if new_rate == rate else joints_at_rate(joints, weights, rate, new_rate)[0]

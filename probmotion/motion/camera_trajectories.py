@@ -113,7 +113,10 @@ def fit_trajectory(
     local = np.asarray(local, dtype=np.float64)
     check_shape("local", local, (track.frames, track.skeleton.n_joints, 3))
     check_finite("local", local)
-    _refuse_camera(camera)
+    if camera.n_views != 1:
+        raise ValueError(f"camera must be one view, got {camera.n_views}")
+    if camera.orthographic:
+        raise ValueError("camera must be perspective to determine depth, got an orthographic one")
     focal = float(camera.focal[0])
     scale = focal / 40 if scale is None else scale
     check_positive("scale", scale)
@@ -121,9 +124,12 @@ def fit_trajectory(
         smoothness_weight = (focal / 30) ** 2
     check_positive("smoothness_weight", smoothness_weight)
     check_count("max_iterations", max_iterations)
-    objective = _Objective(local, *_detections(track, camera), focal, float(smoothness_weight))
-    found, cost, iterations, converged = _minimum(objective, scale, max_iterations)
-    translations, orientations = np.split(found.reshape(-1, 6), 2, axis=1)
+    assert camera.centre is not None
+    centred = track.keypoints - camera.centre[0]
+    detections = np.where(track.confidence[..., None] > 0, centred, 0.0)
+    objective = _Objective(local, detections, track.confidence, focal, float(smoothness_weight))
+    parameters, cost, iterations, converged = _minimum(objective, scale, max_iterations)
+    translations, orientations = np.split(parameters.reshape(-1, 6), 2, axis=1)
     points = objective.points(translations, orientations)
     if points[..., 2].min() <= _NEAR:
         frame, joint = np.argwhere(points[..., 2] <= _NEAR)[0]
@@ -132,14 +138,8 @@ def fit_trajectory(
             f"{points[frame, joint, 2]:.3g} m for joint {joint} of frame {frame}; check the "
             "camera's focal length and axes"
         )
-    return CameraTrajectory(
-        positions=(points - camera.translation[0]) @ camera.rotation[0],
-        translations=translations,
-        orientations=orientations,
-        cost=cost,
-        iterations=iterations,
-        converged=converged,
-    )
+    positions = (points - camera.translation[0]) @ camera.rotation[0]
+    return CameraTrajectory(positions, translations, orientations, cost, iterations, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +162,10 @@ class _Objective:
         translations, orientations = np.split(parameters.reshape(-1, 6), 2, axis=1)
         points = self.points(translations, orientations)
         inverse, slope = _inverse_depth(points[..., 2])
-        apart = self.focal * points[..., :2] * inverse[..., None] - self.detections
-        robust, weight = geman_mcclure((apart**2).sum(axis=-1), scale)
+        residual = self.focal * points[..., :2] * inverse[..., None] - self.detections
+        robust, weight = geman_mcclure((residual**2).sum(axis=-1), scale)
         cost = float((self.confidence * robust).sum())
-        pull = (2 * self.focal) * (self.confidence * weight)[..., None] * apart
+        pull = (2 * self.focal) * (self.confidence * weight)[..., None] * residual
         by_point = np.empty_like(points)
         by_point[..., :2] = pull * inverse[..., None]
         by_point[..., 2] = (pull * points[..., :2]).sum(axis=-1) * slope
@@ -206,7 +206,7 @@ def _minimum(
 ) -> tuple[np.ndarray, float, int, bool]:
     """Return (r_t, φ_t), the cost, the number of iterations and whether the last fit converged."""
     start = _initial_translations(objective)
-    found = np.concatenate([start, np.zeros_like(start)], axis=1).ravel()
+    parameters = np.concatenate([start, np.zeros_like(start)], axis=1).ravel()
     iterations = 0
     # L-BFGS tolerances are absolute below 1; dividing by this unit makes them scale-free.
     unit = (objective.focal / 1000) ** 2
@@ -215,45 +215,25 @@ def _minimum(
         cost, gradient = objective.cost_and_gradient(parameters, scale)
         return cost / unit, gradient / unit
 
+    limits = {"maxiter": max_iterations, "maxfun": 10 * max_iterations}
     for multiple in _SCHEDULE:
         result = minimize(
             scaled,
-            found,
+            parameters,
             args=(multiple * scale,),
             jac=True,
             method="L-BFGS-B",
-            options={
-                "maxiter": max_iterations,
-                "maxfun": 10 * max_iterations,
-                "maxcor": 30,
-                "ftol": 1e-10,
-                "gtol": 1e-6,
-            },
+            options=limits | {"maxcor": 30, "ftol": 1e-10, "gtol": 1e-6},
         )
-        found, iterations = result.x, iterations + int(result.nit)
-    return result.x, unit * float(result.fun), iterations, bool(result.success)
-
-
-def _refuse_camera(camera: Cameras) -> None:
-    if camera.n_views != 1:
-        raise ValueError(f"camera must be one view, got {camera.n_views}")
-    if camera.orthographic:
-        raise ValueError("camera must be perspective to determine depth, got an orthographic one")
-
-
-def _detections(track: KeypointTrack, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Return the detections relative to the principal point, 0 where missing, and confidences."""
-    assert camera.centre is not None
-    centred = track.keypoints - camera.centre[0]
-    return np.where(track.confidence[..., None] > 0, centred, 0.0), track.confidence
+        parameters, iterations = result.x, iterations + int(result.nit)
+    return parameters, unit * float(result.fun), iterations, bool(result.success)
 
 
 def _initial_translations(objective: _Objective) -> np.ndarray:
     """Return r of each frame for φ = 0 by confidence-weighted linear least squares, (L, 3).
 
     Each detection gives f (X + r_x) = u (Z + r_z) and its counterpart in y. Frames with fewer than
-    two
-    detections, or a solution behind the camera, are interpolated.
+    two detections, or a solution behind the camera, are interpolated.
     """
     local, image, focal = objective.local, objective.detections, objective.focal
     L, J, _ = local.shape
@@ -264,15 +244,16 @@ def _initial_translations(objective: _Objective) -> np.ndarray:
     weighted = objective.confidence[..., None, None] * rows
     normal = np.einsum("ljka,ljkb->lab", weighted, rows)
     pull = np.einsum("ljka,ljk->la", weighted, right)
-    found = np.zeros((L, 3))
+    translations = np.zeros((L, 3))
     enough = (objective.confidence > 0).sum(axis=1) >= 2
     enough[enough] = np.linalg.cond(normal[enough]) < 1e12
-    found[enough] = np.linalg.solve(normal[enough], pull[enough][..., None])[..., 0]
-    good = enough & ((found[:, None] + local)[..., 2].min(axis=1) > _NEAR)
+    translations[enough] = np.linalg.solve(normal[enough], pull[enough][..., None])[..., 0]
+    good = enough & ((translations[:, None] + local)[..., 2].min(axis=1) > _NEAR)
     if not good.any():
         raise ValueError(
             f"track must determine a position in front of the camera in at least one of its {L} "
             "frames, from at least two joints of confidence above 0 in the camera's image units"
         )
     known = np.flatnonzero(good)
-    return np.stack([np.interp(np.arange(L), known, found[known, axis]) for axis in range(3)], -1)
+    frames = np.arange(L)
+    return np.stack([np.interp(frames, known, column) for column in translations[known].T], -1)

@@ -65,8 +65,7 @@ def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
     """Return the mean distance from draws to the nearest real motion, and the reverse.
 
     Draws can copy one real motion, so both directions are needed. Both decrease with the size of
-    the
-    other set: compare samplers at equal sizes.
+    the other set: compare samplers at equal sizes.
 
     Parameters
     ----------
@@ -88,8 +87,7 @@ def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
     """Return the fraction of draws that are farther from real motion than their depth mirror image.
 
     Mirroring exchanges near and far but not joint names: knees bend backwards. Orthographic cameras
-    at
-    elevation 0 cannot distinguish the two, which gives 0.5.
+    at elevation 0 cannot distinguish the two, which gives 0.5.
 
     Parameters
     ----------

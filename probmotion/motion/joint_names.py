@@ -58,37 +58,20 @@ _SIDED: dict[str, tuple[str, ...]] = {
 }
 # Names in CMU's ASF files, where a joint is the end of the bone.
 _ASF_CENTRAL = {
-    "root": "pelvis",
-    "lowerback": "lower_spine",
-    "upperback": "spine",
-    "thorax": "chest",
-    "lowerneck": "neck",
-    "upperneck": "upper_neck",
-    "head": "head",
-}
+    "root": "pelvis", "lowerback": "lower_spine", "upperback": "spine", "thorax": "chest",
+    "lowerneck": "neck", "upperneck": "upper_neck", "head": "head",
+}  # fmt: skip
 _ASF_SIDED = {
-    "hipjoint": "hip",
-    "femur": "knee",
-    "tibia": "ankle",
-    "foot": "foot",
-    "toes": "toe",
-    "clavicle": "shoulder",
-    "humerus": "elbow",
-    "radius": "wrist",
-    "wrist": "palm",
-    "hand": "hand",
-    "fingers": "fingers",
-    "thumb": "thumb",
-}
+    "hipjoint": "hip", "femur": "knee", "tibia": "ankle", "foot": "foot", "toes": "toe",
+    "clavicle": "shoulder", "humerus": "elbow", "radius": "wrist", "wrist": "palm", "hand": "hand",
+    "fingers": "fingers", "thumb": "thumb",
+}  # fmt: skip
 _ASF_MARKS = frozenset(side + bone for side in "lr" for bone in ("femur", "tibia", "humerus"))
 # Names of joints called ``…_end``, by the joint before them.
 _END_OF = {
-    "ankle": "foot",
-    "foot": "toe",
-    "head": "head_top",
-    "fingers": "finger_tips",
+    "ankle": "foot", "foot": "toe", "head": "head_top", "fingers": "finger_tips",
     "thumb": "thumb_tip",
-}
+}  # fmt: skip
 _PAW_OF = {"fingers": "front_paw", "foot": "back_paw"}
 
 _PERSON = re.compile(r"^(?P<person>[^:]*):(?P<joint>.+)$")
@@ -123,7 +106,7 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
     several = len(set(people)) > 1
     result = list(names)
     for person in dict.fromkeys(people):
-        members = [index for index, found in enumerate(people) if found == person]
+        members = [index for index, other in enumerate(people) if other == person]
         bare = [_without_person(names[index]) for index in members]
         for index, canonical in zip(members, _names_of_one(bare), strict=True):
             result[index] = f"{person}:{canonical}" if several and person else canonical
@@ -197,17 +180,17 @@ def _meanings(name: str) -> tuple[str, ...]:
 def _trunk(names: list[str]) -> dict[int, str]:
     """Return the meanings of the numbered joints between pelvis and neck."""
     order = ("abdomen", "spine", "chest", "upperchest")
-    found = []
+    joints = []
     for index, name in enumerate(names):
         if match := _TRUNK.match(_word(name)):
-            found.append((order.index(match["word"]), int(match["number"] or 0), index))
-    found.sort()
-    if len(found) == 1:
-        word = order[found[0][0]]
-        return {found[0][2]: "chest" if "chest" in word else "spine"}
-    middle = ["spine"] if len(found) == 2 else ["lower_spine", "spine"]
-    wanted = [*middle, *[""] * (len(found) - len(middle) - 1), "chest"]
-    return {index: name for (_, _, index), name in zip(found, wanted, strict=False) if name}
+            joints.append((order.index(match["word"]), int(match["number"] or 0), index))
+    joints.sort()
+    if len(joints) == 1:
+        word = order[joints[0][0]]
+        return {joints[0][2]: "chest" if "chest" in word else "spine"}
+    middle = ["spine"] if len(joints) == 2 else ["lower_spine", "spine"]
+    canonical = [*middle, *[""] * (len(joints) - len(middle) - 1), "chest"]
+    return {index: name for (_, _, index), name in zip(joints, canonical, strict=False) if name}
 
 
 def _asf_name(name: str) -> str:

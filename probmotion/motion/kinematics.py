@@ -15,8 +15,8 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["fit_rotations", "forward_kinematics"]
 
-# Alternating fits of rest offsets and rotations; the initial rest pose is already close.
-_PASSES = 3
+# Number of alternating fits of rest offsets and rotations.
+_FITS = 3
 # Relative weight of the parent's rotation, which resolves only the undetermined twist.
 _TIE = 1e-12
 
@@ -27,8 +27,7 @@ def forward_kinematics(
     """Return joint positions and global rotations from local rotations.
 
     ``G_j = G_parent R_j`` and ``p_j = p_parent + G_parent o_j``; for a root, ``G_j = R_j`` and p_j
-    is
-    its translation. Accepts NumPy, torch and JAX arrays.
+    is its translation. Accepts NumPy, torch and JAX arrays.
 
     Parameters
     ----------
@@ -169,7 +168,7 @@ def _rest_offsets(bones: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(bones, axis=-1).mean(axis=0)
     rest = _of_lengths(bones[0], lengths)
     upright = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
-    for _ in range(_PASSES if len(lengths) > 1 else 0):
+    for _ in range(_FITS if len(lengths) > 1 else 0):
         turns = _best_turns(rest, bones, upright)
         rest = _of_lengths(np.einsum("lij,lci->cj", turns, bones), lengths)
     return rest

@@ -40,8 +40,7 @@ class Motion:
     ------
     ValueError
         If shapes do not fit the skeleton, a value is not finite, there is no frame, a rotation is
-        not
-        orthonormal, or ``fps`` is not positive.
+        not orthonormal, or ``fps`` is not positive.
     """
 
     positions: np.ndarray
@@ -66,10 +65,10 @@ class Motion:
             check_shape("rotations", self.rotations, (*positions.shape[:2], 3, 3))
             check_finite("rotations", self.rotations)
             product = self.rotations @ np.swapaxes(self.rotations, -1, -2)
-            gap = float(np.abs(product - np.eye(3)).max())
-            if gap > 1e-3:
+            error = float(np.abs(product - np.eye(3)).max())
+            if error > 1e-3:
                 raise ValueError(
-                    f"rotations must be orthonormal to 0.001, got a deviation of {gap:.2g}"
+                    f"rotations must be orthonormal to 0.001, got a deviation of {error:.2g}"
                 )
             check_shape("rest_offsets", self.rest_offsets, (self.skeleton.n_joints, 3))
             check_finite("rest_offsets", self.rest_offsets)
@@ -135,13 +134,9 @@ class Motion:
         """
         if self.skeleton == skeleton:
             return self
-        chosen = matching_joints(self.skeleton, skeleton)
+        positions = self.positions[:, matching_joints(self.skeleton, skeleton)]
         return replace(
-            self,
-            positions=self.positions[:, chosen],
-            skeleton=skeleton,
-            rotations=None,
-            rest_offsets=None,
+            self, positions=positions, skeleton=skeleton, rotations=None, rest_offsets=None
         )
 
     def __repr__(self) -> str:

@@ -14,10 +14,7 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["joints_at_rate", "joints_on_skeleton"]
 
-_MIDPOINTS = {
-    "pelvis": ("left_hip", "right_hip"),
-    "neck": ("left_shoulder", "right_shoulder"),
-}
+_MIDPOINTS = {"pelvis": ("left_hip", "right_hip"), "neck": ("left_shoulder", "right_shoulder")}
 
 
 def joints_on_skeleton(
@@ -26,10 +23,8 @@ def joints_on_skeleton(
     """Return joints on another skeleton, matched by their own or else their canonical names.
 
     A missing ``pelvis`` is the midpoint of the hips and a missing ``neck`` that of the shoulders.
-    With
-    precisions w/σ² of the two joints, a midpoint has the confidence 4 w_a w_b / (w_a + w_b), 0 if
-    one
-    of them is occluded. The correlation of its error with theirs is ignored.
+    With precisions w/σ² of the two joints, a midpoint has the confidence 4 w_a w_b / (w_a + w_b), 0
+    if one of them is occluded. The correlation of its error with theirs is ignored.
 
     Parameters
     ----------
@@ -56,16 +51,16 @@ def joints_on_skeleton(
     if source == target:
         return joints, confidence
     all_by_own_names = set(target.joint_names) <= set(source.joint_names)
-    found: list[tuple[np.ndarray, np.ndarray]] = []
+    matched: list[tuple[np.ndarray, np.ndarray]] = []
     missing: list[str] = []
     for name, canonical in zip(target.joint_names, target.canonical_names, strict=True):
         ends = [counterpart(source, end, end) for end in _MIDPOINTS.get(canonical, ())]
         joint = source.joint_names.index(name) if all_by_own_names else None
         joint = counterpart(source, name, canonical) if joint is None else joint
         if joint is not None:
-            found.append((joints[:, joint], confidence[:, joint]))
+            matched.append((joints[:, joint], confidence[:, joint]))
         elif ends and None not in ends:
-            found.append(_midpoint(joints, confidence, [end for end in ends if end is not None]))
+            matched.append(_midpoint(joints, confidence, [end for end in ends if end is not None]))
         else:
             missing.append(name)
     if missing:
@@ -73,7 +68,7 @@ def joints_on_skeleton(
             f"skeleton must contain the prior's joints, got no {', '.join(missing)} among "
             f"{', '.join(source.joint_names)}"
         )
-    points, weights = zip(*found, strict=True)
+    points, weights = zip(*matched, strict=True)
     return np.stack(points, axis=1), np.stack(weights, axis=1)
 
 
@@ -83,9 +78,8 @@ def joints_at_rate(
     """Return joints at another frame rate, interpolated linearly between neighbouring frames.
 
     Frames are those of :func:`~probmotion.motion.resampling.resample`. A joint is occluded if
-    either
-    neighbour with a nonzero fraction is. For fractions 1 − a and a of frames with precisions w/σ²,
-    the confidence is 1 / ((1 − a)²/w₁ + a²/w₂).
+    either neighbour with a nonzero fraction is. For fractions 1 − a and a of frames with precisions
+    w/σ², the confidence is 1 / ((1 − a)²/w₁ + a²/w₂).
 
     Parameters
     ----------

@@ -37,11 +37,10 @@ _TREES = {
     # OpenPose's BODY_25.
     "body25": """
         nose:neck neck:pelvis right_shoulder:neck right_elbow:right_shoulder
-        right_wrist:right_elbow left_shoulder:neck left_elbow:left_shoulder
-        left_wrist:left_elbow pelvis right_hip:pelvis right_knee:right_hip
-        right_ankle:right_knee left_hip:pelvis left_knee:left_hip left_ankle:left_knee
-        right_eye:nose left_eye:nose right_ear:right_eye left_ear:left_eye
-        left_big_toe:left_ankle left_small_toe:left_ankle left_heel:left_ankle
+        right_wrist:right_elbow left_shoulder:neck left_elbow:left_shoulder left_wrist:left_elbow
+        pelvis right_hip:pelvis right_knee:right_hip right_ankle:right_knee left_hip:pelvis
+        left_knee:left_hip left_ankle:left_knee right_eye:nose left_eye:nose right_ear:right_eye
+        left_ear:left_eye left_big_toe:left_ankle left_small_toe:left_ankle left_heel:left_ankle
         right_big_toe:right_ankle right_small_toe:right_ankle right_heel:right_ankle""",
     # OpenPose's BODY_25B, without pelvis: the hips are children of the neck.
     "body25b": """

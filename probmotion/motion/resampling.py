@@ -21,8 +21,7 @@ def resample(
     """Return positions (L, J, 3) and rotations (L, J, 3, 3) at another frame rate.
 
     Positions are interpolated linearly and rotations along the geodesic. The first frame is kept
-    and
-    nothing is extrapolated: the duration decreases by less than one new frame.
+    and nothing is extrapolated: the duration decreases by less than one new frame.
 
     Raises
     ------

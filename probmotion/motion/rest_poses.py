@@ -19,11 +19,11 @@ import numpy as np
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["estimate_rest_pose", "is_four_legged"]
+__all__ = ["estimate_rest_pose", "is_four_legged", "joint_positions"]
 
-_PASSES = 5000
+_MAX_ITERATIONS = 5000
 """Maximum number of principal-factor iterations; 1000 occur if one bone moves most."""
-_SETTLED = 1e-8
+_TOLERANCE = 1e-8
 """Relative change of the diagonal at convergence."""
 _AMBIGUOUS = 0.01
 """Forward offset in metres below which the front is undetermined."""
@@ -40,15 +40,12 @@ def estimate_rest_pose(
     """Return the rest pose with mean bone directions, estimated from 2D tracks.
 
     2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. The heights of bones
-    are
-    means over frames; X and Z are factors of 2 E[x_a x_b] (see the module), Z from pairs of
-    different
-    bones only. The squared length is 2 E[x²] + E[y²].
+    are means over frames; X and Z are factors of 2 E[x_a x_b] (see the module), Z from pairs of
+    different bones only. The squared length is 2 E[x²] + E[y²].
 
     Not modelled: camera elevation, which shortens heights by its cosine (2 % at π/16); perspective;
     detection errors, which add six times the coordinate variance to the squared length; and the
-    finite
-    number N of azimuths, about 1/√(2N) of a length.
+    finite number N of azimuths, about 1/√(2N) of a length.
 
     Depth is determined up to a reflection that exchanges front and back. Knees, toes and noses of
     people and heads of quadrupeds are in front; other bodies need ``front``. A body without
@@ -68,8 +65,7 @@ def estimate_rest_pose(
     -------
     ndarray, (J, 3)
         Offset of each joint from its parent, metres, 0 for the root; +Y is up, the body faces +Z
-        and
-        its left is at +X. Left and right are symmetric.
+        and its left is at +X. Left and right are symmetric.
 
     Raises
     ------
@@ -87,7 +83,10 @@ def estimate_rest_pose(
     length = np.sqrt(np.diag(gram) + (up**2).sum(axis=0) / count)
     if skeleton.mirrored_pairs:
         even, odd = _sides(skeleton)
-        x, z = _halves(gram, even, odd, _trunk_pairs(skeleton))
+        # Pairs with a common parent: hips and shoulders.
+        parents = skeleton.parents
+        trunk = [float(parents[a] == parents[b]) for a, b in skeleton.mirrored_pairs]
+        x, z = _halves(gram, even, odd, np.array(trunk))
         # Checked before averaging, which would hide a degenerate bone behind its mirror image.
         _check_long(length, skeleton)
         height, length = (
@@ -102,6 +101,15 @@ def estimate_rest_pose(
     rest = np.zeros((skeleton.n_joints, 3))
     rest[joints] = mean * (length / sizes)[:, None]
     return _facing(rest, skeleton, front)
+
+
+def joint_positions(skeleton: Skeleton, offsets: np.ndarray) -> np.ndarray:
+    """Return positions relative to the root of offsets from parents, (J, 3)."""
+    positions = np.zeros_like(offsets)
+    for joint in skeleton.topological_order:
+        if skeleton.parents[joint] >= 0:
+            positions[joint] = positions[skeleton.parents[joint]] + offsets[joint]
+    return positions
 
 
 def is_four_legged(skeleton: Skeleton) -> bool:
@@ -180,12 +188,6 @@ def _sides(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
     return np.array(even), np.array([one[left] - one[right] for left, right in pairs])
 
 
-def _trunk_pairs(skeleton: Skeleton) -> np.ndarray:
-    """Return which pairs have a common parent, such as hips and shoulders."""
-    parents = skeleton.parents
-    return np.array([float(parents[a] == parents[b]) for a, b in skeleton.mirrored_pairs])
-
-
 def _halves(
     gram: np.ndarray, even: np.ndarray, odd: np.ndarray, trunk: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -213,13 +215,13 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
     The diagonal, which includes movement of single bones, is an upper bound.
     """
     filled, bound = gram.copy(), np.diag(gram)
-    for _ in range(_PASSES):
+    for _ in range(_MAX_ITERATIONS):
         values, vectors = np.linalg.eigh(filled)
         factor = vectors[:, -rank:] * np.sqrt(np.maximum(values[-rank:], 0.0))
         diagonal = np.minimum((factor**2).sum(axis=1), bound)
         change = abs(diagonal - np.diag(filled)).max()
         np.fill_diagonal(filled, diagonal)
-        if change <= _SETTLED * bound.max():
+        if change <= _TOLERANCE * bound.max():
             break
     # With fewer bones than axes, the remaining axes are 0.
     return np.pad(factor, ((0, 0), (0, rank - factor.shape[1])))
@@ -227,10 +229,7 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
 
 def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
     """Return the rest pose rotated or reflected to face +Z."""
-    place = np.zeros_like(rest)
-    for joint in skeleton.topological_order:
-        if skeleton.parents[joint] >= 0:
-            place[joint] = place[skeleton.parents[joint]] + rest[joint]
+    place = joint_positions(skeleton, rest)
     ahead = _ahead(place, skeleton, front)
     if skeleton.mirrored_pairs:
         ahead = np.array([0.0, ahead[1]])
@@ -253,9 +252,8 @@ def _ahead(place: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
     names, flat = list(skeleton.canonical_names), place[:, [0, 2]]
     if front is not None:
         if front not in {*skeleton.joint_names, *names}:
-            raise ValueError(
-                f"front must be one of {', '.join(skeleton.joint_names)}, got {front!r}"
-            )
+            known = ", ".join(skeleton.joint_names)
+            raise ValueError(f"front must be one of {known}, got {front!r}")
         return flat[skeleton.index(front)] - flat[skeleton.roots[0]]
     if is_four_legged(skeleton):
         heads = [flat[names.index(name)] for name in _HEADS if name in names]

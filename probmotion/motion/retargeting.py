@@ -63,13 +63,10 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
 
 def counterpart(source: Skeleton, name: str, canonical: str) -> int | None:
     """Return the index in ``source`` of another skeleton's joint, None if there is none."""
-    for wanted, known in (
-        (canonical, source.canonical_names),
-        (name, source.canonical_names),
-        (name, source.joint_names),
-    ):
-        if wanted in known:
-            if known.count(wanted) > 1:
-                raise ValueError(f"skeleton must have one counterpart of {name!r}, got several")
-            return known.index(wanted)
+    canonicals = source.canonical_names
+    for key, names in ((canonical, canonicals), (name, canonicals), (name, source.joint_names)):
+        if names.count(key) > 1:
+            raise ValueError(f"skeleton must have one counterpart of {name!r}, got several")
+        if key in names:
+            return names.index(key)
     return None

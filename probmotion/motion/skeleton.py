@@ -60,10 +60,8 @@ class Skeleton:
         for joint, parent in enumerate(parents):
             check_count(f"parents[{joint}]", parent, least=-1)
             if parent >= len(names):
-                raise ValueError(
-                    f"parents[{joint}] must be -1 or a joint's index below {len(names)}, got "
-                    f"{parent}"
-                )
+                bound = f"-1 or a joint's index below {len(names)}"
+                raise ValueError(f"parents[{joint}] must be {bound}, got {parent}")
         links = tuple(int(parent) for parent in parents)
         _refuse_cycles(names, links)
         for joint, radius in enumerate(radii or ()):
@@ -104,25 +102,19 @@ class Skeleton:
     def topological_order(self) -> tuple[int, ...]:
         """Joint indices in an order with parents before their children."""
         order: list[int] = []
-        children: dict[int, list[int]] = {}
-        for joint, parent in enumerate(self.parents):
-            children.setdefault(parent, []).append(joint)
-        waiting = list(reversed(children.get(-1, [])))
+        waiting = list(reversed(self.roots))
         while waiting:
             joint = waiting.pop()
             order.append(joint)
-            waiting += reversed(children.get(joint, []))
+            waiting += [child for child, parent in reversed(self.bones) if parent == joint]
         return tuple(order)
 
     @cached_property
     def mirrored_pairs(self) -> tuple[tuple[int, int], ...]:
         """Pairs (left, right) of joints with names that differ only in the side."""
-        pairs = []
-        for left, name in enumerate(self.joint_names):
-            other = mirrored_name(name)
-            if other is not None and other in self.joint_names:
-                pairs.append((left, self.joint_names.index(other)))
-        return tuple(pairs)
+        mirrored = [mirrored_name(name) for name in self.joint_names]
+        names = self.joint_names
+        return tuple((j, names.index(name)) for j, name in enumerate(mirrored) if name in names)
 
     @cached_property
     def mirrored_order(self) -> tuple[int, ...]:
@@ -147,10 +139,9 @@ class Skeleton:
         """
         if joint_name in self.joint_names:
             return self.joint_names.index(joint_name)
-        found = [j for j, name in enumerate(self.canonical_names) if name == joint_name]
-        if len(found) == 1:
-            return found[0]
-        problem = "no joint" if not found else "several joints"
+        if self.canonical_names.count(joint_name) == 1:
+            return self.canonical_names.index(joint_name)
+        problem = "several joints" if joint_name in self.canonical_names else "no joint"
         raise ValueError(
             f"joint_name must be one of {', '.join(self.joint_names)}, got {joint_name!r}, which "
             f"names {problem}"
@@ -165,16 +156,14 @@ class Skeleton:
 
     def subset(self, joints: Sequence[int]) -> Skeleton:
         """Return the skeleton of ``joints``, each below its nearest ancestor among them."""
-        kept = list(joints)
-        for joint in kept:
+        chosen, parents = list(joints), []
+        for joint in chosen:
             if not 0 <= joint < self.n_joints:
                 raise ValueError(f"joints must be 0 to {self.n_joints - 1}, got {joint}")
-        parents = []
-        for joint in kept:
-            above = [kept.index(a) for a in self.ancestors(joint) if a in kept]
-            parents.append(above[0] if above else -1)
-        radii = None if self.radii is None else [self.radii[joint] for joint in kept]
-        return Skeleton([self.joint_names[joint] for joint in kept], parents, radii)
+            above = [ancestor for ancestor in self.ancestors(joint) if ancestor in chosen]
+            parents.append(chosen.index(above[0]) if above else -1)
+        radii = None if self.radii is None else [self.radii[joint] for joint in chosen]
+        return Skeleton([self.joint_names[joint] for joint in chosen], parents, radii)
 
 
 def _refuse_cycles(names: tuple[str, ...], parents: tuple[int, ...]) -> None:

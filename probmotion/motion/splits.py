@@ -69,8 +69,8 @@ def split_clips(
     if isinstance(names, str):
         raise ValueError(f"names must be a sequence of names, got {names!r}")
     clips = sorted({clip_of(name) for name in names})
-    held, tried = round(validation * len(clips)), round(test * len(clips))
-    counts = (len(clips) - held - tried, held, tried)
+    n_validation, n_test = round(validation * len(clips)), round(test * len(clips))
+    counts = (len(clips) - n_validation - n_test, n_validation, n_test)
     if min(counts) < 1:
         raise ValueError(
             "names must have at least one clip for each of train, validation and test, got "
@@ -79,9 +79,9 @@ def split_clips(
     order = seeds.generator(seed, "split").permutation(len(clips))
     shuffled = [clips[place] for place in order]
     return Split(
-        train=tuple(sorted(shuffled[held + tried :])),
-        validation=tuple(sorted(shuffled[tried : held + tried])),
-        test=tuple(sorted(shuffled[:tried])),
+        train=tuple(sorted(shuffled[n_validation + n_test :])),
+        validation=tuple(sorted(shuffled[n_test : n_validation + n_test])),
+        test=tuple(sorted(shuffled[:n_test])),
     )
 
 

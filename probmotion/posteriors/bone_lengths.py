@@ -98,50 +98,47 @@ def _from_mean_square(bones: np.ndarray, precisions: np.ndarray) -> float:
 
 
 def _from_median(bones: np.ndarray, precisions: np.ndarray, degrees_of_freedom: float) -> float:
-    """Return ℓ at which simulated bones have the observed median length; NaN if noise exceeds it.
-
-    Common random numbers for every ℓ make the median monotone.
-    """
-    seen = np.linalg.norm(bones, axis=1)
-    wanted = float(np.median(seen))
+    """Return ℓ at which simulated bones have the observed median length, NaN if there is none."""
+    observed = np.linalg.norm(bones, axis=1)
+    target = float(np.median(observed))
     copies = -(-_SIMULATED // len(bones))
     rng = seeds.generator(0, "bone lengths")
+    # The same errors for every ℓ, so that the median is monotone.
     unit = rng.standard_t(degrees_of_freedom, (copies, *bones.shape, 2))
-    stray = (unit / np.sqrt(precisions)[:, None, :]).sum(axis=-1)
-    directions = bones / np.maximum(seen, 1e-12)[:, None]
+    errors = (unit / np.sqrt(precisions)[:, None, :]).sum(axis=-1)
+    directions = bones / np.maximum(observed, 1e-12)[:, None]
 
     def median(length: float) -> float:
-        return float(np.median(np.linalg.norm(length * directions + stray, axis=-1)))
+        return float(np.median(np.linalg.norm(length * directions + errors, axis=-1)))
 
-    low, high = 0.0, wanted
-    if median(low) >= wanted:
+    low, high = 0.0, target
+    if median(low) >= target:
         return np.nan
-    while median(high) < wanted:  # rare: the noise may shorten the bones
+    while median(high) < target:  # rare: the noise may shorten the bones
         high *= 2
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if median(middle) < wanted else (low, middle)
+        low, high = (middle, high) if median(middle) < target else (low, middle)
     return (low + high) / 2
 
 
 def _completed(estimates: np.ndarray, skeleton: Skeleton, typical: np.ndarray | None) -> np.ndarray:
     """Return the lengths with NaN replaced by mirrored or typical ones."""
     lengths = estimates.copy()
+    lengths[list(skeleton.roots)] = 0.0
     order = skeleton.mirrored_order
-    for joint, parent in enumerate(skeleton.parents):
-        if parent < 0:
-            lengths[joint] = 0.0
-        elif np.isnan(estimates[joint]):
-            mirrored = order[joint]
-            same_bone = skeleton.parents[mirrored] == order[parent]
-            if same_bone and not np.isnan(estimates[mirrored]):
-                lengths[joint] = estimates[mirrored]
-            elif typical is not None:
-                lengths[joint] = typical[joint]
-            else:
-                names = skeleton.joint_names
-                raise ValueError(
-                    f"joints must show the bone from {names[parent]} to {names[joint]}, or its "
-                    "mirror image, above the noise; pass typical lengths"
-                )
+    for joint, parent in skeleton.bones:
+        if not np.isnan(estimates[joint]):
+            continue
+        if skeleton.parents[order[joint]] == order[parent]:
+            lengths[joint] = estimates[order[joint]]
+        if not np.isnan(lengths[joint]):
+            continue
+        if typical is None:
+            names = skeleton.joint_names
+            raise ValueError(
+                f"joints must show the bone from {names[parent]} to {names[joint]}, or its "
+                "mirror image, above the noise; pass typical lengths"
+            )
+        lengths[joint] = typical[joint]
     return lengths

@@ -37,10 +37,6 @@ class MotionDraws:
         coordinate), ``log_density`` (chain, draw), statistics per draw (chain, draw) or chain
         (chain), and ``state_*``, the sampler state needed to continue. Attributes: skeleton, fps,
         sampler, settings, seed, versions, seconds and evaluation counts.
-
-    Notes
-    -----
-    Constructed by :meth:`of` or :meth:`load`.
     """
 
     dataset: xr.Dataset
@@ -65,16 +61,12 @@ class MotionDraws:
 
         Parameters
         ----------
-        posterior : MotionPosterior
-            The posterior that was sampled.
         sampler : Sampler
             A dataclass with a ``name``; its fields become the settings.
         positions : ndarray, (chains, draws, L, J, 3)
             Metres.
-        seed : int
-            Seed of the run.
-        seconds : float
-            Wall-clock time of the run.
+        seed, seconds
+            Seed and wall-clock time of the run.
         theta : ndarray, (chains, draws, dim), optional
             Draws in the posterior's coordinates.
         log_density : ndarray, (chains, draws), optional
@@ -96,9 +88,7 @@ class MotionDraws:
         )
         check_finite("positions", positions)
         shape = positions.shape[:2]
-        data: dict[str, Any] = {
-            "positions": (("chain", "draw", "frame", "joint", "axis"), positions)
-        }
+        data = {"positions": (("chain", "draw", "frame", "joint", "axis"), positions)}
         if theta is not None:
             check_shape("theta", theta, (*shape, posterior.dim))
             data["theta"] = (("chain", "draw", "coordinate"), theta)
@@ -168,21 +158,14 @@ class MotionDraws:
     @property
     def counts(self) -> dict[str, int]:
         """Evaluations by kind: ``denoiser``, ``density``, ``gradient``."""
-        prefix = "evaluations_"
-        return {
-            str(name).removeprefix(prefix): int(value)
-            for name, value in self.dataset.attrs.items()
-            if str(name).startswith(prefix)
-        }
+        counts = _with_prefix("evaluations_", self.dataset.attrs)
+        return {name: int(count) for name, count in counts.items()}
 
     @property
     def state(self) -> dict[str, np.ndarray]:
         """Sampler state needed to continue; empty for independent draws."""
-        return {
-            str(name).removeprefix("state_"): values.values
-            for name, values in self.dataset.data_vars.items()
-            if str(name).startswith("state_")
-        }
+        state = _with_prefix("state_", self.dataset.data_vars)
+        return {name: values.values for name, values in state.items()}
 
     def flat(self) -> np.ndarray:
         """Return all draws, (chains × draws, L, J, 3), chain by chain."""
@@ -192,16 +175,18 @@ class MotionDraws:
     def motion(self, draw: int, chain: int = 0) -> Motion:
         """Return one draw as a :class:`~probmotion.Motion`."""
         positions = self.positions.isel(chain=chain, draw=draw).values
-        name = f"{self.dataset.attrs['sampler']}-{chain}-{draw}"
-        return Motion(positions, self.skeleton, self.fps, name=name)
+        return self._motion(positions, f"{chain}-{draw}")
 
     def playback(self, chain: int = 0) -> Motion:
         """Return a chain's draws concatenated into one motion, to animate how the chain moves."""
         chains = self.positions.sizes["chain"]
         if not 0 <= chain < chains:
             raise ValueError(f"chain must be between 0 and {chains - 1}, got {chain!r}")
-        positions = self.positions.isel(chain=chain).values.reshape(-1, *self.positions.shape[3:])
-        name = f"{self.dataset.attrs['sampler']}-{chain}"
+        positions = self.positions.isel(chain=chain).values
+        return self._motion(positions.reshape(-1, *positions.shape[2:]), f"{chain}")
+
+    def _motion(self, positions: np.ndarray, name: str) -> Motion:
+        name = f"{self.dataset.attrs['sampler']}-{name}"
         return Motion(positions, self.skeleton, self.fps, name=name)
 
     def motions(self) -> Iterator[Motion]:
@@ -212,18 +197,15 @@ class MotionDraws:
 
     def to_arviz(self) -> xr.DataTree:
         """Return an ArviZ tree: ``posterior`` (positions, theta) and ``sample_stats``."""
-        inside = [name for name in ("positions", "theta") if name in self.dataset]
+        variables = [name for name in ("positions", "theta") if name in self.dataset]
         statistics = {
             ("lp" if name == "log_density" else str(name)): values
             for name, values in self.dataset.data_vars.items()
-            if values.dims[:1] == ("chain",) and name not in inside
+            if values.dims[:1] == ("chain",) and name not in variables
         }
-        return xr.DataTree.from_dict(
-            {
-                "posterior": self.dataset[inside].assign_attrs(self.dataset.attrs),
-                "sample_stats": xr.Dataset(statistics),
-            }
-        )
+        posterior = self.dataset[variables].assign_attrs(self.dataset.attrs)
+        groups = {"posterior": posterior, "sample_stats": xr.Dataset(statistics)}
+        return xr.DataTree.from_dict(groups)
 
     def citations(self) -> list[str]:
         """Return the works to cite for these draws."""
@@ -256,11 +238,17 @@ class MotionDraws:
             raise
         except Exception as error:
             raise ValueError(f"path must be a netCDF file of draws, got {str(path)!r}") from error
-        found = dataset.attrs.get("format_version")
-        if found != _VERSION:
-            raise ValueError(f"{path} must have format version {_VERSION}, got {found}")
-        counted = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
-        return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counted]}))
+        got = dataset.attrs.get("format_version")
+        if got != _VERSION:
+            raise ValueError(f"{path} must have format version {_VERSION}, got {got}")
+        counts = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
+        return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counts]}))
+
+
+def _with_prefix(prefix: str, entries: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return the entries whose name begins with ``prefix``, without it."""
+    names = [str(name) for name in entries if str(name).startswith(prefix)]
+    return {name.removeprefix(prefix): entries[name] for name in names}
 
 
 def settings_of(sampler: Any) -> dict[str, Any]:

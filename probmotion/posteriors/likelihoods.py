@@ -83,14 +83,13 @@ class EntryNoise:
         n_seen = residual.shape[-1] * int(self.visible.sum())
         log_scale = residual.shape[-1] * 0.5 * float(np.log(self.precision[self.visible]).sum())
         square = residual**2 * constant(self.precision[..., None], residual)
-        if self.degrees_of_freedom is None:
+        nu = self.degrees_of_freedom
+        if nu is None:
             normaliser = -0.5 * math.log(2 * math.pi)
             terms = -0.5 * square
         else:
-            nu = self.degrees_of_freedom
-            normaliser = (
-                math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
-            )
+            gammas = math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2)
+            normaliser = gammas - 0.5 * math.log(nu * math.pi)
             terms = -0.5 * (nu + 1) * xp.log1p(square / nu)
         axes = tuple(range(-1 - self.confidence.ndim, 0))
         return xp.sum(terms, axis=axes) + (log_scale + n_seen * normaliser)
@@ -98,26 +97,24 @@ class EntryNoise:
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Return noise of shape ``(*confidence.shape, size)``; 0 where occluded."""
         shape = (*self.confidence.shape, size)
-        if self.degrees_of_freedom is None:
-            unit = rng.standard_normal(shape)
-        else:
-            unit = rng.standard_t(self.degrees_of_freedom, shape)
-        shown = np.where(self.visible, self.confidence, 1.0)[..., None]
-        return np.where(self.visible[..., None], unit * self.noise / np.sqrt(shown), 0.0)
+        nu = self.degrees_of_freedom
+        unit = rng.standard_normal(shape) if nu is None else rng.standard_t(nu, shape)
+        weight = np.where(self.visible, self.confidence, 1.0)[..., None]
+        return np.where(self.visible[..., None], unit * self.noise / np.sqrt(weight), 0.0)
 
     def require_gaussian(self) -> None:
         """Raise ``NotConjugate`` if the noise is Student-t."""
-        if self.degrees_of_freedom is not None:
-            raise NotConjugate(
-                f"the noise is Student-t with {self.degrees_of_freedom:g} degrees of freedom, not "
-                "Gaussian"
-            )
+        nu = self.degrees_of_freedom
+        if nu is not None:
+            raise NotConjugate(f"the noise is Student-t with {nu:g} degrees of freedom")
 
 
 class _Entries:
     """Properties and shapes of observed entries."""
 
+    noise: float
     confidence: np.ndarray | None
+    degrees_of_freedom: float | None
     entries: EntryNoise
 
     @property
@@ -130,17 +127,13 @@ class _Entries:
         """Number of joints J."""
         return self.entries.confidence.shape[-1]
 
-    def _set_entries(
-        self,
-        name: str,
-        noise: float,
-        degrees_of_freedom: float | None,
-        shape: tuple[int | str, ...],
-    ) -> None:
+    def _set_entries(self, name: str, shape: tuple[int | str, ...]) -> None:
         """Check the observed array ``name`` and set it, its confidence and its noise."""
         observed = np.asarray(getattr(self, name), dtype=np.float64)
         check_shape(name, observed, shape)
-        entries = entry_noise(noise, self.confidence, degrees_of_freedom, observed.shape[:-1])
+        entries = entry_noise(
+            self.noise, self.confidence, self.degrees_of_freedom, observed.shape[:-1]
+        )
         check_finite(name, observed[entries.visible])
         object.__setattr__(self, "entries", entries)
         object.__setattr__(self, "confidence", entries.confidence)
@@ -179,8 +172,7 @@ class Keypoints2D(_Entries):
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        shape = (self.cameras.n_views, "L", "J", 2)
-        self._set_entries("keypoints", self.noise, self.degrees_of_freedom, shape)
+        self._set_entries("keypoints", (self.cameras.n_views, "L", "J", 2))
 
     @classmethod
     def observe(
@@ -207,14 +199,8 @@ class Keypoints2D(_Entries):
     @classmethod
     def from_track(cls, track: KeypointTrack, camera: Cameras, noise: float) -> Keypoints2D:
         """Return the likelihood of a detected track in one known camera."""
-        return cls(
-            track.keypoints[None],
-            camera,
-            noise,
-            track.confidence[None],
-            skeleton=track.skeleton,
-            fps=track.fps,
-        )
+        points, confidence = track.keypoints[None], track.confidence[None]
+        return cls(points, camera, noise, confidence, None, track.skeleton, track.fps)
 
     def log_density(self, positions: Array) -> Array:
         """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
@@ -229,22 +215,13 @@ class Keypoints2D(_Entries):
         return replace(self, keypoints=seen)
 
     def linear(self) -> LinearObservation:
-        """Return the observations in linear Gaussian form.
-
-        Raises
-        ------
-        NotConjugate
-            If a camera is perspective or the noise is Student-t.
-        """
+        """Return the linear Gaussian form; raise ``NotConjugate`` for perspective or Student-t."""
         self.entries.require_gaussian()
         if not self.cameras.orthographic:
             raise NotConjugate("the cameras are perspective, not orthographic")
         shifted = self.keypoints - self.cameras.offset[:, None, None, :]
-        return LinearObservation(
-            axes=self.cameras.image_axes,
-            target=np.where(self.entries.visible[..., None], shifted, 0.0),
-            precision=self.entries.precision,
-        )
+        target = np.where(self.entries.visible[..., None], shifted, 0.0)
+        return LinearObservation(self.cameras.image_axes, target, self.entries.precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +249,7 @@ class Joints3D(_Entries):
     entries: EntryNoise = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._set_entries("joints", self.noise, self.degrees_of_freedom, ("L", "J", 3))
+        self._set_entries("joints", ("L", "J", 3))
 
     @classmethod
     def observe(
@@ -301,17 +278,9 @@ class Joints3D(_Entries):
         return replace(self, joints=to_numpy(positions) + self.entries.draw(rng, 3))
 
     def linear(self) -> LinearObservation:
-        """Return the observations in linear Gaussian form.
-
-        Raises
-        ------
-        NotConjugate
-            If the noise is Student-t.
-        """
+        """Return the linear Gaussian form; raise ``NotConjugate`` if the noise is Student-t."""
         self.entries.require_gaussian()
-        return LinearObservation(
-            axes=np.eye(3)[None], target=self.joints[None], precision=self.entries.precision[None]
-        )
+        return LinearObservation(np.eye(3)[None], self.joints[None], self.entries.precision[None])
 
 
 def entry_noise(

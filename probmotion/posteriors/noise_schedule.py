@@ -14,7 +14,7 @@ from probmotion.validation import check_count
 
 __all__ = ["NoiseSchedule", "PosteriorStep"]
 
-# Keeps β_t from vanishing near t = 0.
+# Prevents β_t from vanishing at small t.
 _OFFSET = 0.008
 
 
@@ -43,13 +43,12 @@ class NoiseSchedule:
 
     def __post_init__(self) -> None:
         levels = np.asarray(self.alpha_bar, dtype=np.float64)
-        if levels.ndim != 1 or len(levels) < 2 or levels[0] != 1.0 or levels[-1] <= 0:
+        one_axis = levels.ndim == 1 and len(levels) > 1
+        if not one_axis or (np.diff([1.0, *levels[1:], 0.0]) >= 0).any() or levels[0] != 1.0:
             raise ValueError(
-                "alpha_bar must have shape (T + 1,), start at 1 and stay above 0, got shape "
-                f"{levels.shape}"
+                "alpha_bar must have shape (T + 1,) and decrease from 1 to a number above 0, got "
+                f"shape {levels.shape}"
             )
-        if (np.diff(levels) >= 0).any():
-            raise ValueError("alpha_bar must decrease at every level")
         times = np.arange(len(levels)) if self.times is None else np.asarray(self.times)
         object.__setattr__(self, "alpha_bar", levels)
         object.__setattr__(self, "times", times)

@@ -9,13 +9,13 @@ import numpy as np
 
 from probmotion.motion.occlusion import joints_at_rate, joints_on_skeleton
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.likelihoods import Joints3D
+from probmotion.posteriors.likelihoods import Joints3D, entry_noise
 from probmotion.posteriors.protocols import MotionPrior
-from probmotion.validation import check_count, check_finite, check_positive, check_shape
+from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["noisy_joints"]
 
-# Mean cosine with an axis above which a body counts as standing along it.
+# Mean cosine with an axis above which a body counts as aligned with it.
 _UPRIGHT = 0.8
 # Plausible longest chain of bones, metres: a three-year-old has 0.5 from pelvis to ankle, an adult
 # 1.15 from pelvis to wrist.
@@ -67,11 +67,6 @@ def noisy_joints(
         Every run of fully occluded frames, at the prior's rate, must be shorter than this; by
         default the window of the prior's networks, else its ``frames``.
 
-    Returns
-    -------
-    Joints3D
-        Likelihood with the prior's skeleton and frame rate.
-
     Warns
     -----
     UserWarning
@@ -87,19 +82,14 @@ def noisy_joints(
     for name, value, kind in (("skeleton", skeleton, Skeleton), ("prior", prior, MotionPrior)):
         if not isinstance(value, kind):
             raise ValueError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
-    check_positive("noise", noise)
     joints = np.asarray(joints, dtype=np.float64)
     check_shape("joints", joints, ("L", skeleton.n_joints, 3))
     if len(joints) == 0:
         raise ValueError("joints must have at least one frame, got 0")
     check_positive("fps", fps)
     seen = _observed(joints, skeleton)
-    weight = np.ones(seen.shape) if confidence is None else np.array(confidence, dtype=np.float64)
-    check_shape("confidence", weight, seen.shape)
-    check_finite("confidence", weight)
-    if weight.min() < 0:
-        raise ValueError(f"confidence must be at least 0, got {weight.min():g}")
-    weight = np.where(seen, weight, 0.0)
+    entries = entry_noise(noise, confidence, degrees_of_freedom, seen.shape)
+    weight = np.where(seen, entries.confidence, 0.0)
     joints, weight = joints_on_skeleton(joints, weight, skeleton, prior.skeleton)
     if abs(fps - prior.fps) > _SAME_RATE * prior.fps:
         if not resample:
@@ -108,16 +98,18 @@ def noisy_joints(
                 "interpolate linearly in time"
             )
         joints, weight = joints_at_rate(joints, weight, fps, prior.fps)
-    window = getattr(getattr(prior, "settings", None), "frames", prior.frames)
-    gap = window if longest_gap is None else longest_gap
-    check_count("longest_gap", gap)
-    _check_frames(weight, gap)
-    if _check_size(joints, weight, prior.skeleton):
+    if longest_gap is None:
+        longest_gap = getattr(getattr(prior, "settings", None), "frames", prior.frames)
+    check_count("longest_gap", longest_gap)
+    _check_frames(weight, longest_gap)
+    if _plausible_size(joints, weight, prior.skeleton):
         if noise > 1:
             warnings.warn(
                 f"noise is {noise:g} m, more than a body is wide; is it in metres?", stacklevel=2
             )
-        _check_floor(joints, weight, getattr(prior, "floor", None))
+        floor = getattr(prior, "floor", None)
+        if floor is not None:
+            _check_floor(joints, weight, floor)
     _check_upright(joints, weight, prior.skeleton)
     return Joints3D(joints, noise, weight, degrees_of_freedom, prior.skeleton, prior.fps)
 
@@ -125,49 +117,49 @@ def noisy_joints(
 def _observed(joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """Return the mask of observed joints (L, J); raise if one is infinite or partly NaN."""
     unknown = np.isnan(joints)
-    for problem, where in (
-        ("infinite values", np.isinf(joints).any(axis=-1)),
-        ("NaN in only some coordinates", unknown.any(-1) & ~unknown.all(-1)),
-    ):
-        if where.any():
-            frame, joint = np.argwhere(where)[0]
-            raise ValueError(
-                f"joints must be finite, or all NaN where occluded, got {problem} at frame "
-                f"{frame}, joint {joint} ({skeleton.joint_names[joint]})"
-            )
+    infinite = np.isinf(joints).any(axis=-1)
+    invalid = infinite | (unknown.any(axis=-1) & ~unknown.all(axis=-1))
+    if invalid.any():
+        frame, joint = np.argwhere(invalid)[0]
+        got = "infinite values" if infinite[frame, joint] else "NaN in only some coordinates"
+        raise ValueError(
+            f"joints must be finite, or all NaN where occluded, got {got} at frame {frame}, joint "
+            f"{joint} ({skeleton.joint_names[joint]})"
+        )
     return ~unknown.any(axis=-1)
 
 
 def _check_frames(confidence: np.ndarray, longest_gap: int) -> None:
-    empty = np.logical_not((confidence > 0).any(axis=1))
-    frames = len(confidence)
-    if empty.all():
+    """Warn of fully occluded frames; raise if there are ``longest_gap`` in a row."""
+    occluded = ~(confidence > 0).any(axis=1)
+    if occluded.all():
         raise ValueError("joints must be observed in some frame, got every frame occluded")
-    edges = np.flatnonzero(np.diff(empty, prepend=False, append=False)).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(occluded, prepend=False, append=False)).reshape(-1, 2)
     for start, stop in edges.tolist():
         if stop - start >= longest_gap:
             raise ValueError(
                 f"joints must include an observed one in any {longest_gap} consecutive frames, got "
                 f"none in the {stop - start} frames from frame {start}"
             )
-    if empty.any():
+    if occluded.any():
         warnings.warn(
-            f"all joints are occluded in {empty.sum()} of {frames} frames; only the prior informs "
-            "them",
+            f"all joints are occluded in {occluded.sum()} of {len(confidence)} frames; only the "
+            "prior informs them",
             stacklevel=3,
         )
 
 
-def _check_size(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> bool:
+def _plausible_size(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> bool:
     """Warn and return False if the longest chain of bones is implausible in metres."""
     size = _longest_chain(joints, confidence, skeleton)
-    if size is None or _SIZES[0] <= size <= _SIZES[1]:
+    least, most = _SIZES
+    if size is None or least <= size <= most:
         return True
-    middle = math.sqrt(_SIZES[0] * _SIZES[1])
     if size == 0:
         raise ValueError("joints must be distinct, got all joints at one point")
+    middle = math.sqrt(least * most)
     unit = min(_UNITS, key=lambda name: abs(math.log(size * _UNITS[name] / middle)))
-    guess = f"; are these {unit}?" if _SIZES[0] <= size * _UNITS[unit] <= _SIZES[1] else ""
+    guess = f"; are these {unit}?" if least <= size * _UNITS[unit] <= most else ""
     warnings.warn(
         f"the longest chain of bones is {size:.4g} long, implausible in metres{guess}",
         stacklevel=3,
@@ -175,10 +167,8 @@ def _check_size(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) 
     return False
 
 
-def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float | None) -> None:
+def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float) -> None:
     """Warn if the lowest joints (feet, or knees if those are occluded) are far from the floor."""
-    if floor is None:
-        return
     heights = np.where(confidence > 0, joints[..., 1], np.inf).min(axis=1)
     lowest = np.quantile(heights[np.isfinite(heights)], _LOW)
     if abs(lowest - floor) > _FAR:
@@ -190,7 +180,7 @@ def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float | None
 
 
 def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> None:
-    """Warn if the body stands along another axis than Y throughout."""
+    """Warn if the body is aligned with another axis than Y throughout."""
     names = skeleton.canonical_names
     if not {"neck", "left_ankle", "right_ankle"} <= set(names):
         return
@@ -205,7 +195,7 @@ def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleto
     if abs(along[axis]) > _UPRIGHT and not (axis == 1 and along[1] > 0):
         sign = "" if along[axis] > 0 else "-"
         warnings.warn(
-            f"the body stands along {sign}{'XYZ'[axis]}, but Y must be up; is it lying down?",
+            f"the body is aligned with {sign}{'XYZ'[axis]}, but Y must be up; is it lying down?",
             stacklevel=3,
         )
 
@@ -222,6 +212,6 @@ def _longest_chain(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleto
         length[joint] = length[parent]
         if seen.any():
             any_seen = True
-            bones = np.linalg.norm(joints[seen, joint] - joints[seen, parent], axis=-1)
-            length[joint] += np.median(bones)
+            bones = joints[seen, joint] - joints[seen, parent]
+            length[joint] += np.median(np.linalg.norm(bones, axis=-1))
     return float(length.max()) if any_seen else None

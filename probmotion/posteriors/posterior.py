@@ -124,10 +124,10 @@ class MotionPosterior:
         if self.likelihood is None:
             return self._shaped(np.asarray(log_prior), self._log_measure(theta))
 
-        def log_likelihood(mask: np.ndarray) -> tuple[np.ndarray, ...]:
-            return (self.log_likelihood(theta[mask]),)
+        def evaluate(mask: np.ndarray) -> tuple[Array, np.ndarray]:
+            return self.log_likelihood(theta[mask]), np.empty((mask.sum(), 0), dtype=int)
 
-        return self._with_observations(theta, np.asarray(log_prior), log_likelihood)[0]
+        return self._with_observations(theta, np.asarray(log_prior), evaluate)[0]
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None = None
@@ -139,7 +139,8 @@ class MotionPosterior:
         theta : ndarray, (n, dim)
             Coordinates.
         generators : sequence of numpy.random.Generator, optional
-            One per point, each drawing new views: the density is then an unbiased estimate.
+            One per point, each drawing new views: the density is then an unbiased estimate, which
+            must not be truncated.
 
         Returns
         -------
@@ -147,20 +148,23 @@ class MotionPosterior:
         closest : ndarray of int, (n, m)
             Argument of :meth:`speeds`; 0 where the likelihood is not evaluated.
         """
-        if not isinstance(self.likelihood, ComparesViews):
-            raise ValueError(
-                f"likelihood must compare views with annotations, got "
-                f"{type(self.likelihood).__name__}"
-            )
         likelihood = self.likelihood
+        if not isinstance(likelihood, ComparesViews):
+            raise ValueError(
+                f"likelihood must compare views with annotations, got {type(likelihood).__name__}"
+            )
+        if generators is not None and self.truncated:
+            raise ValueError(
+                "limit must be infinite with randomly drawn views, since truncating an unbiased "
+                "estimate biases it"
+            )
         log_prior = to_numpy(self.prior.log_density(theta))
 
-        def compare(mask: np.ndarray) -> tuple[np.ndarray, ...]:
+        def compare(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             own = None if generators is None else [generators[i] for i in np.flatnonzero(mask)]
             return likelihood.evaluate(to_numpy(self.prior.motion(theta[mask])), own)
 
-        log_density, closest = self._with_observations(theta, log_prior, compare)
-        return log_density, closest
+        return self._with_observations(theta, log_prior, compare)
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
         """Return extra statistics of draws by name, from θ (…, dim) and log density (…)."""
@@ -184,21 +188,20 @@ class MotionPosterior:
         self,
         theta: np.ndarray,
         log_prior: np.ndarray,
-        evaluate: Callable[[np.ndarray], tuple[np.ndarray, ...]],
-    ) -> tuple[np.ndarray, ...]:
-        """Return the log density and the further results of ``evaluate``.
+        evaluate: Callable[[np.ndarray], tuple[Array, np.ndarray]],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log density and the closest annotations of all points.
 
-        ``evaluate`` maps a mask of points to arrays over them, the log likelihood first.
+        ``evaluate`` maps a mask of points to their log likelihood and closest annotations.
         """
         log_measure = self._log_measure(theta)
         mask = self._needs_likelihood(log_prior, log_measure)
-        log_likelihood, *others = evaluate(mask)
+        log_likelihood, masked = evaluate(mask)
         log_density = np.full(log_prior.shape, -np.inf)
         log_density[mask] = log_prior[mask] + np.asarray(log_likelihood)
-        full = [np.zeros((*log_prior.shape, *some.shape[1:]), some.dtype) for some in others]
-        for array, some in zip(full, others, strict=True):
-            array[mask] = some
-        return self._shaped(log_density, log_measure), *full
+        closest = np.zeros((*log_prior.shape, *masked.shape[1:]), masked.dtype)
+        closest[mask] = masked
+        return self._shaped(log_density, log_measure), closest
 
     # Overridden by TruncatedPosterior.
 

@@ -69,17 +69,17 @@ class Problem:
     simulate: Callable[[int], Problem] | None = None
 
     def __post_init__(self) -> None:
-        shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
-        for name in ("truth", "aligned_to"):
+        for name, batch in (("truth", ()), ("aligned_to", ()), ("held_out", ("G",))):
             motion = getattr(self, name)
             if motion is not None:
-                check_shape(name, motion, shape)
+                check_shape(name, motion, (*batch, *self._shape))
                 check_finite(name, motion)
-        if self.held_out is not None:
-            check_shape("held_out", self.held_out, ("G", *shape))
-            check_finite("held_out", self.held_out)
         if self.stored is not None:
             self.stored.check(self.name, self.posterior)
+
+    @property
+    def _shape(self) -> tuple[int, int, int]:
+        return self.posterior.frames, self.posterior.skeleton.n_joints, 3
 
     @property
     def exact(self) -> ExactPosterior | None:
@@ -113,24 +113,19 @@ class Problem:
     def reference(self, seed: int, n: int) -> np.ndarray:
         """Return n independent reference draws, (n, L, J, 3), metres.
 
-        Exact draws if available, else stored ones chosen without replacement.
-
-        Raises
-        ------
-        ValueError
-            If there are none, or fewer than n are stored.
+        Exact draws if available, else stored ones chosen without replacement; raise ``ValueError``
+        if there are fewer than n.
         """
         check_count("n", n)
-        source = self.exact_source
+        source, rng = self.exact_source, seeds.generator(seed, "reference")
         if source is not None:
-            drawn = source.sample(seeds.generator(seed, "reference"), n)
-            shape = (self.posterior.frames, self.posterior.skeleton.n_joints, 3)
+            draws = source.sample(rng, n)
             name = f"sample(rng, {n}) of {type(source).__name__}"
-            check_shape(name, drawn, (n, *shape))
-            check_finite(name, drawn)
-            return drawn
+            check_shape(name, draws, (n, *self._shape))
+            check_finite(name, draws)
+            return draws
         if self.stored is not None:
-            return self.stored.choose(seeds.generator(seed, "reference"), n)
+            return self.stored.choose(rng, n)
         raise ValueError(
             f"problem {self.name} must have reference draws, but has neither an exact posterior "
             "nor stored draws; make them with probmotion reference"
@@ -140,9 +135,8 @@ class Problem:
         """Return log p(X | y), (n, L, J, 3) → (n,): normalised if exact, ``None`` if unknown."""
         if self.exact is not None:
             return to_numpy(self.exact.log_density(positions))
-        if not isinstance(self.posterior.prior, HasPositionDensity):
-            return None
-        return log_density_at(self.posterior, positions)
+        known = isinstance(self.posterior.prior, HasPositionDensity)
+        return log_density_at(self.posterior, positions) if known else None
 
 
 def simulated(problem: Problem) -> Problem:
@@ -159,11 +153,5 @@ def _another(problem: Problem, k: int) -> Problem:
     truth = to_numpy(prior.sample(seeds.generator(k, "simulated truth"), 1))[0]
     if likelihood is not None:
         likelihood = likelihood.simulate(seeds.generator(k, "simulated evidence"), truth)
-    again = replace(
-        problem,
-        posterior=MotionPosterior(prior, likelihood),
-        truth=truth,
-        stored=None,
-        simulate=None,
-    )
-    return simulated(again)
+    posterior = MotionPosterior(prior, likelihood)
+    return simulated(replace(problem, posterior=posterior, truth=truth, stored=None))

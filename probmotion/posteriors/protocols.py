@@ -134,7 +134,7 @@ class HasCoordinateSpeeds(Protocol):
     def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
         """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
 
-        ``joint_speeds`` holds squared rotations, radians², and stretches, metres².
+        ``joint_speeds`` are squared rotations, radians², and stretches, metres².
         """
 
 
@@ -179,7 +179,7 @@ class HasStyles(Protocol):
 
 @runtime_checkable
 class HasManifold(Protocol):
-    """A prior concentrated near a manifold."""
+    """A prior concentrated around a manifold."""
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
         """Return the variance off the manifold over its expectation: ``(n, L, J, 3) → (n,)``."""
@@ -311,10 +311,4 @@ class HasExactPosterior(Protocol):
     """Closed-form posterior for conjugate likelihoods."""
 
     def exact_posterior(self, likelihood: Likelihood | None) -> ExactPosterior:
-        """Return p(X | y).
-
-        Raises
-        ------
-        NotConjugate
-            If the likelihood is not linear in the positions with Gaussian noise.
-        """
+        """Return p(X | y); raise `NotConjugate` unless y is linear in X with Gaussian noise."""

@@ -8,8 +8,6 @@ a density, at initial points; unlike the bits of a fitted prior, it is reproduci
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,12 +24,7 @@ from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.validation import check_finite, check_shape
 
-__all__ = [
-    "HasPositionDensity",
-    "StoredReference",
-    "fingerprint_of",
-    "log_density_at",
-]
+__all__ = ["HasPositionDensity", "StoredReference", "fingerprint_of", "log_density_at"]
 
 _DRAWS, _CERTIFICATE = "draws.npz", "certificate.json"
 _PROBES = 4
@@ -67,9 +60,9 @@ class StoredReference:
     def __post_init__(self) -> None:
         check_shape("positions", self.positions, ("n", "L", "J", 3))
         check_finite("positions", self.positions)
-        lacking = [name for name in _NEEDED if name not in self.certificate]
-        if lacking:
-            raise ValueError(f"certificate must have {', '.join(_NEEDED)}; missing {lacking}")
+        missing = [name for name in _NEEDED if name not in self.certificate]
+        if missing:
+            raise ValueError(f"certificate must have {', '.join(_NEEDED)}; missing {missing}")
         if self.certificate["draws"] != self.n:
             raise ValueError(
                 f"certificate must be of the {self.n} stored draws, got {self.certificate['draws']}"
@@ -93,63 +86,51 @@ class StoredReference:
     def check(self, name: str, posterior: MotionPosterior) -> None:
         """Raise ``ValueError`` unless the draws belong to this posterior."""
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-        wanted = self.certificate["fingerprint"]
-        found = None
+        stored, expected = self.certificate["fingerprint"], None
         if self.positions.shape[1:] == shape:
-            found = fingerprint_of(posterior, self.positions)
-        if found is None or not _same(found, wanted):
+            expected = fingerprint_of(posterior, self.positions)
+        if expected is None or not _same(expected, stored):
             raise ValueError(
-                f"certificate must have {name}'s fingerprint {found}, got {wanted}; make the "
+                f"certificate must have {name}'s fingerprint {expected}, got {stored}; make the "
                 f"reference with: probmotion reference '{name}'"
             )
 
     def save(self, folder: str | Path) -> Path:
-        """Write ``draws.npz`` and ``certificate.json`` into ``folder``, both or neither.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written; an earlier reference is left intact.
-        """
+        """Write both files into ``folder``, or raise ``OSError`` and keep an earlier reference."""
         folder = Path(folder)
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
-            unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
+            with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as temporary:
+                new, old = Path(temporary, "new"), Path(temporary, "old")
+                new.mkdir()
+                np.savez_compressed(new / _DRAWS, positions=self.positions.astype(np.float32))
+                text = json.dumps(self.certificate, indent=1, allow_nan=False)
+                (new / _CERTIFICATE).write_text(text + "\n", encoding="utf-8")
+                try:
+                    if folder.exists():
+                        folder.rename(old)
+                    new.rename(folder)
+                except BaseException:
+                    if old.exists() and not folder.exists():
+                        old.rename(folder)
+                    raise
         except OSError as error:
-            raise _unwritable(folder, error) from error
-        try:
-            np.savez_compressed(unfinished / _DRAWS, positions=self.positions.astype(np.float32))
-            text = json.dumps(self.certificate, indent=1, allow_nan=False)
-            (unfinished / _CERTIFICATE).write_text(text + "\n", encoding="utf-8")
-            unfinished.chmod(0o755)
-            _replace_folder(unfinished, folder)
-        except OSError as error:
-            raise _unwritable(folder, error) from error
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+            reason = error.strerror or error
+            raise OSError(f"cannot write {folder}: {reason}; choose a writable folder") from error
         return folder
 
     @classmethod
     def load(cls, folder: str | Path) -> StoredReference:
-        """Read a reference written by :meth:`save`.
-
-        Raises
-        ------
-        FileNotFoundError
-            If a file is missing.
-        ValueError
-            If a file is invalid.
-        """
+        """Read a reference written by :meth:`save`; raise ``ValueError`` if a file is invalid."""
         folder = Path(folder)
         try:
             certificate = json.loads((folder / _CERTIFICATE).read_text(encoding="utf-8"))
-            with np.load(folder / _DRAWS, allow_pickle=False) as held:
-                positions = held["positions"]
+            with np.load(folder / _DRAWS, allow_pickle=False) as arrays:
+                positions = arrays["positions"]
             return cls(positions, dict(certificate))
         except (ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
-            raise ValueError(
-                f"{folder} must hold {_DRAWS} and {_CERTIFICATE} of probmotion reference ({error})"
-            ) from error
+            files = f"{_DRAWS} and {_CERTIFICATE} of probmotion reference"
+            raise ValueError(f"{folder} must contain {files} ({error})") from error
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:
@@ -158,39 +139,28 @@ def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[fl
     They are the log density at the first draws; without a density of positions, the log density at
     four initial θ and the mean distance of their joints from the origin, metres. The truncation
     levels are appended if there are any.
-
-    Raises
-    ------
-    ValueError
-        If the prior has no density, or it is not finite at the draws.
     """
     prior = posterior.prior
     if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):
         # Evaluated at the points as stored, in float32.
-        some = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
-        known = [log_density_at(posterior, some)]
+        stored = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
+        numbers = [log_density_at(posterior, stored)]
     else:
         theta = prior.initial(seeds.generator(0, "fingerprint"), _PROBES)
         distances = np.linalg.norm(to_numpy(prior.motion(theta)), axis=-1)
-        known = [to_numpy(posterior.log_density(theta)), distances.mean(axis=(1, 2))]
-        if not np.isfinite(known).all():
+        numbers = [to_numpy(posterior.log_density(theta)), distances.mean(axis=(1, 2))]
+        if not np.isfinite(numbers).all():
             raise ValueError(
                 "posterior must have finite log densities at draws of its prior, got "
-                f"{known[0].tolist()}"
+                f"{numbers[0].tolist()}"
             )
     if isinstance(posterior, TruncatedPosterior) and posterior.truncated:
-        known.append(np.array([posterior.log_floor, posterior.log_cap]))
-    return [round(float(value), 6) for value in np.concatenate(known)]
+        numbers.append(np.array([posterior.log_floor, posterior.log_cap]))
+    return [round(float(value), 6) for value in np.concatenate(numbers)]
 
 
 def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndarray:
-    """Return log p(X) + log p(y | X), unnormalised: ``(n, L, J, 3) → (n,)``.
-
-    Raises
-    ------
-    ValueError
-        If the prior has no density of positions.
-    """
+    """Return log p(X) + log p(y | X), unnormalised: ``(n, L, J, 3) → (n,)``."""
     prior, likelihood = posterior.prior, posterior.likelihood
     if not isinstance(prior, HasPositionDensity):
         raise ValueError(
@@ -203,26 +173,8 @@ def log_density_at(posterior: MotionPosterior, positions: np.ndarray) -> np.ndar
     return np.asarray(value)
 
 
-def _same(found: list[float], wanted: Any) -> bool:
-    if not isinstance(wanted, list) or len(found) != len(wanted):
+def _same(fingerprint: list[float], stored: Any) -> bool:
+    if not isinstance(stored, list) or len(fingerprint) != len(stored):
         return False
-    return bool(np.allclose(found, np.asarray(wanted, dtype=float), rtol=_TOLERANCE, atol=1e-3))
-
-
-def _replace_folder(unfinished: Path, folder: Path) -> None:
-    """Rename a folder, replacing another, which is restored if that fails."""
-    if not folder.exists():
-        unfinished.rename(folder)
-        return
-    before = Path(tempfile.mkdtemp(prefix=".before-", dir=folder.parent))
-    os.replace(folder, before)
-    try:
-        unfinished.rename(folder)
-    except OSError:
-        os.replace(before, folder)
-        raise
-    shutil.rmtree(before)
-
-
-def _unwritable(folder: Path, error: OSError) -> OSError:
-    return OSError(f"cannot write {folder}: {error.strerror or error}; choose a writable folder")
+    numbers = np.asarray(stored, dtype=float)
+    return bool(np.allclose(fingerprint, numbers, rtol=_TOLERANCE, atol=1e-3))

@@ -59,33 +59,20 @@ class Sampler(Protocol):
 class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
     """A sampler does not support a posterior.
 
-    Parameters
-    ----------
-    sampler : str
-        The sampler's name.
-    reason : str
-        Reason, as the rest of a sentence that begins with the sampler's name.
-    word : str
-        The reason in one word, for tables.
-    others : iterable of str, optional
-        Suitable samplers.
+    ``reason`` is the rest of a sentence that begins with the sampler's name, ``word`` the reason in
+    one word, for tables, and ``others`` the names of suitable samplers.
     """
 
     def __init__(self, sampler: str, reason: str, word: str, others: Iterable[str] = ()) -> None:
         names = ", ".join(others)
-        hint = f"; try {names}" if names else ""
-        super().__init__(f"{sampler} {reason}{hint}")
+        super().__init__(f"{sampler} {reason}" + (f"; try {names}" if names else ""))
         self.word = word
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C stopped a sampler; ``draws`` holds the finished draws.
+    """Ctrl-C stopped a sampler; ``draws`` are the finished draws, equally many per chain.
 
-    Parameters
-    ----------
-    draws : MotionDraws
-        Finished draws, equally many per chain. A chain sampler continues from them with
-        ``sampler.sample(posterior, …, initial=interrupted.draws)``.
+    A chain sampler continues with ``sampler.sample(posterior, …, initial=interrupted.draws)``.
     """
 
     def __init__(self, draws: MotionDraws) -> None:
@@ -104,11 +91,11 @@ def require(sampler: Sampler, posterior: MotionPosterior) -> None:
 
     A prior may name substitutes by protocol in a mapping ``stand_ins``, appended to the message.
     """
-    lacking = missing(sampler, posterior)
-    if lacking:
-        names = [[one.__name__ for one in get_args(needed) or (needed,)] for needed in lacking]
+    protocols = missing(sampler, posterior)
+    if protocols:
+        names = [[one.__name__ for one in get_args(needed) or (needed,)] for needed in protocols]
         stand_ins = getattr(posterior.prior, "stand_ins", {})
-        hints = [f"; {stand_ins[one]}" for some in names for one in some if one in stand_ins]
+        hints = [f"; {stand_ins[one]}" for union in names for one in union if one in stand_ins]
         raise UnsupportedPosterior(
             sampler.name,
             f"needs a prior with {' and '.join(map(' or '.join, names))}, got "
@@ -139,28 +126,28 @@ def importable_samplers() -> dict[str, type[Any]]:
 
     Samplers that cannot be imported or constructed are skipped with a warning.
     """
-    refused: dict[str, ValueError] = {}
-    found = {}
-    for name, kind in _imported(refused).items():
+    errors: dict[str, ValueError] = {}
+    samplers = _imported(errors)
+    for name in list(samplers):
         try:
             default_sampler(name)
-            found[name] = kind
         except ValueError as error:
-            refused[name] = error
-    for reason in refused.values():
-        warnings.warn(f"{reason}; sampler skipped", stacklevel=2)
-    return found
+            errors[name] = error
+            del samplers[name]
+    for error in errors.values():
+        warnings.warn(f"{error}; sampler skipped", stacklevel=2)
+    return samplers
 
 
-def _imported(refused: dict[str, ValueError]) -> dict[str, type[Any]]:
-    """Return the importable samplers; add the others' errors to ``refused``."""
-    found = {}
+def _imported(errors: dict[str, ValueError]) -> dict[str, type[Any]]:
+    """Return the importable samplers; add the others' errors to ``errors``."""
+    samplers = {}
     for name in sampler_names():
         try:
-            found[name] = load_sampler(name)
+            samplers[name] = load_sampler(name)
         except ValueError as error:
-            refused[name] = error
-    return found
+            errors[name] = error
+    return samplers
 
 
 @cache
@@ -189,21 +176,14 @@ def sampler_names() -> list[str]:
 
 
 def load_sampler(name: str) -> type[Any]:
-    """Return the class of a registered sampler.
-
-    Raises
-    ------
-    ValueError
-        If no sampler has that name, or it cannot be imported.
-    """
+    """Return the class of a registered sampler; raise ``ValueError`` if it cannot be imported."""
     known = _registered()
     if name not in known:
         raise ValueError(f"sampler must be one of {', '.join(sorted(known))}, got {name!r}")
     point = known[name]
     try:
         return point.load()
-    # Third-party packages may raise anything on import.
-    except Exception as error:
+    except Exception as error:  # third-party packages may raise anything
         raise ValueError(
             f"sampler {name!r} of {_package_of(point)} must be importable from {point.value!r}, "
             f"got {_in_a_line(error)}"
@@ -211,13 +191,7 @@ def load_sampler(name: str) -> type[Any]:
 
 
 def default_sampler(name: str) -> Any:
-    """Return a registered sampler with its default settings.
-
-    Raises
-    ------
-    ValueError
-        As :func:`load_sampler`, or if a setting has no default.
-    """
+    """Return a registered sampler with its default settings; raise ``ValueError`` otherwise."""
     kind = load_sampler(name)
     try:
         return kind()
@@ -232,22 +206,12 @@ def _in_a_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-class _Silent:
-    """A hidden progress bar."""
-
-    def update(self, n: int = 1) -> None:
-        """Count ``n`` more."""
-
-
 @contextmanager
 def progress_bar(total: int, label: str, show: bool) -> Iterator[Any]:
     """Show a progress bar on standard error; yield an object with ``update(n)``."""
-    if not show:
-        yield _Silent()
-        return
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=label, leave=False, dynamic_ncols=True) as bar:
+    with tqdm(total=total, desc=label, leave=False, dynamic_ncols=True, disable=not show) as bar:
         yield bar
 
 

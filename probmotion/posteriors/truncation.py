@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +13,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["TruncatedPosterior", "limit_for_dimension"]
 
-# Nats above the floor within which a draw counts as near it.
+# Distance to the floor, nats, below which a draw is flagged.
 _NEAR = 1.0
 
 
@@ -47,8 +46,8 @@ class TruncatedPosterior(MotionPosterior):
         check_shape("seed", theta, (self.dim,))
         check_finite("seed", theta)
         object.__setattr__(self, "log_seed", math.nan)
-        whole = MotionPosterior(self.prior, self.likelihood)
-        log_density = float(whole.log_density(theta[None])[0])
+        untruncated = MotionPosterior(self.prior, self.likelihood)
+        log_density = float(untruncated.log_density(theta[None])[0])
         if not math.isfinite(log_density):
             raise ValueError(f"seed must have positive density, got log density {log_density}")
         log_seed = log_density - float(self._log_measure(theta[None])[0])
@@ -69,33 +68,8 @@ class TruncatedPosterior(MotionPosterior):
         """log c f₀."""
         return self.log_seed + math.log(self.limit)
 
-    def evaluate(
-        self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log density and the closest annotations; see the base class.
-
-        Raises
-        ------
-        ValueError
-            With generators and a finite limit: truncating an unbiased estimate biases it.
-        """
-        if generators is not None and self.truncated:
-            raise ValueError(
-                "limit must be infinite with randomly drawn views (truncating an unbiased estimate "
-                f"biases it), got {self.limit:g}"
-            )
-        return super().evaluate(theta, generators)
-
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
-        """Return flags (0 or 1) of draws at the cap and of draws within 1 nat of the floor.
-
-        Parameters
-        ----------
-        theta : ndarray, (…, dim)
-            Draws.
-        log_density : ndarray, (…)
-            Their log density.
-        """
+        """Return flags (0 or 1) of draws at the cap and of draws within 1 nat of the floor."""
         with np.errstate(invalid="ignore"):
             level = log_density - self._log_measure(theta)
         return {
@@ -110,8 +84,8 @@ class TruncatedPosterior(MotionPosterior):
     def _needs_likelihood(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         bound = getattr(self.likelihood, "log_bound", math.inf)
         with np.errstate(invalid="ignore"):
-            most = log_prior - log_measure + bound
-        return (log_prior > -np.inf) & (most >= self.log_floor)
+            largest = log_prior - log_measure + bound
+        return (log_prior > -np.inf) & (largest >= self.log_floor)
 
     def _shaped(self, log_density: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
         with np.errstate(invalid="ignore"):

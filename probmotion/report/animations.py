@@ -31,11 +31,11 @@ def shown_problems(comparison: GridResults, budget: int = BUDGET) -> dict[str, S
     Draws, and then frames, are left out until they fit the budget in bytes. Problems without draws
     and references are left out.
     """
-    found = {}
+    problems = {}
     for name in comparison.plan.problems:
         if (shown := _shown(comparison, name)) is not None:
-            found[name] = shown
-    size = 2 * sum(row.size for shown in found.values() for row in shown.rows.values())
+            problems[name] = shown
+    size = 2 * sum(row.size for shown in problems.values() for row in shown.rows.values())
     fraction = next(
         (n / _MOST for n in range(_MOST, 1, -1) if n / _MOST * size <= budget), 1 / _MOST
     )
@@ -49,7 +49,7 @@ def shown_problems(comparison: GridResults, budget: int = BUDGET) -> dict[str, S
             },
             step,
         )
-        for name, shown in found.items()
+        for name, shown in problems.items()
     }
 
 
@@ -81,8 +81,8 @@ def _shown(comparison: GridResults, name: str) -> Shown | None:
 def animation(name: str, shown: Shown, place: int, missing: Mapping[str, str]) -> str:
     """Return the animation of one problem as HTML.
 
-    ``place`` is the number of the problem in the report, for its ids; ``missing`` holds the reason
-    for missing draws by sampler, as HTML.
+    ``place`` is the number of the problem in the report, for its ids; ``missing`` contains the
+    reason for missing draws by sampler, as HTML.
     """
     cards = [
         f"<figure><figcaption>{escape(sampler)}: no draws, {why}</figcaption></figure>"
@@ -106,7 +106,7 @@ def _counted(label: str, n: int, problem: StoredProblem) -> str:
 
 
 def _description(shown: Shown) -> str:
-    """Return sentences on the observations and on what is not shown."""
+    """Return sentences on the observations and on omitted parts."""
     problem = shown.problem
     parts = []
     for observed, words in ((problem.keypoints, "keypoints"), (problem.joints, "noisy 3D joints")):

@@ -148,7 +148,7 @@ def _section(
 <header><h2 id="problem-{place}-name">{escape(name)}</h2></header>
 <p>{escape(comparison.plan.problems[name])}</p>
 {problem_tables(table, name, list(outcomes), outcomes)}
-{_image(plot, f"Quality against cost on {name}; the tables hold the numbers.")}
+{_image(plot, f"Quality against cost on {name}; the tables contain the numbers.")}
 <h3 id="skeletons-{place}">Draws on {escape(name)}</h3>
 {draws}
 </section>"""
@@ -159,11 +159,11 @@ def _outcome(
 ) -> Outcome:
     """Return why a sampler has missing draws; runs without a result are unfinished."""
     seeds = comparison.plan.seeds
-    found = [r for r in comparison.results if (r.problem, r.sampler) == (problem, sampler)]
-    failures = [result.failure for result in found if result.failure is not None]
+    results = [r for r in comparison.results if (r.problem, r.sampler) == (problem, sampler)]
+    failures = [result.failure for result in results if result.failure is not None]
     words = list(dict.fromkeys(failure.word for failure in failures))
     sentences = list(dict.fromkeys(failure.message for failure in failures))
-    if missing := seeds - len(found):
+    if missing := seeds - len(results):
         words.append("unfinished")
         sentences.append(f"{missing} of {seeds} seeds are not finished")
     return Outcome(

@@ -14,6 +14,7 @@ from probmotion.comparison.results.headline_metrics import (
     HEADLINE_METRICS,
     best_of,
     headline_metric,
+    seed_values,
 )
 from probmotion.comparison.results.table import BLOCKS, mean_and_sd
 from probmotion.plots.style import CYCLE, style_of
@@ -43,7 +44,7 @@ _MARKERS = {
 class Outcome:
     """Missing draws of a sampler on a problem.
 
-    ``word`` and ``sentences`` hold the reason, ``note`` the id of its note, and ``failed`` the
+    ``word`` and ``sentences`` are the reason, ``note`` the id of its note, and ``failed`` the
     number of seeds without draws.
     """
 
@@ -72,13 +73,11 @@ def overview(plan: Plan, table: pd.DataFrame, outcomes: Mapping[str, Mapping[str
     )
     rows, used = [], set()
     for place, problem in enumerate(plan.problems):
-        own = table[table["problem"] == problem]
-        metric = headline_metric(own) or "–"
+        measured = table[table["problem"] == problem]
+        metric = headline_metric(measured) or "–"
         used.add(metric)
-        values = {
-            str(name): group.set_index("seed")["value"]
-            for name, group in own[own["metric"] == metric].groupby("sampler", sort=False)
-        }
+        headline = seed_values(measured[measured["metric"] == metric])
+        values = {name: row for (name, _), row in headline.items()}
         best = best_of(metric, values, range(plan.seeds))
         entries = "".join(
             f'<td class="failed">{outcome.link()}</td>'
@@ -104,10 +103,7 @@ def problem_tables(
 ) -> str:
     """Return the tables of one problem as HTML, with further metrics in a folded one."""
     rows = table[(table["problem"] == problem) & ~table["metric"].isin(_FAILURES)]
-    values = {
-        (str(sampler), str(metric)): group.set_index("seed")["value"]
-        for (sampler, metric), group in rows.groupby(["sampler", "metric"], sort=False)
-    }
+    values = seed_values(rows)
     measured = list(dict.fromkeys(str(name) for name in rows["metric"]))
     draws = table.attrs.get("draws")
     parts, shown = [], {"seconds"}
@@ -136,8 +132,8 @@ def _table(
     seeds = range(max(outcome.seeds for outcome in outcomes.values()))
     best = {}
     for metric in headings:
-        own = {name: values[name, metric] for name in samplers if (name, metric) in values}
-        best[metric] = best_of(metric, own, seeds, {other for _, other in values}, draws)
+        by_sampler = {name: values[name, metric] for name in samplers if (name, metric) in values}
+        best[metric] = best_of(metric, by_sampler, seeds, {other for _, other in values}, draws)
     body = []
     for place, sampler in enumerate(samplers):
         outcome = outcomes[sampler]

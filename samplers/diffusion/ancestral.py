@@ -6,31 +6,23 @@ state is drawn from the DDPM posterior around the estimate.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.posteriors.sampling import require
 from probmotion.samplers.diffusion.guidance import Guide, can_guide
-from probmotion.samplers.diffusion.views import StateDenoiser
-from probmotion.samplers.independent import draw_independently, refuse_initial
+from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
 
 __all__ = [
-    "AncestralSampler",
-    "Corrector",
-    "MotionState",
-    "State",
-    "ancestral",
-    "cosine_schedule",
-    "sigma",
-]
+    "AncestralSampler", "Corrector", "MotionState", "NoiseLevels", "State", "ancestral", "sigma",
+]  # fmt: skip
 
 
 class State(Protocol):
@@ -49,19 +41,28 @@ class State(Protocol):
         """Convert clean motions (B, L, J, 3) to the representation of the state."""
 
 
+class Denoiser(Protocol):
+    """Denoiser that counts its evaluations."""
+
+    counts: dict[str, int]
+
+    def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return the estimate of the clean motion from the state at ᾱ, of the same shape."""
+
+
 @dataclass
 class MotionState:
-    """One noisy 3D motion per draw, (B, L, J, 3), with ``shape`` (L, J, 3).
+    """One noisy motion per draw, (B, L, J, 3), or (B, L, J, 2) in 2D; ``shape`` is without B.
 
     ``guide`` corrects the estimate of the clean motion for the observations. ``noise_factor`` maps
     σ to a matrix F, (3, 3), for noise F ε, or to ``None`` for the identity.
     """
 
-    denoiser: StateDenoiser
+    denoiser: Denoiser
     schedule: NoiseSchedule
     shape: tuple[int, ...]
     guide: Guide | None = None
-    noise_factor: Callable[[float], np.ndarray | None] | None = None
+    noise_factor: Callable[[float], np.ndarray | None] = lambda level: None
     counts: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -70,7 +71,7 @@ class MotionState:
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
         """Return F(σ_t) ε, ε ~ N(0, I)."""
         noise = streams.normal(*self.shape)
-        factor = None if self.noise_factor is None else self.noise_factor(sigma(self.schedule, t))
+        factor = self.noise_factor(sigma(self.schedule, t))
         return noise if factor is None else noise @ factor.T
 
     def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
@@ -88,13 +89,6 @@ class MotionState:
 
 Corrector = Callable[[State, NormalStreams, np.ndarray, int], np.ndarray]
 """(state, streams, x_t, t) → another state at the same level t."""
-
-
-def cosine_schedule(steps: int, trained_steps: int | None, power: int) -> NoiseSchedule:
-    """Return ``steps`` levels of a cosine schedule of ``trained_steps`` (``steps`` by default)."""
-    if trained_steps is None:
-        return NoiseSchedule.cosine(steps, power=power)
-    return NoiseSchedule.cosine(trained_steps, power=power).strided(steps)
 
 
 def ancestral(
@@ -143,14 +137,8 @@ def sigma(schedule: NoiseSchedule, t: int) -> float:
     return float(np.sqrt((1 - alpha_bar) / alpha_bar))
 
 
-class AncestralSampler:
-    """Base of the ancestral samplers of 3D motions: frozen dataclasses with these settings."""
-
-    name: ClassVar[str]
-    requires: ClassVar[tuple[type, ...]]
-    draws_from = staticmethod(can_guide)
-    effort: ClassVar[tuple[str, ...]] = ("steps",)
-    least_effort: ClassVar[int] = 2
+class NoiseLevels:
+    """Base of frozen dataclasses with these settings of the noise levels."""
 
     steps: int
     trained_steps: int | None
@@ -159,61 +147,44 @@ class AncestralSampler:
 
     def __post_init__(self) -> None:
         check_count("batch", self.batch)
-        cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
+        # The schedule checks the other settings.
+        check_count("steps", self.schedule.steps)
 
     @property
     def schedule(self) -> NoiseSchedule:
-        """The noise levels."""
-        return cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
+        """The noise levels: ``steps`` of a schedule of ``trained_steps`` levels."""
+        if self.trained_steps is None:
+            return NoiseSchedule.cosine(self.steps, power=self.schedule_power)
+        trained = NoiseSchedule.cosine(self.trained_steps, power=self.schedule_power)
+        return trained.strided(self.steps)
 
-    def sample(
-        self,
-        posterior: MotionPosterior,
-        *,
-        draws: int = 1000,
-        chains: int = 1,
-        seed: int = 0,
-        initial: MotionDraws | np.ndarray | None = None,
-        progress: bool = True,
-    ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` independent draws.
 
-        Warns
-        -----
-        UserWarning
-            If the sampler uses views with elevation 0.
+class AncestralSampler(NoiseLevels, IndependentSampler):
+    """Base of the ancestral samplers of 3D motions."""
 
-        Raises
-        ------
-        UnsupportedPosterior
-            If the prior lacks the denoiser, the likelihood is not linear Gaussian, or the guidance
-            or the views do not support the prior or observations.
-        """
-        require(self, posterior)
-        refuse_initial(self, initial)
-        state = self._state(posterior)
-        return draw_independently(
-            self,
-            posterior,
-            lambda streams, tick: self._run(state, streams, tick),
-            draws=draws,
-            chains=chains,
-            seed=seed,
-            batch=self.batch,
-            steps=self.steps - self._last_level + 1,
-            scale=posterior.prior.scale,  # type: ignore[attr-defined]
-            counts=state.counts,
-            progress=progress,
-        )
+    draws_from = staticmethod(can_guide)
+    effort: ClassVar[tuple[str, ...]] = ("steps",)
+    least_effort: ClassVar[int] = 2
 
-    @property
-    def _last_level(self) -> int:
-        return 1
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
+        if getattr(self, "elevation", None) == 0:
+            warnings.warn(
+                f"{self.name} cannot distinguish a motion from its mirror image with elevation 0; "
+                "use an elevation such as pi/16",
+                stacklevel=3,
+            )
+        state, options = self._state(posterior), self._options()
+
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            return ancestral(state, streams, tick, **options)
+
+        steps = self.steps - options.get("stop", 1) + 1
+        scale = posterior.prior.scale  # type: ignore[attr-defined]
+        return Batches(draw, self.batch, steps, scale, state.counts)
 
     def _state(self, posterior: MotionPosterior) -> State:
         raise NotImplementedError
 
-    def _run(
-        self, state: State, streams: NormalStreams, tick: Callable[[], Any], **options: Any
-    ) -> np.ndarray:
-        return ancestral(state, streams, tick, stop=self._last_level, **options)
+    def _options(self) -> dict[str, Any]:
+        """Return the options of :func:`ancestral`."""
+        return {}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from probmotion.geometry.cameras import Cameras
-from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import (
@@ -20,7 +19,7 @@ from probmotion.posteriors.sampling import (
     require,
     suited,
 )
-from probmotion.samplers.diffusion.ancestral import ancestral, cosine_schedule
+from probmotion.samplers.diffusion.ancestral import MotionState, NoiseLevels, ancestral
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
 
@@ -28,7 +27,7 @@ __all__ = ["Ancestral2D"]
 
 
 @dataclass(frozen=True)
-class Ancestral2D:
+class Ancestral2D(NoiseLevels):
     """DDPM ancestral sampling of one view with a 2D denoiser: the upper bound in table 2 of MAS.
 
     It returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
@@ -52,15 +51,6 @@ class Ancestral2D:
     trained_steps: int | None = None
     schedule_power: int = 2
     batch: int = 256
-
-    def __post_init__(self) -> None:
-        check_count("batch", self.batch)
-        cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
-
-    @property
-    def schedule(self) -> NoiseSchedule:
-        """The noise levels."""
-        return cosine_schedule(self.steps, self.trained_steps, self.schedule_power)
 
     def sample_views(
         self,
@@ -99,13 +89,22 @@ class Ancestral2D:
         ValueError
             If ``camera`` has several views.
         """
-        prior = self._prior(posterior)
+        require(self, posterior)  # type: ignore[arg-type]
+        prior = posterior.prior
+        assert isinstance(prior, Denoises2D)
+        if posterior.likelihood is not None:
+            raise UnsupportedPosterior(
+                self.name,
+                "does not support observations",
+                word="observations",
+                others=suited(posterior),
+            )
         check_count("draws", draws)
         view = Cameras.ring(1, elevation=math.pi / 16) if camera is None else camera
         if view.n_views != 1:
             raise ValueError(f"camera must have one view, got {view.n_views}")
         shape = (posterior.frames, posterior.skeleton.n_joints, 2)
-        state = _ViewState(prior, view, self.schedule, shape)
+        state = MotionState(_ViewDenoiser(prior, view), self.schedule, shape)
         bars = progress_bar(self.steps * -(-draws // self.batch), self.name, progress)
         done: list[np.ndarray] = []
         # Multithreaded products round differently for different batch sizes.
@@ -115,36 +114,16 @@ class Ancestral2D:
                 done.append(ancestral(state, streams, lambda: bar.update(1)) * prior.scale)
         return np.concatenate(done)
 
-    def _prior(self, posterior: MotionPosterior) -> Denoises2D:
-        require(self, posterior)  # type: ignore[arg-type]
-        assert isinstance(posterior.prior, Denoises2D)
-        if posterior.likelihood is not None:
-            raise UnsupportedPosterior(
-                self.name,
-                "does not support observations",
-                word="observations",
-                others=suited(posterior),
-            )
-        return posterior.prior
 
+class _ViewDenoiser:
+    """E[x₀ | x_t] of one view."""
 
-@dataclass
-class _ViewState:
-    """One noisy view per draw, (B, L, J, 2), normalised units."""
+    def __init__(self, prior: Denoises2D, camera: Cameras) -> None:
+        self.prior = prior
+        self.camera = camera
+        self.counts = {"denoiser": 0}
 
-    prior: Denoises2D
-    camera: Cameras
-    schedule: NoiseSchedule
-    shape: tuple[int, ...]
-    counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
-
-    def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
-        return streams.normal(*self.shape)
-
-    def estimate(self, x_t: np.ndarray, t: int) -> np.ndarray:
+    def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return E[x₀ | x_t]: ``(B, L, J, 2) → (B, L, J, 2)``."""
         self.counts["denoiser"] += len(x_t)
-        alpha_bar = float(self.schedule.alpha_bar[t])
         return self.prior.denoise(x_t[:, None], alpha_bar, self.camera)[:, 0]
-
-    def embed(self, motions: np.ndarray) -> np.ndarray:
-        return motions

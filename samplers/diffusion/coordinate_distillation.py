@@ -12,115 +12,32 @@ every level, so the iterates converge to a mode of the posterior.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Protocol
 
 import numpy as np
 
 from probmotion.arrays import to_numpy
-from probmotion.posteriors.draws import MotionDraws
-from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import DenoisesCoordinates, NotConjugate
-from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, suited
-from probmotion.samplers.adam import Adam
+from probmotion.posteriors.sampling import UnsupportedPosterior, suited
 from probmotion.samplers.densities import not_conjugate
-from probmotion.samplers.independent import draw_independently
-from probmotion.seeds import NormalStreams
 from probmotion.validation import check_finite
 
-__all__ = ["distil_coordinates"]
+__all__ = ["coordinate_distillation_gradient", "no_gradient", "posterior_gradient"]
 
 
-class DistillationSettings(Sampler, Protocol):
-    """Settings that :class:`~probmotion.samplers.diffusion.sds.ScoreDistillation` provides."""
-
-    @property
-    def iterations(self) -> int: ...
-
-    @property
-    def batch(self) -> int: ...
-
-    @property
-    def learning_rate(self) -> float: ...
-
-    @property
-    def schedule(self) -> NoiseSchedule: ...
-
-    def plan(self, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def weight(self, alpha_bar: float) -> float: ...
-
-
-def distil_coordinates(
-    sampler: DistillationSettings,
-    posterior: MotionPosterior,
-    *,
-    draws: int,
-    chains: int,
-    seed: int,
-    progress: bool,
-) -> MotionDraws:
-    """Return ``chains`` × ``draws`` points close to modes of the posterior, from random starts.
-
-    They are not draws from the posterior: their spread around a mode is that of Adam. The counts
-    are ``gradient`` for gradients of the likelihood, ``denoiser`` for estimates of E[θ | θ_t] and
-    ``density`` for final log densities. Raises :class:`UnsupportedPosterior` if torch cannot
-    differentiate the log likelihood, and ``ValueError`` if its gradient is not finite.
-    """
-    if posterior.likelihood is not None and not posterior.differentiable:
-        raise _no_gradient(sampler, posterior, "but it has no gradient")
-    counts = {"denoiser": 0, "gradient": 0, "density": 0}
-    thetas: list[np.ndarray] = []
-
-    def draw_batch(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
-        theta = _optimise(sampler, posterior, streams, seed, tick)
-        evaluations = len(theta) * sampler.iterations
-        counts["denoiser"] += evaluations
-        counts["gradient"] += 0 if posterior.likelihood is None else evaluations
-        counts["density"] += len(theta)
-        thetas.append(theta)
-        return posterior.complete(streams, theta)
-
-    return draw_independently(
-        sampler,
-        posterior,
-        draw_batch,
-        draws=draws,
-        chains=chains,
-        seed=seed,
-        batch=sampler.batch,
-        steps=sampler.iterations,
-        scale=1.0,
-        counts=counts,
-        progress=progress,
-        thetas=thetas,
-    )
-
-
-def _optimise(
-    sampler: DistillationSettings,
-    posterior: MotionPosterior,
-    streams: NormalStreams,
-    seed: int,
-    tick: Callable[[], Any],
+def posterior_gradient(
+    posterior: MotionPosterior, theta: np.ndarray, noise: np.ndarray, alpha_bar: float
 ) -> np.ndarray:
-    prior = posterior.prior
-    assert isinstance(prior, DenoisesCoordinates)
-    alpha_bars = sampler.schedule.alpha_bar
-    theta = streams.normal(posterior.dim)
-    adam = Adam(theta, sampler.learning_rate)
-    levels, _ = sampler.plan(seed)
-    for t in levels:
-        alpha_bar = float(alpha_bars[t])
-        noise = streams.normal(posterior.dim)
-        gradient = coordinate_distillation_gradient(prior, theta, noise, alpha_bar)
-        if posterior.likelihood is not None:
-            weight = math.sqrt(alpha_bar * (1 - alpha_bar))
-            gradient -= weight * _likelihood_gradient(sampler, posterior, theta)
-        adam.descend(sampler.weight(alpha_bar) * gradient)
-        tick()
-    return theta
+    """Return ε_φ − ε − √(ᾱ(1−ᾱ)) ∇ log p(y | θ), all arrays (n, dim).
+
+    Raises :class:`UnsupportedPosterior` if torch cannot differentiate the log likelihood, and
+    ``ValueError`` if its gradient is not finite.
+    """
+    assert isinstance(posterior.prior, DenoisesCoordinates)
+    gradient = coordinate_distillation_gradient(posterior.prior, theta, noise, alpha_bar)
+    if posterior.likelihood is not None:
+        gradient -= math.sqrt(alpha_bar * (1 - alpha_bar)) * _likelihood_gradient(posterior, theta)
+    return gradient
 
 
 def coordinate_distillation_gradient(
@@ -133,20 +50,7 @@ def coordinate_distillation_gradient(
     return (noisy - signal * clean) / spread - noise
 
 
-def _no_gradient(
-    sampler: DistillationSettings, posterior: MotionPosterior, reason: str
-) -> UnsupportedPosterior:
-    return UnsupportedPosterior(
-        sampler.name,
-        f"needs a log likelihood that torch can differentiate, {reason}",
-        word="gradient",
-        others=[name for name in suited(posterior) if name != sampler.name],
-    )
-
-
-def _likelihood_gradient(
-    sampler: DistillationSettings, posterior: MotionPosterior, theta: np.ndarray
-) -> np.ndarray:
+def _likelihood_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     """Return ∇ log p(y | θ), ``(n, dim) → (n, dim)``."""
     import torch
 
@@ -155,14 +59,23 @@ def _likelihood_gradient(
     try:
         value = posterior.log_likelihood(point)
     except NotConjugate as error:
-        raise not_conjugate(sampler, error) from error
+        raise not_conjugate("sds", error) from error
     except (TypeError, RuntimeError) as error:
         # Raised by NumPy or torch if the prior or likelihood converts tensors to arrays.
-        raise _no_gradient(
-            sampler, posterior, f"but got {type(error).__name__}: {str(error).splitlines()[0]}"
-        ) from error
+        reason = f"but got {type(error).__name__}: {str(error).splitlines()[0]}"
+        raise no_gradient(posterior, reason) from error
     if not getattr(value, "requires_grad", False):
-        raise _no_gradient(sampler, posterior, f"but {type(posterior.prior).__name__} returns none")
+        raise no_gradient(posterior, f"but {type(posterior.prior).__name__} returns none")
     (gradient,) = torch.autograd.grad(value.sum(), point)
     check_finite("gradient of the log likelihood", gradient)
     return to_numpy(gradient)
+
+
+def no_gradient(posterior: MotionPosterior, reason: str) -> UnsupportedPosterior:
+    """Return the error for a log likelihood without a gradient."""
+    return UnsupportedPosterior(
+        "sds",
+        f"needs a log likelihood that torch can differentiate, {reason}",
+        word="gradient",
+        others=[name for name in suited(posterior) if name != "sds"],
+    )

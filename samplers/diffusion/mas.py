@@ -7,7 +7,6 @@ triangulated to one 3D motion, which is projected back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -17,15 +16,15 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import UnsupportedPosterior, require
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State
+from probmotion.samplers.diffusion.ancestral import (
+    AncestralSampler,
+    MotionState,
+    State,
+    ancestral,
+)
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.diffusion.separate_views import SeparateViews
-from probmotion.samplers.diffusion.views import (
-    MultiViewDenoiser,
-    Views,
-    views_around,
-    warn_of_level_views,
-)
+from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views, views_around
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive, check_shape
 
@@ -139,16 +138,14 @@ class MultiViewAncestral(AncestralSampler):
                 noises.append(noise if noise.shape[-1] == 3 else views.combine(noise))
 
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
-        self._run(state, streams, lambda: None, watch=watch)
+        ancestral(state, streams, lambda: None, watch=watch, **self._options())
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return MultiViewTrace(self, np.stack(estimates), np.stack(noises), scale)
 
-    @property
-    def _last_level(self) -> int:
-        return self.stop_level
+    def _options(self) -> dict[str, Any]:
+        return {"stop": self.stop_level, "variance_for_deviation": self.variance_for_deviation}
 
     def _state(self, posterior: MotionPosterior) -> State:
-        warn_of_level_views(self.name, self.elevation)
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
@@ -165,12 +162,6 @@ class MultiViewAncestral(AncestralSampler):
                 word="observations",
             )
         return SeparateViews(prior, self.cameras, views, self.schedule, shape, self.shared_noise)
-
-    def _run(
-        self, state: State, streams: NormalStreams, tick: Callable[[], Any], **options: Any
-    ) -> np.ndarray:
-        power = self.variance_for_deviation
-        return super()._run(state, streams, tick, variance_for_deviation=power, **options)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,20 +25,13 @@ import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
-from probmotion.samplers.diffusion.ancestral import (
-    AncestralSampler,
-    Corrector,
-    MotionState,
-    State,
-    sigma,
-)
+from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State, sigma
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.diffusion.views import (
     MultiViewDenoiser,
     Views,
     symmetric_power,
     views_around,
-    warn_of_level_views,
 )
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
@@ -116,7 +109,6 @@ class MultiViewPredictorCorrector(AncestralSampler):
         return self.gamma if level >= self.gamma_from else 0.0
 
     def _state(self, posterior: MotionPosterior) -> State:
-        warn_of_level_views(self.name, self.elevation)
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
         views = Views(views_around(self.n_views, self.elevation))
@@ -125,10 +117,8 @@ class MultiViewPredictorCorrector(AncestralSampler):
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         return MotionState(denoiser, self.schedule, shape, guide, self._noise_factor(views))
 
-    def _run(
-        self, state: State, streams: NormalStreams, tick: Callable[[], Any], **options: Any
-    ) -> np.ndarray:
-        return super()._run(state, streams, tick, corrector=self._corrector(), **options)
+    def _options(self) -> dict[str, Any]:
+        return {"corrector": self._correct} if self.corrector_steps else {}
 
     def _noise_factor(self, views: Views) -> Callable[[float], np.ndarray | None]:
         """Return σ → Λ^(γ(σ)/2), or ``None`` for the identity."""
@@ -140,19 +130,13 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
         return lambda level: power(self.gamma_at(level))
 
-    def _corrector(self) -> Corrector | None:
-        if self.corrector_steps == 0:
-            return None
-        size = self.corrector_size
-
-        def correct(state: State, streams: NormalStreams, x: np.ndarray, t: int) -> np.ndarray:
-            if sigma(state.schedule, t) < self.corrected_from:
-                return x
-            alpha_bar = float(state.schedule.alpha_bar[t])
-            for _ in range(self.corrector_steps):
-                drift = math.sqrt(alpha_bar) * state.estimate(x, t) - x
-                kick = math.sqrt(2 * size * (1 - alpha_bar)) * state.noise(streams, t)
-                x = x + size * drift + kick
+    def _correct(self, state: State, streams: NormalStreams, x: np.ndarray, t: int) -> np.ndarray:
+        """Return the state after the corrector steps at level t."""
+        if sigma(state.schedule, t) < self.corrected_from:
             return x
-
-        return correct
+        size, alpha_bar = self.corrector_size, float(state.schedule.alpha_bar[t])
+        for _ in range(self.corrector_steps):
+            drift = math.sqrt(alpha_bar) * state.estimate(x, t) - x
+            kick = math.sqrt(2 * size * (1 - alpha_bar)) * state.noise(streams, t)
+            x = x + size * drift + kick
+        return x

@@ -15,15 +15,14 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.geometry.cameras import Cameras
-from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D, DenoisesCoordinates
-from probmotion.posteriors.sampling import UnsupportedPosterior, require, suited
+from probmotion.posteriors.sampling import UnsupportedPosterior, suited
 from probmotion.samplers.adam import Adam
-from probmotion.samplers.diffusion.coordinate_distillation import distil_coordinates
+from probmotion.samplers.diffusion.coordinate_distillation import no_gradient, posterior_gradient
 from probmotion.samplers.diffusion.views import Views
-from probmotion.samplers.independent import draw_independently, refuse_initial
+from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
 
@@ -34,13 +33,14 @@ Weighting = Literal["constant", "variance", "residual"]
 
 
 @dataclass(frozen=True)
-class ScoreDistillation:
+class ScoreDistillation(IndependentSampler):
     """Score distillation sampling with a 2D denoiser, or a denoiser of the prior's coordinates.
 
     SDS seeks modes: its draws are overconfident, with a spread far below that of the posterior.
     Draws have independent starts and noises, but all draws of a run share the level t and the
     views of an iteration. Priors without a 2D denoiser are optimised in their coordinates, with or
-    without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`).
+    without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`); the counts
+    then include likelihood gradients and final log densities.
 
     Parameters
     ----------
@@ -123,58 +123,59 @@ class ScoreDistillation:
         """Return whether there are no observations, or the coordinates are optimised."""
         return posterior.likelihood is None or not isinstance(posterior.prior, Denoises2D)
 
-    def sample(
-        self,
-        posterior: MotionPosterior,
-        *,
-        draws: int = 1000,
-        chains: int = 1,
-        seed: int = 0,
-        initial: MotionDraws | np.ndarray | None = None,
-        progress: bool = True,
-    ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` motions, each optimised from its own start.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the prior has neither denoiser, or there are observations and the denoiser is 2D or
-            the log likelihood is not differentiable by torch.
-        """
-        require(self, posterior)
-        refuse_initial(self, initial)
-        prior = posterior.prior
-        if not isinstance(prior, Denoises2D):
-            return distil_coordinates(
-                self, posterior, draws=draws, chains=chains, seed=seed, progress=progress
-            )
-        if not self.draws_from(posterior):
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
+        if not isinstance(posterior.prior, Denoises2D):
+            return self._coordinate_batches(posterior, seed)
+        if posterior.likelihood is not None:
             raise UnsupportedPosterior(
                 self.name,
                 "does not support observations with a 2D denoiser",
                 word="observations",
                 others=suited(posterior),
             )
-        counts = {"denoiser": 0}
+        prior, counts = posterior.prior, {"denoiser": 0}
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
+        elevation = np.full(self.n_views, self.elevation)
 
-        def draw_batch(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
-            counts["denoiser"] += len(streams.generators) * self.iterations * self.n_views
-            return self._optimise(prior, streams, shape, seed, tick)
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            motions = streams.normal(*shape)
+            counts["denoiser"] += len(motions) * self.iterations * self.n_views
 
-        return draw_independently(
-            self,
-            posterior,
-            draw_batch,
-            draws=draws,
-            chains=chains,
-            seed=seed,
-            batch=self.batch,
-            steps=self.iterations,
-            scale=prior.scale,
-            counts=counts,
-            progress=progress,
-        )
+            def gradient(alpha_bar: float, numbers: np.ndarray) -> np.ndarray:
+                views = Views(Cameras.around(self.arc * numbers / self.azimuths, elevation))
+                if self.shared_noise:
+                    noise = views.project(streams.normal(*shape))
+                else:
+                    noise = streams.normal(self.n_views, *shape[:-1], 2)
+                return score_distillation_gradient(prior, views, motions, noise, alpha_bar)
+
+            self._descend(motions, gradient, seed, tick)
+            return motions
+
+        return Batches(draw, self.batch, self.iterations, prior.scale, counts)
+
+    def _coordinate_batches(self, posterior: MotionPosterior, seed: int) -> Batches:
+        observed = posterior.likelihood is not None
+        if observed and not posterior.differentiable:
+            raise no_gradient(posterior, "but it has no gradient")
+        counts = {"denoiser": 0, "gradient": 0, "density": 0}
+        thetas: list[np.ndarray] = []
+
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            theta = streams.normal(posterior.dim)
+
+            def gradient(alpha_bar: float, numbers: np.ndarray) -> np.ndarray:
+                noise = streams.normal(posterior.dim)
+                return posterior_gradient(posterior, theta, noise, alpha_bar)
+
+            self._descend(theta, gradient, seed, tick)
+            counts["denoiser"] += len(theta) * self.iterations
+            counts["gradient"] += len(theta) * self.iterations * observed
+            counts["density"] += len(theta)
+            thetas.append(theta)
+            return posterior.complete(streams, theta)
+
+        return Batches(draw, self.batch, self.iterations, counts=counts, thetas=thetas)
 
     def weight(self, alpha_bar: float) -> float:
         """Return w(t)."""
@@ -195,29 +196,20 @@ class ScoreDistillation:
         fall = np.linspace(self.steps - 1, 1, self.iterations)
         return np.round(fall).astype(int), views
 
-    def _optimise(
+    def _descend(
         self,
-        prior: Denoises2D,
-        streams: NormalStreams,
-        shape: tuple[int, ...],
+        values: np.ndarray,
+        gradient: Callable[[float, np.ndarray], np.ndarray],
         seed: int,
         tick: Callable[[], Any],
-    ) -> np.ndarray:
-        schedule = self.schedule
-        motions = streams.normal(*shape)
-        adam = Adam(motions, self.learning_rate)
+    ) -> None:
+        """Optimise values in place by their gradient at (ᾱ, azimuth indices)."""
+        alpha_bars = self.schedule.alpha_bar
+        adam = Adam(values, self.learning_rate)
         for t, numbers in zip(*self.plan(seed), strict=True):
-            azimuth = self.arc * numbers / self.azimuths
-            views = Views(Cameras.around(azimuth, np.full(self.n_views, self.elevation)))
-            if self.shared_noise:
-                noise = views.project(streams.normal(*shape))
-            else:
-                noise = streams.normal(self.n_views, *shape[:-1], 2)
-            alpha_bar = float(schedule.alpha_bar[t])
-            gradient = score_distillation_gradient(prior, views, motions, noise, alpha_bar)
-            adam.descend(self.weight(alpha_bar) * gradient)
+            alpha_bar = float(alpha_bars[t])
+            adam.descend(self.weight(alpha_bar) * gradient(alpha_bar, numbers))
             tick()
-        return motions
 
 
 def score_distillation_gradient(

@@ -6,7 +6,6 @@ motions are in normalised units.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -27,7 +26,6 @@ __all__ = [
     "Views",
     "symmetric_power",
     "views_around",
-    "warn_of_level_views",
 ]
 
 
@@ -92,16 +90,6 @@ def views_around(
     azimuth = 2 * np.pi * np.arange(n_views) / max(3, n_views)
     tilt = np.full(n_views, elevation)
     return Cameras.around(azimuth, tilt, distance=distance, perspective=perspective)
-
-
-def warn_of_level_views(sampler: str, elevation: float) -> None:
-    """Warn if the elevation is 0; the warning is attributed to the caller of the sampler."""
-    if elevation == 0:
-        warnings.warn(
-            f"{sampler} cannot distinguish a motion from its mirror image with elevation 0; "
-            "use an elevation such as pi/16",
-            stacklevel=4,
-        )
 
 
 class MotionDenoiser:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -97,10 +97,16 @@ class NUTS:
 
         check_count("draws", draws)
         require(self, posterior)
-        self._require_gradient(posterior)
+        for part in (posterior.prior, posterior.likelihood):
+            if not getattr(part, "differentiable", True):
+                raise UnsupportedPosterior(
+                    self.name,
+                    f"needs a differentiable density, which {type(part).__name__} does not have",
+                    word="gradient",
+                    others=suited(posterior),
+                )
         with jax.enable_x64(True):
-            # The cache key omits the settings that do not affect the compiled code.
-            kernel = compiled(replace(self, thin=1, candidates=1), posterior)
+            kernel = compiled(posterior, self.warmup, self.target_acceptance, self.max_tree_depth)
             start = time.perf_counter()
             earlier = continued(self, kernel.log_densities, initial, chains, seed)
             densities = 0
@@ -121,16 +127,6 @@ class NUTS:
                     raise
                 raise Interrupted(self._result(posterior, run, seed, start)) from stop
             return self._result(posterior, run, seed, start)
-
-    def _require_gradient(self, posterior: MotionPosterior) -> None:
-        for part in (posterior.prior, posterior.likelihood):
-            if not getattr(part, "differentiable", True):
-                raise UnsupportedPosterior(
-                    self.name,
-                    f"needs a differentiable density, which {type(part).__name__} does not have",
-                    word="gradient",
-                    others=suited(posterior),
-                )
 
     def _result(
         self, posterior: MotionPosterior, run: _Run, seed: int, start: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -12,56 +12,50 @@ from probmotion import seeds
 from probmotion.arrays import jax_from_torch
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import NotConjugate
-from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior
+from probmotion.posteriors.sampling import UnsupportedPosterior
 from probmotion.samplers.densities import not_conjugate
 
 __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 
-class NutsSettings(Sampler, Protocol):
-    """Settings of :class:`~probmotion.samplers.mcmc.nuts.NUTS` that the kernel depends on."""
-
-    @property
-    def warmup(self) -> int: ...
-
-    @property
-    def target_acceptance(self) -> float: ...
-
-    @property
-    def max_tree_depth(self) -> int: ...
-
-
 CHUNK = 50
-"""Maximum draws per compiled call, between updates of the progress bar. Also the maximum
-iterations, unless a single draw takes more."""
+"""Maximum iterations per compiled call, unless a single draw takes more; limits the rows too."""
 
 
 @lru_cache(maxsize=8)
-def compiled(sampler: NutsSettings, posterior: MotionPosterior) -> NutsKernel:
+def compiled(
+    posterior: MotionPosterior, warmup: int, target_acceptance: float, max_tree_depth: int
+) -> NutsKernel:
     """Return the compiled kernel, cached for other seeds and restarts."""
-    return NutsKernel(sampler, posterior)
+    return NutsKernel(posterior, warmup, target_acceptance, max_tree_depth)
 
 
 class NutsKernel:
     """NumPyro's NUTS on the log density of a posterior."""
 
-    def __init__(self, sampler: NutsSettings, posterior: MotionPosterior) -> None:
+    def __init__(
+        self, posterior: MotionPosterior, warmup: int, target_acceptance: float, max_tree_depth: int
+    ) -> None:
         import jax
         from numpyro.infer import NUTS as Kernel  # noqa: N811
 
-        to_jax = _bridge(sampler, posterior)
+        to_jax = _bridge(posterior)
         log_density = to_jax(posterior.log_density)
-        self.sampler = sampler
+        self.warmup = warmup
         self.kernel = Kernel(
             potential_fn=lambda theta: -log_density(theta),
-            target_accept_prob=sampler.target_acceptance,
-            max_tree_depth=sampler.max_tree_depth,
+            target_accept_prob=target_acceptance,
+            max_tree_depth=max_tree_depth,
         )
         # Evaluated once per chain, so not compiled.
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
         self.log_likelihood = jax.jit(to_jax(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
-        self._compile(posterior)
+        # Compile all functions now, so that timed runs do not.
+        theta = posterior.initial(seeds.generator(0, "compile"), 1)[0]
+        if posterior.likelihood is not None:
+            self.log_likelihoods(theta[None])
+        self.advance(self._init(jax.random.key(0), theta, *self.value_and_gradient(theta)), 0, 1)
 
     def begin(self, key: Any, theta: np.ndarray) -> Any:
         """Return the initial state at ``theta``; evaluates the gradient once."""
@@ -106,22 +100,12 @@ class NutsKernel:
                 out.append(np.asarray(leaf))
         return out
 
-    def _compile(self, posterior: MotionPosterior) -> None:
-        """Compile all functions, so that timed runs do not."""
-        import jax
-
-        theta = posterior.initial(seeds.generator(0, "compile"), 1)[0]
-        if posterior.likelihood is not None:
-            self.log_likelihoods(theta[None])
-        state = self._init(jax.random.key(0), theta, *self.value_and_gradient(theta))
-        self.advance(state, 0, 1)
-
     def _init(self, key: Any, theta: np.ndarray, potential: Any, gradient: Any) -> Any:
         import jax.numpy as jnp
         from numpyro.infer.util import ParamInfo
 
         start = ParamInfo(jnp.asarray(theta), jnp.asarray(potential), jnp.asarray(gradient))
-        return self.kernel.init(key, self.sampler.warmup, start)
+        return self.kernel.init(key, self.warmup, start)
 
     def _advance(self, state: Any, draws: Any, thin: Any) -> tuple[Any, dict[str, Any]]:
         """Return the state after ``draws`` ≤ CHUNK draws, and their values in CHUNK rows."""
@@ -159,9 +143,7 @@ class NutsKernel:
         return jax.lax.fori_loop(0, draws, draw, (state, empty))
 
 
-def _bridge(
-    sampler: NutsSettings, posterior: MotionPosterior
-) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
+def _bridge(posterior: MotionPosterior) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
     """Return the conversion of densities to JAX: the identity, or :func:`jax_from_torch`.
 
     Raises :class:`UnsupportedPosterior` if neither JAX nor torch can differentiate the density.
@@ -172,16 +154,15 @@ def _bridge(
     try:
         jax.eval_shape(jax.grad(posterior.log_density), point)
     except NotConjugate as error:
-        raise not_conjugate(sampler, error) from error
+        raise not_conjugate("nuts", error) from error
     except Exception as refused:
         # A density that does not accept JAX arrays may raise any exception. Try torch.
-        bridged = jax_from_torch(posterior.log_density)
         try:
             theta = posterior.initial(seeds.generator(0, "probe"), 1)[0]
-            jax.value_and_grad(bridged)(theta)
+            jax.value_and_grad(jax_from_torch(posterior.log_density))(theta)
         except Exception:
             raise UnsupportedPosterior(
-                sampler.name,
+                "nuts",
                 "needs a log density that JAX or torch can differentiate, but JAX raised "
                 f"{type(refused).__name__}: {str(refused).splitlines()[0]}",
                 word="gradient",

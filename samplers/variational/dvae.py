@@ -17,7 +17,6 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.motion.motion import Motion
-from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import (
     HasInferenceNetwork,
@@ -26,8 +25,8 @@ from probmotion.posteriors.protocols import (
     MotionInference,
     Samplable,
 )
-from probmotion.posteriors.sampling import UnsupportedPosterior, progress_bar, require
-from probmotion.samplers.independent import draw_independently, refuse_initial
+from probmotion.posteriors.sampling import UnsupportedPosterior, progress_bar
+from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.samplers.variational.amortised import AmortisedPosterior, AmortisedSettings
 from probmotion.samplers.variational.simulated_pairs import observed_entries
 from probmotion.seeds import NormalStreams
@@ -44,13 +43,13 @@ _CLIP = 30.0
 
 
 @dataclass(frozen=True)
-class DVAEInference:
+class DVAEInference(IndependentSampler):
     """Variational inference with networks that map observations to motions (Motion-DVAE, B to E).
 
     Uses ``network`` or the inference network of the prior; without observations, draws are those
     of a prior with such a network. Otherwise a network is trained first on pairs simulated from
     the prior and likelihood (:mod:`~probmotion.samplers.variational.amortised`), without
-    optimisation.
+    optimisation. Draws have θ and log densities if the motion fits into one window of the network.
 
     Parameters
     ----------
@@ -130,56 +129,21 @@ class DVAEInference:
             return False
         return True
 
-    def sample(
-        self,
-        posterior: MotionPosterior,
-        *,
-        draws: int = 1000,
-        chains: int = 1,
-        seed: int = 0,
-        initial: MotionDraws | np.ndarray | None = None,
-        progress: bool = True,
-    ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` independent draws from the variational posterior.
-
-        They have θ and log densities if the motion fits into one window of the network.
-
-        Raises
-        ------
-        UnsupportedPosterior
-            If the prior cannot be sampled, or no network supports the observations.
-        ValueError
-            If the optimisation or training diverges, or a window has no observations.
-        """
-        require(self, posterior)
-        refuse_initial(self, initial)
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         counts = {"gradient": 0}
         thetas: list[np.ndarray] = []
 
         @cache
-        def draw() -> Callable[[NormalStreams], np.ndarray]:
+        def fitted() -> Callable[[NormalStreams], np.ndarray]:
             return self._draw_function(posterior, seed, counts, thetas, progress)
 
-        def draw_batch(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             # The first batch includes training and optimisation in the timed run.
             tick()
             with one_thread():
-                return draw()(streams)
+                return fitted()(streams)
 
-        return draw_independently(
-            self,
-            posterior,
-            draw_batch,
-            draws=draws,
-            chains=chains,
-            seed=seed,
-            batch=self.batch,
-            steps=1,
-            scale=1.0,
-            counts=counts,
-            progress=progress,
-            thetas=thetas,
-        )
+        return Batches(draw, self.batch, counts=counts, thetas=thetas)
 
     def predict(
         self,
@@ -279,7 +243,7 @@ class DVAEInference:
         )
         if self.mode == "regression":
             return inference
-        losses = self._fit(inference, seed, counts, progress)
+        losses = self._optimised(inference, seed, counts, progress)
         # The loss is noisy; a rise of one nat per coordinate is more than that.
         chance = 3 * posterior.frames * posterior.skeleton.n_joints
         if not all(map(math.isfinite, losses)) or losses[-1] > losses[0] + chance:
@@ -289,7 +253,7 @@ class DVAEInference:
             )
         return inference
 
-    def _fit(
+    def _optimised(
         self, inference: MotionInference, seed: int, counts: dict[str, int], progress: bool
     ) -> list[float]:
         """Optimise; return all losses, and the final one with the random numbers of the first."""

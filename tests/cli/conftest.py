@@ -1,5 +1,11 @@
 """Fixtures of the command-line tests."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import pytest
 
 from probmotion.cli.main import main
@@ -16,6 +22,30 @@ def fails(capsys):
         lines = capsys.readouterr().err.splitlines()
         (line,) = (line for line in lines if line.startswith("probmotion: "))
         return line.removeprefix("probmotion: ")
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def interrupted():
+    """Press Ctrl-C once a command has written a path; return its message."""
+    script = "import sys; from probmotion.cli.main import main; sys.exit(main())"
+
+    def run(words, path):
+        process = subprocess.Popen(
+            [sys.executable, "-c", script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, start_new_session=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+        limit = time.monotonic() + 60
+        while not path.exists() and process.poll() is None and time.monotonic() < limit:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the whole process group
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 130
+        assert "Traceback" not in errors
+        (line,) = (line for line in errors.splitlines() if line.startswith("probmotion: "))
+        return line
 
     return run
 

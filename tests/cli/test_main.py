@@ -1,30 +1,26 @@
 """The command line: output, files and error messages."""
 
 import json
-import os
+import re
 import resource
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from probmotion import Motion, MotionDraws, Skeleton
+from probmotion import MotionDraws, Skeleton
 from probmotion.cli.main import main
 from probmotion.cli.settings_options import object_from_text, text_of_object
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import load, save
 from probmotion.models.training.checkpoints import WEIGHTS
 
-SCRIPT = "import sys; from probmotion.cli.main import main; sys.exit(main())"
-PROGRAM = [sys.executable, "-c", SCRIPT]
-ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 PNG = b"\x89PNG"
 
 
@@ -32,9 +28,6 @@ def compare(out, words):
     """Run compare in this process and return its table."""
     assert main(["compare", *words.split(), "--workers", "0", "--out", str(out)]) == 0
     return pd.read_csv(out / "table.csv")
-
-
-# Help and start-up.
 
 
 def test_help_is_fast_and_loads_nothing_heavy():
@@ -59,9 +52,10 @@ def test_command_help(command, capsys):
     assert end.value.code == 0
     help_text = capsys.readouterr().out
     assert f"usage: probmotion {command}" in help_text
-    if command == "compare":
-        for option in ("--clips", "--prior", "--observe", "--workers", "--settings.mas.n-views"):
-            assert option in help_text
+    assert not re.search(r"``|:[a-z]+:`", help_text)
+    options = ("--clips", "--prior", "--observe", "--workers", "--settings.mas.n-views")
+    for option in options if command == "compare" else ():
+        assert option in help_text
 
 
 def test_list_prints_problems_samplers_presets_and_skeletons(capsys):
@@ -75,20 +69,16 @@ def test_list_prints_problems_samplers_presets_and_skeletons(capsys):
 @pytest.mark.parametrize(("words", "lines"), [("compare --help", 1), ("which gait", 0)])
 def test_closed_pipe_is_no_error(words, lines):
     """The pipe closes while it is written to, or when the buffer is flushed at the end."""
-    program = f"{sys.executable} -c '{SCRIPT}' {words}"
-    code = f"unset PYTHONUNBUFFERED; {program} | head -n {lines}; exit ${{PIPESTATUS[0]}}"
-    run = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
-    assert run.returncode == 0
-    assert run.stderr == ""
-
-
-# compare
+    script = "import sys; from probmotion.cli.main import main; sys.exit(main())"
+    code = f"{sys.executable} -c '{script}' {words} | head -n {lines}; exit ${{PIPESTATUS[0]}}"
+    command = ["bash", "-c", f"unset PYTHONUNBUFFERED; {code}"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
 
 
 def test_compare_writes_the_table_and_passes_settings_to_presets_and_samplers(tmp_path, capsys):
     words = "gait --samplers exact mas mas.reference_code --draws 20 --seeds 2"
     table = compare(tmp_path, words + " --settings.mas.steps 5 --settings.mas.n-views 3")
-    assert list(table.columns) == ["problem", "sampler", "seed", "metric", "value"]
     assert set(table["sampler"]) == {"exact", "mas", "mas.reference_code"}
     assert set(table["seed"]) == {0, 1}
     assert {"swd_ratio", "seconds"} <= set(table["metric"])
@@ -97,35 +87,24 @@ def test_compare_writes_the_table_and_passes_settings_to_presets_and_samplers(tm
     assert set(calls["value"]) == {20 * 3 * 5}
 
 
-def test_compare_draws_figures_after_printing_the_table(tmp_path, capsys, monkeypatch):
-    words = "gait-monocular walk2d --samplers exact mas --draws 12 --settings.mas.steps 2 --figures"
-    compare(tmp_path, words)
-    names = ("quality_against_cost", "skeletons_gait-monocular", "skeletons_walk2d")
-    for name in names:
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(PNG)
-    capsys.readouterr()
-
-    def fail(*_):
-        raise ValueError("no figure today")
-
-    monkeypatch.setattr("probmotion.comparison.figures.draw_comparison", fail)
-    words = ["compare", *words.split(), "--workers", "0", "--out", str(tmp_path)]
-    assert main(words) == 2
+def test_the_table_is_printed_before_figures_fail(tmp_path, capsys, monkeypatch):
+    failing = Mock(side_effect=ValueError("invalid figure"))
+    monkeypatch.setattr("probmotion.comparison.figures.draw_comparison", failing)
+    words = f"compare gait --samplers exact --draws 12 --figures --workers 0 --out {tmp_path}"
+    assert main(words.split()) == 2
     printed = capsys.readouterr()
-    assert "no figure today" in printed.err
+    assert "invalid figure" in printed.err
     assert "seconds" in printed.out
 
 
-@pytest.mark.parametrize("named", ["mine", "mine/model.safetensors"])
-def test_compare_samples_a_user_prior(named, tmp_path):
+def test_compare_samples_a_user_prior(tmp_path):
     (tmp_path / "mine").mkdir()
     shutil.copy(WEIGHTS / "walk2d.safetensors", tmp_path / "mine" / "model.safetensors")
     words = "--samplers mas mh --draws 12 --settings.mas.steps 2 --figures --prior "
     out = tmp_path / "out"
-    table = compare(out, words + str(tmp_path / named))
+    table = compare(out, words + str(tmp_path / "mine" / "model.safetensors"))
     assert set(table["problem"]) == {"mine"}
-    mas = table[table["sampler"] == "mas"]
-    assert {"seconds", "denoiser_evaluations"} <= set(mas["metric"])
+    assert "denoiser_evaluations" in set(table[table["sampler"] == "mas"]["metric"])
     assert list(table[table["sampler"] == "mh"]["metric"]) == ["unsupported"]
     assert MotionDraws.load(out / "runs" / "mine" / "mas" / "0" / "draws.nc").fps == 20
     # Without a measure of quality there is no plot of it.
@@ -142,14 +121,14 @@ def test_compare_fits_a_prior_to_user_clips_of_two_formats(tmp_path, write_walks
     assert {"swd_ratio", "mpjpe_mm"} <= set(table["metric"])
 
 
-def test_quick_run_and_overrides(tmp_path, capsys):
-    words = "gait --samplers exact --quick"
-    compare(tmp_path / "a", words)
-    assert "6 seconds per" in capsys.readouterr().out
-    assert json.loads((tmp_path / "a" / "comparison.json").read_text())["draws"] == 40
-    compare(tmp_path / "b", words + " --draws 12 --evaluations 100")
-    assert "100 evaluations" in capsys.readouterr().out
-    assert json.loads((tmp_path / "b" / "comparison.json").read_text())["draws"] == 12
+@pytest.mark.parametrize(
+    ("more", "budget", "draws"),
+    [("", "6 seconds per", 40), (" --draws 12 --evaluations 100", "100 evaluations", 12)],
+)
+def test_quick_run_and_overrides(more, budget, draws, tmp_path, capsys):
+    compare(tmp_path, "gait --samplers exact --quick" + more)
+    assert budget in capsys.readouterr().out
+    assert json.loads((tmp_path / "comparison.json").read_text())["draws"] == draws
 
 
 def test_all_runs_the_problems_with_available_data(tmp_path, capsys, monkeypatch, fails):
@@ -176,34 +155,17 @@ def test_calibration_within_a_budget_resumes(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("workers", ["0", "2"])
-def test_interrupted_comparison_keeps_finished_runs(workers, tmp_path):
-    words = ["compare", "gait", "--samplers", "exact", "mas", "--draws", "40"]
-    words = [*words, "--out", str(tmp_path)]
+def test_interrupted_comparison_keeps_finished_runs(workers, tmp_path, interrupted):
+    words = f"compare gait --samplers exact mas --draws 40 --out {tmp_path}".split()
     long = ["--settings.mas.steps", "1000000", "--workers", workers]
-    running = subprocess.Popen(
-        [*PROGRAM, *words, *long], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=ONE_THREAD, start_new_session=True,
-    )  # fmt: skip
     stored = tmp_path / "runs" / "gait" / "exact" / "0"
-    deadline = time.monotonic() + 60
-    while not stored.exists() and running.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert stored.exists()
-    os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to the whole process group
-    _, errors = running.communicate(timeout=30)
-    assert running.returncode == 130
-    assert "Traceback" not in errors
-    message = errors.strip().splitlines()[-1]
+    message = interrupted([*words, *long], stored)
     assert "1 of 2 runs finished" in message
     assert str(tmp_path) in message
-
     before = {path: path.stat().st_mtime_ns for path in stored.iterdir()}
     assert main([*words, "--settings.mas.steps", "3", "--workers", "0"]) == 0
     assert {path: path.stat().st_mtime_ns for path in stored.iterdir()} == before
     assert set(pd.read_csv(tmp_path / "table.csv")["sampler"]) == {"exact", "mas"}
-
-
-# show and convert
 
 
 def test_show_and_convert_a_motion(tmp_path, capsys):
@@ -223,11 +185,9 @@ def test_show_and_convert_a_motion(tmp_path, capsys):
 def test_show_finds_a_network_by_folder_or_name(tmp_path, capsys, monkeypatch, fails):
     monkeypatch.chdir(tmp_path)
     Path("mine").mkdir()
-    shutil.copy(WEIGHTS / "walk2d.safetensors", "mine/model.safetensors")
-    for given, file in {
-        "mine": Path("mine/model.safetensors"),
-        "walk2d": WEIGHTS / "walk2d.safetensors",
-    }.items():
+    shipped = WEIGHTS / "walk2d.safetensors"
+    shutil.copy(shipped, "mine/model.safetensors")
+    for given, file in (("mine", "mine/model.safetensors"), ("walk2d", shipped)):
         assert main(["show", given]) == 0
         printed = capsys.readouterr().out
         assert printed.startswith(f"{file}: a motion-diffusion of ")
@@ -261,9 +221,6 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
     assert fails("convert", target, target, "--draw", "0").startswith("draw requires a file of dr")
 
 
-# Invalid input: one line, status 2.
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -272,14 +229,11 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
         ("compare gait --samplers mas.best", ("'mas.best'", "mas.reference_code")),
         ("compare jump", ("'jump'", "gait-monocular")),
         ("compare", ("problems must not be empty", "--clips", "--prior")),
-        ("compare gait --draws 3", ("draws must be", "got 3")),
         ("compare gait --calibrate 5", ("calibrate must be at least 10, got 5",)),
-        ("compare dance-pairs --calibrate 20", ("calibrate requires a problem that can be sim",)),
-        ("compare gait --chains 0", ("chains must be", "got 0")),
+        ("compare walk2d --calibrate 20", ("calibrate requires a problem that can be sim",)),
         ("compare gait --observe sparse", ("observe requires --clips",)),
         ("compare --prior no/such", ("no/such", "the folder of a training run")),
         ("compare --clips no/such/*.bvh", ("no/such/*.bvh",)),
-        ("compare --clips no/such.bvh", ("no/such.bvh",)),
         ("show no/such.bvh", ("no/such.bvh",)),
         ("convert no/such.bvh out.npz", ("no/such.bvh",)),
         ("draw", ("'draw'", "compare, which, list, show, convert")),
@@ -292,30 +246,20 @@ def test_invalid_options_are_one_line(words, expected, tmp_path, fails, monkeypa
         assert part in message
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("shopping.bvh", "eggs\nmilk\n"),
-        ("half.bvh", None),
-        ("zip.npz", "PK\x03\x04"),
-        ("a.txt", ""),
-    ],
-)
 @pytest.mark.parametrize("command", ["show", "compare --out out --clips", "convert"])
-def test_damaged_files_are_named(name, content, command, tmp_path, fails, monkeypatch):
+def test_damaged_files_are_named(command, tmp_path, fails, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if content is None:
-        save(make_gait("walk"), name)
-        content = Path(name).read_text()[:2000]
-    Path(name).write_text(content)
-    assert name in fails(*command.split(), name, *["out.npz"] * (command == "convert"))
+    save(make_gait("walk"), "half.bvh")
+    half = Path("half.bvh").read_text()[:2000]
+    files = {"shopping.bvh": "eggs\nmilk\n", "half.bvh": half, "zip.npz": "PK\x03\x04", "a.txt": ""}
+    for name, content in files.items():
+        Path(name).write_text(content)
+        assert name in fails(*command.split(), name, *["out.npz"] * (command == "convert"))
 
 
-def test_clips_that_are_too_short(tmp_path, fails, monkeypatch, write_walks):
-    monkeypatch.chdir(tmp_path)
-    skeleton = Skeleton.preset("h36m17")
-    save(Motion(np.zeros((1, 17, 3)) + np.arange(17)[:, None], skeleton, 30), "still.npz")
-    assert "frames" in fails("compare", "--clips", "still.npz", write_walks(tmp_path, 2, frames=8))
+def test_clips_that_are_too_short(tmp_path, fails, write_walks):
+    short = write_walks(tmp_path, 2, frames=8)
+    assert "frames" in fails("compare", "--clips", short, "--out", tmp_path / "out")
 
 
 def test_invalid_setting_exits_with_status_2(capsys):
@@ -325,17 +269,11 @@ def test_invalid_setting_exits_with_status_2(capsys):
     assert "n_views must be an integer of at least 2" in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.parametrize("out", ["taken", "locked/out", "/proc/no-folder-can-be-made-here"])
+@pytest.mark.parametrize("out", ["taken", "/proc/no-folder-can-be-made-here"])
 def test_unwritable_output_folder_is_named(out, tmp_path, fails, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("taken").write_text("a file")
-    Path("locked").mkdir(mode=0o500)
-    if out == "locked/out" and os.geteuid() == 0:
-        pytest.skip("root can write into a read-only folder")
     assert out in fails("compare", "gait", "--samplers", "exact", "--draws", "12", "--out", out)
-
-
-# Settings that are objects.
 
 
 @dataclass(frozen=True)
@@ -349,19 +287,10 @@ class Step:
     inner: Plain | None = None
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("Plain", Plain()),
-        ("Step(size=2)", Step(2)),
-        ("Step(0.25, inner=Plain())", Step(0.25, Plain())),
-        (" Step( inner = Plain ) ", Step(inner=Plain())),
-    ],
-)
-def test_objects_round_trip_through_text(text, value):
-    read = object_from_text(text, [Plain, Step])
-    assert read == value
-    assert object_from_text(text_of_object(read), [Plain, Step]) == value
+def test_objects_are_read_from_text():
+    step = Step(0.25, Plain())
+    assert object_from_text(" Step( 0.25, inner = Plain ) ", [Plain, Step]) == step
+    assert text_of_object(step) == "Step(size=0.25, inner=Plain)"
 
 
 @pytest.mark.parametrize(
@@ -373,7 +302,6 @@ def test_objects_round_trip_through_text(text, value):
         ("Step(", "must be one of"),
         ("Step(size=__import__('os'))", "."),
         ("3", "must be one of"),
-        ("Step(size=open)", "must be one of"),
     ],
 )
 def test_invalid_object_text_is_rejected(text, expected):

@@ -13,24 +13,19 @@ from probmotion.problems.references import making as references
 SMALL = "gait-sparse(frames=2, components=6)"
 
 
-def test_reference_writes_draws_and_their_certificate(tmp_path, capsys):
-    words = ["reference", "gait-sparse(components=6,frames=2)", "--draws", "80"]
-    assert main([*words, "--out", str(tmp_path)]) == 0
+def test_reference_writes_draws_and_their_certificate(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    assert main(["reference", "gait-sparse(components=6,frames=2)", "--draws", "80"]) == 0
     assert "agreement of two runs: sliced Wasserstein ratio" in capsys.readouterr().out
-    stored = StoredReference.load(tmp_path / SMALL)
+    folder = tmp_path / "references" / SMALL
+    stored = StoredReference.load(folder)
     assert (stored.n, stored.certificate["exact"]) == (80, True)
-    assert json.loads((tmp_path / SMALL / "certificate.json").read_text())["problem"] == SMALL
+    assert json.loads((folder / "certificate.json").read_text())["problem"] == SMALL
     stored.check(SMALL, load_problem(SMALL).posterior)
     with pytest.raises(ValueError, match="fingerprint"):
         stored.check(SMALL, load_problem(SMALL, noise=0.04).posterior)
-    with np.load(tmp_path / SMALL / "draws.npz", allow_pickle=False) as archive:
+    with np.load(folder / "draws.npz", allow_pickle=False) as archive:
         assert archive["positions"].dtype == np.float32
-
-
-def test_default_folder_is_the_reference_store(tmp_path, monkeypatch):
-    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
-    assert main(["reference", SMALL, "--draws", "80"]) == 0
-    assert (tmp_path / "references" / SMALL / "draws.npz").is_file()
 
 
 def test_disagreeing_runs_fail_and_write_nothing(tmp_path, capsys, monkeypatch):

@@ -1,13 +1,8 @@
 """``probmotion train diffusion | evaluator | lifter``: files, resuming and error messages."""
 
 import csv
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -18,12 +13,10 @@ from probmotion.cli.main import main
 from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
 from probmotion.models.evaluation.evaluator import TrackEvaluator
 from probmotion.models.evaluation.lifter import PoseLifter
-from probmotion.models.evaluation.pose_flow import PoseFlow
 
 PERSON = Skeleton.preset("person14")
-SCRIPT = "import sys; from probmotion.cli.main import main; sys.exit(main())"
-ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 KINDS = ("diffusion", "evaluator", "lifter", "dvae", "denoiser", "motion-vae")
+FILES = {"losses.csv", "model.safetensors", "state.safetensors"}
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
 
@@ -46,16 +39,8 @@ def copied(trained, tmp_path):
     return shutil.copytree(trained, tmp_path / "run")
 
 
-def losses(out):
-    with open(out / "losses.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def contents(folder):
     return {file.name: file.read_bytes() for file in folder.iterdir()}
-
-
-# Output.
 
 
 def test_run_writes_a_prior_that_denoises(trained):
@@ -63,14 +48,13 @@ def test_run_writes_a_prior_that_denoises(trained):
     assert (prior.skeleton, prior.fps, prior.frames) == (PERSON, 20.0, 20)
     noisy = np.random.default_rng(0).standard_normal((2, 3, 20, 14, 2))
     assert np.isfinite(prior.denoise(noisy, 0.5, Cameras.ring(3))).all()
-    assert [row["step"] for row in losses(trained)] == ["10", "20"]
-    assert prior.card["step"] == 20
+    with open(trained / "losses.csv", newline="") as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["10", "20"]
     network = prior.card["network"]
     assert network["data"]["clips"] == ["walk0", "walk1", "walk2"]
     assert network["validation_data"]["clips"] == ["walk3"]
     assert network["data"]["tracks"] == 6
-    files = {"losses.csv", "model.safetensors", "state.safetensors"}
-    assert {file.name for file in trained.iterdir()} == files
+    assert {file.name for file in trained.iterdir()} == FILES
 
 
 def test_default_data_are_synthetic_walks(tmp_path, capsys):
@@ -94,9 +78,9 @@ def test_data_and_training_options_take_effect(walks, tmp_path):
     assert card["network"]["joint_names"] == list(Skeleton.preset("h36m17").joint_names)
     assert card["network"]["augmentation"]["shift"] > 0
     assert max(np.ravel(card["network"]["deviation"][0])) > 0
-    for name, value in {"batch": 7, "learning_rate": 0.003, "seed": 4}.items():
-        assert card["training"][name] == value
-    assert card["training"]["ema"] == 0.99  # the default of the size
+    # The decay of the average is the default of the size.
+    training = {"batch": 7, "learning_rate": 0.003, "seed": 4, "ema": 0.99}
+    assert training.items() <= card["training"].items()
 
 
 def test_evaluator_on_a_random_split_of_six_clips(write_walks, tmp_path):
@@ -109,25 +93,17 @@ def test_evaluator_on_a_random_split_of_six_clips(write_walks, tmp_path):
 def test_lifter_is_trained_after_its_flow_and_extended_alone(walks, tmp_path, capsys, fails):
     flow, lifter = tmp_path / "flow", tmp_path / "lifter"
     assert main(words("lifter", walks, tmp_path, "--steps", 5)) == 0
-    PoseFlow.load(flow)
-    PoseLifter.load(lifter)
     before = contents(flow)
     # An interrupted lifter continues with the finished flow.
     shutil.rmtree(lifter)
-    capsys.readouterr()
-    assert main(words("lifter", walks, tmp_path, "--steps", 5)) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[-2].endswith("is finished: 5 of 5 steps")
-    assert printed[-1].startswith("wrote ")
-    assert main(words("lifter", walks, tmp_path, "--steps", 8)) == 0
-    printed = capsys.readouterr().out.splitlines()[-1]
-    assert printed.startswith(f"wrote {lifter / 'model.safetensors'}: step 8, loss ")
+    for steps in (5, 8):
+        assert main(words("lifter", walks, tmp_path, "--steps", steps)) == 0
+        last = capsys.readouterr().out.splitlines()[-1]
+        assert last.startswith(f"wrote {lifter / 'model.safetensors'}: step {steps}, loss ")
+    PoseLifter.load(lifter)
     # Other data are rejected before the flow is changed.
     assert "out" in fails(*words("lifter", walks, tmp_path, "--steps", 9, "--data-seed", 1))
     assert contents(flow) == before
-
-
-# Resuming.
 
 
 def test_finished_run_writes_nothing(walks, copied, capsys):
@@ -139,91 +115,69 @@ def test_finished_run_writes_nothing(walks, copied, capsys):
         assert contents(copied) == before
 
 
-def test_folder_of_another_run_is_rejected(walks, copied, fails):
+@pytest.mark.parametrize(
+    ("option", "value", "named"),
+    [("--batch", "3", "batch"), ("--threshold", "0.4", "threshold"), ("--data-seed", "1", "")],
+)
+def test_folder_of_another_run_is_rejected(walks, copied, fails, option, value, named):
     before = contents(copied)
-    for changed, named in {
-        ("--batch", "3"): "batch",
-        ("--threshold", "0.4"): "threshold",
-        ("--data-seed", "1"): "",
-    }.items():
-        message = fails(*words("diffusion", walks, copied, "--steps", 40), *changed)
-        assert re.match(rf"out .*{re.escape(str(copied))}.*{named}", message)
-        assert contents(copied) == before
+    message = fails(*words("diffusion", walks, copied, "--steps", 40, option, value))
+    assert re.match(rf"out .*{re.escape(str(copied))}.*{named}", message)
+    assert contents(copied) == before
 
 
 def test_folder_of_another_kind_is_rejected(walks, copied, fails):
-    given = words("evaluator", walks, copied, "--steps", 40)
-    for gone in ("losses.csv", "state.safetensors"):
-        (copied / gone).unlink()
-        message = fails(*given)
+    for missing in ("losses.csv", "state.safetensors"):
+        (copied / missing).unlink()
+        message = fails(*words("evaluator", walks, copied, "--steps", 40))
         assert "motion-diffusion" in message
         assert "track-evaluator" in message
     assert MotionDiffusion.load(copied).card["step"] == 20
 
 
-def test_ctrl_c_stores_a_checkpoint_from_which_the_command_continues(walks, tmp_path, capsys):
+def test_ctrl_c_stores_a_checkpoint_to_continue_from(walks, tmp_path, capsys, interrupted):
     out = tmp_path / "run"
     given = words("diffusion", walks, out, "--checkpoint-every", 5)
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, *given, "--steps", "100000"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ONE_THREAD,
-    )  # fmt: skip
-    try:
-        deadline = time.monotonic() + 60
-        state = out / "state.safetensors"
-        while not state.exists() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
+    message = interrupted([*given, "--steps", "100000"], out / "state.safetensors")
     step = int(MotionDiffusion.load(out).card["step"])
-    last = errors.strip().splitlines()[-1]
-    assert last.startswith(f"probmotion: stopped at step {step} of 100000")
-    assert str(out) in last
-    assert "Traceback" not in errors
-    files = {"losses.csv", "model.safetensors", "state.safetensors"}
-    assert {file.name for file in out.iterdir()} == files
+    assert message.startswith(f"probmotion: stopped at step {step} of 100000")
+    assert str(out) in message
+    assert {file.name for file in out.iterdir()} == FILES
     assert main([*given, "--steps", "1"]) == 0
     assert f"{step} of 1 steps" in capsys.readouterr().out
     assert main([*given, "--steps", str(step + 7)]) == 0
     assert MotionDiffusion.load(out).card["step"] == step + 7
 
 
-# Invalid input.
-
-
 def test_invalid_options_are_one_line_and_write_nothing(walks, tmp_path, monkeypatch, fails):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out, table = tmp_path / "run", tmp_path / "table.csv"
     table.write_text("a,b\n")
-    base = ["train", "diffusion", "--size", "tiny", "--out", str(out)]
-    clips = ["--views", "1", "--clips", walks]
+    base = f"train diffusion --size tiny --out {out}".split()
+    clips = f"--views 1 --clips {walks}"
     cases = {
-        ("--clips", walks, "--tracks", "a.json"): "clips and tracks are mutually exclusive",
-        ("--clips", str(tmp_path / "no.bvh")): "no.bvh: No such file or directory",
-        ("--clips", str(tmp_path / "no*.bvh")): "no*.bvh",
-        ("--tracks", str(tmp_path / "no.npz")): "no.npz",
-        ("--tracks", str(table)): "fps",
-        (*clips, "--tracks-fps", "30"): "tracks_fps requires --tracks",
-        ("--tracks", "a.json", "--views", "64"): "views applies to 3D clips only",
-        ("--skeleton", "own"): "skeleton 'own' requires --tracks",
-        ("--skeleton", "cat"): "got 'cat'",
-        (*clips,): "clips must be at least 6 for a random split, got 5 (walk0, walk1, walk2, walk",
-        (*clips, "--validation", "walk1"): "validation requires test",
-        (*clips, "--test", "walk1"): "test requires validation",
-        (*clips, "--validation", "walk1", "--test", "walk9"): "test must name clips among walk0, ",
-        (*clips, *PARTS, "--threshold", "1.5"): "tracks must contain joints",
-        (*clips, "--views", "0"): "views must be an integer of at least 1, got 0",
-        (*clips, "--fps", "0"): "fps must be a finite number above 0, got 0.0",
-        ("--device", "cuda"): "device",
-        ("--steps", "0"): "steps must be an integer of at least 1, got 0",
-        ("--frames", "1"): "frames must be an integer of at least 2, got 1",
-        ("--seed", "-1"): "seed must be an integer of at least 0, got -1",
+        f"--clips {walks} --tracks a.json": "clips and tracks are mutually exclusive",
+        f"--clips {tmp_path}/no.bvh": "no.bvh: No such file or directory",
+        f"--clips {tmp_path}/no*.bvh": "no*.bvh",
+        f"--tracks {tmp_path}/no.npz": "no.npz",
+        f"--tracks {table}": "fps",
+        f"{clips} --tracks-fps 30": "tracks_fps requires --tracks",
+        "--tracks a.json --views 64": "views applies to 3D clips only",
+        "--skeleton own": "skeleton 'own' requires --tracks",
+        "--skeleton cat": "got 'cat'",
+        clips: "clips must be at least 6 for a random split, got 5 (walk0, walk1, walk2, walk",
+        f"{clips} --test walk1": "test requires validation",
+        f"{clips} --validation walk1 --test walk9": "test must name clips among walk0, ",
+        f"{clips} --validation walk3 --test walk4 --threshold 1.5": "tracks must contain joints",
+        f"{clips} --views 0": "views must be an integer of at least 1, got 0",
+        f"{clips} --fps 0": "fps must be a finite number above 0, got 0.0",
+        "--device cuda": "device",
+        "--steps 0": "steps must be an integer of at least 1, got 0",
+        "--frames 1": "frames must be an integer of at least 2, got 1",
+        "--seed -1": "seed must be an integer of at least 0, got -1",
     }
-    for given, expected in cases.items():
-        assert expected in fails(*base, *given), given
+    for options, expected in cases.items():
+        assert expected in fails(*base, *options.split()), options
         assert not out.exists()
     for given, got in {("train",): "none", ("train", "vae"): "'vae'"}.items():
         assert fails(*given) == f"kind must be one of {', '.join(KINDS)}, got {got}"
@@ -250,25 +204,13 @@ def test_options_are_checked_before_data_are_read(kind, tmp_path, monkeypatch, f
     assert [file.name for file in tmp_path.iterdir()] == ["run"]
 
 
-def test_help(capsys):
-    options = {
-        "diffusion": ("--frames", "--tracks", "--views"),
-        "evaluator": ("--frames", "--tracks"),
-        "lifter": ("--size", "--tracks"),
-        "dvae": ("--fps", "--skeleton"),
-        "denoiser": ("--prior", "--most"),
-        "motion-vae": ("--rest", "--kl"),
-    }
+@pytest.mark.parametrize("kind", ["", *KINDS])
+def test_help(kind, capsys):
     with pytest.raises(SystemExit) as end:
-        main(["train", "--help"])
+        main(["train", *kind.split(), "--help"])
     assert end.value.code == 0
     printed = capsys.readouterr().out
-    for kind, own in options.items():
-        assert f"\n  {kind} " in printed
-        with pytest.raises(SystemExit) as end:
-            main(["train", kind, "--help"])
-        assert end.value.code == 0
-        help_text = capsys.readouterr().out
-        assert f"usage: probmotion train {kind}" in help_text
-        for option in (*own, "--clips", "--validation", "--device", "--steps", "--data-seed"):
-            assert option in help_text
+    assert f"usage: probmotion train {kind}" in printed
+    options = ("--clips", "--validation", "--device", "--steps", "--data-seed") if kind else KINDS
+    for option in options:
+        assert f" {option} " in printed

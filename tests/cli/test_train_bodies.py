@@ -52,34 +52,18 @@ def denoiser(clips, prior, tmp_path_factory):
     return out
 
 
-def losses(out):
-    with open(out / "losses.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{name: row[name] for name in row if name != "seconds"} for row in rows]
-
-
-# Output.
-
-
 def test_run_writes_a_prior_that_samples(prior):
     dvae = MotionDVAE.load(prior)
     assert (dvae.skeleton, dvae.fps, dvae.frames) == (PERSON, 30.0, 12)
     assert np.isfinite(dvae.sample(np.random.default_rng(0), 3)).all()
     network = dvae.card["network"]
-    assert network["data"]["clips"] == ["walk0", "walk1", "walk2"]
-    assert network["data"]["frames"] == 3 * 40
+    data = {"clips": ["walk0", "walk1", "walk2"], "frames": 3 * 40}
+    assert data.items() <= network["data"].items()
     assert network["validation_data"]["clips"] == ["walk3"]
     usual, annealing = usual_dvae_training("tiny")
     assert network["annealing"] == annealing
     assert (dvae.card["training"]["batch"], dvae.card["training"]["ema"]) == (4, usual.ema)
     assert {file.name for file in prior.iterdir()} == FILES
-    # The rest pose is estimated from the training clips.
-    hip = PERSON.joint_names.index("left_hip")
-    width = [
-        np.linalg.norm(walk[:, hip] - walk[:, PERSON.roots[0]], axis=-1).mean()
-        for walk in (make_gait("walk", n, frames=40).retarget(PERSON).positions for n in range(3))
-    ]
-    assert np.linalg.norm(dvae.states.rest[hip]) == pytest.approx(np.mean(width), abs=1e-6)
 
 
 def test_run_writes_a_denoiser_of_its_prior(prior, denoiser):
@@ -94,19 +78,18 @@ def test_run_writes_a_denoiser_of_its_prior(prior, denoiser):
 
 def test_default_data_are_synthetic_people(tmp_path, capsys):
     out = tmp_path / "run"
-    given = ["--size", "tiny", "--steps", "1", "--fps", "10", "--out", str(out)]
-    assert main(["train", "dvae", *given]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == "resampled to 10 fps: 84 clips at 30 fps"
-    assert printed[1] == (
-        "train: 2400 frames of 60 clips: walk-0, run-0, march-0, walk-1, run-1, march-1, …"
-    )
-    assert printed[2].startswith("validation: 480 frames of 12 clips: walk-20, ")
-    assert printed[3].startswith("test: 480 frames of 12 clips: walk-24, ")
-    annealing = usual_dvae_training("tiny")[1]
-    assert printed[4] == f"KL weight: annealed over {annealing} steps, more than the 1 of this run"
-    assert printed[5].startswith(f"wrote {out / 'model.safetensors'}: step 1, loss ")
-    assert len(printed) == 6
+    given = f"train dvae --size tiny --steps 1 --fps 10 --out {out}"
+    assert main(given.split()) == 0
+    expected = [
+        "resampled to 10 fps: 84 clips at 30 fps",
+        "train: 2400 frames of 60 clips: walk-0, run-0, march-0, walk-1, run-1, march-1, …",
+        "validation: 480 frames of 12 clips: walk-20, ",
+        "test: 480 frames of 12 clips: walk-24, ",
+        f"KL weight: annealed over {usual_dvae_training('tiny')[1]} steps, more than the 1 of this",
+        f"wrote {out / 'model.safetensors'}: step 1, loss ",
+    ]
+    for line, beginning in zip(capsys.readouterr().out.splitlines(), expected, strict=True):
+        assert line.startswith(beginning)
     assert MotionDVAE.load(out).fps == 10
 
 
@@ -123,24 +106,24 @@ def test_resampled_and_skipped_clips_are_printed(write_walks, tmp_path, capsys):
 
 
 def test_denoiser_uses_the_joints_and_frame_rate_of_its_prior(clips, tmp_path, capsys):
-    own = tmp_path / "own"
+    prior, out = tmp_path / "prior", tmp_path / "run"
     more = ["--skeleton", "h36m17", "--fps", 20, "--steps", 1]
-    assert main(words("dvae", clips, own, *more)) == 0
-    assert MotionDVAE.load(own).skeleton == Skeleton.preset("h36m17")
+    assert main(words("dvae", clips, prior, *more)) == 0
+    assert MotionDVAE.load(prior).skeleton == Skeleton.preset("h36m17")
     capsys.readouterr()
-    assert main(words("denoiser", clips, tmp_path / "run", "--prior", own, "--steps", 1)) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == "prior: 17 joints, windows of 12 frames at 20 fps"
-    assert printed[1] == "resampled to 20 fps: 5 clips at 30 fps"
-    assert MotionDenoiser.load(tmp_path / "run", MotionDVAE.load(own)).prior.fps == 20
+    assert main(words("denoiser", clips, out, "--prior", prior, "--steps", 1)) == 0
+    assert capsys.readouterr().out.splitlines()[:2] == [
+        "prior: 17 joints, windows of 12 frames at 20 fps",
+        "resampled to 20 fps: 5 clips at 30 fps",
+    ]
+    assert MotionDenoiser.load(out, MotionDVAE.load(prior)).prior.fps == 20
 
 
 def test_data_seed_splits_six_clips(write_walks, tmp_path, capsys):
-    given = ["train", "dvae", "--clips", write_walks(tmp_path, 6), "--size", "tiny", "--steps", "1"]
-    parts = []
-    for seed in (0, 0, 1):
-        out = str(tmp_path / f"run{len(parts)}")
-        assert main([*given, "--data-seed", str(seed), "--out", out]) == 0
+    clips, parts = write_walks(tmp_path, 6), []
+    for run, seed in enumerate((0, 0, 1)):
+        given = f"train dvae --clips {clips} --size tiny --steps 1 --data-seed {seed} --out"
+        assert main([*given.split(), str(tmp_path / f"run{run}")]) == 0
         printed = capsys.readouterr().out
         parts.append(re.findall(r"(?:train|validation|test): .* clips: (.*)", printed))
     assert [len(names.split(", ")) for names in parts[0]] == [4, 1, 1]
@@ -148,18 +131,13 @@ def test_data_seed_splits_six_clips(write_walks, tmp_path, capsys):
     assert parts[0] == parts[1] != parts[2]
 
 
-# Other commands.
-
-
 @pytest.mark.parametrize("kind", ["dvae", "denoiser"])
 def test_more_steps_extend_a_run(kind, clips, prior, denoiser, tmp_path, capsys):
     more = ["--prior", prior, "--hidden", 0.25] if kind == "denoiser" else []
     out = shutil.copytree(denoiser if kind == "denoiser" else prior, tmp_path / "run")
-    assert main(words(kind, clips, out, "--steps", 4, *more)) == 0
-    assert capsys.readouterr().out.splitlines()[-1].endswith("is finished: 4 of 4 steps")
-    assert main(words(kind, clips, out, "--steps", 6, *more)) == 0
-    printed = capsys.readouterr().out.splitlines()[-1]
-    assert printed.startswith(f"wrote {out / 'model.safetensors'}: step 6, loss ")
+    for steps, expected in ((4, "is finished: 4 of 4 steps"), (6, ": step 6, loss ")):
+        assert main(words(kind, clips, out, "--steps", steps, *more)) == 0
+        assert expected in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_show_summarises_priors_and_denoisers(prior, denoiser, capsys):
@@ -168,36 +146,33 @@ def test_show_summarises_priors_and_denoisers(prior, denoiser, capsys):
     numbers = sum(t.numel() for t in MotionDVAE.load(prior).model.state_dict().values())
     assert printed[0] == f"{prior / 'model.safetensors'}: a motion-dvae of {numbers} parameters"
     assert printed[1].startswith("  frames 12, latent 6, hidden 32, ")
-    assert printed[2:5] == [
+    body = [
         "  14 joints, rooted at pelvis, 6 left-right pairs",
         "  windows of 12 frames at 30 fps, 0.37 s",
-        "  trained on 120 frames of 3 clips: walk0, walk1, walk2",
     ]
-    last = losses(prior)[-1]
+    assert printed[2:5] == [*body, "  trained on 120 frames of 3 clips: walk0, walk1, walk2"]
     assert printed[5].startswith("  step 4 of 4, batches of 4, ")
+    with open(prior / "losses.csv", newline="") as file:
+        *_, last = csv.DictReader(file)
     loss, validation = float(last["loss"]), float(last["validation_loss"])
     assert printed[5].endswith(f"loss {loss:.4f}, validation loss {validation:.4f}")
-    assert len(printed) == 6
     assert main(["show", str(denoiser / "model.safetensors")]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].startswith(f"{denoiser / 'model.safetensors'}: a motion-denoiser of ")
     assert printed[2:6] == [
-        "  14 joints, rooted at pelvis, 6 left-right pairs",
-        "  windows of 12 frames at 30 fps, 0.37 s",
+        *body,
         "  trained on noisy joints of 3 clips: walk0, walk1, walk2",
         "  noise of 0.01 to 0.08 m, outliers in 40% of windows, occlusion in 25%",
     ]
 
 
 def test_compare_samples_a_trained_prior(prior, tmp_path):
-    out = tmp_path / "out"
-    given = "compare --samplers mh mas --draws 12 --settings.mh.warmup 10 --settings.mh.thin 2"
-    where = ["--workers", "0", "--prior", str(prior), "--out", str(out)]
-    assert main([*given.split(), *where]) == 0
-    table = pd.read_csv(out / "table.csv")
+    words = f"compare --samplers mh mas --draws 12 --workers 0 --prior {prior} --out {tmp_path}"
+    assert main([*words.split(), "--settings.mh.warmup", "10", "--settings.mh.thin", "2"]) == 0
+    table = pd.read_csv(tmp_path / "table.csv")
     assert set(table["problem"]) == {"prior"}
     assert "density_evaluations" in set(table[table["sampler"] == "mh"]["metric"])
-    draws = MotionDraws.load(out / "runs" / "prior" / "mh" / "0" / "draws.nc")
+    draws = MotionDraws.load(tmp_path / "runs" / "prior" / "mh" / "0" / "draws.nc")
     assert (draws.skeleton, draws.fps) == (PERSON, 30.0)
     assert list(table[table["sampler"] == "mas"]["metric"]) == ["unsupported"]
 
@@ -214,64 +189,62 @@ def test_compare_rejects_networks_that_are_no_prior(denoiser, tmp_path, fails):
     assert not out.exists()
 
 
-# Invalid input.
-
-
 def test_invalid_clips_are_one_line_and_write_nothing(write_walks, clips, tmp_path, fails):
     out = tmp_path / "run"
     short = write_walks(tmp_path / "short", 6, frames=7)
     twin = shutil.copy(tmp_path / "short" / "walk1.npz", tmp_path / "walk1.npz")
     walk = make_gait("walk", 0, frames=40)
-    files = {name: tmp_path / f"{name}.npz" for name in ("torn", "kneeless", "large")}
-    save(replace(walk, positions=1000 * walk.positions, name="large"), files["large"])
+    torn, kneeless, large = (tmp_path / f"{name}.npz" for name in ("torn", "kneeless", "large"))
+    save(replace(walk, positions=1000 * walk.positions, name="large"), large)
     legs = [j for j, name in enumerate(walk.skeleton.joint_names) if "knee" not in name.lower()]
-    kneeless = Motion(walk.positions[:, legs], walk.skeleton.subset(legs), walk.fps)
-    save(kneeless, files["kneeless"])
-    save(walk, files["torn"])
-    with np.load(files["torn"]) as archive:
+    save(Motion(walk.positions[:, legs], walk.skeleton.subset(legs), walk.fps), kneeless)
+    save(walk, torn)
+    with np.load(torn) as archive:
         arrays = dict(archive)
     arrays["positions"][3, 2] = np.nan
-    np.savez(files["torn"], **arrays)
+    np.savez(torn, **arrays)
+    missing = tmp_path / "no.npz"
     known = "walk0, walk1, walk2, walk3, walk4"
-    clips = ("--clips", clips)
+    given = f"--clips {clips}"
     cases = {
-        ("--clips", short): "clips must include one of at least 12 frames at 30 fps, got at most 7",
-        clips: f"clips must be at least 6 for a random split, got 5 ({known}); name held-out",
-        (*clips, "--validation", "walk1"): "validation requires test",
-        (*clips, "--validation", "walk1", "--test", "walk1"): "validation and test must be disj",
-        (*clips, "--validation", "walk9", "--test", "walk1"): "validation must name clips among "
+        f"--clips {short}": "clips must include one of at least 12 frames at 30 fps, got at most 7",
+        given: f"clips must be at least 6 for a random split, got 5 ({known}); name held-out",
+        f"{given} --validation walk1": "validation requires test",
+        f"{given} --validation walk1 --test walk1": "validation and test must be disj",
+        f"{given} --validation walk9 --test walk1": "validation must name clips among "
         f"{known}, got 'walk9'",
-        (*clips, "--validation", "walk0", "walk1", "walk2", *PARTS[2:], "walk3"): "validation and "
-        "test must leave training clips",
-        ("--validation", "walk-0"): "validation requires --clips",
-        ("--test", "walk-0"): "test requires --clips",
-        (*clips, str(twin)): "files must have unique names, got ",
-        ("--clips", str(tmp_path / "no.npz")): f"{tmp_path / 'no.npz'}: No such file or directory",
-        (*clips, str(files["large"])): "large must have bones",
-        (*clips, str(files["torn"])): str(files["torn"]),
-        (*clips, str(files["kneeless"])): "clip kneeless cannot be retargeted: ",
-        ("--steps", "0"): "steps must be an integer of at least 1, got 0",
-        ("--data-seed", "-1"): "data_seed must be an integer of at least 0, got -1",
-        ("--fps", "0"): "fps must be a finite number above 0, got 0.0",
-        ("--skeleton", "h36m17"): "clip walk-0 cannot be retargeted: ",
+        f"{given} --validation walk0 walk1 walk2 --test walk4 walk3": "validation and test must "
+        "leave training clips",
+        "--validation walk-0": "validation requires --clips",
+        "--test walk-0": "test requires --clips",
+        f"{given} {twin}": "files must have unique names, got ",
+        f"--clips {missing}": f"{missing}: No such file or directory",
+        f"{given} {large}": "large must have bones",
+        f"{given} {torn}": str(torn),
+        f"{given} {kneeless}": "clip kneeless cannot be retargeted: ",
+        "--steps 0": "steps must be an integer of at least 1, got 0",
+        "--data-seed -1": "data_seed must be an integer of at least 0, got -1",
+        "--fps 0": "fps must be a finite number above 0, got 0.0",
+        "--skeleton h36m17": "clip walk-0 cannot be retargeted: ",
     }
-    for given, expected in cases.items():
-        message = fails("train", "dvae", "--size", "tiny", "--out", out, *given)
-        assert message.startswith(expected), given
+    for options, expected in cases.items():
+        message = fails("train", "dvae", "--size", "tiny", "--out", out, *options.split())
+        assert message.startswith(expected), options
         assert not out.exists()
 
 
 def test_invalid_options_of_the_denoiser(denoiser, tmp_path, fails):
     out = tmp_path / "run"
-    for given, expected in {
-        ("--prior", "walk2d"): "motion-diffusion",
-        ("--prior", str(denoiser)): "motion-denoiser",
-        ("--prior", "no/such"): "no/such",
-        ("--prior", "x", "--least", "0"): "least",
-        ("--prior", "x", "--least", "0.1"): "most must be at least least=0.1, got 0.08",
-        ("--prior", "x", "--most", "inf"): "most must be a finite number",
-        ("--prior", "x", "--outliers", "2"): "outliers",
-        ("--prior", "x", "--hidden", "-1"): "hidden",
+    for options, expected in {
+        "walk2d": "motion-diffusion",
+        str(denoiser): "motion-denoiser",
+        "no/such": "no/such",
+        "x --least 0": "least",
+        "x --least 0.1": "most must be at least least=0.1, got 0.08",
+        "x --most inf": "most must be a finite number",
+        "x --outliers 2": "outliers",
+        "x --hidden -1": "hidden",
     }.items():
-        assert expected in fails("train", "denoiser", *given, "--size", "tiny", "--out", out)
+        given = f"train denoiser --size tiny --out {out} --prior {options}"
+        assert expected in fails(*given.split())
         assert not out.exists()

@@ -17,14 +17,9 @@ PERSON = Skeleton.preset("person14")
 
 
 def write(track, path):
-    np.savez(
-        path,
-        keypoints=track.keypoints,
-        confidence=track.confidence,
-        joint_names=np.array(track.skeleton.joint_names),
-        parents=np.array(track.skeleton.parents),
-        fps=track.fps,
-    )
+    names, parents = np.array(track.skeleton.joint_names), np.array(track.skeleton.parents)
+    arrays = {"keypoints": track.keypoints, "confidence": track.confidence, "fps": track.fps}
+    np.savez(path, joint_names=names, parents=parents, **arrays)
 
 
 @pytest.fixture(scope="module")
@@ -61,19 +56,16 @@ def test_prior_of_3d_motion_from_2d_tracks(tracks, tmp_path, capsys, fails):
     assert "size" in fails(*words(tracks, out, "--steps", 6), "--size", "small")
 
 
-@pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        (["--frames", "80"], "80"),
-        (["--centre", "sequence"], "centre must be 'frame', got 'sequence'"),
-        (["--distance", "0"], "distance must be a finite number above 0, got 0.0"),
-        (["--threshold", "0"], "threshold must be a finite number above 0, got 0.0"),
-        (["--rest", "no.npz"], "no.npz"),
-        (["--kl", "-1"], "kl must be a finite number of at least 0, got -1.0"),
-    ],
-)
-def test_invalid_options_are_one_line(tracks, tmp_path, more, expected, fails):
-    assert expected in fails(*words(tracks, tmp_path / "run", "--steps", 2), *more)
+def test_invalid_options_are_one_line(tracks, tmp_path, fails):
+    for options, expected in {
+        "--frames 80": "80",
+        "--centre sequence": "centre must be 'frame', got 'sequence'",
+        "--distance 0": "distance must be a finite number above 0, got 0.0",
+        "--threshold 0": "threshold must be a finite number above 0, got 0.0",
+        "--rest no.npz": "no.npz",
+        "--kl -1": "kl must be a finite number of at least 0, got -1.0",
+    }.items():
+        assert expected in fails(*words(tracks, tmp_path / "run", "--steps", 2), *options.split())
 
 
 def changed(pattern, folder, change):
@@ -85,32 +77,32 @@ def changed(pattern, folder, change):
 
 def test_short_motions_with_a_given_rest_pose_and_weight(tracks, tmp_path, capsys, fails):
     walk = make_gaits(1, styles={"walk": 1.0}, frames=2)[0]
-    pose = tmp_path / "rest.npz"
+    pose, out = tmp_path / "rest.npz", tmp_path / "run"
     save(walk, pose)
 
-    def first(track):
+    def shortened(track):
         return replace(track, keypoints=track.keypoints[:14], confidence=track.confidence[:14])
 
-    brief = changed(tracks, tmp_path, first)
+    short = changed(tracks, tmp_path, shortened)
     more = ["--steps", 2, "--frames", 5, "--rest", pose, "--kl", 0.02]
-    assert main(words(brief, tmp_path / "run", *more)) == 0
+    assert main(words(short, out, *more)) == 0
     assert f"rest pose: the first frame of {pose}" in capsys.readouterr().out
-    prior = MotionVAE.load(tmp_path / "run" / "vae")
+    prior = MotionVAE.load(out / "vae")
     assert prior.settings.kl == 0.02
     expected = walk.retarget(PERSON).positions[0]
     np.testing.assert_allclose(prior.body.rest_positions, expected - expected[0], atol=1e-6)
-    message = fails(*words(brief, tmp_path / "other", "--steps", 2))
+    message = fails(*words(short, tmp_path / "other", "--steps", 2))
     assert message.endswith("10 frames at 10 fps; the longest track has 5")
 
 
-def test_root_that_is_never_seen_is_named(tracks, tmp_path, fails):
-    def hidden(track):
+def test_tracks_without_the_root_are_rejected(tracks, tmp_path, fails):
+    def without_root(track):
         confidence = track.confidence.copy()
         confidence[:, PERSON.index("pelvis")] = 0.0
         return replace(track, confidence=confidence)
 
-    message = fails(*words(changed(tracks, tmp_path, hidden), tmp_path / "run", "--steps", 2))
-    assert "tracks never show the root (pelvis)" in message
+    given = words(changed(tracks, tmp_path, without_root), tmp_path / "run", "--steps", 2)
+    assert "tracks never show the root (pelvis)" in fails(*given)
 
 
 @pytest.mark.filterwarnings("always:body is not left-right symmetric")
@@ -123,8 +115,7 @@ def test_own_skeleton_without_left_right_pairs(tracks, tmp_path, capsys):
         keypoints, confidence = track.keypoints[:, index], track.confidence[:, index]
         return replace(track, keypoints=keypoints, confidence=confidence, skeleton=leg)
 
-    own = changed(tracks, tmp_path, one_leg)
-    more = ["--steps", 2, "--skeleton", "own", "--front", "knee"]
-    assert main(words(own, tmp_path / "run", *more)) == 0, capsys.readouterr().err
+    given = words(changed(tracks, tmp_path, one_leg), tmp_path / "run", "--steps", 2)
+    assert main([*given, "--skeleton", "own", "--front", "knee"]) == 0
     assert "body is not left-right symmetric" in capsys.readouterr().err
     assert MotionVAE.load(tmp_path / "run" / "vae").skeleton == leg

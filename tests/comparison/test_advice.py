@@ -25,53 +25,45 @@ def measurements(headline="swd_ratio", seconds=None, more=(), **values):
         for metric, value in ((headline, quality), ("seconds", seconds[name]))
     ]
     rows += [("p", name, seed, metric, value) for name, metric, value in more for seed in range(3)]
-    return Measured(
-        pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"]),
-        "made here",
-        40,
-        3,
-        1.3,
-        ["all had 6 seconds"],
-        {"p": "a problem"},
-        [*values, "sds"],
-        {"p/sds": "observations"},
-    )
+    table = pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"])
+    notes, problems, words = ["all had 6 seconds"], {"p": "a problem"}, {"p/sds": "observations"}
+    return Measured(table, "made here", 40, 3, 1.3, notes, problems, [*values, "sds"], words)
 
 
 def names(standings):
     return [each.sampler for each in standings]
 
 
-NEAR, ALIKE, FAR = [1.0, 1.02, 0.97], [1.03, 0.99, 1.05], [2.0, 2.1, 2.05]
+GOOD, EQUAL, BAD = [1.0, 1.02, 0.97], [1.03, 0.99, 1.05], [2.0, 2.1, 2.05]
 
 
 def test_the_best_is_recommended_and_others_are_tied_or_worse():
-    found = advise("p", measurements(near=NEAR, far=FAR, alike=ALIKE, farther=[3.0, 3.1, 3.05]))
-    assert found.recommended.sampler == "near"
-    assert found.recommended.value == pytest.approx(sum(NEAR) / 3)
-    assert names(found.tied) == ["alike"]
-    assert names(found.worse) == ["far", "farther"]
-    assert found.without_draws == {"sds": "observations"}
-    text = str(found)
-    assert "recommended: near 0.997 ± 0.025 in 6 s" in text
-    assert "worse: far 2.05 ± 0.05 in 6 s (far from the references: swd ratio 2.05); fart" in text
+    result = advise("p", measurements(good=GOOD, bad=BAD, equal=EQUAL, worst=[3.0, 3.1, 3.05]))
+    assert result.recommended.sampler == "good"
+    assert result.recommended.value == pytest.approx(sum(GOOD) / 3)
+    assert names(result.tied) == ["equal"]
+    assert names(result.worse) == ["bad", "worst"]
+    assert result.without_draws == {"sds": "observations"}
+    text = str(result)
+    assert "recommended: good 0.997 ± 0.025 in 6 s" in text
+    assert "worse: bad 2.05 ± 0.05 in 6 s (far from the references: swd ratio 2.05); wors" in text
     assert "without draws: sds (observations)" in text
     assert "40 draws, 3 seeds, all had 6 seconds (made here)" in text
     assert max(map(len, text.splitlines())) <= 100
 
 
 def test_a_tied_sampler_in_less_than_half_the_time_is_recommended():
-    values = {"near": NEAR, "alike": ALIKE, "far": FAR}
-    quick = advise("p", measurements(seconds={"alike": 2.9, "far": 0.1}, **values))
-    assert quick.recommended.sampler == "alike"
-    assert names(quick.tied) == ["near"]
-    slower = advise("p", measurements(seconds={"alike": 3.1}, **values))
-    assert slower.recommended.sampler == "near"
+    values = {"good": GOOD, "equal": EQUAL, "bad": BAD}
+    quick = advise("p", measurements(seconds={"equal": 2.9, "bad": 0.1}, **values))
+    assert quick.recommended.sampler == "equal"
+    assert names(quick.tied) == ["good"]
+    slower = advise("p", measurements(seconds={"equal": 3.1}, **values))
+    assert slower.recommended.sampler == "good"
 
 
 def test_ratios_are_compared_on_a_logarithmic_scale():
-    far = {"quarter": [0.25, 0.26, 0.24], "half": [0.5, 0.51, 0.49], "thrice": [3.0, 3.1, 2.9]}
-    assert names(advise("p", measurements(near=NEAR, **far)).worse) == ["half", "thrice", "quarter"]
+    bad = {"quarter": [0.25, 0.26, 0.24], "half": [0.5, 0.51, 0.49], "thrice": [3.0, 3.1, 2.9]}
+    assert names(advise("p", measurements(good=GOOD, **bad)).worse) == ["half", "thrice", "quarter"]
 
 
 @pytest.mark.parametrize(
@@ -88,10 +80,10 @@ def test_ratios_are_compared_on_a_logarithmic_scale():
 def test_metrics_out_of_range_are_warnings(metric, value, warning):
     usual = [("a", metric, {"mode_proportions_tv": 0.0, "c2st": 0.5}.get(metric, 1.0))]
     slightly = [1.2, 1.21, 1.19]
-    found = advise("p", measurements(a=NEAR, b=slightly, more=[*usual, ("b", metric, value)]))
-    assert found.recommended.warnings == ()
-    assert found.worse[0].warnings == (warning,)
-    assert f"b 1.2 ± 0.01 in 6 s ({warning})" in " ".join(str(found).split())
+    result = advise("p", measurements(a=GOOD, b=slightly, more=[*usual, ("b", metric, value)]))
+    assert result.recommended.warnings == ()
+    assert result.worse[0].warnings == (warning,)
+    assert f"b 1.2 ± 0.01 in 6 s ({warning})" in " ".join(str(result).split())
 
 
 @pytest.mark.parametrize(
@@ -104,36 +96,36 @@ def test_metrics_out_of_range_are_warnings(metric, value, warning):
 )
 def test_rhat_warns_at_more_seeds_than_by_chance(rhat, warnings):
     """One of three seeds exceeds the limit in 14 % of tables with mixed chains."""
-    found = measurements(b=[1.2, 1.21, 1.19])
+    result = measurements(b=[1.2, 1.21, 1.19])
     rows = [("p", "b", seed, "rhat", value) for seed, value in enumerate(rhat)]
-    rows = pd.concat([found.rows, pd.DataFrame(rows, columns=found.rows.columns)])
-    assert advise("p", replace(found, rows=rows)).recommended.warnings == warnings
+    rows = pd.concat([result.rows, pd.DataFrame(rows, columns=result.rows.columns)])
+    assert advise("p", replace(result, rows=rows)).recommended.warnings == warnings
 
 
 def test_samplers_with_warnings_are_recommended_only_without_alternative():
-    doubtful = [("near", "rhat", 2.0)]
-    found = advise("p", measurements(near=NEAR, alike=ALIKE, more=doubtful))
-    assert (found.recommended.sampler, found.tied) == ("alike", ())
-    assert names(found.tied_with_warnings) == ["near"]
-    text = " ".join(str(found).split())
-    assert "with warnings: near 0.997 ± 0.025 in 6 s (chains disagree: R-hat 2)" in text
-    alone = advise("p", measurements(near=NEAR, far=FAR, more=doubtful))
-    assert "none is right at this cost; best: near 0.997" in str(alone)
-    assert "none is right at this cost; best: far 2.05" in str(advise("p", measurements(far=FAR)))
+    doubtful = [("good", "rhat", 2.0)]
+    result = advise("p", measurements(good=GOOD, equal=EQUAL, more=doubtful))
+    assert (result.recommended.sampler, result.tied) == ("equal", ())
+    assert names(result.tied_with_warnings) == ["good"]
+    text = " ".join(str(result).split())
+    assert "with warnings: good 0.997 ± 0.025 in 6 s (chains disagree: R-hat 2)" in text
+    alone = advise("p", measurements(good=GOOD, bad=BAD, more=doubtful))
+    assert "none is right at this cost; best: good 0.997" in str(alone)
+    assert "none is right at this cost; best: bad 2.05" in str(advise("p", measurements(bad=BAD)))
 
 
 def test_a_single_sampler_is_recommended():
-    found = advise("p", measurements("fid", only=NEAR))
-    assert (found.recommended.sampler, found.tied, found.worse) == ("only", (), ())
-    assert "on par: none" in str(found)
+    result = advise("p", measurements("fid", only=GOOD))
+    assert (result.recommended.sampler, result.tied, result.worse) == ("only", (), ())
+    assert "on par: none" in str(result)
 
 
 def test_missing_seeds_are_warnings():
     nan = float("nan")
-    found = advise("p", measurements(near=NEAR, some=[1.0, nan, nan], none=[nan, nan, nan]))
-    assert found.recommended.sampler == "near"
-    assert [each.warnings for each in found.tied_with_warnings] == [("draws at 1 of 3 seeds",)]
-    assert "nan" not in str(found)
+    result = advise("p", measurements(good=GOOD, some=[1.0, nan, nan], none=[nan, nan, nan]))
+    assert result.recommended.sampler == "good"
+    assert [each.warnings for each in result.tied_with_warnings] == [("draws at 1 of 3 seeds",)]
+    assert "nan" not in str(result)
 
 
 def test_measurements_of_a_comparison_are_saved_and_read(tmp_path):
@@ -141,26 +133,26 @@ def test_measurements_of_a_comparison_are_saved_and_read(tmp_path):
     samplers = {"exact": ExactSampler(), "sds": ScoreDistillation(iterations=3)}
     comparison = compare(problem, samplers, draws=12, chains=2, seeds=2, workers=0, progress=False)
     save_measurements(comparison, "a test", tmp_path)
-    found = measured(tmp_path)
-    assert (found.command, found.draws, found.seeds) == ("a test", 12, 2)
-    assert found.rhat_at_most > 1.1
-    assert found.samplers == ["exact", "sds"]
+    result = measured(tmp_path)
+    assert (result.command, result.draws, result.seeds) == ("a test", 12, 2)
+    assert result.rhat_at_most > 1.1
+    assert result.samplers == ["exact", "sds"]
     table = comparison.table()
     swd = table[table["metric"] == "swd_ratio"]["value"].mean()
-    stored = found.rows[found.rows["metric"] == "swd_ratio"]["value"].mean()
+    stored = result.rows[result.rows["metric"] == "swd_ratio"]["value"].mean()
     assert stored == pytest.approx(swd, rel=1e-4)
-    assert advise(problem.name, found).recommended.sampler == "exact"
+    assert advise(problem.name, result).recommended.sampler == "exact"
 
 
 def test_shipped_measurements_cover_every_sampler_and_problem():
-    found = measured()
-    assert list(found.problems) == problem_names()
-    assert found.samplers == sampler_names()
-    for problem in found.problems:
+    result = measured()
+    assert list(result.problems) == problem_names()
+    assert result.samplers == sampler_names()
+    for problem in result.problems:
         advice = advise(problem)
         best = names([advice.recommended, *advice.tied])
         others = names([*advice.tied_with_warnings, *advice.worse])
-        assert {*best, *others, *advice.without_draws} == set(found.samplers)
+        assert {*best, *others, *advice.without_draws} == set(result.samplers)
         # Nothing is significantly closer to exact draws than exact draws.
         if "exact" not in advice.without_draws:
             assert "exact" in best

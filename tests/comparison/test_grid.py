@@ -8,7 +8,7 @@ import os
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Timer
-from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -19,15 +19,15 @@ from toy_samplers import (
     Failing,
     PriorDraws,
     Walking,
-    count,
     generation,
     monocular,
     numbers,
 )
 
 from probmotion.comparison import Budget, Comparison, compare
+from probmotion.comparison.figures import draw_comparison
 from probmotion.comparison.results.failures import ResultNotWritten
-from probmotion.comparison.results.plan import Plan, _reference_notes
+from probmotion.comparison.results.plan import Plan
 from probmotion.posteriors.problem import Problem
 from probmotion.samplers import ExactSampler
 
@@ -36,26 +36,16 @@ def test_table_has_one_row_per_metric(grid):
     table = grid.table()
     assert list(table.columns) == ["problem", "sampler", "seed", "metric", "value"]
     assert table["value"].dtype == float
-    assert set(table["problem"]) == {"generation", "monocular"}
-    assert set(table["seed"]) == {0, 1}
     assert not table.duplicated(["problem", "sampler", "seed", "metric"]).any()
-    wide = table[(table["sampler"] == "wide") & (table["problem"] == "generation")]
-    values = wide.set_index(["metric", "seed"])["value"]
-    assert values["variance_ratio", 0] == pytest.approx(4, rel=0.5)
-    assert values["denoiser_evaluations", 1] == 100
+    values = table.set_index(["problem", "sampler", "metric", "seed"])["value"]
+    assert values["generation", "wide", "variance_ratio", 0] == pytest.approx(4, rel=0.5)
+    assert values["generation", "wide", "denoiser_evaluations", 1] == 100
 
 
-def test_samplers_share_reference_draws_but_seeds_do_not(monkeypatch):
-    asked = []
-    reference = Problem.reference
-
-    def recorded(self, seed, n):
-        asked.append(seed)
-        return reference(self, seed, n)
-
-    monkeypatch.setattr(Problem, "reference", recorded)
-    compare(generation(), {"a": PriorDraws(), "b": PriorDraws(2.0)}, seeds=2, **SMALL)
-    assert len(set(asked)) == 2
+def test_samplers_share_reference_draws_but_seeds_do_not():
+    with patch.object(Problem, "reference", autospec=True, side_effect=Problem.reference) as called:
+        compare(generation(), {"a": PriorDraws(), "b": PriorDraws(2.0)}, seeds=2, **SMALL)
+    assert len({call.args[1] for call in called.call_args_list}) == 2
 
 
 def test_draws_are_stored_by_problem_sampler_and_seed(grid):
@@ -79,21 +69,21 @@ def test_a_run_does_not_depend_on_the_rest_of_the_grid(grid):
 
 def test_every_run_has_different_random_numbers():
     problems = {"a": generation(), "b": generation()}
-    found = compare(problems, {"a": PriorDraws(), "b": PriorDraws()}, seeds=2, **SMALL)
-    first = {found.draws(*address).flat()[0].tobytes() for address in found.plan.runs()}
+    comparison = compare(problems, {"a": PriorDraws(), "b": PriorDraws()}, seeds=2, **SMALL)
+    first = {comparison.draws(*address).flat()[0].tobytes() for address in comparison.plan.runs()}
     assert len(first) == 8
 
 
 def test_results_are_identical_in_processes_and_threads(grid, samplers, tmp_path, monkeypatch):
     problems, settings = [generation(), monocular()], {**SMALL, "seeds": 2}
-    found = [compare(problems, samplers, **(settings | {"workers": 2}))]
+    comparisons = [compare(problems, samplers, **(settings | {"workers": 2}))]
     # Threads with another working directory than the relative ``out``.
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
     with ThreadPoolExecutor(2, initializer=os.chdir, initargs=[tmp_path / "elsewhere"]) as executor:
-        found.append(compare(problems, samplers, executor=executor, out="out", **settings))
+        comparisons.append(compare(problems, samplers, executor=executor, out="out", **settings))
     assert not list((tmp_path / "elsewhere").iterdir())
-    for each in found:
+    for each in comparisons:
         assert numbers(each.table()) == numbers(grid.table())
         np.testing.assert_array_equal(
             each.draws("generation", "wide", 1).flat(), grid.draws("generation", "wide", 1).flat()
@@ -112,9 +102,9 @@ def test_results_are_identical_with_dask(grid, samplers, tmp_path):
     )
     with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
         assert len(set(client.run(os.getpid).values()) - {os.getpid()}) == 2
-        problems = [generation(), monocular()]
-        found = compare(problems, samplers, executor=executor, out=tmp_path, **SMALL | {"seeds": 2})
-    assert numbers(found.table()) == numbers(grid.table())
+        settings = {**SMALL, "seeds": 2, "executor": executor, "out": tmp_path}
+        comparison = compare([generation(), monocular()], samplers, **settings)
+    assert numbers(comparison.table()) == numbers(grid.table())
 
 
 def test_registered_problems_and_budgets_give_identical_results_in_a_worker(capsys):
@@ -135,30 +125,29 @@ def test_notes_name_the_source_of_long_run_references(tmp_path):
     plan.save(tmp_path)
     assert Plan.load(tmp_path) == plan
     assert Comparison(tmp_path, plan).notes == list(plan.references)
-    long_run = SimpleNamespace(certificate={"sampler": "tempered-pairs"}, n=2000)
-    problem = SimpleNamespace(stored=long_run, max_references=2000, aligned_to=np.zeros(3))
-    assert list(_reference_notes({"pairs": problem})) == [
-        "reference draws of pairs are 2000 draws from long runs of tempered-pairs, up to a rigid "
-        "motion"
-    ]
 
 
 def test_failures_are_recorded_and_do_not_stop_the_grid(grid):
-    table = grid.table()
-    rows = {(row.problem, row.sampler, row.metric): row.value for row in table.itertuples()}
-    assert rows["generation", "crashing", "failed"] == 1
-    assert rows["generation", "wide", "swd_ratio"] > 0
-    assert rows["monocular", "wide", "unsupported"] == 1
-    assert ("generation", "crashing", "swd_ratio") not in rows
+    values = grid.table().set_index(["problem", "sampler", "metric", "seed"])["value"]
+    assert values["generation", "crashing", "failed", 0] == 1
+    assert values["monocular", "wide", "unsupported", 1] == 1
+    assert values["generation", "wide", "swd_ratio", 1] > 0
     stored = json.loads((grid.folder / "failures.json").read_text())
     by_run = {(each["problem"], each["sampler"], each["seed"]): each for each in stored}
     assert len(by_run) == len(stored) == 6
+    assert by_run["monocular", "wide", 1]["word"] == "observations"
     crashed = by_run["generation", "crashing", 0]
-    assert crashed["message"] == "the floor gave way"
+    assert crashed["message"] == "singular matrix"
     assert "toy_samplers.py" in crashed["traceback"]
-    printed = str(table)
-    assert "wide on monocular: prior-draws takes no observations; try exact" in printed
-    assert "crashing on generation: the floor gave way" in printed
+    assert "wide on monocular: prior-draws takes no observations; try exact" in grid.notes
+    assert "crashing on generation: singular matrix" in grid.notes
+
+
+def test_figures_are_written_for_every_problem_with_draws_or_references(grid, tmp_path):
+    names = ["quality_against_cost.png", "skeletons_generation.png", "skeletons_monocular.png"]
+    written = draw_comparison(grid, [generation(), monocular()], tmp_path)
+    assert written == [tmp_path / name for name in names]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
 
 
 def test_a_problem_is_sent_to_a_worker_once(tmp_path):
@@ -168,47 +157,39 @@ def test_a_problem_is_sent_to_a_worker_once(tmp_path):
     assert diary.read_text() == "1 1 1 2 2 2 "
 
 
-class Broken(ThreadPoolExecutor):
-    """Executor that fails every task."""
+class Choosy(ThreadPoolExecutor):
+    """Executor that refuses the tasks of one sampler, forgets and fails those of others."""
 
     error: Exception = OSError("the cluster is gone")
-
-    def submit(self, function, *arguments, **settings):
-        future = Future()
-        future.set_exception(self.error)
-        return future
-
-
-class Choosy(ThreadPoolExecutor):
-    """Executor that refuses the tasks of one sampler and forgets those of another."""
 
     def submit(self, function, task, **settings):
         if task.sampler == "refused":
             raise TypeError("refused cannot be sent")
+        future = Future()
         if task.sampler == "forgotten":
-            future = Future()
             future.set_result(None)
-            return future
-        return super().submit(function, task, **settings)
+        elif task.sampler == "failed":
+            future.set_exception(self.error)
+        else:
+            return super().submit(function, task, **settings)
+        return future
 
 
 def test_failures_of_an_executor_are_recorded():
-    samplers = {name: PriorDraws() for name in ("refused", "forgotten", "right")}
+    samplers = {name: PriorDraws() for name in ("refused", "forgotten", "failed", "right")}
     with Choosy(1) as executor:
-        found = compare(generation(), samplers, executor=executor, **SMALL)
-    words = {result.sampler: result.failure and str(result.failure) for result in found.results}
-    assert words == {
+        comparison = compare(generation(), samplers, executor=executor, **SMALL)
+        executor.error = ResultNotWritten("No space left on device")
+        with pytest.raises(OSError, match="to out, No space left on device, with 0 of 1 runs"):
+            compare(generation(), {"failed": PriorDraws()}, executor=executor, **SMALL)
+    failures = {result.sampler: str(result.failure) for result in comparison.results}
+    assert failures == {
         "refused": "TypeError: refused cannot be sent",
         "forgotten": "FileNotFoundError: generation/forgotten/0 ended without a result in out; "
         "workers must see the folder out",
-        "right": None,
+        "failed": "OSError: the cluster is gone",
+        "right": "None",
     }
-    with Broken() as executor:
-        found = compare(generation(), samplers, executor=executor, **SMALL)
-        assert {r.failure.message for r in found.results} == {"the cluster is gone"}
-        executor.error = ResultNotWritten("No space left on device")
-        with pytest.raises(OSError, match="to out, No space left on device, with 0 of 3 runs"):
-            compare(generation(), samplers, executor=executor, **SMALL)
 
 
 def test_runs_that_a_shut_down_executor_cancels_are_recorded():
@@ -216,9 +197,9 @@ def test_runs_that_a_shut_down_executor_cancels_are_recorded():
     samplers = {"first": PriorDraws(nap=0.5), "second": PriorDraws(), "third": PriorDraws()}
     shut = Timer(0.2, executor.shutdown, kwargs={"wait": False, "cancel_futures": True})
     shut.start()
-    found = compare(generation(), samplers, executor=executor, **SMALL)
+    comparison = compare(generation(), samplers, executor=executor, **SMALL)
     shut.join()
-    messages = [result.failure and result.failure.message for result in found.results]
+    messages = [result.failure and result.failure.message for result in comparison.results]
     assert messages == [None, *2 * ["the executor cancelled it"]]
 
 
@@ -259,20 +240,9 @@ def test_invalid_arguments_raise_before_anything_runs(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unwritable_folder_raises_before_anything_runs(tmp_path):
-    diary = tmp_path / "diary"
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    for folder in (blocked, blocked / "below"):
-        with pytest.raises(OSError, match=r"out"):
-            compare(generation(), PriorDraws(diary=str(diary)), out=folder, **SMALL)
-    assert count(diary) == 0
-
-
 def test_loading_another_folder_raises(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"one that compare\(\) wrote, .* without comparison\.json"
-    ):
+    message = r"one that compare\(\) wrote, .* without comparison\.json"
+    with pytest.raises(ValueError, match=message):
         Comparison.load(tmp_path)
     (tmp_path / "comparison.json").write_text("{")
     with pytest.raises(ValueError, match="is damaged"):

@@ -34,17 +34,12 @@ def count(diary: Path) -> int:
     return len(diary.read_text().split()) if diary.exists() else 0
 
 
-def start(*words, **settings) -> subprocess.Popen:
+def start(*words, cwd=None) -> subprocess.Popen:
     """Start Python with these samplers importable."""
     paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, *map(str, words)],
-        env={**os.environ, "PYTHONPATH": paths},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **settings,
-    )
+    command, environment = [sys.executable, *map(str, words)], os.environ | {"PYTHONPATH": paths}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=environment, text=True, cwd=cwd, **pipes)
 
 
 def finish(process: subprocess.Popen, returncode: int = 0) -> tuple[str, str]:
@@ -111,9 +106,8 @@ class PriorDraws:
             with open(self.diary, "a") as file:
                 file.write(f"{seed}\n")
         if posterior.likelihood is not None:
-            raise UnsupportedPosterior(
-                self.name, "takes no observations", "observations", ["exact"]
-            )
+            reason = "takes no observations"
+            raise UnsupportedPosterior(self.name, reason, "observations", ["exact"])
         time.sleep(self.nap)
         rng = seeds.generator(seed, "toy")
         x = self.spread * posterior.prior.sample(rng, draws * chains)
@@ -147,6 +141,14 @@ class Counting(PriorDraws):
         return PriorDraws().sample(posterior, **settings)
 
 
+ERRORS = {
+    "raise": RuntimeError("singular\nmatrix"),
+    "exit": SystemExit(3),
+    "memory": MemoryError(),
+    "KeyboardInterrupt": KeyboardInterrupt("of its own"),
+}
+
+
 @dataclass(frozen=True)
 class Failing(PriorDraws):
     """Fails in the given way."""
@@ -156,18 +158,12 @@ class Failing(PriorDraws):
     file: str = ""
 
     def sample(self, posterior, **settings):
+        if self.how in ERRORS:
+            raise ERRORS[self.how]
         match self.how:
-            case "raise":
-                raise RuntimeError("the floor gave\nway")
             case "until the file exists":
                 if not Path(self.file).exists():
                     raise RuntimeError("not yet")
-            case "exit":
-                raise SystemExit(3)
-            case "memory":
-                raise MemoryError
-            case "KeyboardInterrupt":
-                raise KeyboardInterrupt("of its own")
             case "die":
                 os._exit(9)
             case "hang" | "hang without signals":
@@ -179,14 +175,15 @@ class Failing(PriorDraws):
                     except Exception:  # as libraries that wrap errors of callbacks
                         continue
             case "too few":
-                return super().sample(posterior, **settings | {"draws": settings["draws"] - 1})
+                settings["draws"] -= 1
             case "one chain":
-                n = settings["draws"] * settings["chains"]
-                return super().sample(posterior, **settings | {"draws": n, "chains": 1})
+                settings |= {"draws": settings["draws"] * settings["chains"], "chains": 1}
             case "infinite":
-                shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-                x = np.full((settings["chains"], settings["draws"], *shape), np.inf)
+                x = np.full((2, 10, posterior.frames, posterior.skeleton.n_joints, 3), np.inf)
                 return MotionDraws.of(posterior, self, x, seed=0, seconds=0.0)
+            case "other skeleton":
+                skeleton = Skeleton(["x", "y", "z"], posterior.skeleton.parents)
+                posterior = MotionPosterior(replace(posterior.prior, skeleton=skeleton))
         draws = super().sample(posterior, **settings)
         positions = draws.dataset["positions"].values
         match self.how:
@@ -201,15 +198,8 @@ class Failing(PriorDraws):
                 positions[0, 0] *= 1e200
             case "none":
                 return None
-            case "array":
-                return positions
             case "no time":
                 return replace(draws, dataset=draws.dataset.assign_attrs(seconds=np.nan))
-            case "other skeleton":
-                names = [f"{name} of another" for name in draws.skeleton.joint_names]
-                skeleton = Skeleton(names, draws.skeleton.parents)
-                other = MotionPosterior(replace(posterior.prior, skeleton=skeleton))
-                return super().sample(other, **settings)
         return draws
 
 
@@ -230,14 +220,10 @@ class Walking(PriorDraws):
             raise ValueError(f"stride must be at most {self.most}, got {self.stride}")
 
     def sample(self, posterior, *, draws=1000, chains=1, **settings):
-        found = super().sample(posterior, draws=draws, chains=chains, **settings)
+        dataset = super().sample(posterior, draws=draws, chains=chains, **settings).dataset
         cost = chains * (50 + self.start + draws * self.stride)
         counts = {"evaluations_density": cost, "evaluations_gradient": chains * draws}
-        return MotionDraws(
-            found.dataset.drop_attrs(deep=False).assign_attrs(
-                {**found.dataset.attrs, "evaluations_denoiser": 0, **counts}
-            )
-        )
+        return MotionDraws(dataset.assign_attrs({"evaluations_denoiser": 0, **counts}))
 
 
 @dataclass(frozen=True)
@@ -250,5 +236,5 @@ class Napping(PriorDraws):
     rounds: int = 4
 
     def sample(self, posterior, **settings):
-        found = super().sample(posterior, **settings)
-        return MotionDraws(found.dataset.assign_attrs(seconds=0.01 * self.rounds))
+        dataset = super().sample(posterior, **settings).dataset
+        return MotionDraws(dataset.assign_attrs(seconds=0.01 * self.rounds))

@@ -9,18 +9,12 @@ from scipy.spatial.transform import Rotation
 from probmotion import Cameras
 
 
-def yaw(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-
 def points(*shape, seed=0):
     return np.random.default_rng(seed).standard_normal((*shape, 3))
 
 
 def by_definition(cameras, world):
     """x = f (X, Y) / Z + c (orthographic: without Z) for (X, Y, Z) = R X + t, point by point."""
-    assert cameras.centre is not None
     frames, joints = world.shape[:2]
     image = np.zeros((cameras.n_views, frames, joints, 2))
     for view, frame, joint in np.ndindex(image.shape[:3]):
@@ -32,12 +26,11 @@ def by_definition(cameras, world):
 
 
 def random_cameras(orthographic):
-    """Three unrelated cameras."""
     rng = np.random.default_rng(4)
     return Cameras(
         Rotation.random(3, rng=4).as_matrix(),
         np.array([0.0, 0.0, 20.0]) + rng.standard_normal((3, 3)),
-        rng.uniform(0.5, 1000.0, 3) if not orthographic else rng.uniform(0.5, 2.0, 3),
+        rng.uniform(0.5, 2.0 if orthographic else 1000.0, 3),
         rng.uniform(-50, 50, (3, 2)),
         orthographic,
     )
@@ -52,21 +45,8 @@ def test_projection_agrees_with_its_definition(library, orthographic):
     size = float(np.abs(np.asarray(image)).max())
     for batch in range(2):
         library.assert_close(image[batch, ...] / size, by_definition(cameras, world[batch]) / size)
-
-
-def test_depth_is_the_third_camera_coordinate(library):
-    cameras = random_cameras(orthographic=False)
-    world = points(4, 5)
-    wanted = np.einsum("vi,lji->vlj", cameras.rotation[:, 2], world)
-    wanted += cameras.translation[:, 2, None, None]
-    library.assert_close(cameras.depth(library.array(world)) / 20, wanted / 20)
-
-
-@pytest.mark.parametrize("orthographic", [True, False])
-def test_empty_batches_stay_empty(orthographic):
-    cameras = Cameras.ring(3, perspective=not orthographic)
-    for shape in ((0, 4, 5, 3), (0, 5, 3), (2, 4, 0, 3)):
-        assert cameras.project(np.zeros(shape)).shape == (*shape[:-3], 3, *shape[-3:-1], 2)
+    assert cameras.project(np.zeros((2, 4, 0, 3))).shape == (2, 3, 4, 0, 2)
+    assert cameras.project(np.zeros((0, 5, 3))).shape == (3, 0, 5, 2)
 
 
 @given(st.integers(1, 8), st.floats(-1.5, 1.5), st.floats(-3, 3))
@@ -99,51 +79,41 @@ def test_perspective_differs_from_orthographic_by_at_most_one_over_distance(
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-1.4, 1.4), st.booleans())
 def test_rotating_the_world_equals_moving_the_camera(azimuth, psi, elevation, perspective):
     """A camera at azimuth φ projects R_y(ψ) X as camera 0 projects R_y(ψ − φ) X."""
+
+    def yaw(angle):
+        return Rotation.from_rotvec([0, angle, 0]).as_matrix()
+
     world = points(1, 6)
     placed = {"elevation": elevation, "perspective": perspective, "distance": 9.0}
-    there = Cameras.ring(1, start=azimuth, **placed).project(world @ yaw(psi).T)
+    moved = Cameras.ring(1, start=azimuth, **placed).project(world @ yaw(psi).T)
     front = Cameras.ring(1, **placed).project(world @ yaw(psi - azimuth).T)
-    np.testing.assert_allclose(there, front, atol=1e-12)
+    np.testing.assert_allclose(moved, front, atol=1e-12)
 
 
 def test_ring_placement_and_image_axes():
     cameras = Cameras.ring(4, distance=7.0)
     centres = -np.swapaxes(cameras.rotation, -1, -2) @ cameras.translation[..., None]
-    wanted = 7.0 * np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]])
-    np.testing.assert_allclose(centres[..., 0], wanted, atol=1e-14)
+    expected = 7.0 * np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]])
+    np.testing.assert_allclose(centres[..., 0], expected, atol=1e-14)
     image = cameras.project(np.eye(3)[None])[0, 0]
     np.testing.assert_allclose(image, [[1, 0], [0, -1], [0, 0]], atol=1e-15)  # y is down
-    raised = Cameras.ring(5, elevation=0.3, start=0.2)
-    np.testing.assert_allclose(raised.elevation, 0.3)
-    np.testing.assert_allclose(np.diff(np.unwrap(raised.azimuth)), 2 * np.pi / 5)
-    assert raised.azimuth[0] == pytest.approx(0.2)
-    above = -np.swapaxes(raised.rotation, -1, -2) @ raised.translation[..., None]
-    np.testing.assert_allclose(above[:, 1, 0], 7 * np.sin(0.3))
-
-
-@pytest.mark.parametrize("perspective", [True, False])
-def test_ring_cameras_face_the_origin(perspective):
-    cameras = Cameras.ring(6, elevation=0.4, perspective=perspective)
-    np.testing.assert_allclose(cameras.project(np.zeros((1, 1, 3))), 0, atol=1e-15)
-    np.testing.assert_allclose(cameras.depth(np.zeros((1, 1, 3))), 7.0)
+    for perspective in (True, False):
+        raised = Cameras.ring(5, elevation=0.3, start=0.2, perspective=perspective)
+        np.testing.assert_allclose(raised.elevation, 0.3)
+        np.testing.assert_allclose(np.unwrap(raised.azimuth), 0.2 + 2 * np.pi / 5 * np.arange(5))
+        above = -np.swapaxes(raised.rotation, -1, -2) @ raised.translation[..., None]
+        np.testing.assert_allclose(above[:, 1, 0], 7 * np.sin(0.3))
+        origin = np.zeros((1, 1, 3))
+        np.testing.assert_allclose(raised.project(origin), 0, atol=1e-15)
+        np.testing.assert_allclose(raised.depth(origin), 7.0)
 
 
 def test_view_selects_one_camera():
     cameras = random_cameras(False)
     world = points(2, 3)
-    together = cameras.project(world)
     for index in (0, 1, 2, -1):
-        np.testing.assert_array_equal(cameras.view(index).project(world)[0], together[index])
-    assert [cameras.view(i).n_views for i in (0, -1)] == [1, 1]
-
-
-def test_orthographic_projection_is_image_axes_plus_offset():
-    cameras = random_cameras(True)
-    world = points(2, 3)
-    by_axes = np.einsum("vai,lji->vlja", cameras.image_axes, world)
-    np.testing.assert_allclose(
-        cameras.project(world), by_axes + cameras.offset[:, None, None], atol=1e-13
-    )
+        one = cameras.view(index).project(world)
+        np.testing.assert_array_equal(one, cameras.project(world)[index][None])
 
 
 def test_points_behind_a_perspective_camera_are_refused(library):

@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from probmotion.geometry import rotations as r
 
-ORDERS = [
-    "".join(o) for o in product("XYZ", repeat=3) if o[0] != o[1] and o[1] != o[2]
-]  # 6 with three axes, 6 with two
+ORDERS = ["".join(o) for o in product("XYZ", repeat=3) if o[0] != o[1] and o[1] != o[2]]
 
 
 def rotation_vectors():
@@ -22,17 +20,12 @@ def rotation_vectors():
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     axes[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     sizes = [0.0, 1e-30, 1e-12, 1e-8, 9.9e-4, 1.01e-3, 0.1, 1.0, 3.0]
-    near = [np.pi - gap for gap in (1e-3, 1e-6, 1e-9, 0.0)]
-    return np.concatenate([size * axes for size in sizes + near])
+    half_turns = [np.pi - gap for gap in (1e-3, 1e-6, 1e-9, 0.0)]
+    return np.concatenate([size * axes for size in sizes + half_turns])
 
 
 VECTORS = rotation_vectors()
 ORACLE = Rotation.from_rotvec(VECTORS)
-
-
-def up_to_sign(quaternions):
-    """Products of a quaternion's entries, equal for q and −q."""
-    return quaternions[..., :, None] * quaternions[..., None, :]
 
 
 def test_conversions_agree_with_scipy(library):
@@ -46,9 +39,11 @@ def test_conversions_agree_with_scipy(library):
         np.asarray(six), np.asarray(matrices)[..., :2].swapaxes(-1, -2).reshape(-1, 6)
     )
     library.assert_close(run(r.rotation_6d_to_matrix)(2.0 * six), ORACLE.as_matrix())
+    # Products of entries are equal for q and −q.
+    expected = ORACLE.as_quat(scalar_first=True)
+    expected = expected[..., :, None] * expected[..., None, :]
     for got in (run(r.vector_to_quaternion)(vectors), run(r.matrix_to_quaternion)(matrices)):
-        wanted = up_to_sign(ORACLE.as_quat(scalar_first=True))
-        library.assert_close(got[..., :, None] * got[..., None, :], wanted)
+        library.assert_close(got[..., :, None] * got[..., None, :], expected)
     # At half a turn both signs of the vector are correct.
     short = np.linalg.norm(VECTORS, axis=-1) < 3.1
     for got in (run(r.matrix_to_vector)(matrices), run(r.quaternion_to_vector)(-2 * quaternions)):
@@ -105,31 +100,16 @@ def test_euler_angles_round_trip_at_gimbal_lock(order, gap):
             assert (r.matrix_to_euler(matrices, order)[:, 0] == 0).all()
 
 
-def test_invalid_orders_are_refused():
+def test_invalid_orders_and_shapes_are_refused():
     for order in ("XXY", "ZYY", "XY", "XYZX", "XYW", ""):
         with pytest.raises(ValueError, match=r"order must be three of X, Y and Z .*, got"):
             r.euler_to_matrix(np.zeros(3), order)
-
-
-def test_invalid_shapes_are_refused():
     with pytest.raises(ValueError, match=r"vector must have shape \(…, 3\), got \(4,\)"):
         r.vector_to_matrix(np.zeros(4))
     with pytest.raises(ValueError, match=r"matrix must have shape \(…, 3, 3\), got \(3, 2\)"):
         r.matrix_to_quaternion(np.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"second must have shape \(…, 4\), got \(3,\)"):
         r.quaternion_product(np.ones(4), np.ones(3))
-
-
-def test_rotations_are_active_and_euler_angles_follow_bvh():
-    quarter = r.vector_to_matrix(np.array([0.0, 0.0, np.pi / 2]))
-    np.testing.assert_allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(r.matrix_to_quaternion(quarter), [half, 0, 0, half], atol=1e-15)
-    # R_z R_x R_y, as in BVH files.
-    x, y, z = r.vector_to_matrix(np.diag([0.3, 0.5, 0.7]))
-    np.testing.assert_allclose(
-        r.euler_to_matrix(np.array([0.7, 0.3, 0.5]), "ZXY"), z @ x @ y, atol=1e-15
-    )
 
 
 @pytest.mark.parametrize("form", ["matrix", "quaternion"])
@@ -164,7 +144,6 @@ def test_empty_batches_stay_empty():
     none = np.zeros((0, 3, 3))
     assert r.vector_to_matrix(none[:, 0]).shape == (0, 3, 3)
     assert r.vector_to_quaternion(np.zeros((2, 0, 3))).shape == (2, 0, 4)
-    assert r.quaternion_to_vector(np.zeros((0, 4))).shape == (0, 3)
     assert r.rotation_6d_to_matrix(np.zeros((0, 6))).shape == (0, 3, 3)
     assert r.matrix_to_euler(none, "ZXY").shape == r.matrix_to_vector(none).shape == (0, 3)
     assert r.geodesic_angle(none, none).shape == (0,)
@@ -172,53 +151,30 @@ def test_empty_batches_stay_empty():
 
 
 def test_slerp_and_geodesic_angle_agree_with_scipy(library):
-    first, second = Rotation.random(30, rng=1), Rotation.random(30, rng=2)
+    first = Rotation.random(30, rng=1)
+    # Random rotations and, at the end, close ones.
+    sizes = np.where(np.arange(30) < 24, 1.0, 1e-4)
+    step = sizes[:, None] * (first.inv() * Rotation.random(30, rng=2)).as_rotvec()
     fraction = np.linspace(0, 1, 30)
-    step = (first.inv() * second).as_rotvec()
-    wanted = (first * Rotation.from_rotvec(fraction[:, None] * step)).as_matrix()
-    a, b = library.array(first.as_matrix()), library.array(second.as_matrix())
-    library.assert_close(library.compiled(r.slerp)(a, b, library.array(fraction)), wanted)
+    expected = (first * Rotation.from_rotvec(fraction[:, None] * step)).as_matrix()
+    second = (first * Rotation.from_rotvec(step)).as_matrix()
+    a, b = library.array(first.as_matrix()), library.array(second)
+    library.assert_close(library.compiled(r.slerp)(a, b, library.array(fraction)), expected)
     angle = library.compiled(r.geodesic_angle)(a, b)
     library.assert_close(angle, np.linalg.norm(step, axis=-1))
 
 
-unit = st.floats(-1, 1, width=64)
-turns = arrays(np.float64, 3, elements=unit).map(lambda v: r.vector_to_matrix(np.pi * v))
+turns = arrays(np.float64, 3, elements=st.floats(-1, 1, width=64)).map(
+    lambda v: r.vector_to_matrix(np.pi * v)
+)
 
 
 @settings(max_examples=60)
-@given(turns, turns, turns)
-def test_group_axioms(a, b, c):
-    p, q, s = (r.matrix_to_quaternion(m) for m in (a, b, c))
-    for m in (a, b, c):
-        np.testing.assert_allclose(m @ m.T, np.eye(3), atol=1e-14)
-        assert np.linalg.det(m) == pytest.approx(1)
-        np.testing.assert_allclose(
-            r.rotation_6d_to_matrix(r.matrix_to_rotation_6d(m)), m, atol=1e-14
-        )
-        np.testing.assert_allclose(r.vector_to_matrix(r.matrix_to_vector(m)), m, atol=1e-12)
-    np.testing.assert_allclose(
-        r.quaternion_to_matrix(r.quaternion_product(p, q)), a @ b, atol=1e-14
-    )
-    np.testing.assert_allclose(
-        r.quaternion_product(r.quaternion_product(p, q), s),
-        r.quaternion_product(p, r.quaternion_product(q, s)),
-        atol=1e-14,
-    )
-    one = np.array([1.0, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(r.quaternion_product(one, p), p, atol=0)
-    np.testing.assert_allclose(r.quaternion_product(p, p * [1, -1, -1, -1]), one, atol=1e-14)
-    np.testing.assert_allclose(r.vector_to_matrix(-r.matrix_to_vector(a)), a.T, atol=1e-12)
-
-
-@settings(max_examples=60)
-@given(turns, turns, turns, st.floats(0, 1))
-def test_geodesic_angle_is_a_metric_with_slerp_as_geodesic(a, b, c, fraction):
-    angle = r.geodesic_angle(a, b)
-    assert 0 <= angle <= np.pi + 1e-12
-    assert r.geodesic_angle(b, a) == pytest.approx(angle, abs=1e-12)
-    assert r.geodesic_angle(a, c) <= angle + r.geodesic_angle(b, c) + 1e-12
-    assert r.geodesic_angle(c @ a, c @ b) == pytest.approx(angle, abs=1e-7)
-    between = r.slerp(a, b, np.asarray(fraction))
-    assert r.geodesic_angle(a, between) == pytest.approx(fraction * angle, abs=1e-7)
-    assert r.geodesic_angle(between, b) == pytest.approx((1 - fraction) * angle, abs=1e-7)
+@given(turns, turns)
+def test_matrices_are_rotations_and_quaternions_multiply_like_them(a, b):
+    np.testing.assert_allclose(a @ a.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(a) == pytest.approx(1)
+    np.testing.assert_allclose(r.rotation_6d_to_matrix(r.matrix_to_rotation_6d(a)), a, atol=1e-14)
+    np.testing.assert_allclose(r.vector_to_matrix(r.matrix_to_vector(a)), a, atol=1e-12)
+    product = r.quaternion_product(r.matrix_to_quaternion(a), r.matrix_to_quaternion(b))
+    np.testing.assert_allclose(r.quaternion_to_matrix(product), a @ b, atol=1e-14)

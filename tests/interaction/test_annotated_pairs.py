@@ -16,7 +16,6 @@ from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.interaction.annotations.views import project_to_views
 from probmotion.interaction.geometry.coordinates import interaction_distance
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
-from probmotion.posteriors.protocols import ComparesViews, Likelihood
 from probmotion.problems import load_problem
 
 DANCES = synthetic_dances(5)
@@ -28,7 +27,7 @@ POSES = DANCES[4].positions[[0, 20, 50, 80], None]
 
 @pytest.fixture(scope="module")
 def likelihood():
-    return AnnotatedPairs(ANNOTATIONS, n_views=6, n_near=5)
+    return AnnotatedPairs(ANNOTATIONS, n_views=6, n_near=5, shortest_edge=0.3)
 
 
 def test_density_equals_equations_6_and_9(likelihood):
@@ -37,15 +36,10 @@ def test_density_equals_equations_6_and_9(likelihood):
         projections = project_to_views(pose, likelihood.views, likelihood.skeleton)[0]
         terms = []
         for projection, near in zip(projections, likelihood.near, strict=True):
-            distances = interaction_distance(projection, ANNOTATIONS.keypoints[near])
+            distances = interaction_distance(projection, ANNOTATIONS.keypoints[near], epsilon=0.3)
             terms.append(-(distances.min() ** 2) / (2 * likelihood.noise**2))
         expected.append(logsumexp(terms) - np.log(6))
     assert np.allclose(likelihood.log_density(POSES), expected, atol=1e-8)
-
-
-def test_protocols_are_implemented(likelihood):
-    assert isinstance(likelihood, Likelihood)
-    assert isinstance(likelihood, ComparesViews)
 
 
 def test_density_with_fixed_views_depends_on_the_seed_only():
@@ -87,21 +81,17 @@ def test_joint_speeds_are_means_over_the_closest_annotations(likelihood):
     assert np.allclose(speeds[1, :, 1], stretch[5] ** 2)
 
 
-def test_views_are_estimated_from_the_first_seed():
+def test_views_are_estimated_and_annotations_without_an_estimate_dropped():
     estimated = AnnotatedPairs.estimated(UNKNOWN_VIEWS, DRAWN.positions[0], n_views=4)
     assert np.isfinite(estimated.log_density(DRAWN.positions[:3, None])).all()
     posterior = pair_posterior(DRAWN.positions[[0, 30]], UNKNOWN_VIEWS, PairSettings(n_views=4))
     views = posterior.likelihood.annotations.views
     assert np.array_equal(views, estimated.annotations.views)
-
-
-def test_annotations_without_estimated_views_are_dropped_and_counted():
-    hidden = draw_annotations(DANCES[:4], 60, seed=0, hidden=0.7).annotations
-    estimated = AnnotatedPairs.estimated(hidden, DRAWN.positions[0], n_views=4).annotations
-    dropped = estimated.dropped["view not estimated"]
+    occluded = draw_annotations(DANCES[:4], 60, seed=0, hidden=0.7).annotations
+    remaining = AnnotatedPairs.estimated(occluded, DRAWN.positions[0], n_views=4).annotations
+    dropped = remaining.dropped["view not estimated"]
     assert dropped > 0
-    assert len(estimated) == 60 - dropped
-    assert "view not estimated" in estimated.describe()
+    assert len(remaining) == 60 - dropped
 
 
 def test_simulated_annotations_favour_their_pose(likelihood):
@@ -119,15 +109,9 @@ def test_degenerate_projections_are_counted(likelihood):
     assert 0 < likelihood.degenerate_fraction(flat) <= 1 / 4
 
 
-def test_shortest_edge_changes_the_density():
-    fine, coarse = (
-        AnnotatedPairs(ANNOTATIONS, shortest_edge=size, noise=0.1).log_density(POSES)
-        for size in (0.01, 0.5)
-    )
-    assert np.abs(fine - coarse).min() > 1e-3
-
-
-LEGS = np.array(["hip" in name or "knee" in name for name in ANNOTATIONS.skeleton.joint_names])
+LEGS = ["hip" in name or "knee" in name for name in ANNOTATIONS.skeleton.joint_names]
+ONLY_LEGS = replace(ANNOTATIONS, visible=np.tile(LEGS, (60, 1)))
+MILLIMETRES = replace(ANNOTATIONS, keypoints=1000 * ANNOTATIONS.keypoints)
 
 
 @pytest.mark.parametrize(
@@ -137,18 +121,13 @@ LEGS = np.array(["hip" in name or "knee" in name for name in ANNOTATIONS.skeleto
         (lambda x: x.log_density(torch.tensor(POSES)), "must be a NumPy array, got Tensor"),
         (lambda x: MotionPosterior(load_problem("gait").posterior.prior, x), "likelihood"),
         (
-            lambda _: AnnotatedPairs.estimated(
-                replace(ANNOTATIONS, visible=np.tile(LEGS, (60, 1))), DRAWN.positions[0]
-            ),
+            lambda _: AnnotatedPairs.estimated(ONLY_LEGS, DRAWN.positions[0]),
             "at least three torso joints of each person in one frame, got none in 60 frames",
         ),
-        (
-            lambda _: AnnotatedPairs(replace(ANNOTATIONS, keypoints=1000 * ANNOTATIONS.keypoints)),
-            "annotations must have bones of .*: keypoints must be in metres",
-        ),
+        (lambda _: AnnotatedPairs(MILLIMETRES), "have bones of .*: keypoints must be in metres"),
         (
             lambda _: AnnotatedPairs.estimated(ANNOTATIONS, DRAWN.positions[0, :17]),
-            r"seed_pose must have shape \(34, 3\), .*, got \(17, 3\)",
+            r"seed_pose must have shape \(34, 3\), got \(17, 3\)",
         ),
         (lambda _: AnnotatedPairs(ANNOTATIONS, shortest_edge=0), "shortest_edge must be"),
         (lambda _: AnnotatedPairs(ANNOTATIONS, view_bandwidth=0), "view_bandwidth must be"),

@@ -75,14 +75,8 @@ def test_blend_moves_occluded_joints_by_the_gaussian_weighted_mean():
     w0, w1 = np.exp(-(0.25**2) / 0.5), np.exp(-(0.75**2) / 0.5)
     expected = (0.4 * w0 - 0.2 * w1) / (w0 + w1)
     np.testing.assert_allclose(blended, [[0.0, 0.4], [1.0, -0.2], [0.25, expected]])
-
-
-def test_blend_reproduces_a_shift_and_distant_joints_follow_the_nearest():
-    shift = np.array([0.3, -0.1, 0.2])
-    np.testing.assert_allclose(blend(TRUTH, masked(TRUTH + shift), ~HIDDEN, 0.3), TRUTH + shift)
-    median = np.array([[0.0, 0, 0], [1.0, 0, 0], [500.0, 0, 0]])
-    target = np.array([[0.0, 1, 0], [1.0, 2, 0], [np.nan] * 3])
-    assert blend(median, target, np.array([True, True, False]), 0.1)[2, 1] == pytest.approx(2)
+    median[2] = 500.0  # a distant joint follows the nearest joint
+    assert blend(median, target, np.array([True, True, False]), 0.1)[2, 1] == pytest.approx(499.8)
 
 
 def test_projection_of_a_draw_is_recovered():
@@ -92,15 +86,6 @@ def test_projection_of_a_draw_is_recovered():
     )
     np.testing.assert_allclose(result.positions, projection, atol=1e-9)
     assert result.indices.tolist() == [7]
-
-
-def test_visible_keypoints_are_unchanged():
-    projection = project_to_views(TRUTH[None], VIEWS[[3]], PAIR)[0, 0]
-    result = complete_keypoints(
-        masked(projection), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=5
-    )
-    np.testing.assert_array_equal(result.positions[~HIDDEN], projection[~HIDDEN])
-    assert occluded_joint_error(projection, result.positions, HIDDEN) < 0.3
 
 
 def test_nearest_annotation_completes_occluded_joints():
@@ -126,20 +111,6 @@ def test_error_is_the_mean_distance_of_occluded_joints():
     estimate[6] += [0.3, 0.0, 0.4]
     estimate[0] += 9.0
     assert occluded_joint_error(TRUTH, estimate, HIDDEN) == pytest.approx(0.5 / 6)
-    with pytest.raises(ValueError, match="hidden must mark at least one joint, got none"):
-        occluded_joint_error(TRUTH, estimate, ~HIDDEN & HIDDEN)
-
-
-def test_invalid_arguments_are_rejected():
-    with pytest.raises(ValueError, match="visible must mark at least 4 joints, got 3"):
-        completed(visible=np.arange(34) < 3)
-    with pytest.raises(ValueError, match=r"n_nearest must be at most 20, .*, got 100"):
-        completed(DRAWS[:20], n_nearest=100)
-    with pytest.raises(ValueError, match="pose must be finite, got 3 values"):
-        completed(pose=masked(TRUTH, np.arange(34) == 0))
-
-
-# Retrieval.
 
 
 def retrieve(keypoints, draws=FEW, **options):
@@ -172,14 +143,9 @@ def test_distances_are_minima_over_views():
 
 
 def test_occluded_joints_are_ignored():
-    visible = ~np.isin(np.arange(34), [6, 7, 20])
-    results = [
-        retrieve(np.where(visible[:, None], projection(8, 1), value), visible=visible)
-        for value in (np.nan, 7.0)
-    ]
-    assert results[0].indices[0] == 8
-    assert results[0].distances[0] < 1e-9
-    assert results[0].distances == results[1].distances
+    result = retrieve(masked(projection(8, 1)), visible=~HIDDEN)
+    assert result.indices[0] == 8
+    assert result.distances[0] < 1e-9
 
 
 def test_batches_and_blocks_do_not_change_the_result(monkeypatch):
@@ -188,10 +154,9 @@ def test_batches_and_blocks_do_not_change_the_result(monkeypatch):
     assert together.indices.shape == (1, 3, 2)
     assert together.views.shape == (1, 3, 2, 2)
     monkeypatch.setattr(retrieval, "_BLOCK", 13)
-    for place in range(3):
-        alone = retrieve(queries[0, place], n=2)
-        for many, one in zip(together, alone, strict=True):
-            np.testing.assert_array_equal(many[0, place], one)
+    for index, query in enumerate(queries[0]):
+        for many, one in zip(together, retrieve(query, n=2), strict=True):
+            np.testing.assert_array_equal(many[0, index], one)
 
 
 def test_repeated_poses_count_once_by_their_first_index():
@@ -203,25 +168,28 @@ def test_repeated_poses_count_once_by_their_first_index():
         retrieve(projection(9, 3), repeated, n=4)
 
 
-def test_default_views_surround_the_pair():
+def test_grids_of_views():
     views = view_grid()
     assert np.unique(views, axis=0).shape == (48, 2)
-    assert np.degrees(views[:, 1]).min() == pytest.approx(50)
-    assert np.degrees(views[:, 1]).max() == pytest.approx(100)
-    # The view is between two grid points.
-    between = project_to_views(FEW[11][None], views[[20]] + 0.15, PAIR)[0, 0]
-    assert retrieve(between, views=None).indices[0] in (10, 11, 12)
+    assert np.degrees(views[[0, -1]]) == pytest.approx(np.array([[-180, 50], [157.5, 100]]))
+    offsets = np.degrees(views_around(np.array([0.3, 1.2])) - [0.3, 1.2])
+    assert offsets[[0, 7, 14]] == pytest.approx(np.array([[-30, -15], [0, 0], [30, 15]]))
 
 
-def test_views_around_an_estimate_contain_it():
-    views = views_around(np.array([0.3, 1.2]))
-    assert views.shape == (15, 2)
-    assert np.abs(views - [0.3, 1.2]).sum(axis=1).min() < 1e-12
-    assert np.degrees(np.abs(views - [0.3, 1.2]).max(axis=0)) == pytest.approx([30, 15])
+FOURTH = np.arange(34) == 3
 
 
-def test_invalid_queries_are_rejected():
-    with pytest.raises(ValueError, match="views must contain at least one view, got none"):
-        retrieve(projection(0, 0), views=np.empty((0, 2)))
-    with pytest.raises(ValueError, match="visible must share an edge with at least 1 draws"):
-        retrieve(projection(0, 0), visible=np.arange(34) == 3)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: completed(visible=FOURTH), "visible must mark at least 4 joints, got 1"),
+        (lambda: completed(DRAWS[:20], n_nearest=100), "n_nearest must be at most 20, .*, got 100"),
+        (lambda: completed(pose=masked(TRUTH, FOURTH)), "pose must be finite, got 3 values"),
+        (lambda: occluded_joint_error(TRUTH, TRUTH, HIDDEN & ~HIDDEN), "must mark at least one"),
+        (lambda: retrieve(TRUTH[:, :2], views=np.empty((0, 2))), "must contain at least one view"),
+        (lambda: retrieve(TRUTH[:, :2], visible=FOURTH), "visible must share an edge with"),
+    ],
+)
+def test_invalid_arguments_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,10 +1,11 @@
 """ASF and AMC reading: positions by hand, a real recording and damaged files."""
 
+import re
+
 import numpy as np
 import pytest
 
 from probmotion.io.amc import read_amc
-from probmotion.io.asf import read_asf
 from probmotion.io.errors import MotionFileError, MotionFileWarning
 from probmotion.io.files import load
 
@@ -64,7 +65,7 @@ ASF = """# a leg and a head
   end
 """
 
-# Channel values of root, thigh, shin and toe, and the ends of thigh, head, shin and toe in
+# Channel values of root, thigh, shin and toe, and positions of thigh, head, shin and toe in
 # decimetres. The root is at (10, 20, 30).
 FRAMES: dict[tuple[float, ...], list[tuple[int, ...]]] = {
     # Rest pose.
@@ -115,24 +116,6 @@ def test_positions_by_hand(tmp_path):
     assert motion.rotations is None
 
 
-def test_asf_rest_pose_and_channels(tmp_path):
-    put(tmp_path)
-    body = read_asf(tmp_path / "made.asf")
-    assert body.channels[1:] == (("RX", "RZ"), (), ("RX",), ("RZ", "RY"))
-    assert body.unit == pytest.approx(0.1)
-    np.testing.assert_allclose(
-        body.offsets[1:], [[0.0, -0.4, 0], [0, 0.2, 0], [0, -0.3, 0], [0, 0, 0.1]], atol=1e-15
-    )
-    # The toe's axes x, y, z are the world's y, z, x.
-    np.testing.assert_allclose(body.axes[4], np.eye(3)[[2, 0, 1]], atol=1e-15)
-
-
-def test_length_unit_is_an_inch_over_the_declared_length(tmp_path):
-    whole = read_amc(put(tmp_path)).positions
-    cmu = read_amc(put(tmp_path, ASF.replace("length 0.254", "length 0.45"))).positions
-    np.testing.assert_allclose(cmu, whole * 0.254 / 0.45, rtol=1e-15)
-
-
 def test_line_ends_comments_case_and_first_frame_number(tmp_path):
     wanted = read_amc(put(tmp_path)).positions
     other = AMC.replace("shin", "# nothing\n\nshin").replace("DEGREES", "degrees")
@@ -145,12 +128,10 @@ def test_line_ends_comments_case_and_first_frame_number(tmp_path):
 
 
 def test_root_channels_follow_the_declared_order(tmp_path):
-    turned = AMC.replace("root 10 20 3.0e+001 90 90 0", "root 0 90 90 10 20 30")
-    turned = turned.replace("root 10 20 3.0e+001 0 0 0", "root 0 0 0 10 20 30")
-    path = put(tmp_path, ASF.replace("TX TY TZ RX RY RZ", "RZ RX RY TX TY TZ"), turned)
-    np.testing.assert_allclose(
-        read_amc(path).positions[:, 1:], np.array([*FRAMES.values()]) / 10, atol=1e-12
-    )
+    reordered = re.sub(r"root 10 20 3.0e\+001 (\d+) (\d+) 0", r"root 0 \1 \2 10 20 30", AMC)
+    path = put(tmp_path, ASF.replace("TX TY TZ RX RY RZ", "RZ RX RY TX TY TZ"), reordered)
+    positions = read_amc(path).positions[:, 1:]
+    np.testing.assert_allclose(positions, np.array([*FRAMES.values()]) / 10, atol=1e-12)
 
 
 def test_skeleton_file_is_found_or_given(tmp_path):
@@ -162,15 +143,13 @@ def test_skeleton_file_is_found_or_given(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no .*run_01\.asf or .*run\.asf with the skelet"):
         read_amc(away)
     assert read_amc(away, tmp_path / "made.asf").frames == len(FRAMES)
-    with pytest.raises(FileNotFoundError):
-        read_amc(away, tmp_path / "none.asf")
-    with pytest.raises(FileNotFoundError):
-        read_amc(tmp_path / "none.amc")
+    for files in ((away, tmp_path / "none.asf"), (tmp_path / "none.amc",)):
+        with pytest.raises(FileNotFoundError):
+            read_amc(*files)
 
 
 def test_frame_rate_is_given_or_assumed_with_a_warning(tmp_path):
     path = put(tmp_path)
-    assert read_amc(path, fps=60.0).fps == 60.0
     with pytest.raises(ValueError, match="fps must be a finite number above 0, got 0"):
         read_amc(path, fps=0)
     with pytest.warns(MotionFileWarning, match=r"made\.amc: assuming 120 frames per second"):
@@ -181,117 +160,80 @@ def test_frame_rate_is_given_or_assumed_with_a_warning(tmp_path):
         read_amc(path)
 
 
-WRONG_SKELETONS = {
-    "": "expected a line that begins with ':', got nothing",
-    "HIERARCHY\nROOT Hips": "line 1: expected :version, :name or :units, got 'HIERARCHY'",
-    ASF.partition(":hierarchy")[0]: "line 48: expected :hierarchy, got the end of the file",
-    ASF.rpartition("end")[0]: "line 53: expected end around the hierarchy",
-    ASF + ":root\n": "line 55: expected ':root' once, got it again",
-    ASF.replace("angle deg", "angle rad"): "line 7: angle must be deg, got 'rad'",
-    ASF.replace("length 0.254", ""): "line 7: expected length in :units",
-    ASF.replace("length 0.254", "length 0"): "line 6: length must be between 0.001 and 1000, got 0",
-    ASF.replace("length 0.254", "length 1 2"): "line 6: length: expected 1 values, got 2",
-    ASF.replace("order", "other"): "expected order in :root",
-    ASF.replace("TX TY", "TX L"): "line 11: expected channels TX, TY, TZ, RX, RY, RZ, each at most",
-    ASF.replace("position 0 0", "position 0 1"): "line 13: position must be 0 0 0, got 0 1 0",
-    ASF.replace("rx rz", "rx rx"): "line 22: expected channels RX, RY, RZ, each at most once, got",
-    ASF.replace("dof RX", "dof TX"): "each at most once, got 'TX'",
-    ASF.replace("name toe", "name thigh"): "line 28: name must be unique, got 'thigh'",
-    ASF.replace("name toe\n", "\n"): "line 33: expected name in the bone of line 26",
-    ASF.replace("direction 0 0 1", "direction 0 0 2"): "direction must be a unit vector, got 0 0 2",
-    ASF.replace("direction 0 0 1", "direction 0 0"): "line 29: direction: expected 3 values, got 2",
-    ASF.replace("length 4", "length -4"): "line 20: length must be 0 or more, got -4",
-    ASF.replace("length 4", "length nan"): "line 20: length: expected a number between",
-    ASF.replace(
-        "90 0 90 XYZ", "90 0 90 ZYX"
-    ): "axis must be three angles and XYZ, got '90 0 90 ZYX",
-    ASF.replace("90 0 90 XYZ", "90 0 90"): "axis must be three angles and XYZ, got '90 0 90'",
-    ASF.replace("id 2", "length 3"): "expected length once in the bone of line 26",
-    ASF.replace("id 2", "eggs 2"): "line 27: expected id, name, direction",
-    ASF.replace("  end\n:hier", "\n:hier"): "expected end of the bone of line 42",
-    ASF.replace("shin toe\n", "shin\n"): "line 26: expected a parent of 'toe' in the hierarchy",
-    ASF.replace("shin toe", "shin nose"): "line 53: expected a bone of :bonedata, got 'nose'",
-    ASF.replace(
-        "shin toe", "shin toe head"
-    ): "line 53: expected one parent of 'head', got a second",
-    ASF.replace("root thigh head", "root head\nshin thigh"): "parents must form trees, got a cycle",
-}
+SKELETON_DEFECTS = [
+    ("", "expected a line that begins with ':', got nothing"),
+    ("HIERARCHY\nROOT Hips", "line 1: expected :version, :name or :units, got 'HIERARCHY'"),
+    (ASF.partition(":hierarchy")[0], "line 48: expected :hierarchy, got the end of the file"),
+    (ASF.rpartition("end")[0], "line 53: expected end around the hierarchy"),
+    (ASF + ":root\n", "line 55: expected ':root' once, got it again"),
+    *(
+        (ASF.replace(old, new), message)
+        for old, new, message in (
+            ("angle deg", "angle rad", "line 7: angle must be deg, got 'rad'"),
+            ("length 0.254", "", "line 7: expected length in :units"),
+            ("length 0.254", "length 0", "line 6: length must be between 0.001 and 1000, got 0"),
+            ("order", "other", "expected order in :root"),
+            ("TX TY", "TX L", "line 11: expected channels TX, TY, TZ, RX, RY, RZ, each at most"),
+            ("position 0 0", "position 0 1", "line 13: position must be 0 0 0, got 0 1 0"),
+            ("rx rz", "rx rx", "line 22: expected channels RX, RY, RZ, each at most once, got"),
+            ("dof RX", "dof TX", "each at most once, got 'TX'"),
+            ("name toe", "name thigh", "line 28: name must be unique, got 'thigh'"),
+            ("name toe\n", "\n", "line 33: expected name in the bone of line 26"),
+            ("0 0 1\n", "0 0 2\n", "line 29: direction must be a unit vector, got 0 0 2"),
+            ("length 4", "length -4", "line 20: length must be 0 or more, got -4"),
+            ("axis 90 0 90 XYZ", "axis 90 0 90", "line 31: axis must be three angles and XYZ"),
+            ("id 2", "length 3", "expected length once in the bone of line 26"),
+            ("id 2", "eggs 2", "line 27: expected id, name, direction"),
+            ("  end\n:hier", "\n:hier", "expected end of the bone of line 42"),
+            ("shin toe\n", "shin\n", "line 26: expected a parent of 'toe' in the hierarchy"),
+            ("shin toe", "shin nose", "line 53: expected a bone of :bonedata, got 'nose'"),
+            ("shin toe", "shin toe head", "line 53: expected one parent of 'head', got a second"),
+            ("root thigh head", "root head\nshin thigh", "parents must form trees, got a cycle"),
+        )
+    ),
+]
+MOTION_DEFECTS = [
+    ("", "expected a line that begins with ':', got nothing"),
+    (AMC.partition("1\n")[0], "line 3: expected at least one frame, got the end of the file"),
+    (AMC.rpartition("toe")[0], "line 32: expected all moving bones in frame 6, got no 'toe'"),
+    *(
+        (AMC.replace(old, new, 1), message)
+        for old, new, message in (
+            (":DEGREES", ":RADIANS", "line 4: expected :DEGREES first, got '1'"),
+            ("\n1\n", "\n", "line 4: expected the number of a frame, got 'root'"),
+            ("\n3\n", "\n4\n", "line 14: expected frame 3, got 4"),
+            ("\n3\n", "\n", "line 14: expected each moving bone once in a frame, got 'root'"),
+            ("shin 90\n", "\n", "line 14: expected all moving bones in frame 2, got no 'shin'"),
+            ("shin 90", "head 90", "line 11: expected each moving bone once in a frame, got"),
+            ("shin 90", "shin 90 1", "line 11: 'shin': expected 1 values, got 2"),
+            ("shin 90", "shin inf", "line 11: 'shin': expected a number between -1e9 and 1e9, g"),
+        )
+    ),
+]
 
 
-@pytest.mark.parametrize("asf", WRONG_SKELETONS, ids=list(WRONG_SKELETONS.values()))
-def test_skeleton_defects_are_reported(asf, tmp_path):
-    path = put(tmp_path, asf)
-    with pytest.raises(MotionFileError) as error:
+@pytest.mark.parametrize(
+    ("asf", "motion", "name", "message"),
+    [
+        *((text, AMC, "made.asf", message) for text, message in SKELETON_DEFECTS),
+        *((ASF, text, "made.amc", message) for text, message in MOTION_DEFECTS),
+    ],
+)
+def test_defects_are_reported(tmp_path, asf, motion, name, message):
+    path = put(tmp_path, asf, motion)
+    with pytest.raises(MotionFileError, match=re.escape(message)) as error:
         read_amc(path)
-    assert f"{tmp_path / 'made.asf'}" in str(error.value)
-    assert WRONG_SKELETONS[asf] in str(error.value)
+    assert str(tmp_path / name) in str(error.value)
 
 
-WRONG_MOTIONS = {
-    "": "expected a line that begins with ':', got nothing",
-    "HIERARCHY\nROOT Hips": "line 1: expected :FULLY-SPECIFIED first, got 'HIERARCHY'",
-    AMC.replace(":DEGREES", ":RADIANS"): "line 4: expected :DEGREES first, got '1'",
-    AMC.partition("1\n")[0]: "line 3: expected at least one frame, got the end of the file",
-    AMC.replace("\n1\n", "\n"): "line 4: expected the number of a frame, got 'root'",
-    AMC.replace("\n3\n", "\n4\n"): "line 14: expected frame 3, got 4",
-    AMC.replace("\n3\n", "\n"): "line 14: expected each moving bone once in a frame, got 'root'",
-    AMC.replace("shin 90\n", "\n", 1): "line 14: expected all moving bones in frame 2, got no 'shi",
-    AMC.rpartition("toe")[0]: "line 32: expected all moving bones in frame 6, got no 'toe'",
-    AMC.replace("shin 90", "head 90"): "line 11: expected each moving bone once in a frame, got",
-    AMC.replace("shin 90", "shin"): "line 11: 'shin': expected 1 values, got 0",
-    AMC.replace("shin 90", "shin 90 1"): "line 11: 'shin': expected 1 values, got 2",
-    AMC.replace(
-        "shin 90", "shin inf"
-    ): "line 11: 'shin': expected a number between -1e9 and 1e9, g",
-    AMC.replace("shin 90", "shin 1e10"): "line 11: 'shin': expected a number between",
-}
-
-
-@pytest.mark.parametrize("motion", WRONG_MOTIONS, ids=list(WRONG_MOTIONS.values()))
-def test_motion_defects_are_reported(motion, tmp_path):
-    path = put(tmp_path, motion=motion)
-    with pytest.raises(MotionFileError) as error:
-        read_amc(path)
-    assert str(path) in str(error.value)
-    assert WRONG_MOTIONS[motion] in str(error.value)
-
-
-def outcomes(path, damaged, put_one):
-    """Return which of the damaged texts are read; the others raise MotionFileError."""
-    read = []
-    for text in damaged:
-        put_one(text)
-        try:
-            read.append(bool(np.isfinite(read_amc(path).positions).all()))
-        except MotionFileError as error:
-            assert "must" in str(error) or "expected" in str(error), text  # noqa: PT017
-            assert str(error).isprintable()  # noqa: PT017
-            read.append(False)
-    return read
-
-
-def test_truncated_and_garbled_files_are_read_or_refused(tmp_path):
-    short = amc(list(FRAMES)[-2:])
-    path = put(tmp_path, ASF, short)
-    put_asf = (tmp_path / "made.asf").write_text
-    garbled = ["", "1e300", "begin", ":units", "é\x00"]
-
-    def damages(text):
-        words = text.split(" ")
-        cut = [text[:stop] for stop in range(0, len(text), 9)]
-        return cut + [
-            " ".join([*words[:place], other, *words[place + 1 :]])
-            for place in range(0, len(words), 5)
-            for other in garbled
-        ]
-
-    assert True in outcomes(path, damages(short), path.write_text)
-    # A truncated motion is valid only after a frame, or within its last number.
-    assert sum(outcomes(path, [short[:stop] for stop in range(len(short))], path.write_text)) <= 4
-    path.write_text(short)
-    assert False in outcomes(path, damages(ASF), put_asf)
-    whole = ASF.rstrip()
-    assert not any(outcomes(path, [whole[:stop] for stop in range(0, len(whole), 9)], put_asf))
+def test_truncated_files_are_refused(tmp_path):
+    last = amc(list(FRAMES)[-1:])
+    for stop in range(len(last) - 1):
+        with pytest.raises(MotionFileError, match="expected"):
+            read_amc(put(tmp_path, motion=last[:stop]))
+    for stop in range(0, len(ASF) - 1, 9):
+        with pytest.raises(MotionFileError, match=r"expected|must"):
+            read_amc(put(tmp_path, ASF[:stop]))
 
 
 def test_real_recording_agrees_with_its_conversion(real_data):

@@ -2,7 +2,7 @@
 
 import itertools
 import re
-import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ import pytest
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError, MotionFileWarning
 from probmotion.io.files import load
+from probmotion.motion.skeleton import Skeleton
 
 MINIMAL = """HIERARCHY
 ROOT Hips
@@ -40,20 +41,16 @@ def written(folder, text, name="clip.bvh"):
     return path
 
 
-def chain(order, rng, frames=5):
-    """Root and two joints of one rotation order with random offsets and angles."""
+def chain(order, rng):
+    """Root and two joints of one rotation order with random offsets and angles, five frames."""
     channels = " ".join(f"{axis}rotation" for axis in order)
-    offsets = rng.normal(size=(3, 3))
     lines = ["HIERARCHY"]
-    for depth, keyword in enumerate(("ROOT a", "JOINT b", "JOINT c")):
-        offset = offsets[depth] if depth else np.zeros(3)
-        position = "" if depth else "Xposition Yposition Zposition "
-        lines += [keyword, "{", "OFFSET " + " ".join(map(repr, offset.tolist()))]
-        lines += [f"CHANNELS {3 if depth else 6} {position}{channels}"]
-    lines += ["End Site", "{", "OFFSET 0 0.1 0", "}", "}", "}", "}", "MOTION"]
-    lines += [f"Frames: {frames}", "Frame Time: 0.04"]
-    for row in rng.uniform(-180, 180, size=(frames, 12)):
-        lines.append(" ".join(map(repr, row.tolist())))
+    for joint in ("ROOT a", "JOINT b", "JOINT c"):
+        offset = " ".join(map(repr, rng.normal(size=3).tolist()))
+        count = "6 Xposition Yposition Zposition" if joint == "ROOT a" else "3"
+        lines += [joint, "{", f"OFFSET {offset}", f"CHANNELS {count} {channels}"]
+    lines += ["End Site", "{", "OFFSET 0 0.1 0", *"}}}}", "MOTION", "Frames: 5", "Frame Time: 0.04"]
+    lines += [" ".join(map(repr, row)) for row in rng.uniform(-180, 180, size=(5, 12)).tolist()]
     return "\n".join(lines) + "\n"
 
 
@@ -70,38 +67,13 @@ def test_positions_agree_with_pybvh(tmp_path, order):
     np.testing.assert_allclose(positions, pybvh_positions(path), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["60_10_scaled", "131_01"])
-def test_positions_of_real_files_agree_with_pybvh(name, real_data):
-    path = real_data / "originals" / f"{name}.bvh"
-    positions = read_bvh(path, scale=1.0, end_sites=True).positions
-    np.testing.assert_allclose(positions, pybvh_positions(path), atol=1e-8)
-
-
 def test_cmu_clip_agrees_with_its_conversion(real_data):
     archive = np.load(real_data / "cmu_single" / "cmu_131_01.npz")
     with pytest.warns(MotionFileWarning, match=r"1/0\.45 inch"):
         motion = read_bvh(real_data / "originals" / "131_01.bvh", end_sites=True)
-    assert motion.skeleton.joint_names == tuple(archive["joint_names"])
-    assert motion.skeleton.parents == tuple(archive["parents"])
+    assert motion.skeleton == Skeleton(archive["joint_names"].tolist(), archive["parents"].tolist())
     assert motion.fps == 120
     np.testing.assert_allclose(motion.positions[1::4], archive["positions"], atol=1e-6)
-
-
-def test_quarter_turns_by_hand(tmp_path):
-    motion = read_bvh(written(tmp_path, MINIMAL), scale=1.0, end_sites=True)
-    assert motion.skeleton.joint_names == ("Hips", "Knee", "Knee_end")
-    # Frame 1: the hip rotates (0, -1, 0) about z to (1, 0, 0); the shank points along -z.
-    expected = [[0, 1, 0], [1, 1, 0], [1, 1, -0.5]]
-    np.testing.assert_allclose(motion.positions[1], expected, atol=1e-12)
-
-
-def test_rotations_and_rest_offsets_reproduce_positions(tmp_path):
-    motion = read_bvh(written(tmp_path, chain("YXZ", np.random.default_rng(2))), scale=0.01)
-    world = motion.rotations[:, 0]
-    knee = motion.positions[:, 0] + world @ motion.rest_offsets[1]
-    foot = knee + world @ motion.rotations[:, 1] @ motion.rest_offsets[2]
-    np.testing.assert_allclose(motion.positions[:, 1], knee, atol=1e-12)
-    np.testing.assert_allclose(motion.positions[:, 2], foot, atol=1e-12)
 
 
 def test_position_channels_replace_offsets_axis_by_axis(tmp_path):
@@ -111,7 +83,7 @@ def test_position_channels_replace_offsets_axis_by_axis(tmp_path):
     motion = read_bvh(written(tmp_path, text), scale=1.0)
     np.testing.assert_allclose(motion.positions[0], [[0, 1, 0], [2, 0, 3]], atol=1e-12)
     np.testing.assert_allclose(motion.positions[1], [[0, 1, 0], [1, 1, 0]], atol=1e-12)
-    assert motion.rotations is None, "rotations alone would not reproduce these positions"
+    assert motion.rotations is None
 
 
 def test_joints_with_arbitrary_channels(tmp_path):
@@ -126,14 +98,14 @@ def test_joints_with_arbitrary_channels(tmp_path):
     np.testing.assert_allclose(motion.positions[1, 2], [0, 1, -1.5], atol=1e-12)
 
 
-def test_several_roots_form_one_skeleton(tmp_path):
+def test_roots_may_translate(tmp_path):
     ball = "ROOT Ball\n{\nOFFSET 5 0 0\nCHANNELS 1 Yposition\n}\nMOTION"
     text = MINIMAL.replace("MOTION", ball).replace("0 0 90\n", "0 0 90 4\n")
     text = text.replace("0 1 0 0 0 0 0 0 0\n", "0 1 0 0 0 0 0 0 0 3\n")
     motion = read_bvh(written(tmp_path, text), scale=1.0)
     assert motion.skeleton.roots == (0, 2)
     np.testing.assert_allclose(motion.positions[:, 2], [[5, 3, 0], [5, 4, 0]])
-    assert motion.rotations is not None, "roots may translate"
+    assert motion.rotations is not None
 
 
 def test_end_sites_are_optional(tmp_path):
@@ -143,33 +115,24 @@ def test_end_sites_are_optional(tmp_path):
     path = written(tmp_path, two)
     assert read_bvh(path, scale=1.0).skeleton.joint_names == ("Hips", "Knee")
     named = read_bvh(path, scale=1.0, end_sites=True).skeleton
-    assert named.joint_names == ("Hips", "Knee", "Knee_end", "Knee_end2")
-    assert named.parents == (-1, 0, 1, 1)
+    assert named == Skeleton(["Hips", "Knee", "Knee_end", "Knee_end2"], [-1, 0, 1, 1])
 
 
-def test_line_ends_blanks_case_and_byte_order_mark(tmp_path):
+def test_line_ends_blanks_case_and_encodings(tmp_path):
     expected = read_bvh(written(tmp_path, MINIMAL)).positions
     lines = MINIMAL.split("\n")
     ends = itertools.cycle(["\r\n", "\n", "\r", "\n\n\t \r\n"])
     mixed = "".join(line + end for line, end in zip(lines, ends, strict=False))
     variants = [
-        mixed.encode(),
-        MINIMAL.replace("\n", "\r").encode(),
-        MINIMAL.replace("    ", "\t").replace(" 0", "\t\t0").encode(),
-        b"\xef\xbb\xbf" + MINIMAL.encode(),
-        MINIMAL.replace("\n{", " {").encode(),
-        MINIMAL.rstrip().encode(),
-        re.sub("HIERARCHY|ROOT|OFFSET|Xposition|Frame Time", lambda m: m[0].lower(), MINIMAL)
-        .replace("End Site", "End site")
-        .encode(),
+        mixed,
+        MINIMAL.replace("\n", "\r"),
+        MINIMAL.replace("    ", "\t").replace(" 0", "\t\t0").replace("\n{", " {").rstrip(),
+        "\ufeff" + MINIMAL,
+        re.sub("HIER|ROOT|OFFSET|Xpos|Frame Time|Site", lambda match: match[0].lower(), MINIMAL),
     ]
     for variant in variants:
-        motion = read_bvh(written(tmp_path, variant))
-        np.testing.assert_array_equal(motion.positions, expected)
-
-
-def test_names_with_blanks_and_any_script(tmp_path):
-    for name, encoding in (("Bip01 L Thigh", "utf-8"), ("膝", "utf-8"), ("Hüfte", "latin-1")):
+        np.testing.assert_array_equal(read_bvh(written(tmp_path, variant)).positions, expected)
+    for name, encoding in (("Bip01 L 膝", "utf-8"), ("Hüfte", "latin-1")):
         text = MINIMAL.replace("Knee", name).encode(encoding)
         assert read_bvh(written(tmp_path, text)).skeleton.joint_names[1] == name
 
@@ -178,13 +141,10 @@ def test_names_with_blanks_and_any_script(tmp_path):
     ("frame_time", "fps"),
     [
         ("0.0333333", 30),
-        (".0083333", 120),
         ("0.00833", 120),
         ("0.041708", 1 / 0.041708),  # 23.976 frames per second, not 24
         ("0.0333667", 1 / 0.0333667),  # 29.97, not 30
-        ("0.03", 1 / 0.03),
         (repr(1 / 59.998), 59.998),
-        ("1", 1),
         ("0.0001", 10_000),
     ],
 )
@@ -196,28 +156,20 @@ def test_rounded_frame_times_become_integer_rates(tmp_path, frame_time, fps):
 @pytest.mark.parametrize(
     ("reach", "unit", "factor"),
     [
+        *((reach, "", 1.0) for reach in (0.0, 0.3, 2.4, 5.0)),
         (240.0, "centimetres", 0.01),
-        (2400.0, "millimetres", 0.001),
-        (42.0, "CMU", 0.0254 / 0.45),
         (130.0, "centimetres", 0.01),
+        (2400.0, "millimetres", 0.001),
+        (42.0, "1/0.45 inch", 0.0254 / 0.45),
     ],
 )
-def test_unit_is_inferred_with_a_warning(tmp_path, reach, unit, factor):
-    text = MINIMAL.replace("OFFSET 0 -1 0", f"OFFSET 0 -{reach} 0")
-    with pytest.warns(MotionFileWarning, match=unit) as caught:
-        motion = load(written(tmp_path, text))
-    assert len(caught) == 1
-    assert "clip.bvh" in str(caught[0].message)
+def test_unit_is_inferred_with_a_warning_unless_metres(tmp_path, reach, unit, factor):
+    path = written(tmp_path, MINIMAL.replace("OFFSET 0 -1 0", f"OFFSET 0 -{reach} 0"))
+    warns = pytest.warns(MotionFileWarning, match=rf"clip\.bvh: assuming {unit}")
+    with warns if unit else nullcontext():
+        motion = load(path)
     np.testing.assert_allclose(motion.positions[0, 0], [0, factor, 0])
     np.testing.assert_allclose(motion.rest_offsets[1], [0, -reach * factor, 0])
-
-
-def test_metres_are_read_without_a_warning(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for reach in (0.0, 0.3, 1.0, 2.4, 5.0):
-            text = MINIMAL.replace("OFFSET 0 -1 0", f"OFFSET 0 -{reach} 0")
-            assert load(written(tmp_path, text)).positions[0, 0, 1] == 1
 
 
 def test_scale_overrides_the_inferred_unit(tmp_path):
@@ -227,79 +179,65 @@ def test_scale_overrides_the_inferred_unit(tmp_path):
         read_bvh(written(tmp_path, text), scale=0)
 
 
-def defect(old, new, message, line):
-    assert old in MINIMAL
-    return pytest.param(MINIMAL.replace(old, new, 1), message, line, id=message[:40])
-
-
 NUMBER, ROW = "expected a number between", "0 1 0 90 0 0 0 0 90"
 DEFECTS = [
-    defect("Frames: 2", "Frames: 3", "expected 3 lines of values as in line 17, got 2", 20),
-    defect("Frames: 2", "Frames: 1", "expected 1 lines of values as in line 17, got 2", 20),
-    defect("Frames: 2", "Frames: 0", "Frames must be an integer of at least 1, got '0'", 17),
-    defect("Frames: 2", "Frames: -2", "at least 1, got '-2'", 17),
-    defect("Frames: 2\n", "", "expected 'Frames: …', got", 17),
-    defect("Frame Time: 0.0333333\n", "", "expected 'Frame Time: …', got", 18),
-    defect("0.0333333", "0", "Frame Time must be 0.0001 to 1 seconds, got 0", 18),
-    defect("0.0333333", "33.3", "seconds, got 33.3", 18),
-    defect("0.0333333", "nan", NUMBER, 18),
-    defect(ROW, ROW[:-3], "expected 9 values, one per channel, got 8", 20),
-    defect(ROW, ROW + " 1", "expected 9 values, one per channel, got 10", 20),
-    defect("0 1 0 90", "0 nan 0 90", f"{NUMBER} -1e9 and 1e9, got 'nan'", 20),
-    defect("0 1 0 90", "0 1e300 0 90", NUMBER, 20),
-    defect("0 1 0 90", "0 1_0 0 90", NUMBER, 20),
-    defect("0 1 0 90", "0 ١ 0 90", NUMBER, 20),
-    defect("0 1 0 90", "0 1,5 0 90", NUMBER, 20),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1", "expected 3 values of OFFSET, got 2", 8),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1 zero", f"{NUMBER} -1e9 and 1e9, got 'zero'", 8),
-    defect("        OFFSET 0 -1 0\n", "", "expected OFFSET in 'Knee', got '}'", 13),
-    defect("OFFSET 0 -1 0", "OFFSET 0 -1 0\nOFFSET 0 -1 0", "one OFFSET of 'Knee', got a", 9),
-    defect("CHANNELS 3 Z", "CHANNELS 2 Z", "expected '2' channels as declared, got 3", 9),
-    defect("CHANNELS 3 Z", "CHANNELS Z", "expected 'Zrotation' channels as declared", 9),
-    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation", "at most once, got 'Wrotation'", 9),
-    defect("CHANNELS 3 Zrotation", "CHANNELS 3 Xrotation", "at most once, got 'Xrotation'", 9),
-    defect("            OFFSET 0 -0.5 0\n", "", "expected OFFSET in 'Knee_end'", 12),
-    defect("OFFSET 0 -0.5 0", "CHANNELS 0", "inside an End Site, got CHANNELS", 12),
-    defect("OFFSET 0 -0.5 0", "JOINT x", "inside an End Site, got JOINT", 12),
-    defect("End Site", "End", "expected End Site, got 'End'", 10),
-    defect("JOINT Knee", "ROOT Knee", "expected ROOT outside braces, got it inside 'Hips'", 6),
-    defect("JOINT Knee", "JOINT", "expected a name after JOINT", 6),
-    defect("JOINT Knee", "JOINT Hips", "expected unique names, got 'Hips' as in line 2", 6),
-    defect("JOINT Knee", "LIMB Knee", "a brace or MOTION, got 'LIMB'", 6),
-    defect("ROOT Hips", "JOINT Hips", "expected ROOT, got JOINT Hips outside a joint", 2),
-    defect("ROOT Hips\n{", "ROOT Hips", "expected '{', got 'OFFSET'", 3),
-    defect("}\nMOTION", "MOTION", "expected the closing brace of 'Hips', line 2", 15),
-    defect("}\nMOTION", "}\n}\nMOTION", "got '}' without an open brace", 16),
-    defect("HIERARCHY\n", "", "expected HIERARCHY, got 'ROOT Hips'", 1),
-    defect("MOTION\n", "", "a brace or MOTION, got 'Frames:'", 16),
+    ("Frames: 2", "Frames: 3", "expected 3 lines of values as in line 17, got 2", 20),
+    ("Frames: 2", "Frames: 1", "expected 1 lines of values as in line 17, got 2", 20),
+    ("Frames: 2", "Frames: 0", "Frames must be an integer of at least 1, got '0'", 17),
+    ("Frames: 2\n", "", "expected 'Frames: …', got", 17),
+    ("Frame Time: 0.0333333\n", "", "expected 'Frame Time: …', got", 18),
+    ("0.0333333", "0", "Frame Time must be 0.0001 to 1 seconds, got 0", 18),
+    ("0.0333333", "33.3", "seconds, got 33.3", 18),
+    (ROW, ROW[:-3], "expected 9 values, one per channel, got 8", 20),
+    (ROW, ROW + " 1", "expected 9 values, one per channel, got 10", 20),
+    ("0 1 0 90", "0 nan 0 90", f"{NUMBER} -1e9 and 1e9, got 'nan'", 20),
+    ("0 1 0 90", "0 1e300 0 90", NUMBER, 20),
+    ("0 1 0 90", "0 1_0 0 90", NUMBER, 20),
+    ("0 1 0 90", "0 ١ 0 90", NUMBER, 20),
+    ("OFFSET 0 -1 0", "OFFSET 0 -1", "expected 3 values of OFFSET, got 2", 8),
+    ("        OFFSET 0 -1 0\n", "", "expected OFFSET in 'Knee', got '}'", 13),
+    ("OFFSET 0 -1 0", "OFFSET 0 -1 0\nOFFSET 0 -1 0", "one OFFSET of 'Knee', got a", 9),
+    ("CHANNELS 3 Z", "CHANNELS 2 Z", "expected '2' channels as declared, got 3", 9),
+    ("CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation", "at most once, got 'Wrotation'", 9),
+    ("CHANNELS 3 Zrotation", "CHANNELS 3 Xrotation", "at most once, got 'Xrotation'", 9),
+    ("            OFFSET 0 -0.5 0\n", "", "expected OFFSET in 'Knee_end'", 12),
+    ("OFFSET 0 -0.5 0", "CHANNELS 0", "inside an End Site, got CHANNELS", 12),
+    ("OFFSET 0 -0.5 0", "JOINT x", "inside an End Site, got JOINT", 12),
+    ("End Site", "End", "expected End Site, got 'End'", 10),
+    ("JOINT Knee", "ROOT Knee", "expected ROOT outside braces, got it inside 'Hips'", 6),
+    ("JOINT Knee", "JOINT", "expected a name after JOINT", 6),
+    ("JOINT Knee", "JOINT Hips", "expected unique names, got 'Hips' as in line 2", 6),
+    ("JOINT Knee", "LIMB Knee", "a brace or MOTION, got 'LIMB'", 6),
+    ("ROOT Hips", "JOINT Hips", "expected ROOT, got JOINT Hips outside a joint", 2),
+    ("ROOT Hips\n{", "ROOT Hips", "expected '{', got 'OFFSET'", 3),
+    ("}\nMOTION", "MOTION", "expected the closing brace of 'Hips', line 2", 15),
+    ("}\nMOTION", "}\n}\nMOTION", "got '}' without an open brace", 16),
+    ("HIERARCHY\n", "", "expected HIERARCHY, got 'ROOT Hips'", 1),
+    ("MOTION\n", "", "a brace or MOTION, got 'Frames:'", 16),
 ]
 
 
-@pytest.mark.parametrize(("text", "message", "line"), DEFECTS)
-def test_defects_are_reported_with_their_line(tmp_path, text, message, line):
-    path = written(tmp_path, text)
+@pytest.mark.parametrize(("old", "new", "message", "line"), DEFECTS)
+def test_defects_are_reported_with_their_line(tmp_path, old, new, message, line):
+    path = written(tmp_path, MINIMAL.replace(old, new, 1))
     with pytest.raises(MotionFileError) as caught:
         load(path)
     assert str(caught.value).startswith(f"{path}, line {line}: ")
     assert message in str(caught.value)
 
 
-def test_motion_before_hierarchy_is_refused(tmp_path):
-    hierarchy, motion = MINIMAL.split("MOTION\n")
-    with pytest.raises(MotionFileError, match="line 1: expected HIERARCHY"):
-        read_bvh(written(tmp_path, "MOTION\n" + motion + hierarchy))
-
-
 def test_truncated_files_are_refused(tmp_path):
-    for length in range(len(MINIMAL) - len(" 90\n") + 1):
+    for length in range(0, len(MINIMAL) - len(" 90\n") + 1, 3):
         with pytest.raises(MotionFileError, match=r"line \d+"):
             read_bvh(written(tmp_path, MINIMAL[:length]))
 
 
-def test_empty_missing_and_foreign_files(tmp_path):
+def test_foreign_files_are_refused(tmp_path):
     (tmp_path / "folder.bvh").mkdir()
+    hierarchy, motion = MINIMAL.split("MOTION\n")
     for path, error, message in (
-        (written(tmp_path, ""), MotionFileError, "expected HIERARCHY"),
+        (written(tmp_path, "", "empty.bvh"), MotionFileError, "expected HIERARCHY"),
+        (written(tmp_path, f"MOTION\n{motion}{hierarchy}"), MotionFileError, "line 1: expected H"),
         (tmp_path / "none.bvh", FileNotFoundError, "none.bvh"),
         (tmp_path / "none.txt", FileNotFoundError, "none.txt"),
         (written(tmp_path, MINIMAL, "clip.txt"), MotionFileError, r"got '\.txt'"),

@@ -39,7 +39,7 @@ def written(folder, text, name="table.csv"):
 
 def test_single_animal(tmp_path):
     (track,) = read_keypoints(written(tmp_path, SINGLE), fps=50)
-    assert (track.name, track.fps, track.frames) == ("table", 50, 3)
+    assert (track.name, track.fps) == ("table", 50)
     assert track.skeleton == Skeleton(["snout", "tail_base"], [-1, -1])
     nan = [np.nan, np.nan]
     np.testing.assert_array_equal(
@@ -56,12 +56,9 @@ def test_several_animals_have_one_track_each(tmp_path):
     np.testing.assert_array_equal(two.confidence[:, 0], [0.5, 0, 0.7])
     np.testing.assert_array_equal(one.keypoints[:, 0], [[3, 4], nan, nan])
     np.testing.assert_array_equal(one.confidence[:, 0], [0.6, 0, 0])
-    assert corners.name == "table single"
-    assert corners.skeleton.joint_names == ("corner",)
+    assert (corners.name, corners.skeleton.joint_names) == ("table single", ("corner",))
     np.testing.assert_array_equal(corners.confidence, np.ones((3, 1)))
-
-
-def test_body_parts_of_no_animal_are_dropped_for_a_skeleton(tmp_path):
+    # Body parts of no animal are dropped for a skeleton without them.
     tracks = read_keypoints(written(tmp_path, SEVERAL), 50, Skeleton(["snout"], [-1]))
     assert [track.name for track in tracks] == ["table mouse2", "table mouse1"]
 
@@ -79,36 +76,15 @@ def test_labelled_images_have_confidence_one(tmp_path):
     np.testing.assert_array_equal(again.keypoints, run.keypoints)
 
 
-def quadruped_table(skeleton, names):
-    """Table of the joints in reverse order under ``names``, and an extra body part."""
-    values = np.random.default_rng(0).uniform(1, 9, size=(4, skeleton.n_joints, 2)).round(3)
-    order = list(range(skeleton.n_joints))[::-1]
-    rows = [["scorer"], ["bodyparts"], ["coords"], *([str(frame)] for frame in range(4))]
-    for joint in [*order, None]:
-        name = "antler" if joint is None else names[joint]
-        for axis, coordinate in enumerate(("x", "y", "likelihood")):
-            rows[0].append("net")
-            rows[1].append(name)
-            rows[2].append(coordinate)
-            for frame in range(4):
-                cell = 0.5 if axis == 2 or joint is None else values[frame, joint, axis]
-                rows[3 + frame].append(str(cell))
-    return "\n".join(",".join(row) for row in rows), values
-
-
-@pytest.mark.parametrize("side", ["left_", "L_"])
-def test_skeleton_selects_joints_by_own_or_canonical_names(tmp_path, side):
-    skeleton = Skeleton.preset("apt36k17")
-    names = [name.replace("left_", side) for name in skeleton.joint_names]
-    text, values = quadruped_table(skeleton, names)
+def test_skeleton_selects_joints_by_own_or_canonical_names(tmp_path):
+    text = SINGLE.replace("snout", "L_ankle").replace("tail_base", "right_ankle")
     path = written(tmp_path, text)
-    for given in (skeleton, "apt36k17"):
-        (track,) = read_keypoints(path, 30, given)
-        assert track.skeleton == skeleton
-        np.testing.assert_array_equal(track.keypoints, values)
+    skeleton = Skeleton(["right_ankle", "left_ankle"], [-1, 0])
+    (track,) = read_keypoints(path, 30, skeleton)
+    assert track.skeleton == skeleton
     (own,) = read_keypoints(path, 30)
-    assert own.skeleton.joint_names == (*names[::-1], "antler")
-    np.testing.assert_array_equal(own.keypoints[:, :17], values[:, ::-1])
+    np.testing.assert_array_equal(track.keypoints, own.keypoints[:, ::-1])
+    np.testing.assert_array_equal(track.confidence, own.confidence[:, ::-1])
 
 
 @pytest.mark.parametrize(
@@ -116,13 +92,16 @@ def test_skeleton_selects_joints_by_own_or_canonical_names(tmp_path, side):
     [
         ("scorer,", "speed,", r"expected the rows scorer, .*, got \['speed', "),
         ("coords,x", "cords,x", "expected the rows scorer"),
+        (SINGLE, "", "expected the rows scorer"),
+        (SINGLE[SINGLE.index("\n0,") :], "", "expected a row per frame, got none"),
+        (SINGLE, "scorer\nbodyparts\ncoords\n0\n", "expected at least one body part, got none"),
+        (SINGLE, 'scorer,"net', "expected a CSV table"),
         ("3.5,4.5,0.8,,,", "3.5,4.5,0.8,,", "line 5: expected 7 cells as in the first row, got 6"),
         ("30,40", "30,4o", "line 6, column 6: expected a number between .*, got '4o'"),
         ("30,40", "30,1e12", "line 6, column 6: expected a number between .*, got '1e12'"),
         ("40,0.25", "40,-0.25", "line 6, column 7: expected a likelihood of 0 or more, got -0.25"),
         ("\n1,3.5", "\n1.5,3.5", "line 5, column 1: expected a frame number .*, got '1.5'"),
-        ("\n1,3.5", "\n,3.5", "line 5, column 1: expected a frame number .*, got ''"),
-        ("\n1,3.5", "\nimage.png,3.5", "expected a name with a frame number, got 'image.png'"),
+        ("\n1,3.5", "\nimage.png,3.5", "a frame number of at most 18 digits, got 'image.png'"),
         ("\n1,3.5", "\n2,3.5", "two people without track ids in frame 2"),
         ("x,y,likelihood,x", "x,x,likelihood,x", "column 3: expected x, .* got 'x' of 'snout'"),
         ("x,y,likelihood,x", "x,z,likelihood,x", "column 3: expected x, .* got 'z' of 'snout'"),
@@ -137,28 +116,22 @@ def test_defects_are_reported(tmp_path, old, new, message):
     assert str(path) in str(caught.value)
 
 
-HEAD = "\n".join(SINGLE.splitlines()[:3])
-
-
 @pytest.mark.parametrize(
-    ("content", "arguments", "message"),
+    ("content", "name", "changes", "message"),
     [
-        (SINGLE, {"fps": None}, "fps must be given for .*, which does not contain a frame rate"),
-        (SINGLE, {"fps": 0}, "fps must be a finite number above 0, got 0"),
-        (SINGLE, {"people": 1}, "people must be None for .csv files, got 1"),
-        (SINGLE, {"skeleton": "coco17"}, "expected the joint 'nose' .* body parts of the table"),
-        (SEVERAL, {"skeleton": Skeleton(["corner"], [-1])}, "body parts of individual 'mouse2'"),
-        ("", {}, "expected the rows scorer"),
-        (HEAD, {}, "expected a row per frame, got none"),
-        ("scorer\nbodyparts\ncoords\n0\n", {}, "expected at least one body part, got none"),
-        (b"\xff\xfe\x00", {}, "expected a CSV table"),
-        (b'scorer,"net', {}, "expected a CSV table"),
+        (
+            SINGLE,
+            "a.csv",
+            {"fps": None},
+            "fps must be given for .*, which does not contain a frame",
+        ),
+        (SINGLE, "a.csv", {"fps": 0}, "fps must be a finite number above 0, got 0"),
+        (SINGLE, "a.csv", {"people": 1}, "people must be None for .csv files, got 1"),
+        (SINGLE, "a.csv", {"skeleton": "coco17"}, "the joint 'nose' .* body parts of the table"),
+        (SEVERAL, "a.csv", {"skeleton": Skeleton(["corner"], [-1])}, "of individual 'mouse2'"),
+        ("", "a.h5", {}, "expected a CSV table, got HDF5"),
     ],
 )
-def test_invalid_files_and_arguments_are_refused(tmp_path, content, arguments, message):
-    path = tmp_path / "table.csv"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+def test_invalid_arguments_are_refused(tmp_path, content, name, changes, message):
     with pytest.raises(ValueError, match=message):
-        read_keypoints(path, **({"fps": 25} | arguments))
-    with pytest.raises(MotionFileError, match="expected a CSV table, got HDF5"):
-        read_keypoints(written(tmp_path, "", "table.h5"), fps=25)
+        read_keypoints(written(tmp_path, content, name), **({"fps": 25} | changes))

@@ -29,9 +29,11 @@ def test_crossing_people_keep_their_ids():
         left, right = person_at(100 + 25 * frame), person_at(412 - 25 * frame)
         detections += shuffled(left, right, frame=frame)
     linked = link_people(detections, 2)
-    for found in linked:
-        x = found.values[:, 0].mean() - BODY[:, 0].mean()
-        expected = 100 + 25 * found.frame if found.person == "0" else 412 - 25 * found.frame
+    for detection in linked:
+        x = detection.values[:, 0].mean() - BODY[:, 0].mean()
+        expected = (
+            100 + 25 * detection.frame if detection.person == "0" else 412 - 25 * detection.frame
+        )
         assert x == pytest.approx(expected)
     assert len(linked) == 24
 
@@ -41,13 +43,13 @@ def test_tracking_starts_at_the_first_full_image_without_bystanders():
     detections += shuffled(person_at(100), person_at(300), person_at(900, 0.2), frame=1)
     detections += shuffled(person_at(110), person_at(905, 0.99), person_at(290), frame=2)
     detections += shuffled(person_at(280), frame=3)
-    linked = [(found.frame, found.person) for found in link_people(detections, 2)]
+    linked = [(detection.frame, detection.person) for detection in link_people(detections, 2)]
     assert linked == [(0, "1"), (1, "0"), (1, "1"), (2, "0"), (2, "1"), (3, "1")]
 
 
 def test_people_are_followed_in_files_without_ids(tmp_path):
     frames = [
-        {"people": [{"pose_keypoints_2d": found.values.ravel().tolist()} for found in one]}
+        {"people": [{"pose_keypoints_2d": detection.values.ravel().tolist()} for detection in one]}
         for one in (shuffled(person_at(100 + k), person_at(300 - k), frame=k) for k in range(5))
     ]
     path = tmp_path / "video.json"

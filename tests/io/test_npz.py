@@ -1,7 +1,6 @@
 """npz archives: exact round trips, real clips and defects by key."""
 
 import io
-import os
 
 import numpy as np
 import pytest
@@ -12,21 +11,16 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
 
-def arrays(**changes):
-    """Content of a valid archive with changed keys; None removes a key."""
+def archive(folder, **changes):
+    """Write a valid archive with changed keys; None removes a key."""
     content: dict[str, object] = {
         "positions": np.arange(24.0).reshape(4, 2, 3),
         "fps": np.float32(30),
         "joint_names": np.array(["hip", "knee"]),
         "parents": np.array([-1, 0], dtype=np.int32),
-    }
-    content |= changes
-    return {key: value for key, value in content.items() if value is not None}
-
-
-def archive(folder, **changes):
+    } | changes
     path = folder / "clip.npz"
-    np.savez(path, **arrays(**changes))
+    np.savez(path, **{key: value for key, value in content.items() if value is not None})
     return path
 
 
@@ -50,9 +44,8 @@ def test_motions_round_trip_exactly(tmp_path):
 
 
 def test_name_defaults_to_the_file_stem(tmp_path):
-    save(load(archive(tmp_path)), tmp_path / "walk.npz")
     save(Motion(np.zeros((1, 1, 3)), Skeleton(["a"], [-1]), 1), tmp_path / "still.npz")
-    assert [load(tmp_path / f"{name}.npz").name for name in ("walk", "still")] == ["clip", "still"]
+    assert load(tmp_path / "still.npz").name == "still"
 
 
 def test_several_people_form_one_skeleton(tmp_path):
@@ -68,9 +61,8 @@ def test_several_people_form_one_skeleton(tmp_path):
 
 def test_z_up_is_rotated_not_mirrored(tmp_path):
     axes = np.stack([np.eye(3), np.eye(3)], axis=1)  # x̂, ŷ, ẑ in three frames
-    x, y, z = load(archive(tmp_path, positions=axes, up_axis="z")).positions[:, 0]
-    np.testing.assert_array_equal(z, [0, 1, 0])
-    np.testing.assert_array_equal(np.cross(x, y), z)
+    rotated = load(archive(tmp_path, positions=axes, up_axis="z")).positions[:, 0]
+    np.testing.assert_array_equal(rotated, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def test_joints_without_positions_are_dropped_with_a_warning(tmp_path):
@@ -89,7 +81,6 @@ def test_joints_without_positions_are_dropped_with_a_warning(tmp_path):
     [
         ("cmu_salsa_pairs", 10, {50}, 2),
         ("cmu_single", 26, {31, 38}, 1),
-        ("deepmimic_human", 22, {15}, 1),
         ("deepmimic_dog", 4, {23}, 1),
     ],
 )
@@ -97,8 +88,7 @@ def test_real_clips_are_read(real_data, folder, clips, joints, roots):
     motions = [load(path) for path in sorted((real_data / folder).glob("*.npz"))]
     assert len(motions) == clips
     assert {motion.skeleton.n_joints for motion in motions} == joints
-    assert {len(motion.skeleton.roots) for motion in motions} == {roots}
-    assert {motion.fps for motion in motions} == {30.0}
+    assert {(len(motion.skeleton.roots), motion.fps) for motion in motions} == {(roots, 30.0)}
     for motion in motions:
         assert 0.2 < np.ptp(motion.positions[..., 1], axis=1).mean() < 2.5, motion
 
@@ -106,17 +96,14 @@ def test_real_clips_are_read(real_data, folder, clips, joints, roots):
 def test_real_views_are_read_as_tracks_and_upright_3d(real_data):
     folder = real_data / "pose2sim_multiview"
     path = folder / "S00_P00_T01_BalancingTrial_multiview.npz"
-    tracks = read_keypoints(path)
-    assert [track.name.split()[1] for track in tracks] == [f"cam_0{i}" for i in (1, 2, 3, 4)]
     single = folder / "S00_P00_T01_BalancingTrial_cam_02.npz"
-    (alone,) = read_keypoints(single)
+    tracks, (alone,) = read_keypoints(path), read_keypoints(single)
+    assert [track.name.split()[1] for track in tracks] == [f"cam_0{i}" for i in (1, 2, 3, 4)]
     np.testing.assert_array_equal(alone.keypoints, tracks[1].keypoints)
-    assert alone.fps == 60
-    assert read_keypoints(path, fps=30)[0].fps == 30
+    assert (alone.fps, read_keypoints(path, fps=30)[0].fps) == (60, 30)
     with pytest.warns(MotionFileWarning, match="LEye, REye, LEar, REar, which have no position"):
         motion = load(path)
-    names = motion.skeleton.joint_names
-    head, foot = names.index("Nose"), names.index("LAnkle")
+    head, foot = (motion.skeleton.index(name) for name in ("Nose", "LAnkle"))
     assert (motion.positions[:, head, 1] - motion.positions[:, foot, 1]).min() > 1
     with pytest.raises(MotionFileError, match="use read_keypoints for 2D"):
         load(single)
@@ -124,6 +111,8 @@ def test_real_views_are_read_as_tracks_and_upright_3d(real_data):
 
 NAN = np.full((4, 2, 3), np.nan)
 NAN[0] = 0
+TWO = {"positions": np.zeros((4, 2, 2, 3))}
+TRACK = {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2)), "positions": None}
 
 
 @pytest.mark.parametrize(
@@ -131,25 +120,20 @@ NAN[0] = 0
     [
         ({"positions": None}, "expected the key positions, got fps, joint_names, parents"),
         ({"fps": None}, "expected the key fps"),
-        ({"parents": None}, "expected the key parents"),
         ({"joint_names": None}, "expected the key joint_names"),
         ({"positions": np.zeros((4, 2))}, r"positions must have shape \(L, J, 3\) or .*\(4, 2\)"),
         ({"positions": np.zeros((4, 2, 2))}, r"positions must have shape .* got \(4, 2, 2\)"),
         ({"positions": np.zeros((0, 2, 3))}, r"positions must have shape .* got \(0, 2, 3\)"),
         ({"positions": NAN}, "positions must be finite, got 18 values that are NaN"),
-        ({"positions": np.full((4, 2, 3), np.nan)}, "24 values that are NaN"),
+        ({"positions": NAN * np.nan}, "24 values that are NaN"),
         ({"positions": np.full((4, 2, 3), np.inf)}, "must be between -1e9 and 1e9, got inf"),
         ({"positions": np.zeros((4, 2, 3), complex)}, "must contain real numbers, got .*complex"),
-        ({"positions": np.array([["a"]])}, "positions must contain real numbers"),
         ({"positions": np.array([None])}, "numbers or strings in positions .*allow_pickle"),
-        ({"fps": np.float64(0)}, "fps must be one number above 0, got 0.0"),
         ({"fps": np.array([30.0, 60.0])}, r"fps must be one number above 0, got \[30.0, 60.0\]"),
         ({"fps": np.float64("nan")}, "fps must be one number above 0, got nan"),
         ({"joint_names": np.array(["hip"])}, "joint_names must be 2 strings, got"),
         ({"joint_names": np.array([1, 2])}, "joint_names must be 2 strings, got int64"),
         ({"joint_names": np.array(["hip", "hip"])}, r"joint_names must be unique, got \['hip'\]"),
-        ({"parents": np.array([1, 0])}, "parents must form trees, got a cycle"),
-        ({"parents": np.array([-1, 7])}, r"parents\[1\] must be -1 or .* below 2, got 7"),
         ({"parents": np.array([-1])}, r"parents must be 2 integers, got shape \(1,\)"),
         ({"parents": np.array([-1, 0.5])}, "parents must be 2 integers"),
         ({"up_axis": "x"}, "up_axis must be 'y' or 'z', got 'x'"),
@@ -161,36 +145,21 @@ NAN[0] = 0
             {"rotations": np.zeros((4, 2, 3)), "rest_offsets": np.zeros((2, 3))},
             r"rotations must have shape \(4, 2, 3, 3\), got \(4, 2, 3\)",
         ),
+        (TWO | {"persons": np.array(["a"])}, "persons must be 2 strings, got"),
+        (TRACK | {"keypoints": NAN}, r"keypoints must have shape .* got \(4, 2, 3\)"),
         (
-            {"positions": np.zeros((4, 3, 2, 3)), "persons": np.array(["a", "b"])},
-            "persons must be 3 strings, got",
+            TRACK | {"confidence": np.ones((4, 3))},
+            r"confidence must have shape \(4, 2\), got \(4, 3",
         ),
-        (
-            {"positions": np.zeros((4, 2, 2, 3)), "persons": np.array(["a", "a"])},
-            "joint_names must be unique",
-        ),
+        (TRACK | {"confidence": -np.ones((4, 2))}, "confidence must be 0 to 2, got -1"),
     ],
 )
-def test_motion_defects_are_reported(tmp_path, changes, message):
+def test_defects_are_reported(tmp_path, changes, message):
     path = archive(tmp_path, **changes)
+    read = read_keypoints if "confidence" in changes else load
     with pytest.raises(MotionFileError, match=message) as caught:
-        load(path)
+        read(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"keypoints": None}, "expected the key keypoints"),
-        ({"keypoints": np.zeros((4, 2, 3))}, r"keypoints must have shape .* got \(4, 2, 3\)"),
-        ({"confidence": np.ones((4, 3))}, r"confidence must have shape \(4, 2\), got \(4, 3\)"),
-        ({"confidence": -np.ones((4, 2))}, "confidence must be 0 to 2, got -1"),
-    ],
-)
-def test_track_defects_are_reported(tmp_path, changes, message):
-    track = {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2)), "positions": None}
-    with pytest.raises(MotionFileError, match=message):
-        read_keypoints(archive(tmp_path, **(track | changes)))
 
 
 def test_invalid_archives_are_refused(tmp_path):
@@ -208,15 +177,10 @@ def test_invalid_archives_are_refused(tmp_path):
         read_keypoints(path, people=1)
 
 
-def test_failed_writes_keep_the_old_file(tmp_path):
+def test_failed_writes_leave_no_file(tmp_path):
     motion = load(archive(tmp_path))
     with pytest.raises(OSError, match=r"cannot write .*choose a writable folder"):
         save(motion, tmp_path / "none" / "clip.npz")
     with pytest.raises(ValueError, match=r"path must end in \.bvh or \.npz, got '\.txt'"):
         save(motion, tmp_path / "clip.txt")
-    if os.geteuid() != 0:  # root can write everywhere
-        tmp_path.chmod(0o500)
-        with pytest.raises(OSError, match="cannot write"):
-            save(motion, tmp_path / "other.npz")
-        tmp_path.chmod(0o700)
     assert [path.name for path in tmp_path.iterdir()] == ["clip.npz"]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import roma
 import torch
-from scipy.spatial.transform import Rotation
 
 from probmotion.arrays import to_numpy
 from probmotion.metrics.accuracy import (
@@ -27,13 +26,8 @@ def truth(rng):
     return rng.normal(size=(L, J, 3))
 
 
-def test_errors_of_a_shift(truth):
-    errors = joint_errors(truth + np.array([3.0, 0.0, 4.0]), truth)
-    np.testing.assert_allclose(errors, 5)
-    assert mean_over(errors) == pytest.approx(5)
-
-
-def test_masked_means(truth):
+def test_means_of_the_errors_of_shifted_joints(truth):
+    np.testing.assert_allclose(mean_over(joint_errors(truth + np.array([3, 0, 4]), truth)), 5)
     moved = truth.copy()
     moved[2, 1, 0] += 0.5
     mask = np.zeros((L, J), dtype=bool)
@@ -52,22 +46,16 @@ def test_root_alignment_is_invariant_to_the_root_path(truth, rng):
     assert (expected[:, 2] == 0).all()
 
 
-def test_similarity_alignment_inverts_a_similarity_per_frame(truth):
-    turns = Rotation.random(L, rng=np.random.default_rng(1)).as_matrix()
-    moved = 1.7 * np.einsum("lij,lkj->lki", turns, truth) + np.arange(L)[:, None, None]
-    np.testing.assert_allclose(aligned_by_similarity(moved, truth), truth, atol=1e-12)
-    # Coincident joints are translated only.
-    expected = np.broadcast_to(truth.mean(axis=1, keepdims=True), truth.shape)
-    found = aligned_by_similarity(np.ones((L, J, 3)), truth)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
 def test_similarity_alignment_agrees_with_roma(truth, rng):
     motions = rng.normal(size=(4, L, J, 3))
     x, y = torch.asarray(motions), torch.asarray(truth).expand(4, L, J, 3)
     turn, shift, scale = roma.rigid_points_registration(x, y, compute_scaling=True)
     expected = scale[..., None, None] * (x @ turn.mT) + shift[..., None, :]
     np.testing.assert_allclose(aligned_by_similarity(motions, truth), expected, atol=1e-12)
+    # Coincident joints are translated only.
+    expected = np.broadcast_to(truth.mean(axis=1, keepdims=True), truth.shape)
+    result = aligned_by_similarity(np.ones((L, J, 3)), truth)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
 def test_acceleration_of_a_parabola(truth):
@@ -111,18 +99,5 @@ def test_all_libraries_agree(truth, rng, library, batch):
     ]
     with jax.enable_x64(True):
         for function in functions:
-            found = to_numpy(function(make(motions), make(truth)))
-            np.testing.assert_allclose(found, function(motions, truth), rtol=1e-10, atol=1e-12)
-
-
-def test_alignment_is_differentiable(truth, rng):
-    motion = torch.tensor(truth + 0.2 * rng.normal(size=truth.shape), requires_grad=True)
-    target = torch.asarray(truth)
-
-    def error(x):
-        return joint_errors(aligned_by_similarity(x, target), target).mean()
-
-    (slope,) = torch.autograd.grad(error(motion), motion)
-    step = 1e-6 * torch.asarray(rng.normal(size=truth.shape))
-    rise = float((error(motion + step) - error(motion - step)).detach()) / 2
-    assert rise == pytest.approx(float((slope * step).sum()), rel=1e-5)
+            result = to_numpy(function(make(motions), make(truth)))
+            np.testing.assert_allclose(result, function(motions, truth), rtol=1e-10, atol=1e-12)

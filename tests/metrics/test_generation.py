@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.stats
 
 from probmotion import seeds
 from probmotion.geometry.cameras import Cameras
@@ -21,24 +22,6 @@ from probmotion.metrics.generation import (
 from probmotion.motion.skeleton import Skeleton
 
 
-def with_moments(rng, mean, covariance, n=60):
-    """Points with exactly this sample mean and covariance."""
-    points = rng.normal(size=(n, len(mean)))
-    points -= points.mean(axis=0)
-    white = points @ np.linalg.inv(np.linalg.cholesky(np.cov(points.T))).T
-    return white @ np.linalg.cholesky(covariance).T + mean
-
-
-def test_frechet_distance_of_gaussians_with_common_axes(rng):
-    basis, _ = np.linalg.qr(rng.normal(size=(4, 4)))
-    first, second = np.array([1.0, 4.0, 9.0, 0.25]), np.array([4.0, 4.0, 1.0, 1.0])
-    shift = np.array([1.0, -2.0, 0.0, 2.0])
-    a = with_moments(rng, np.zeros(4), basis * first @ basis.T)
-    b = with_moments(rng, shift, basis * second @ basis.T)
-    # ‖μ‖² + Σ (σ_a − σ_b)², standard deviations 1 2 3 .5 and 2 2 1 1.
-    assert frechet_distance(a, b) == pytest.approx(9 + 1 + 0 + 4 + 0.25)
-
-
 def test_frechet_distance_agrees_with_the_matrix_square_root(rng):
     a = rng.normal(size=(80, 6)) @ rng.normal(size=(6, 6))
     b = rng.normal(size=(50, 6)) @ rng.normal(size=(6, 6)) + 1
@@ -48,13 +31,9 @@ def test_frechet_distance_agrees_with_the_matrix_square_root(rng):
     expected = apart + np.trace(covariances[0] + covariances[1] - 2 * root).real
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-10)
     assert frechet_distance(b, a) == pytest.approx(expected, rel=1e-10)
-
-
-@pytest.mark.parametrize("n", [5, 200])
-def test_frechet_distance_of_equal_sets_is_zero_even_with_more_features(rng, n):
-    features = 100 * rng.normal(size=(n, 20))
-    found = frechet_distance(features, features[::-1])
-    assert 0 <= found < 1e-12 * features.var(axis=0).sum()
+    # Equal sets of fewer motions than features.
+    features = 100 * rng.normal(size=(5, 20))
+    assert 0 <= frechet_distance(features, features[::-1]) < 1e-12 * features.var(axis=0).sum()
 
 
 def test_diversity_is_the_mean_distance_of_different_motions(rng):
@@ -89,11 +68,7 @@ def test_scores_are_means_and_standard_deviations_over_repeats(rng):
         assert scores[name] == pytest.approx((np.mean(values), np.std(values, ddof=1)))
     assert len({number for number, _ in calls}) == 3
     assert {n for _, n in calls} == {40}
-
-
-def test_collapsed_below_a_recall_of_a_tenth():
-    assert GenerationScores(1.0, 0.1, 0.9, 0.09).collapsed
-    assert not GenerationScores(1.0, 0.1, 0.9, 0.1).collapsed
+    assert [GenerationScores(1.0, 0.1, 0.9, recall).collapsed for recall in (0.09, 0.1)] == [1, 0]
 
 
 def test_views_agree_with_cameras_around_the_root(rng):
@@ -110,12 +85,10 @@ def test_views_agree_with_cameras_around_the_root(rng):
 
 
 def test_azimuths_are_uniform(rng):
-    # Kolmogorov's distance from the uniform distribution, p = 1e-4.
-    uniform = (np.arange(4000) + 0.5) / 4000
-    found = np.sort(random_azimuths(rng, 4000)) / (2 * math.pi)
-    side = (np.sort(random_azimuths(rng, 4000, "side")) - math.pi / 4) / (math.pi / 2)
-    for values in (found, side):
-        assert np.abs(values - uniform).max() < 2.23 / math.sqrt(4000)
+    around = random_azimuths(rng, 4000) / (2 * math.pi)
+    side = (random_azimuths(rng, 4000, "side") - math.pi / 4) / (math.pi / 2)
+    for values in (around, side):
+        assert scipy.stats.kstest(values, "uniform").pvalue > 1e-4
     assert (random_azimuths(rng, 3, "reference-code-side") == math.pi / 2).all()
 
 
@@ -129,19 +102,19 @@ class Plain:
         return views[:, [0, -1], :2].reshape(len(views), -1)
 
 
-def made(rng, n):
+def drawn(rng, n):
     return 0.5 * rng.normal(size=(n, 4, 3, 3))
 
 
 @pytest.fixture
 def reference(rng):
-    views = film_motions(made(rng, 200), rng, elevation=0.2, distance=9.0, root=2)
+    views = film_motions(drawn(rng, 200), rng, elevation=0.2, distance=9.0, root=2)
     return GenerationReference(Plain(), Plain().features(views), elevation=0.2, distance=9.0)
 
 
 def test_views_use_the_cameras_of_the_reference(rng, reference):
     side = "reference-code-side"
-    motions = made(rng, 30)
+    motions = drawn(rng, 30)
     scores = reference.score_motions(motions, seed=0, repeats=2, angles=side)
     views = film_motions(motions, rng, elevation=0.2, distance=9.0, angles=side, root=2)
     expected = frechet_distance(Plain().features(views), reference.held_out_features)
@@ -153,63 +126,52 @@ def test_views_use_the_cameras_of_the_reference(rng, reference):
 
 
 def test_repeats_differ_in_views_and_subsets_only(rng, reference):
-    motions = made(rng, 100)
+    motions = drawn(rng, 100)
     scores = reference.score_motions(motions, seed=1, samples=50, repeats=3)
     assert scores == reference.score_motions(motions, seed=1, samples=50, repeats=3)
     assert all(deviation > 0 for _, deviation in scores.values())
-    assert scores != reference.score_motions(motions, seed=2, samples=50, repeats=3)
     fixed = reference.score_motions(motions, seed=1, repeats=3, angles="reference-code-side")
     # With one azimuth for all motions, only the pairs of the diversity are random.
     assert fixed["fid"][1] < 1e-12
     assert fixed["recall"][1] < 1e-12 < 1e-3 < fixed["diversity"][1]
 
 
-@pytest.mark.parametrize(("frames", "whole"), [(23, 20), (10, 10), (4, 4)])
-def test_the_chamfer_distance_uses_whole_windows(rng, reference, frames, whole):
+@pytest.mark.parametrize(("frames", "used"), [(23, 20), (10, 10), (4, 4)])
+def test_the_chamfer_distance_uses_complete_windows(rng, reference, frames, used):
     motions = 0.5 * rng.normal(size=(1, frames, 3, 3))
-    filmed = film_motions(
-        motions, seeds.generator(3, "chamfer"), elevation=0.2, distance=9.0, root=2
-    )
-    real = filmed + np.array([0.1, 0.0])
-    real[:, whole:] = 50.0
-    found = replace(reference, held_out_views=real).chamfer(motions, seed=3)
+    filming = {"elevation": 0.2, "distance": 9.0, "root": 2}
+    real = film_motions(motions, seeds.generator(3, "chamfer"), **filming) + np.array([0.1, 0.0])
+    real[:, used:] = 50.0
+    result = replace(reference, held_out_views=real).chamfer(motions, seed=3)
     # The nearest window of each is its copy, 10 cm away.
-    assert found.of_generated == pytest.approx(0.01)
+    assert result.of_generated == pytest.approx(0.01)
 
 
 def test_training_clips_as_reference(rng):
-    held_out, learnt = rng.normal(size=(2, 50, 3)) + np.array([[[0.0]], [[5.0]]])
+    held_out, learnt = rng.normal(size=(2, 50, 3))
     again = GenerationReference(Plain(), held_out, learnt, elevation=0.1).of_learnt()
     np.testing.assert_array_equal(again.held_out_features, learnt)
     assert again.elevation == 0.1
 
 
 REAL = GenerationReference(Plain(), np.zeros((5, 2)))
+FIVE = np.zeros((5, 2))
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: frechet_distance(np.zeros((5, 2)), np.zeros((5, 3))), r"b must have shape \(M, 2"),
-        (lambda: frechet_distance(np.zeros((5, 2)), np.zeros((1, 2))), "b must have at least 2 mo"),
-        (lambda: frechet_distance(np.array([[0.0], [np.nan]]), np.zeros((5, 1))), "a must be fini"),
-        (lambda: diversity(np.zeros((1, 2)), None), "features must have at least 2 motions, got 1"),
+        (lambda: frechet_distance(FIVE, np.zeros((5, 3))), r"b must have shape \(M, 2"),
+        (lambda: frechet_distance(FIVE, FIVE[:1]), "b must have at least 2 motions, got 1"),
+        (lambda: frechet_distance(FIVE * np.nan, FIVE), "a must be finite, got 10 values"),
+        (lambda: diversity(FIVE[:1], None), "features must have at least 2 motions, got 1"),
         (lambda: random_azimuths(None, 3, "front"), "angles must be one of all, side, .*got 'fro"),
-        (lambda: GenerationReference(Plain(), np.zeros(5)), "held_out_features must have shape"),
-        (
-            lambda: replace(REAL, learnt_features=np.zeros((5, 3))),
-            "learnt_features must have shape",
-        ),
-        (
-            lambda: replace(REAL, held_out_views=np.zeros((5, 4, 2, 2))),
-            "held_out_views must have sh",
-        ),
+        (lambda: replace(REAL, held_out_features=FIVE[0]), "held_out_features must have shape"),
+        (lambda: replace(REAL, learnt_features=FIVE[:, :1]), "learnt_features must have shape"),
+        (lambda: replace(REAL, held_out_views=FIVE), "held_out_views must have shape"),
         (lambda: REAL.of_learnt(), "learnt_features must be given, got None"),
         (lambda: REAL.chamfer(np.zeros((1, 4, 3, 3)), seed=0), "held_out_views must be given"),
-        (
-            lambda: score_generation(np.negative, None, np.zeros((9, 2)), seed=0, repeats=1),
-            "repeats must be an integer of at least 2, got 1",
-        ),
+        (lambda: REAL.score_views(None, seed=0, repeats=1), "repeats must be an integer of at lea"),
     ],
 )
 def test_invalid_arguments(call, message):

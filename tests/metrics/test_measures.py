@@ -43,7 +43,7 @@ def generation(prior):
     return Problem("generation", "no observations", MotionPosterior(prior))
 
 
-def observed(prior, kind="occluded", motion=None):
+def observed(prior, kind, motion=None):
     motion = prior.sample(np.random.default_rng(1), 1)[0] if motion is None else motion
     motion = Motion(motion, prior.skeleton, 30.0)
     likelihood = observe(motion, kind, 0.05, 0)
@@ -52,7 +52,7 @@ def observed(prior, kind="occluded", motion=None):
 
 @pytest.fixture(scope="module")
 def occluded(prior):
-    return observed(prior)
+    return observed(prior, "occluded")
 
 
 def measured(problem, positions, seed=0, **more):
@@ -64,23 +64,18 @@ def measured(problem, positions, seed=0, **more):
 
 
 def test_exact_draws_have_ideal_values(generation):
-    found = [measured(generation, generation.reference(100 + i, N), i) for i in range(6)]
-    for name, ideal in {
-        "swd_ratio": 1,
-        "variance_ratio": 1,
-        "off_manifold_ratio": 1,
-        "log_density_gap": 0,
-        "mode_proportion_calm": 0.7,
-        "mode_proportion_wild": 0.3,
-        "c2st": 0.5,
-        "mmd": 0,
-    }.items():
-        values = np.array([each[name] for each in found])
+    runs = [measured(generation, generation.reference(100 + i, N), i) for i in range(6)]
+    ideals = {
+        "swd_ratio": 1, "variance_ratio": 1, "off_manifold_ratio": 1, "log_density_gap": 0,
+        "mode_proportion_calm": 0.7, "mode_proportion_wild": 0.3, "c2st": 0.5, "mmd": 0,
+    }  # fmt: skip
+    for name, ideal in ideals.items():
+        values = np.array([run[name] for run in runs])
         spread = values.std(ddof=1) / math.sqrt(len(values))
         # Student's t with 5 degrees of freedom exceeds 6.9 once in a thousand.
         assert abs(values.mean() - ideal) < 6.9 * spread, name
         assert spread < 0.35, name
-    assert np.mean([each["mean_error_sd"] for each in found]) < 2 / math.sqrt(N)
+    assert np.mean([run["mean_error_sd"] for run in runs]) < 2 / math.sqrt(N)
 
 
 def test_errors_are_detected(generation, prior):
@@ -89,18 +84,17 @@ def test_errors_are_detected(generation, prior):
     rough = exact + 0.1 * np.random.default_rng(2).normal(size=exact.shape)
     calm = exact[prior.style_responsibilities(exact)[:, 0] > 0.5]
     calm = np.concatenate([calm, calm])[:N]
-    motions = {"narrow": narrow, "rough": rough, "calm": calm}
-    found = {name: measured(generation, positions, 3) for name, positions in motions.items()}
-    assert found["narrow"]["variance_ratio"] == pytest.approx(0.25, rel=0.1)
+    narrow, rough, calm = (measured(generation, some, 3) for some in (narrow, rough, calm))
+    assert narrow["variance_ratio"] == pytest.approx(0.25, rel=0.1)
     # Noise of twice δ on top: five times the variance off the manifold.
-    assert found["rough"]["off_manifold_ratio"] == pytest.approx(5, rel=0.1)
-    assert found["rough"]["log_density_gap"] < -50
-    assert found["rough"]["c2st"] > 0.7
-    assert found["calm"]["mode_proportion_calm"] == pytest.approx(1, abs=1e-6)
-    assert found["calm"]["mode_proportions_tv"] == pytest.approx(0.3, abs=0.06)
-    assert found["calm"]["recall"] < 0.8 < found["calm"]["precision"]
-    assert found["calm"]["swd_ratio"] > 2
-    assert found["calm"]["mmd"] > 0.01
+    assert rough["off_manifold_ratio"] == pytest.approx(5, rel=0.1)
+    assert rough["log_density_gap"] < -50
+    assert rough["c2st"] > 0.7
+    assert calm["mode_proportion_calm"] == pytest.approx(1, abs=1e-6)
+    assert calm["mode_proportions_tv"] == pytest.approx(0.3, abs=0.06)
+    assert calm["recall"] < 0.8 < calm["precision"]
+    assert calm["swd_ratio"] > 2
+    assert calm["mmd"] > 0.01
 
 
 def test_the_off_manifold_ratio_is_relative_to_exact_draws(occluded, prior):
@@ -114,9 +108,8 @@ def test_the_off_manifold_ratio_is_relative_to_exact_draws(occluded, prior):
 def test_stein_discrepancy_of_stored_theta(occluded, prior):
     exact = occluded.reference(4, 60)
     theta = np.random.default_rng(5).normal(size=(1, 60, prior.dim))
-    score = score_of(occluded.posterior, theta[0])
-    found = measured(occluded, exact, theta=theta)["ksd"]
-    assert found == pytest.approx(kernel_stein_discrepancy(theta[0], score))
+    expected = kernel_stein_discrepancy(theta[0], score_of(occluded.posterior, theta[0]))
+    assert measured(occluded, exact, theta=theta)["ksd"] == pytest.approx(expected)
     # Undefined for a chain that rarely moves, unlike other metrics.
     theta[0, :54] = 0
     stuck = measured(occluded, exact, theta=theta)
@@ -126,22 +119,20 @@ def test_stein_discrepancy_of_stored_theta(occluded, prior):
 
 
 def test_image_errors_against_the_projected_truth(occluded):
-    truth = occluded.truth
+    truth, posterior = occluded.truth, occluded.posterior
     far = truth.copy()
-    far[:, ::2] += 10.0  # every other joint is outside the image
-    n_far = len(range(0, truth.shape[1], 2)) / truth.shape[1]
-    motions = {"right": truth, "still": np.repeat(truth[:1], L, axis=0), "far": far}
-    found = {name: measured(occluded, np.stack([m] * 9)) for name, m in motions.items()}
-    assert (found["right"]["pck"], found["right"]["velocity_error"]) == (100, 0)
-    assert found["far"]["pck"] == pytest.approx(100 * (1 - n_far))
-    assert found["still"]["velocity_error"] == pytest.approx(1)
-    assert found["far"]["velocity_error"] == pytest.approx(0, abs=1e-9)
+    far[:, ::2] += 10.0  # three of five joints are outside the image
+    still = np.repeat(truth[:1], L, axis=0)
+    right, still, far = (measured(occluded, np.stack([m] * 9)) for m in (truth, still, far))
+    assert (right["pck"], right["velocity_error"]) == (100, 0)
+    assert far["pck"] == pytest.approx(40)
+    assert still["velocity_error"] == pytest.approx(1)
+    assert far["velocity_error"] == pytest.approx(0, abs=1e-9)
     # Undefined behind a camera.
-    posterior = occluded.posterior
     camera = Cameras.ring(1, distance=5.0, perspective=True)
     motion = Motion(truth, posterior.skeleton, posterior.fps)
-    seen = Keypoints2D.observe(motion, camera, noise=0.05, seed=0)
-    problem = Problem("near", "near", MotionPosterior(posterior.prior, seen), truth)
+    keypoints = Keypoints2D.observe(motion, camera, noise=0.05, seed=0)
+    problem = Problem("close", "", MotionPosterior(posterior.prior, keypoints), truth)
     behind = measured(problem, np.stack([truth, truth + 20.0, truth - 20.0] * 3))
     assert math.isnan(behind["pck"])
     assert math.isnan(behind["velocity_error"])
@@ -150,18 +141,19 @@ def test_image_errors_against_the_projected_truth(occluded):
 @pytest.mark.parametrize(("n_joints", "frames"), [(1, 1), (5, 1), (1, 4)])
 def test_the_smallest_motions(n_joints, frames):
     problem = observed(mixture(frames, n_joints, ("calm",), [1.0]), "monocular")
-    found = measured(problem, problem.reference(0, 20))
-    assert ("pck" in found) == (n_joints * frames > 1)
-    assert ("velocity_error" in found) == (frames > 1)
-    assert math.isfinite(found["swd_ratio"] + found["g_mpjpe_mm"])
+    result = measured(problem, problem.reference(0, 20))
+    assert ("pck" in result) == (n_joints * frames > 1)
+    assert ("velocity_error" in result) == (frames > 1)
+    assert math.isfinite(result["swd_ratio"] + result["g_mpjpe_mm"])
 
 
 def test_samplers_share_the_exact_draws_of_a_seed(generation):
-    assert _exact_draws(generation, 4, 50) is _exact_draws(generation, 4, 50)
     positions = generation.reference(1, 50)
-    found = measured(generation, positions, 4)
-    assert measured(generation, positions, 4) == found
-    assert measured(generation, positions, 5)["swd_ratio"] != found["swd_ratio"]
+    result = measured(generation, positions, 4)
+    exact = _exact_draws(generation, 4, 50)
+    assert measured(generation, positions, 4) == result
+    assert _exact_draws(generation, 4, 50) is exact
+    assert measured(generation, positions, 5)["swd_ratio"] != result["swd_ratio"]
 
 
 def test_alignment_before_comparison(generation, prior):
@@ -172,13 +164,13 @@ def test_alignment_before_comparison(generation, prior):
     shifts = 10 * rng.normal(size=(N, 1, 1, 3))
     right = generation.reference(100, N)
     wrong = prior.means[0] + 1.5 * (right - prior.means[0])
-    found = measured(aligned, right @ turns + shifts)
-    assert found["swd_ratio"] == pytest.approx(1, abs=0.4)
-    assert found["variance_ratio"] == pytest.approx(1, abs=0.2)
-    assert found["c2st"] == pytest.approx(0.5, abs=0.1)
-    found = measured(aligned, wrong @ turns + shifts)
-    assert found["swd_ratio"] > 2
-    assert found["variance_ratio"] > 1.5
+    result = measured(aligned, right @ turns + shifts)
+    assert result["swd_ratio"] == pytest.approx(1, abs=0.4)
+    assert result["variance_ratio"] == pytest.approx(1, abs=0.2)
+    assert result["c2st"] == pytest.approx(0.5, abs=0.1)
+    result = measured(aligned, wrong @ turns + shifts)
+    assert result["swd_ratio"] > 2
+    assert result["variance_ratio"] > 1.5
     assert measured(generation, right @ turns + shifts)["swd_ratio"] > 5
     with pytest.raises(ValueError, match="aligned_to must have shape"):
         replace(generation, aligned_to=prior.means)
@@ -192,14 +184,20 @@ def test_only_applicable_metrics_are_returned(generation, occluded, prior):
             return theta.reshape(*theta.shape[:-1], L, J, 3)
 
     exact = occluded.reference(0, 20)
-    found = measured(occluded, exact)
-    assert {"mpjpe_mm", "mpjpe_visible_mm", "mpjpe_occluded_mm", "pa_mpjpe_mm"} < set(found)
-    assert found["mpjpe_occluded_mm"] > found["mpjpe_visible_mm"]
-    assert (found["seconds"], found["denoiser_evaluations"]) == (1.5, 10)
+    result = measured(occluded, exact)
+    assert {"mpjpe_mm", "mpjpe_visible_mm", "mpjpe_occluded_mm", "pa_mpjpe_mm"} < set(result)
+    assert result["mpjpe_occluded_mm"] > result["mpjpe_visible_mm"]
+    assert (result["seconds"], result["denoiser_evaluations"]) == (1.5, 10)
     assert not any(name.endswith("_mm") for name in measured(generation, exact))
     plain = measured(Problem("plain", "", MotionPosterior(Plain()), occluded.truth), exact)
     assert "mpjpe_mm" in plain
     assert not {"swd_ratio", "off_manifold_ratio", "mode_proportion_calm"} & set(plain)
+
+
+def check(errors, **expected):
+    """Compare errors, named without ``_mm``, with their expected values in millimetres."""
+    found = {name: errors[f"{name}_mm"] for name in expected}
+    assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_errors_by_hand(occluded):
@@ -212,46 +210,35 @@ def test_errors_by_hand(occluded):
     wrong = truth.copy()
     wrong[:, 1:, 0] += 0.03
     wrong[hidden, 0] += 0.03
-    found = accuracy_of(np.stack([truth, wrong]) + np.array([0, 0, 1.0]), truth, posterior)
+    errors = accuracy_of(np.stack([truth, wrong]) + np.array([0, 0, 1.0]), truth, posterior)
     away = 30.0 * (L * (J - 1) + n_hidden) / (L * J)
-    assert found["mpjpe_mm"] == pytest.approx(away / 2)
-    assert found["mpjpe_mean_mm"] == pytest.approx(away / 2)
-    assert found["mpjpe_best_mm"] == pytest.approx(0, abs=1e-9)
-    assert found["mpjpe_occluded_mm"] == pytest.approx(30)
     visible = 30.0 * (L * (J - 1) - n_hidden) / (~hidden).sum()
-    assert found["mpjpe_visible_mm"] == pytest.approx(visible / 2)
-    assert found["g_mpjpe_mm"] > 1000
-    assert found["pa_mpjpe_mm"] < away / 2
+    check(errors, mpjpe=away / 2, mpjpe_mean=away / 2, mpjpe_best=0)
+    check(errors, mpjpe_occluded=30, mpjpe_visible=visible / 2)
+    assert errors["g_mpjpe_mm"] > 1000
+    assert errors["pa_mpjpe_mm"] < away / 2
     # Two draws 10 cm to either side, with occluded joints 40 cm lower.
-    draws = np.stack([truth, truth])
-    draws[0, ..., 0] += 0.1
-    draws[1, ..., 0] -= 0.1
+    draws = truth + np.array([0.1, -0.1])[:, None, None, None] * [1.0, 0, 0]
     draws[:, hidden, 1] -= 0.4
-    found = accuracy_of(draws, truth, posterior)
-    below = 1000 * np.hypot(0.1, 0.4)
-    total = (100 * (L * J - n_hidden) + below * n_hidden) / (L * J)
-    assert found["g_mpjpe_visible_mm"] == pytest.approx(100)
-    assert found["g_mpjpe_occluded_mm"] == pytest.approx(below)
-    assert found["g_mpjpe_mm"] == pytest.approx(total)
-    assert found["g_mpjpe_mean_visible_mm"] == pytest.approx(0, abs=1e-9)
-    assert found["g_mpjpe_mean_occluded_mm"] == pytest.approx(400)
-    assert found["g_mpjpe_mean_mm"] == pytest.approx(400 * n_hidden / (L * J))
+    errors = accuracy_of(draws, truth, posterior)
+    below, portion = 1000 * np.hypot(0.1, 0.4), n_hidden / (L * J)
+    check(errors, g_mpjpe=100 * (1 - portion) + below * portion)
+    check(errors, g_mpjpe_visible=100, g_mpjpe_occluded=below)
+    check(errors, g_mpjpe_mean=400 * portion)
+    check(errors, g_mpjpe_mean_visible=0, g_mpjpe_mean_occluded=400)
 
 
-def test_accelerations(prior, occluded):
+def test_accelerations_and_joints_that_any_camera_observes(prior, occluded):
     truth, posterior = occluded.truth, MotionPosterior(prior)
     middle = truth.mean(axis=0)
     scaled = np.stack([middle + 2 * (truth - middle), middle + 0.5 * (truth - middle)])
     assert accuracy_of(scaled, truth, posterior)["acceleration_ratio"] == pytest.approx(1.25)
-    found = accuracy_of(truth[None], np.zeros_like(truth), posterior)
-    assert "acceleration_error" in found
-    assert "acceleration_ratio" not in found
-
-
-def test_joints_are_visible_if_any_camera_observes_them(prior, occluded):
-    truth = Motion(occluded.truth, prior.skeleton, 30.0)
+    errors = accuracy_of(truth[None], np.zeros_like(truth), posterior)
+    assert "acceleration_error" in errors
+    assert "acceleration_ratio" not in errors
     hidden = np.zeros((2, L, J), dtype=bool)
     hidden[0, 0, 1] = hidden[1, 0, 2] = True
-    likelihood = Keypoints2D.observe(truth, Cameras.ring(2), 0.05, 0, hidden=hidden)
-    found = accuracy_of(occluded.truth[None], occluded.truth, MotionPosterior(prior, likelihood))
-    assert "mpjpe_occluded_mm" not in found
+    motion = Motion(truth, prior.skeleton, 30.0)
+    likelihood = Keypoints2D.observe(motion, Cameras.ring(2), 0.05, 0, hidden=hidden)
+    errors = accuracy_of(truth[None], truth, MotionPosterior(prior, likelihood))
+    assert "mpjpe_occluded_mm" not in errors

@@ -15,11 +15,6 @@ from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score
 from probmotion.posteriors.protocols import NotConjugate
 
 
-def within(values, expected):
-    """Whether the mean is within four standard errors."""
-    return abs(np.mean(values) - expected) < 4 * np.std(values, ddof=1) / math.sqrt(len(values))
-
-
 def test_agreement_with_derivatives_by_torch(rng):
     theta, score = rng.normal(size=(2, 6, 3))
     scale = 1.7
@@ -35,8 +30,8 @@ def test_agreement_with_derivatives_by_torch(rng):
         trace = sum(torch.autograd.grad(by_b[k], a, retain_graph=True)[0][k] for k in range(3))
         total += ((s @ t) * kernel(a, b) + s @ by_b + t @ by_a + trace).item()
     expected = total / 30 * scale**2
-    found = kernel_stein_discrepancy(theta, score, length_scale=scale)
-    assert found == pytest.approx(expected, rel=1e-10)
+    result = kernel_stein_discrepancy(theta, score, length_scale=scale)
+    assert result == pytest.approx(expected, rel=1e-10)
 
 
 def double_integral(mean, spread, length_scale):
@@ -56,8 +51,9 @@ def test_agreement_with_quadrature(rng, mean, spread):
     expected = double_integral(mean, spread, 1.2)
     for n in (2, 20):
         draws = mean + spread * rng.normal(size=(400 // n + 100, n, 1))
-        found = [kernel_stein_discrepancy(theta, -theta, length_scale=1.2) for theta in draws]
-        assert within(found, expected)
+        values = [kernel_stein_discrepancy(theta, -theta, length_scale=1.2) for theta in draws]
+        deviation = np.std(values, ddof=1) / math.sqrt(len(values))
+        assert abs(np.mean(values) - expected) < 4 * deviation
     assert (mean, spread) == (0, 1) or expected > 0.01
 
 
@@ -65,15 +61,8 @@ def test_invariance_to_units_and_axes(rng):
     theta, score = rng.normal(size=(2, 30, 4))
     turned = np.linalg.qr(rng.normal(size=(4, 4)))[0]
     expected = kernel_stein_discrepancy(theta, score)
-    found = kernel_stein_discrepancy(1000 * theta @ turned + 7, score @ turned / 1000)
-    assert found == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_missing_distant_mode_is_not_detected(rng):
-    # A documented limitation: the score of .5 N(m, I) + .5 N(−m, I), to 1e-200.
-    middle = np.array([20.0, 0.0])
-    theta = rng.normal(size=(400, 2)) + middle
-    assert abs(kernel_stein_discrepancy(theta, middle - theta)) < 0.02
+    result = kernel_stein_discrepancy(1000 * theta @ turned + 7, score @ turned / 1000)
+    assert result == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +89,7 @@ class Bent:
 
     library: str = "any"
 
-    skeleton = SKELETON
-    frames = 2
-    fps = 10.0
-    dim = 12
+    skeleton, frames, fps, dim = SKELETON, 2, 10.0, 12
 
     def motion(self, theta):
         return theta.reshape((*theta.shape[:-1], 2, 2, 3))
@@ -131,27 +117,18 @@ def finite_differences(posterior, theta, step=1e-5):
     return np.stack(columns, axis=-1)
 
 
-def seen(rng):
-    return pm.Joints3D(rng.normal(size=(2, 2, 3)), 0.5, skeleton=SKELETON)
-
-
 @pytest.mark.parametrize("library", ["any", "torch", "jax"])
 def test_scores_agree_with_finite_differences(rng, library):
-    theta = rng.normal(size=(5, 12))
-    posterior = pm.MotionPosterior(Bent(library), None if library == "jax" else seen(rng))
+    theta = rng.normal(size=(300, 12))
+    joints = pm.Joints3D(rng.normal(size=(2, 2, 3)), 0.5, skeleton=SKELETON)
+    posterior = pm.MotionPosterior(Bent(library), None if library == "jax" else joints)
     score = score_of(posterior, theta)
     assert score.dtype == np.float64
     expected = finite_differences(posterior, theta)
-    np.testing.assert_allclose(score, expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(score, expected, rtol=1e-6, atol=1e-5)
 
 
-def test_batches_of_the_score(rng):
-    theta = rng.normal(size=(300, 12))
-    posterior = pm.MotionPosterior(Bent())
-    np.testing.assert_allclose(score_of(posterior, theta)[290:], score_of(posterior, theta[290:]))
-
-
-def test_missing_gradients():
+def test_missing_and_infinite_gradients():
     class Stepped(Bent):
         differentiable = False
 
@@ -163,24 +140,19 @@ def test_missing_gradients():
         skeleton, frames, fps, dim = SKELETON, 2, 10.0, 12
         motion = Bent.motion
 
-    for prior, message in (
-        (Bent("numpy"), "Bent with no likelihood is not differentiable, torch met"),
-        (Stepped(), "posterior has no score: Stepped has no gradient"),
-        (Unclosed(), "posterior has no score: noise is Student's"),
-        (Mute(), "posterior has no score: Mute has no log density"),
-    ):
-        with pytest.raises(NoGradient, match=message):
-            score_of(pm.MotionPosterior(prior), np.ones((3, 12)))
-
-
-def test_scores_must_be_finite():
     class Cornered(Bent):
         def log_density(self, theta):
             return (theta**2).sum(-1) ** 0.5
 
-    theta = np.ones((3, 12))
-    theta[1] = 0
-    with pytest.raises(ValueError, match="score must be finite, got 12 values"):
-        score_of(pm.MotionPosterior(Cornered()), theta)
-    with pytest.raises(ValueError, match=r"theta must have shape \(n, 12\), got \(3, 5\)"):
-        score_of(pm.MotionPosterior(Bent()), theta[:, :5])
+    zero = np.zeros((3, 12))
+    for prior, theta, error, message in (
+        (Bent("numpy"), zero, NoGradient, "Bent with no likelihood is not differentiable, torch m"),
+        (Stepped(), zero, NoGradient, "posterior has no score: Stepped has no gradient"),
+        (Unclosed(), zero, NoGradient, "posterior has no score: noise is Student's"),
+        (Mute(), zero, NoGradient, "posterior has no score: Mute has no log density"),
+        (Cornered(), zero, ValueError, "score must be finite, got 36 values"),
+        (Bent(), zero[:, :5], ValueError, r"theta must have shape \(n, 12\), got \(3, 5\)"),
+    ):
+        with pytest.raises(ValueError, match=message) as raised:
+            score_of(pm.MotionPosterior(prior), theta)
+        assert raised.type is error

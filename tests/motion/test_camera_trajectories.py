@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import check_grad
 
 from probmotion import Cameras, Skeleton
-from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.geometry.rotations import geodesic_angle, vector_to_matrix
 from probmotion.motion import camera_trajectories
-from probmotion.motion.camera_trajectories import _Objective, fit_trajectory, geman_mcclure
+from probmotion.motion.camera_trajectories import _Objective, fit_trajectory
 from probmotion.motion.motion import KeypointTrack
 
 L, J, FOCAL = 40, 9, 1000.0
@@ -34,7 +34,7 @@ def camera():
 
 @pytest.fixture(scope="module")
 def truth():
-    """Body half a metre wide that walks an arc of 3 m and waves, world metres, (L, J, 3)."""
+    """Positions of a body that walks an arc of 3 m and waves, metres, (L, J, 3)."""
     rng = np.random.default_rng(1)
     time = np.linspace(0, 1, L)[:, None, None]
     body = rng.uniform(-0.5, 0.5, size=(J, 3)) * [0.6, 1.6, 0.6]
@@ -50,89 +50,70 @@ def local_of(truth, camera):
     return seen - seen[:, :1]
 
 
-def turned(local, vectors):
-    return np.einsum("lab,ljb->lja", vector_to_matrix(vectors), local)
+def mean_error(result, truth):
+    """Mean distance, metres."""
+    return np.linalg.norm(result.positions - truth, axis=-1).mean()
 
 
 def track_of(keypoints, confidence=None):
-    shown = np.ones(keypoints.shape[:2]) if confidence is None else confidence
-    return KeypointTrack(keypoints, shown, SKELETON, 30.0)
-
-
-def error_of(found, truth):
-    """Mean distance, metres."""
-    return np.linalg.norm(found.positions - truth, axis=-1).mean()
+    confidence = np.ones(keypoints.shape[:2]) if confidence is None else confidence
+    return KeypointTrack(keypoints, confidence, SKELETON, 30.0)
 
 
 def test_exact_detections_recover_the_trajectory(truth, camera):
     local = local_of(truth, camera)
     track = track_of(camera.project(truth)[0])
-    found = fit_trajectory(local, track, camera, smoothness_weight=0.01)
-    assert found.converged
-    assert np.abs(found.positions - truth).max() < 1e-3
+    exact = fit_trajectory(local, track, camera, smoothness_weight=0.01)
+    assert exact.converged
+    assert np.abs(exact.positions - truth).max() < 1e-3
     origin = truth[:, 0] @ camera.rotation[0].T + camera.translation[0]
-    np.testing.assert_allclose(found.translations, origin, atol=1e-3)
-    np.testing.assert_allclose(found.orientations, 0, atol=1e-3)
+    np.testing.assert_allclose(exact.translations, origin, atol=1e-3)
+    np.testing.assert_allclose(exact.orientations, 0, atol=1e-3)
     # Smoothing affects mainly the ends.
     default = fit_trajectory(local, track, camera)
-    assert error_of(default, truth) < 0.02
+    assert mean_error(default, truth) < 0.02
     assert np.abs(default.positions - truth)[8:-8].max() < 0.02
-
-
-def test_defaults_scale_with_the_image_unit(truth, camera):
+    # The defaults scale with the image unit.
     unit = Cameras(
         camera.rotation, camera.translation, np.ones(1), camera.centre / FOCAL, orthographic=False
     )
-    local = local_of(truth, camera)
-    pixels = fit_trajectory(local, track_of(camera.project(truth)[0]), camera)
     slopes = fit_trajectory(local, track_of(unit.project(truth)[0]), unit)
-    np.testing.assert_allclose(slopes.positions, pixels.positions, atol=1e-6)
-    assert slopes.cost == pytest.approx(pixels.cost / FOCAL**2, rel=1e-6)
+    np.testing.assert_allclose(slopes.positions, default.positions, atol=1e-6)
+    assert slopes.cost == pytest.approx(default.cost / FOCAL**2, rel=1e-6)
+    assert not fit_trajectory(local, track, camera, max_iterations=1).converged
 
 
 def outliers(keypoints, rng, fraction):
     """Move a fraction of the detections by up to 500 pixels to one side of the image."""
-    wild = rng.random(keypoints.shape[:2]) < fraction
+    chosen = rng.random(keypoints.shape[:2]) < fraction
     moved = keypoints.copy()
-    moved[wild] += rng.uniform(100, 500, size=(wild.sum(), 2))
+    moved[chosen] += rng.uniform(100, 500, size=(chosen.sum(), 2))
     return moved
 
 
-def test_outliers_affect_the_quadratic_loss_only(truth, camera, rng):
-    local = local_of(truth, camera)
-    keypoints = camera.project(truth)[0] + 2 * rng.normal(size=(L, J, 2))
-    track = track_of(outliers(keypoints, rng, 0.3))
-    robust = fit_trajectory(local, track, camera, scale=15.0)
-    # For a scale far beyond every error, ρ(e) = e².
-    quadratic = fit_trajectory(local, track, camera, scale=1e6)
-    assert error_of(robust, truth) < 0.04
-    assert error_of(quadratic, truth) > 0.5
-
-
 def test_scale_schedule_avoids_local_minima(truth, camera, rng, monkeypatch):
-    local = turned(local_of(truth, camera), 0.3 * rng.normal(size=(L, 3)))
+    turns = vector_to_matrix(0.3 * rng.normal(size=(L, 3)))
+    local = np.einsum("lab,ljb->lja", turns, local_of(truth, camera))
     track = track_of(outliers(camera.project(truth)[0], rng, 0.3))
-    found = fit_trajectory(local, track, camera, scale=15.0)
+    scheduled = fit_trajectory(local, track, camera, scale=15.0)
     monkeypatch.setattr(camera_trajectories, "_SCHEDULE", (1.0,))
-    at_once = fit_trajectory(local, track, camera, scale=15.0)
-    assert error_of(found, truth) < 0.05
-    assert found.cost < at_once.cost
-    assert error_of(at_once, truth) > 0.5
+    direct = fit_trajectory(local, track, camera, scale=15.0)
+    assert mean_error(scheduled, truth) < 0.05
+    assert scheduled.cost < direct.cost
+    assert mean_error(direct, truth) > 0.5
 
 
 def test_orientations_are_corrected(truth, camera, rng):
     local = local_of(truth, camera)
-    turns = 0.25 * rng.normal(size=(L, 3))
-    noisy = turned(local, turns)
+    turns = vector_to_matrix(0.25 * rng.normal(size=(L, 3)))
+    noisy = np.einsum("lab,ljb->lja", turns, local)
     keypoints = camera.project(truth)[0] + 2 * rng.normal(size=(L, J, 2))
-    found = fit_trajectory(noisy, track_of(keypoints), camera)
+    result = fit_trajectory(noisy, track_of(keypoints), camera)
     before = np.linalg.norm(noisy - local, axis=-1).mean()
-    after = found.positions - found.positions[:, :1] - (truth - truth[:, :1])
-    assert before > 0.1
+    after = result.positions - result.positions[:, :1] - (truth - truth[:, :1])
     assert np.linalg.norm(after, axis=-1).mean() < before / 4
-    left = vector_to_matrix(found.orientations) @ vector_to_matrix(turns)
-    angles = np.arccos(np.clip((np.trace(left, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    assert np.median(angles) < 0.1 < np.median(np.linalg.norm(turns, axis=-1))
+    remaining = geodesic_angle(vector_to_matrix(result.orientations), np.swapaxes(turns, -1, -2))
+    assert np.median(remaining) < 0.1
 
 
 @pytest.mark.parametrize("missing", [slice(15, 25), slice(0, 6), slice(34, L)])
@@ -141,12 +122,14 @@ def test_missing_frames_are_interpolated_smoothly(truth, camera, missing):
     confidence[missing] = 0
     keypoints = camera.project(truth)[0]
     keypoints[missing] = np.nan
-    found = fit_trajectory(local_of(truth, camera), track_of(keypoints, confidence), camera)
-    apart = np.linalg.norm(found.positions - truth, axis=-1).mean(axis=1)
+    result = fit_trajectory(local_of(truth, camera), track_of(keypoints, confidence), camera)
     if missing == slice(15, 25):
-        assert apart[missing].max() < 0.06
-    steps = np.linalg.norm(np.diff(found.positions.mean(axis=1), axis=0), axis=-1)
-    true_steps = np.linalg.norm(np.diff(truth.mean(axis=1), axis=0), axis=-1)
+        errors = np.linalg.norm(result.positions - truth, axis=-1).mean(axis=1)
+        assert errors[missing].max() < 0.06
+    steps, true_steps = (
+        np.linalg.norm(np.diff(positions.mean(axis=1), axis=0), axis=-1)
+        for positions in (result.positions, truth)
+    )
     assert steps.max() < 1.5 * true_steps.max()
     # Without detections at the ends, the smoothest motion is static there.
     if missing.start == 0:
@@ -157,26 +140,15 @@ def test_detections_of_confidence_zero_are_ignored(truth, camera):
     keypoints = camera.project(truth)[0]
     confidence = np.ones((L, J))
     confidence[::3, 2] = confidence[:, 5] = 0
-    wild = keypoints + np.where(confidence[..., None] > 0, 0, 1e5)
-    absent = np.where(confidence[..., None] > 0, keypoints, np.nan)
-    local = local_of(truth, camera)
-    first, second = (fit_trajectory(local, track_of(y, confidence), camera) for y in (wild, absent))
-    np.testing.assert_array_equal(first.positions, second.positions)
-    assert error_of(first, truth) < 0.02
-
-
-def test_larger_smoothness_weight_gives_smoother_motion(truth, camera, rng):
-    track = track_of(camera.project(truth)[0] + 3 * rng.normal(size=(L, J, 2)))
-    rough, smooth = (
-        np.diff(
-            fit_trajectory(
-                local_of(truth, camera), track, camera, smoothness_weight=weight
-            ).positions,
-            axis=0,
+    seen = confidence[..., None] > 0
+    first, second = (
+        fit_trajectory(
+            local_of(truth, camera), track_of(np.where(seen, keypoints, other), confidence), camera
         )
-        for weight in (500.0, 5e4)
+        for other in (1e5, np.nan)
     )
-    assert (smooth**2).sum() < (rough**2).sum()
+    np.testing.assert_array_equal(first.positions, second.positions)
+    assert mean_error(first, truth) < 0.02
 
 
 def test_cost_is_equation_12(truth, camera, rng):
@@ -185,14 +157,15 @@ def test_cost_is_equation_12(truth, camera, rng):
     confidence = rng.uniform(0, 1, size=(L, J))
     y = camera.project(truth)[0] + 5 * rng.normal(size=(L, J, 2))
     track = track_of(y, confidence)
-    found = fit_trajectory(local, track, camera, scale=8.0, smoothness_weight=300.0)
-    points = turned(local, found.orientations) + found.translations[:, None]
+    result = fit_trajectory(local, track, camera, scale=8.0, smoothness_weight=300.0)
+    turns = vector_to_matrix(result.orientations)
+    points = np.einsum("lab,ljb->lja", turns, local) + result.translations[:, None]
     world = np.einsum("ba,ljb->lja", camera.rotation[0], points - camera.translation[0])
-    np.testing.assert_allclose(found.positions, world, atol=1e-12)
+    np.testing.assert_allclose(result.positions, world, atol=1e-12)
     error = np.linalg.norm(camera.project(world)[0] - y, axis=-1)
     robust = 8.0**2 * error**2 / (8.0**2 + error**2)
     smooth = (np.linalg.norm(points[1:] - points[:-1], axis=-1) ** 2).sum()
-    assert found.cost == pytest.approx((confidence * robust).sum() + 300 * smooth)
+    assert result.cost == pytest.approx((confidence * robust).sum() + 300 * smooth)
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 0.02, 0.05, 2.0])
@@ -206,32 +179,17 @@ def test_gradient_agrees_with_finite_differences(rng, size):
         smoothness_weight=40.0,
     )
     translations = np.array([0, 0, 3.0]) + 0.5 * rng.normal(size=(frames, 3))
-    translations[2, 2] = -0.5  # some joints behind the near plane
+    translations[2, 2] = -0.5  # some joints are behind the camera
     orientations = size * rng.normal(size=(frames, 3))
     assert (objective.points(translations, orientations)[..., 2] < 0.1).any()
     point = np.concatenate([translations, orientations], axis=1).ravel()
     for scale in (30.0, 1e6):
-        off = check_grad(
-            lambda x, c=scale: objective.cost_and_gradient(x, c)[0],
-            lambda x, c=scale: objective.cost_and_gradient(x, c)[1],
-            point,
-            epsilon=1e-7,
-        )
-        size_of = np.linalg.norm(objective.cost_and_gradient(point, scale)[1])
-        assert off < 2e-5 * size_of
 
+        def part(index, scale=scale):
+            return lambda x: objective.cost_and_gradient(x, scale)[index]
 
-def test_geman_mcclure_by_hand():
-    value, slope = geman_mcclure(np.array([0.0, 4.0, 9.0, 1e12]), 2.0)
-    np.testing.assert_allclose(value, [0, 2, 36 / 13, 4], rtol=1e-9)
-    np.testing.assert_allclose(slope, [1, 1 / 4, (4 / 13) ** 2, 0], atol=1e-9)
-
-
-def test_iteration_limit_is_reported(truth, camera, rng):
-    track = track_of(camera.project(truth)[0] + 5 * rng.normal(size=(L, J, 2)))
-    found = fit_trajectory(local_of(truth, camera), track, camera, max_iterations=3)
-    assert not found.converged
-    assert found.iterations == 12
+        error = check_grad(part(0), part(1), point, epsilon=1e-7)
+        assert error < 2e-5 * np.linalg.norm(part(1)(point))
 
 
 @pytest.mark.parametrize(
@@ -248,12 +206,9 @@ def test_iteration_limit_is_reported(truth, camera, rng):
     ],
 )
 def test_invalid_input_is_refused(truth, camera, change, message):
-    given = {"local": local_of(truth, camera), "track": track_of(camera.project(truth)[0])}
+    arguments = {"local": local_of(truth, camera), "track": track_of(camera.project(truth)[0])}
     with pytest.raises(ValueError, match=message):
-        fit_trajectory(**(given | {"camera": camera} | change))
-
-
-def test_point_reflected_detections_are_refused(truth, camera):
-    reflected = 2 * camera.centre[0] - camera.project(truth)[0]
+        fit_trajectory(**(arguments | {"camera": camera} | change))
+    reflected = track_of(2 * camera.centre[0] - camera.project(truth)[0])
     with pytest.raises(ValueError, match="track must determine a position in front of the camera"):
-        fit_trajectory(local_of(truth, camera), track_of(reflected), camera)
+        fit_trajectory(arguments["local"], reflected, camera)

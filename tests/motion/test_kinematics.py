@@ -9,6 +9,10 @@ from probmotion.motion.kinematics import fit_rotations, forward_kinematics
 
 # Two trees with some parents after their children.
 TANGLED = Skeleton(["c", "b", "a", "e", "d", "f"], [1, 2, -1, 4, -1, 2])
+SKELETONS = pytest.mark.parametrize(
+    "skeleton", [TANGLED, Skeleton.preset("pair17")], ids=["tangled", "pair"]
+)
+CHAIN = Skeleton(["a", "b", "c"], [-1, 0, 1])
 
 
 def random_pose(skeleton, batch, seed):
@@ -34,28 +38,22 @@ def by_matrix_products(skeleton, rotations, translations, offsets):
     return positions
 
 
-@pytest.mark.parametrize("skeleton", [TANGLED, Skeleton.preset("pair17")], ids=["tangled", "pair"])
+@SKELETONS
 def test_positions_agree_with_matrix_products(library, skeleton):
     pose = random_pose(skeleton, (2, 3), seed=1)
-    arrays = [library.array(part) for part in pose]
     run = library.compiled(lambda *parts: forward_kinematics(skeleton, *parts))
-    positions, turns = run(*arrays)
-    wanted = [
+    positions, turns = run(*(library.array(part) for part in pose))
+    expected = [
         [by_matrix_products(skeleton, pose[0][b, f], pose[1][b, f], pose[2]) for f in range(3)]
         for b in range(2)
     ]
-    library.assert_close(positions, np.array(wanted))
-    np.testing.assert_allclose(
-        np.asarray(turns)[:, :, skeleton.roots[0]],
-        pose[0][:, :, skeleton.roots[0]],
-        atol=library.tolerance,
-    )
-    joint, parent = skeleton.bones[0]
-    np.testing.assert_allclose(
-        np.asarray(turns)[:, :, joint],
-        np.asarray(turns)[:, :, parent] @ pose[0][:, :, joint],
-        atol=library.tolerance,
-    )
+    library.assert_close(positions, np.array(expected))
+    local, turns = pose[0], np.asarray(turns)
+    root, (joint, parent) = skeleton.roots[0], skeleton.bones[0]
+    tolerance = library.tolerance
+    np.testing.assert_allclose(turns[:, :, root], local[:, :, root], atol=tolerance)
+    product = turns[:, :, parent] @ local[:, :, joint]
+    np.testing.assert_allclose(turns[:, :, joint], product, atol=tolerance)
 
 
 def test_empty_batches_stay_empty():
@@ -63,20 +61,23 @@ def test_empty_batches_stay_empty():
     assert (positions.shape, turns.shape) == ((0, 4, 6, 3), (0, 4, 6, 3, 3))
 
 
-def test_invalid_input_is_refused():
-    rotations, translations, offsets = random_pose(TANGLED, (2,), seed=1)
-    with pytest.raises(ValueError, match=r"rotations must have shape \(…, L, 6, 3, 3\), got"):
-        forward_kinematics(TANGLED, rotations[:, :5], translations, offsets)
-    with pytest.raises(ValueError, match=r"root_translations must have shape \(…, L, 2, 3\), got"):
-        forward_kinematics(TANGLED, rotations, translations[:, :1], offsets)
-    with pytest.raises(ValueError, match=r"rest_offsets must have shape \(…, 6, 3\), got"):
-        forward_kinematics(TANGLED, rotations, translations, offsets[:5])
-    with pytest.raises(ValueError, match=r"positions must have shape \(L, 6, 3\), got"):
-        fit_rotations(TANGLED, np.zeros((2, 5, 3)))
-    with pytest.raises(ValueError, match="positions must contain at least one frame, got none"):
-        fit_rotations(TANGLED, np.zeros((0, 6, 3)))
-    with pytest.raises(ValueError, match="positions must be finite, got 18 values"):
-        fit_rotations(TANGLED, np.full((1, 6, 3), np.nan))
+ROTATIONS, TRANSLATIONS, OFFSETS = random_pose(TANGLED, (2,), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (forward_kinematics, (ROTATIONS[:, :5], TRANSLATIONS, OFFSETS), r"\(…, L, 6, 3, 3\), got"),
+        (forward_kinematics, (ROTATIONS, TRANSLATIONS[:, :1], OFFSETS), r"\(…, L, 2, 3\), got"),
+        (forward_kinematics, (ROTATIONS, TRANSLATIONS, OFFSETS[:5]), r"shape \(…, 6, 3\), got"),
+        (fit_rotations, (np.zeros((2, 5, 3)),), r"positions must have shape \(L, 6, 3\), got"),
+        (fit_rotations, (np.zeros((0, 6, 3)),), "positions must contain at least one frame"),
+        (fit_rotations, (np.full((1, 6, 3), np.nan),), "positions must be finite, got 18 values"),
+    ],
+)
+def test_invalid_input_is_refused(function, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        function(TANGLED, *arguments)
 
 
 def assert_rotations(rotations):
@@ -93,45 +94,27 @@ def errors_of(skeleton, positions):
     return np.linalg.norm(back - positions, axis=-1)
 
 
-@pytest.mark.parametrize("skeleton", [TANGLED, Skeleton.preset("pair17")], ids=["tangled", "pair"])
+@SKELETONS
 def test_rigid_motion_is_reconstructed_exactly(skeleton):
-    rotations, translations, offsets = random_pose(skeleton, (7,), seed=2)
-    positions, _ = forward_kinematics(skeleton, rotations, translations, offsets)
+    positions, _ = forward_kinematics(skeleton, *random_pose(skeleton, (7,), seed=2))
     assert errors_of(skeleton, positions).max() < 1e-9
-    fitted, rest = fit_rotations(skeleton, positions)
-    np.testing.assert_allclose(
-        np.linalg.norm(rest, axis=-1)[[j for j, _ in skeleton.bones]],
-        np.linalg.norm(offsets, axis=-1)[[j for j, _ in skeleton.bones]],
-        atol=1e-12,
-    )
     # The rest pose is the first frame.
-    np.testing.assert_allclose(fitted[0], np.tile(np.eye(3), (skeleton.n_joints, 1, 1)), atol=1e-9)
-
-
-def test_rotation_of_noncoplanar_children_is_recovered():
-    hub = Skeleton(["a", "b", "c", "d"], [-1, 0, 0, 0])
-    rotations, translations, offsets = random_pose(hub, (5,), seed=3)
-    rotations[0, 0] = np.eye(3)
-    positions, _ = forward_kinematics(hub, rotations, translations, offsets)
-    fitted, rest = fit_rotations(hub, positions)
-    np.testing.assert_allclose(rest[1:], offsets[1:], atol=1e-12)
-    np.testing.assert_allclose(fitted[:, 0], rotations[:, 0], atol=1e-9)
+    rotations, _ = fit_rotations(skeleton, positions)
+    np.testing.assert_allclose(rotations[0], [np.eye(3)] * skeleton.n_joints, atol=1e-9)
 
 
 def test_chains_are_fitted_without_twist():
-    chain = Skeleton(["a", "b", "c"], [-1, 0, 1])
     rng = np.random.default_rng(5)
     positions = np.cumsum(rng.standard_normal((9, 3, 3)), axis=1)
     positions[1, 1] = positions[0, 1]
     positions[1] = 2 * positions[1, :1] - positions[1]  # every bone reversed
     positions[2] = positions[0] + [[0, 0, 0], [1e-9, 0, 0], [0, 1e-9, 0]]
-    rotations, offsets = fit_rotations(chain, positions)
+    rotations, offsets = fit_rotations(CHAIN, positions)
     assert_rotations(rotations)
     # The axis of a minimal rotation is orthogonal to the bone.
-    axis = Rotation.from_matrix(rotations[:, 0]).as_rotvec()
-    np.testing.assert_allclose(axis @ offsets[1], 0, atol=1e-9)
-    axis = Rotation.from_matrix(rotations[:, 1]).as_rotvec()
-    np.testing.assert_allclose(axis @ offsets[2], 0, atol=1e-9)
+    for joint in (0, 1):
+        axis = Rotation.from_matrix(rotations[:, joint]).as_rotvec()
+        np.testing.assert_allclose(axis @ offsets[joint + 1], 0, atol=1e-9)
 
 
 def test_half_turns_are_fitted():
@@ -144,30 +127,17 @@ def test_half_turns_are_fitted():
 
 
 def test_zero_length_bones_follow_their_parents():
-    skeleton = Skeleton(["a", "b", "c"], [-1, 0, 1])
     positions = np.zeros((4, 3, 3))
-    positions[:, 2] = np.random.default_rng(6).standard_normal((4, 3))
-    positions[:, 2] /= np.linalg.norm(positions[:, 2], axis=-1, keepdims=True)
-    assert errors_of(skeleton, positions).max() < 1e-12
-    rotations, _ = fit_rotations(skeleton, positions)
-    np.testing.assert_array_equal(rotations[:, 0], np.tile(np.eye(3), (4, 1, 1)))
-    assert errors_of(skeleton, np.zeros((2, 3, 3))).max() == 0
+    positions[:, 2] = Rotation.random(4, rng=6).as_matrix()[:, 0]
+    assert errors_of(CHAIN, positions).max() < 1e-12
+    rotations, _ = fit_rotations(CHAIN, positions)
+    np.testing.assert_array_equal(rotations[:, 0], [np.eye(3)] * 4)
+    assert errors_of(CHAIN, np.zeros((2, 3, 3))).max() == 0
 
 
-def test_varying_bones_keep_direction_and_mean_length():
-    bone = Skeleton(["a", "b"], [-1, 0])
-    lengths = np.array([0.9, 1.0, 1.2])
-    directions = Rotation.random(3, rng=1).as_matrix()[:, 0]
-    positions = np.stack([np.zeros((3, 3)), lengths[:, None] * directions], axis=1)
-    np.testing.assert_allclose(
-        errors_of(bone, positions)[:, 1], np.abs(lengths - lengths.mean()), atol=1e-12
-    )
-
-
-def test_errors_do_not_accumulate_along_a_chain():
-    chain = Skeleton(["a", "b", "c"], [-1, 0, 1])
+def test_bones_have_their_mean_length_and_errors_do_not_accumulate():
     positions = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1.2, 0, 0], [1.2, 1, 0]]])
-    errors = errors_of(chain, positions)
+    errors = errors_of(CHAIN, positions)
     np.testing.assert_allclose(errors[:, 1], 0.1, atol=1e-12)
     np.testing.assert_allclose(errors[:, 2], np.sqrt(1 + 0.1**2) - 1, atol=1e-12)
 

@@ -40,8 +40,7 @@ def test_integer_ratios_preserve_duration_and_shared_frames(fps, other):
 def test_edge_cases_of_rate_and_length():
     motion = clip(7, 30)
     assert motion.resample(30) is motion
-    resampled = clip(1, 30).resample(50)
-    assert (resampled.frames, resampled.fps) == (1, 50.0)
+    assert clip(1, 30).resample(50).frames == 1
     for fps in (0, np.nan):
         with pytest.raises(ValueError, match="fps must be a finite number above 0, got"):
             motion.resample(fps)

@@ -6,6 +6,8 @@ import pytest
 from probmotion import Motion, Skeleton
 from probmotion.motion.retargeting import common_skeleton
 
+SMPL = Skeleton.preset("smpl22")
+
 
 def motion_of(skeleton, frames=4, seed=0):
     positions = np.random.default_rng(seed).standard_normal((frames, skeleton.n_joints, 3))
@@ -18,32 +20,37 @@ BVH = Skeleton(
 )
 
 
-def test_joints_are_matched_by_canonical_names():
-    motion = motion_of(BVH)
-    legs = Skeleton(["RAnkle", "RKnee", "RHip", "LHip", "prop"], [1, 2, -1, 2, -1])
-    moved = motion.retarget(legs)
-    np.testing.assert_array_equal(moved.positions, motion.positions[:, [6, 5, 4, 1, 7]])
-    assert moved.skeleton == legs
+@pytest.mark.parametrize(
+    ("source", "target", "matches"),
+    [
+        (
+            BVH,
+            Skeleton(["RAnkle", "RKnee", "RHip", "LHip", "prop"], [1, 2, -1, 2, -1]),
+            [6, 5, 4, 1, 7],
+        ),
+        # A name of the source takes precedence over an equal canonical name.
+        (
+            SMPL,
+            Skeleton(["pelvis", "spine1", "left_foot"], [-1, 0, 0]),
+            ["pelvis", "spine1", "left_foot"],
+        ),
+        # Human3.6M calls the ankle a foot.
+        (SMPL, Skeleton(["left_foot", "LKnee"], [1, -1]), ["left_ankle", "left_knee"]),
+        (
+            Skeleton.preset("pair17"),
+            Skeleton(["person1:RHip", "person0:RHip"], [-1, -1]),
+            ["person1:right_hip", "person0:right_hip"],
+        ),
+    ],
+    ids=["canonical names", "equal names", "foot", "two people"],
+)
+def test_joints_are_matched_by_name(source, target, matches):
+    motion = motion_of(source)
+    moved = motion.retarget(target)
+    joints = [source.index(joint) if isinstance(joint, str) else joint for joint in matches]
+    np.testing.assert_array_equal(moved.positions, motion.positions[:, joints])
+    assert moved.skeleton == target
     assert (moved.fps, moved.name) == (30.0, "clip")
-
-
-def test_own_names_take_precedence():
-    """The joints of a subset keep their names, although their canonical names differ."""
-    smpl = Skeleton.preset("smpl22")
-    motion = motion_of(smpl)
-    part = Skeleton(["pelvis", "spine1", "left_foot"], [-1, 0, 0])
-    assert part.canonical_names == ("pelvis", "spine", "left_ankle")
-    moved = motion.retarget(part)
-    wanted = [smpl.joint_names.index(name) for name in part.joint_names]
-    np.testing.assert_array_equal(moved.positions, motion.positions[:, wanted])
-
-
-def test_foot_of_h36m_is_an_ankle():
-    feet = Skeleton(["left_foot", "LKnee"], [1, -1])
-    moved = motion_of(Skeleton.preset("smpl22")).retarget(feet)
-    smpl = Skeleton.preset("smpl22")
-    ankle = motion_of(smpl).positions[:, smpl.index("left_ankle")]
-    np.testing.assert_array_equal(moved.positions[:, 0], ankle)
 
 
 def test_missing_and_ambiguous_joints_are_named():
@@ -67,34 +74,22 @@ def test_rotations_are_dropped():
     turns = np.tile(np.eye(3), (2, 2, 1, 1))
     motion = Motion(np.zeros((2, 2, 3)), skeleton, 30, rotations=turns, rest_offsets=np.eye(3)[:2])
     moved = motion.retarget(Skeleton(["neck", "hip"], [-1, 0]))
-    assert moved.rotations is None
-    assert moved.rest_offsets is None
-
-
-def test_joints_of_several_people_are_matched_by_person():
-    pair = Skeleton.preset("pair17")
-    motion = motion_of(pair)
-    second = Skeleton(["person1:RHip", "person0:RHip"], [-1, -1])
-    moved = motion.retarget(second)
-    wanted = [pair.index("person1:right_hip"), pair.index("person0:right_hip")]
-    np.testing.assert_array_equal(moved.positions, motion.positions[:, wanted])
+    assert moved.rotations is moved.rest_offsets is None
 
 
 def test_common_skeleton_has_the_joints_of_all():
     motions = [motion_of(Skeleton.preset(name)) for name in ("h36m17", "smpl22", "cmu31")]
     shared = common_skeleton([motion.skeleton for motion in motions])
     limbs = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-    wanted = {"pelvis", "spine", "neck", "head"} | {
-        f"{s}_{l}" for s in ("left", "right") for l in limbs
-    }
-    assert set(shared.joint_names) == wanted
+    paired = {f"{side}_{limb}" for side in ("left", "right") for limb in limbs}
+    assert set(shared.joint_names) == {"pelvis", "spine", "neck", "head"} | paired
     assert shared.parents[shared.index("left_knee")] == shared.index("left_hip")
     assert shared.parents[shared.index("head")] == shared.index("neck")  # bridging the nose
     assert len(shared.roots) == 1
     for motion in motions:
-        moved = motion.retarget(shared)
         knee = motion.positions[:, motion.skeleton.index("left_knee")]
-        np.testing.assert_array_equal(moved.positions[:, shared.index("left_knee")], knee)
+        moved = motion.retarget(shared).positions[:, shared.index("left_knee")]
+        np.testing.assert_array_equal(moved, knee)
 
 
 def test_skeletons_without_common_joints_are_refused():

@@ -55,41 +55,34 @@ def test_presets_are_symmetric_trees_of_their_size(preset):
     skeleton = Skeleton.preset(preset)
     order = skeleton.topological_order
     assert sorted(order) == list(range(skeleton.n_joints))
-    for joint, parent in skeleton.bones:
-        assert order.index(parent) < order.index(joint)
     # Mirrored joints have mirrored parents.
     mirror = dict(skeleton.mirrored_pairs) | {b: a for a, b in skeleton.mirrored_pairs}
     assert len(mirror) == 2 * len(skeleton.mirrored_pairs)
-    for joint, other in mirror.items():
-        parent = skeleton.parents[joint]
-        assert skeleton.parents[other] == mirror.get(parent, parent)
-    digits = "".join(c for c in preset.replace("body25b", "25").replace("36", "") if c.isdigit())
-    people = 2 if preset == "pair17" else 1
-    expected = 18 if preset == "gymnast-ball" else people * int(digits)
-    assert skeleton.n_joints == expected
+    for joint, parent in skeleton.bones:
+        assert order.index(parent) < order.index(joint)
+        if joint in mirror:
+            assert skeleton.parents[mirror[joint]] == mirror.get(parent, parent)
+    sizes = {"pair17": 34, "gymnast-ball": 18, "body25": 25, "body25b": 25}
+    assert skeleton.n_joints == sizes.get(preset, int(preset[-2:]) if preset[-1].isdigit() else 0)
 
 
 def test_canonical_names_of_presets():
-    sides = ("left", "right")
-    person = {"pelvis", "spine", "neck", "nose", "head"} | {
-        f"{side}_{part}"
-        for side in sides
-        for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-    }
-    assert set(Skeleton.preset("h36m17").canonical_names) == person
-    quadruped = {"nose", "neck", "tail"} | {
-        f"{side}_{part}"
-        for side in sides
-        for part in ("eye", "shoulder", "elbow", "front_paw", "hip", "knee", "back_paw")
-    }
-    assert set(Skeleton.preset("apt36k17").canonical_names) == quadruped
-    pair = Skeleton.preset("pair17")
-    assert len(pair.roots) == 2
-    mocap = person - {"nose"} | {"chest"}
-    assert {name.split(":")[1] for name in pair.canonical_names} == mocap
-    assert set(Skeleton.preset("person17").canonical_names) == mocap
+    def both(*parts):
+        return {f"{side}_{part}" for side in ("left", "right") for part in parts}
+
+    limbs = both("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+    legs = both("eye", "shoulder", "elbow", "front_paw", "hip", "knee", "back_paw")
+    mocap = {"pelvis", "spine", "chest", "neck", "head"} | limbs
+    for preset, names in (
+        ("h36m17", mocap - {"chest"} | {"nose"}),
+        ("apt36k17", {"nose", "neck", "tail"} | legs),
+        ("person17", mocap),
+        ("pair17", {f"person{p}:{name}" for p in (0, 1) for name in mocap}),
+    ):
+        assert set(Skeleton.preset(preset).canonical_names) == names
     assert Skeleton.preset("gymnast-ball").joint_names[-1] == "ball"
-    assert len(Skeleton.preset("gymnast-ball").roots) == 2
+    for preset in ("pair17", "gymnast-ball"):
+        assert len(Skeleton.preset(preset).roots) == 2
 
 
 def test_presets_agree_with_real_data(real_data):
@@ -98,9 +91,9 @@ def test_presets_agree_with_real_data(real_data):
         ("body25b", "pose2sim_multiview/S00_P00_T01_BalancingTrial_cam_01.npz"),
     ):
         archive = np.load(real_data / file)
-        found = Skeleton(archive["joint_names"].tolist(), archive["parents"].tolist())
-        assert found.canonical_names == Skeleton.preset(preset).canonical_names
-        assert found.parents == Skeleton.preset(preset).parents
+        real = Skeleton(archive["joint_names"].tolist(), archive["parents"].tolist())
+        assert real.canonical_names == Skeleton.preset(preset).canonical_names
+        assert real.parents == Skeleton.preset(preset).parents
 
 
 def test_subset_bridges_missing_joints():
@@ -113,7 +106,6 @@ def test_subset_bridges_missing_joints():
 
 
 def test_equality_and_hash_ignore_radii():
-    assert Skeleton.preset("coco17") == Skeleton.preset("coco17")
     assert len({Skeleton.preset("coco17"), Skeleton.preset("coco17")}) == 1
-    assert Skeleton(["a"], [-1], [0.1]) == Skeleton(["a"], [-1])
+    assert len({Skeleton(["a"], [-1], [0.1]), Skeleton(["a"], [-1])}) == 1
     assert Skeleton(["a", "b"], [-1, 0]) != Skeleton(["a", "b"], [-1, -1])

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import arviz_base
 import numpy as np
 import pytest
 import xarray as xr
@@ -56,13 +56,11 @@ def some_draws(**changes):
 
 
 def test_metadata():
-    draws = some_draws()
-    assert list(draws.positions["joint"].values) == list(CHAIN.joint_names)
+    draws = some_draws(independent=True)
+    assert draws.independent
     assert (draws.skeleton, draws.fps, draws.seconds) == (CHAIN, 25.0, 1.5)
     assert draws.counts == {"density": 2**40, "gradient": 0}
     assert draws.dataset.attrs["seed"] == SEED
-    assert not draws.independent
-    assert some_draws(independent=True).independent
     assert '"step": 2.0' in draws.dataset.attrs["settings"]
     assert '"numpy"' in draws.dataset.attrs["versions"]
     np.testing.assert_array_equal(draws.state["scale"], 0.25)
@@ -71,12 +69,11 @@ def test_metadata():
 def test_motions_are_the_draws_in_order():
     draws = some_draws()
     motion = draws.motion(draw=3, chain=1)
-    np.testing.assert_array_equal(motion.positions, draws.positions.values[1, 3])
     assert (motion.fps, motion.skeleton, motion.name) == (25.0, CHAIN, "walker-1-3")
-    motions = list(draws.motions())
-    assert len(motions) == CHAINS * DRAWS
-    for motion, positions in zip(motions, draws.flat(), strict=True):
-        np.testing.assert_array_equal(motion.positions, positions)
+    np.testing.assert_array_equal(motion.positions, draws.positions.values[1, 3])
+    motions = np.stack([motion.positions for motion in draws.motions()])
+    np.testing.assert_array_equal(motions, draws.flat())
+    np.testing.assert_array_equal(draws.playback(chain=1).positions, motions[5:].reshape(15, 2, 3))
 
 
 @pytest.mark.parametrize("full", [True, False])
@@ -92,19 +89,15 @@ def test_saved_draws_load_unchanged(tmp_path, full):
     for name in ("skeleton", "fps", "seconds", "counts", "independent"):
         assert getattr(loaded, name) == getattr(draws, name)
     assert loaded.skeleton.radii == CHAIN.radii
-    assert loaded.state.keys() == draws.state.keys()
     for name in ("seed", "settings", "versions", "sampler"):
         assert loaded.dataset.attrs[name] == draws.dataset.attrs[name]
-    # Loaded draws can be saved again.
     loaded.save(tmp_path / "again.nc")
-    again = MotionDraws.load(tmp_path / "again.nc").positions.values
-    np.testing.assert_array_equal(again, draws.positions.values)
+    np.testing.assert_array_equal(MotionDraws.load(tmp_path / "again.nc").flat(), draws.flat())
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_failed_saves_leave_the_folder_unchanged(tmp_path, monkeypatch, error):
-    draws = some_draws()
-    path = tmp_path / "draws.nc"
+    draws, path = some_draws(), tmp_path / "draws.nc"
     draws.save(path)
     before = path.read_bytes()
 
@@ -113,31 +106,19 @@ def test_failed_saves_leave_the_folder_unchanged(tmp_path, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", broken)
-    message = r"cannot write .*\.nc: No space left" if isinstance(error, OSError) else None
-    for target in (path, tmp_path / "new.nc"):
-        with pytest.raises(type(error), match=message):
-            draws.save(target)
+    with pytest.raises(type(error)):
+        draws.save(path)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["draws.nc"]
-
-
-def test_folders_that_cannot_be_written_are_named(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    closed = tmp_path / "closed"
-    closed.mkdir(mode=0o500)
-    for folder in ("missing", "file", *(["closed"] if os.geteuid() else [])):
-        with pytest.raises(OSError, match=rf"cannot write .*{folder}.draws\.nc"):
-            some_draws().save(tmp_path / folder / "draws.nc")
 
 
 def test_invalid_files_are_rejected(tmp_path):
     path = tmp_path / "other.nc"
     some_draws().save(path)
-    whole = path.read_bytes()
-    parts = [whole[:part] for part in (10, 100, len(whole) // 2, len(whole) - 1000)]
-    junk = [b"", b"not a file of numbers", b"CDF\x01", b"\x89HDF\r\n\x1a\n" + bytes(64)]
-    for content in (*parts, *junk):
-        path.write_bytes(content)
+    content = path.read_bytes()
+    parts = [content[:end] for end in (10, 100, len(content) // 2, len(content) - 1000)]
+    for damaged in (*parts, b"", b"not a file of numbers", b"\x89HDF\r\n\x1a\n" + bytes(64)):
+        path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"path must be a netCDF file of draws, got .*other"):
             MotionDraws.load(path)
     xr.Dataset({"x": ("n", [1.0])}).to_netcdf(path, engine="scipy")
@@ -156,12 +137,9 @@ def test_conversion_to_arviz():
     statistics = {"lp", "acceptance", "divergent", "step_size"}
     assert set(tree["sample_stats"].data_vars) == statistics
     np.testing.assert_array_equal(tree["sample_stats"]["lp"], draws.dataset["log_density"])
-    arviz_base = pytest.importorskip("arviz_base")
     theta = arviz_base.extract(tree, var_names=["theta"], combined=True)
     expected = draws.dataset["theta"].values.reshape(-1, DIM)
     np.testing.assert_array_equal(theta.transpose("sample", ...).values, expected)
-    inside = arviz_base.extract(tree, group="sample_stats", combined=False)
-    np.testing.assert_array_equal(inside["acceptance"], draws.dataset["acceptance"])
 
 
 BROKEN = np.zeros((CHAINS, DRAWS, FRAMES, 2, 3))
@@ -171,10 +149,7 @@ BROKEN[1, 2, 0, 0, 0] = np.nan
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"positions": np.zeros((CHAINS, DRAWS, FRAMES, 3, 3))},
-            r"positions must have shape \(chain, draw, 3, 2, 3\)",
-        ),
+        ({"positions": BROKEN[..., :2]}, r"positions must have shape \(chain, draw, 3, 2, 3\)"),
         ({"positions": BROKEN}, "positions must be finite, got 1 values"),
         ({"theta": np.zeros((CHAINS, DRAWS, 3))}, r"theta must have shape \(2, 5, 4\)"),
         ({"log_density": np.zeros((DRAWS, CHAINS))}, r"log_density must have shape \(2, 5\)"),

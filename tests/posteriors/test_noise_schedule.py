@@ -27,3 +27,17 @@ def test_strided_levels_are_a_subset():
     np.testing.assert_array_equal(fewer.alpha_bar, schedule.alpha_bar[fewer.times])
     with pytest.raises(ValueError, match="at most the schedule's 100, got 101"):
         schedule.strided(101)
+
+
+def test_cosine_schedule_follows_the_formula():
+    angle = (np.arange(51) / 50 + 0.008) / 1.008 * np.pi / 2
+    for power in (2, 4):
+        levels = NoiseSchedule.cosine(50, power=power).alpha_bar
+        np.testing.assert_allclose(levels[:-1], (np.cos(angle) / np.cos(angle[0]))[:-1] ** power)
+        assert levels[-1] == pytest.approx(levels[-2] / 1000)  # β ≤ 0.999
+
+
+@pytest.mark.parametrize("levels", [[1.0], [0.9, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.0]])
+def test_invalid_levels_are_refused(levels):
+    with pytest.raises(ValueError, match="decrease from 1 to a number above 0"):
+        NoiseSchedule(np.array(levels))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -43,49 +42,18 @@ def likelihood_of(joints, **options):
     return noisy_joints(joints, **given)
 
 
-@pytest.fixture
-def no_warnings():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
-
-
 def test_matching_recordings_are_unchanged():
     joints = walk()
-    confidence = np.random.default_rng(0).uniform(0.1, 2.0, (40, 14))
-    found = likelihood_of(joints, confidence=confidence, degrees_of_freedom=4.0)
-    np.testing.assert_array_equal(found.joints, joints)
-    np.testing.assert_array_equal(found.confidence, confidence)
-    assert (found.noise, found.degrees_of_freedom) == (0.03, 4.0)
-    assert (found.skeleton, found.fps, found.frames) == (PERSON, 30.0, 40)
-
-
-def test_nan_joints_are_occluded():
-    joints = walk()
     joints[4:9, 3] = np.nan
-    confidence = np.full((40, 14), 2.0)
-    confidence[20, 5] = 0.0
-    found = likelihood_of(joints, confidence=confidence)
-    occluded = np.zeros((40, 14), bool)
-    occluded[4:9, 3] = occluded[20, 5] = True
-    np.testing.assert_array_equal(found.confidence, np.where(occluded, 0.0, 2.0))
-    assert (confidence == 2).sum() == 40 * 14 - 1  # arguments are not modified
-
-
-@pytest.mark.parametrize(
-    ("value", "axes", "message"),
-    [
-        (np.nan, [1], r"NaN in only some coordinates at frame 6, joint 2 \(left_should"),
-        (np.nan, [0, 2], "NaN in only some coordinates at frame 6"),
-        (np.inf, [0], "infinite values at frame 6, joint 2"),
-        (-np.inf, [0, 1, 2], "infinite values at frame 6, joint 2"),
-    ],
-)
-def test_partly_invalid_joints_are_rejected(value, axes, message):
-    joints = walk()
-    joints[6, 2, axes] = value
-    with pytest.raises(ValueError, match=message):
-        likelihood_of(joints)
+    confidence = np.random.default_rng(0).uniform(0.1, 2.0, (40, 14))
+    given = confidence.copy()
+    likelihood = likelihood_of(joints, confidence=given, degrees_of_freedom=4.0)
+    np.testing.assert_array_equal(given, confidence)
+    occluded = np.isnan(joints).all(axis=-1)
+    np.testing.assert_array_equal(likelihood.confidence, np.where(occluded, 0.0, confidence))
+    np.testing.assert_array_equal(likelihood.joints[~occluded], joints[~occluded])
+    assert (likelihood.noise, likelihood.degrees_of_freedom) == (0.03, 4.0)
+    assert (likelihood.skeleton, likelihood.fps, likelihood.frames) == (PERSON, 30.0, 40)
 
 
 def test_fully_occluded_frames():
@@ -95,49 +63,48 @@ def test_fully_occluded_frames():
         likelihood_of(joints)
     for options in ({"longest_gap": 31}, {"prior": Prior(frames=31)}):
         with pytest.warns(UserWarning, match="occluded in 30 of 40 frames") as caught:
-            found = likelihood_of(joints, **options)
+            likelihood = likelihood_of(joints, **options)
         assert [warning.filename for warning in caught] == [__file__]
-        assert (found.confidence.sum(axis=1) == 0).sum() == 30
+        assert (likelihood.confidence.sum(axis=1) == 0).sum() == 30
     confidence = np.ones((40, 14))
-    confidence[35:] = 0.0
-    with pytest.raises(ValueError, match=r"any 5 .* the 5 frames from frame 35"):
-        likelihood_of(walk(), confidence=confidence, longest_gap=5)
+    confidence[28:] = 0.0
+    with pytest.raises(ValueError, match=r"any 12 .* the 12 frames from frame 28"):
+        likelihood_of(walk(), confidence=confidence, prior=Standing())  # the networks' window
+    with pytest.warns(UserWarning, match="12 of 40 frames"):
+        likelihood_of(walk(), confidence=confidence, prior=Standing(), longest_gap=13)
     with pytest.raises(ValueError, match="got every frame occluded"):
         likelihood_of(np.full((10, 14, 3), np.nan))
 
 
-def test_the_longest_gap_is_the_window_of_the_networks_by_default():
-    joints = walk()
-    joints[5:17] = np.nan
-    with pytest.raises(ValueError, match=r"any 12 .* the 12 frames from frame 5"):
-        likelihood_of(joints, prior=Standing())
-    for options in ({"longest_gap": 13}, {"prior": Prior()}):
-        with pytest.warns(UserWarning, match="12 of 40 frames"):
-            likelihood_of(joints, **({"prior": Standing()} | options))
+def lifted(height):
+    joints = walk() + np.array([0.0, height, 0.0])
+    joints[0, 10] = [0.0, -9.0, 0.0]  # a single outlier is ignored
+    return joints
 
 
+# The longest chain is from the pelvis to a wrist: .5 + .175 + .29 + .25 m.
 @pytest.mark.parametrize(
-    ("scale", "unit"),
-    [(1000.0, "millimetres"), (100.0, "centimetres"), (39.37, "inches"), (0.001, "kilometres")],
+    ("joints", "options", "message"),
+    [
+        (walk() * 1e3, {"noise": 30}, "is 121[0-9] long, implausible in metres; are these mill"),
+        (walk() * 100, {"noise": 3}, "is 121.* long, implausible in metres; are these centim"),
+        (walk() * 39.37, {}, "is 47.* long, implausible in metres; are these inches"),
+        (walk() / 1e3, {}, "is 0.00121.* long, implausible in metres; are these kilometres"),
+        (walk() / 1e6, {}, "implausible in metres$"),
+        (walk(), {"noise": 30.0}, "^noise is 30 m, more than .* is it in metres"),
+        (walk()[..., [0, 2, 1]], {}, "aligned with Z, but Y must be up"),
+        (walk()[..., [1, 0, 2]], {}, "aligned with X, but Y must be up"),
+        (walk() * [1, -1, 1], {}, "aligned with -Y, but Y must be up"),
+        (lifted(3.0), {"prior": Standing()}, "joints are at 3.* is Y up and the floor at that h"),
+        (lifted(-0.8), {"prior": Standing()}, "joints are at -0.[78].* is Y up and the floor"),
+    ],
 )
-def test_implausible_sizes_suggest_a_unit(scale, unit):
-    joints = walk() * scale
-    with pytest.warns(UserWarning, match=f"implausible in metres; are these {unit}") as caught:
-        found = likelihood_of(joints, noise=0.03 * scale)
-    np.testing.assert_array_equal(found.joints, joints)
-    # The longest chain is from the pelvis to a wrist: .5 + .175 + .29 + .25 m.
-    size = float(str(caught[0].message).partition("bones is ")[2].split()[0])
-    assert size == pytest.approx(1.2146 * scale, rel=0.01)
+def test_implausible_recordings_give_a_warning(joints, options, message):
+    with pytest.warns(UserWarning, match=message):
+        likelihood = likelihood_of(joints, **options)
+    np.testing.assert_array_equal(likelihood.joints, joints)
 
 
-def test_sizes_without_a_matching_unit():
-    with pytest.warns(UserWarning, match="implausible in metres$"):
-        likelihood_of(walk() * 1e-6)
-    with pytest.raises(ValueError, match="joints must be distinct"):
-        likelihood_of(np.ones((40, 14, 3)))
-
-
-@pytest.mark.usefixtures("no_warnings")
 def test_plausible_recordings_give_no_warnings():
     for scale in (0.45, 1.0, 1.5):
         likelihood_of(walk() * scale)
@@ -155,9 +122,9 @@ def test_resampling_on_request():
     joints = walk(81, 60.0)
     with pytest.raises(ValueError, match="fps must be the prior's 30, got 60; pass resample=True"):
         likelihood_of(joints, fps=60.0)
-    found = likelihood_of(joints, fps=60.0, resample=True)
-    assert found.fps == 30.0
-    np.testing.assert_allclose(found.joints, joints[::2], atol=1e-12)
+    likelihood = likelihood_of(joints, fps=60.0, resample=True)
+    assert likelihood.fps == 30.0
+    np.testing.assert_allclose(likelihood.joints, joints[::2], atol=1e-12)
     # 29.97 is another rate; rounded frame times of 0.03333 s are not.
     with pytest.raises(ValueError, match=r"got 29\.97"):
         likelihood_of(joints[:40], fps=29.97)
@@ -170,22 +137,21 @@ def test_resampling_on_request():
 
 
 def test_joints_are_mapped_by_name():
-    whole = make_gait("walk", frames=40)
-    names = whole.skeleton.joint_names
-    kept = [j for j, name in enumerate(names) if name not in ("pelvis", "neck", "spine")]
-    source = whole.skeleton.subset(kept)
-    joints = whole.positions[:, kept].copy()
-    joints[5, source.index("left_hip")] = np.nan
-    found = likelihood_of(joints, skeleton=source)
-    assert found.skeleton == PERSON
-    hips = [source.index("left_hip"), source.index("right_hip")]
-    seen = np.arange(40) != 5
-    np.testing.assert_allclose(found.joints[seen, 0], joints[seen][:, hips].mean(axis=1))
-    assert found.confidence[5, 0] == 0
-    np.testing.assert_array_equal(found.joints[:, 13], joints[:, source.index("right_ankle")])
-    arms = [j for j in range(source.n_joints) if "knee" not in source.joint_names[j]]
-    with pytest.raises(ValueError, match="left_knee, right_knee"):
-        likelihood_of(joints[:, arms], skeleton=source.subset(arms))
+    motion = make_gait("walk", frames=40)
+    joints = motion.positions.copy()
+    joints[5, motion.skeleton.index("left_hip")] = np.nan
+    likelihood = likelihood_of(joints, skeleton=motion.skeleton)
+    wanted = motion.retarget(PERSON).positions
+    occluded = np.argwhere(likelihood.confidence == 0)
+    assert occluded.tolist() == [[5, PERSON.index("left_hip")]]
+    seen = likelihood.confidence > 0
+    np.testing.assert_allclose(likelihood.joints[seen], wanted[seen])
+
+
+def invalid(value, axes):
+    joints = walk()
+    joints[6, 2, axes] = value
+    return joints
 
 
 @pytest.mark.parametrize(
@@ -193,13 +159,18 @@ def test_joints_are_mapped_by_name():
     [
         ({"joints": np.zeros((40, 3, 3))}, "joints must have shape"),
         ({"joints": np.zeros((0, 14, 3))}, "joints must have at least one frame"),
+        ({"joints": np.ones((40, 14, 3))}, "joints must be distinct"),
+        (
+            {"joints": invalid(np.nan, [1])},
+            r"NaN in only some .* at frame 6, joint 2 \(left_should",
+        ),
+        ({"joints": invalid(np.inf, [0])}, "infinite values at frame 6, joint 2"),
+        ({"joints": invalid(-np.inf, [0, 1, 2])}, "infinite values at frame 6, joint 2"),
         ({"confidence": np.ones((40, 3))}, "confidence must have shape"),
         ({"confidence": np.full((40, 14), -1.0)}, "confidence must be at least 0, got -1"),
-        ({"confidence": np.full((40, 14), np.nan)}, "confidence must be finite, got 560 values"),
         ({"noise": "3 cm"}, "noise must be a finite number above 0, got '3 cm'"),
         ({"skeleton": "person14"}, "skeleton must be a Skeleton, got str"),
         ({"prior": "body-dvae"}, "prior must be a MotionPrior, got str"),
-        ({"degrees_of_freedom": 0.0}, "degrees_of_freedom must be a finite number above 0"),
         ({"fps": 0.0}, "fps must be a finite number above 0"),
         ({"longest_gap": 0}, "longest_gap must be an integer of at least 1"),
     ],
@@ -207,33 +178,3 @@ def test_joints_are_mapped_by_name():
 def test_invalid_arguments(options, message):
     with pytest.raises(ValueError, match=message):
         likelihood_of(**({"joints": walk()} | options))
-
-
-@pytest.mark.parametrize("height", [3.0, -0.8])
-def test_distance_from_the_floor(height):
-    joints = walk() + np.array([0.0, height, 0.0])
-    joints[0, 10] = [0.0, -9.0, 0.0]  # a single outlier is ignored
-    lowest = np.quantile(joints[1:, :, 1].min(axis=1), 0.05)
-    with pytest.warns(UserWarning, match="is Y up and the floor at that height") as caught:
-        found = likelihood_of(joints, prior=Standing())
-    value = str(caught[0].message).removeprefix("the lowest joints are at ").split()[0]
-    assert float(value) == pytest.approx(lowest, abs=0.06)
-    np.testing.assert_array_equal(found.joints, joints)
-
-
-def test_noise_in_another_unit():
-    with pytest.warns(UserWarning, match=r"^noise is 30 m, more than .* is it in metres"):
-        assert likelihood_of(walk(), noise=30.0).noise == 30.0
-
-
-@pytest.mark.parametrize(
-    ("change", "axis"),
-    [
-        (lambda joints: joints[..., [0, 2, 1]], "Z"),
-        (lambda joints: joints[..., [1, 0, 2]], "X"),
-        (lambda joints: joints * [1, -1, 1], "-Y"),
-    ],
-)
-def test_bodies_along_another_axis_than_y(change, axis):
-    with pytest.warns(UserWarning, match=f"stands along {axis}, but Y must be up"):
-        likelihood_of(change(walk()))

@@ -78,12 +78,7 @@ def test_marginalised_variables(likelihood):
     assert rng.random() == np.random.default_rng(3).random()  # rng is unused
 
 
-def test_initial_points_are_prior_draws(likelihood):
-    posterior = MotionPosterior(Flat(), likelihood)
-    points = posterior.initial(np.random.default_rng(0), 7)
-    np.testing.assert_array_equal(points, Flat().initial(np.random.default_rng(0), 7))
-    assert (posterior.dim, posterior.frames, posterior.fps) == (DIM, FRAMES, 30.0)
-    assert posterior.skeleton == CHAIN
+PRIOR = MotionPosterior(Flat())
 
 
 def observed(skeleton=CHAIN, fps=30.0):
@@ -91,32 +86,28 @@ def observed(skeleton=CHAIN, fps=30.0):
 
 
 @pytest.mark.parametrize(
+    ("likelihood", "message"),
+    [
+        (Keypoints2D(np.zeros((1, 3, 2, 2)), Cameras.ring(1), 1), "the prior's frames, 2, got 3"),
+        (Joints3D(np.zeros((FRAMES, 5, 3)), 0.1), "the prior's n_joints, 2, got 5"),
+        (observed(OTHER), "the prior's joints, hip, knee, got hip, ankle; retarget"),
+        (observed(fps=60.0), "the prior's frame rate, 30, got 60; resample"),
+        (0.3, r"likelihood must have log_density.*, got float"),
+    ],
+)
+def test_likelihoods_that_do_not_match_are_refused(likelihood, message):
+    with pytest.raises(ValueError, match=message):
+        MotionPosterior(Flat(), likelihood)
+
+
+@pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda: MotionPosterior(
-                Flat(), Keypoints2D(np.zeros((1, 3, 2, 2)), Cameras.ring(1), 1)
-            ),
-            "likelihood must have the prior's frames, 2, got 3",
-        ),
-        (
-            lambda: MotionPosterior(Flat(), Joints3D(np.zeros((FRAMES, 5, 3)), 0.1)),
-            "likelihood must have the prior's n_joints, 2, got 5",
-        ),
-        (
-            lambda: MotionPosterior(Flat(), observed(OTHER)),
-            "likelihood must have the prior's joints, hip, knee, got hip, ankle; retarget",
-        ),
-        (
-            lambda: MotionPosterior(Flat(), observed(fps=60.0)),
-            "likelihood must have the prior's frame rate, 30, got 60; resample",
-        ),
         (lambda: MotionPosterior("walk"), "prior must have skeleton, frames, .*, got str"),
-        (lambda: MotionPosterior(Flat(), 0.3), r"likelihood must have log_density.*, got float"),
-        (lambda: MotionPosterior(Flat()).log_density(np.zeros((3, 5))), r"shape \(…, 12\), got"),
-        (lambda: MotionPosterior(Flat()).motion(np.zeros((3, 5))), r"shape \(…, 12\), got \(3, 5"),
-        (lambda: MotionPosterior(Flat()).complete(None, np.zeros(DIM)), r"shape \(n, 12\), got"),
-        (lambda: MotionPosterior(Flat()).log_likelihood(np.zeros(DIM)), "must have a likelihood"),
+        (lambda: PRIOR.log_density(np.zeros((3, 5))), r"shape \(…, 12\), got"),
+        (lambda: PRIOR.motion(np.zeros((3, 5))), r"shape \(…, 12\), got \(3, 5"),
+        (lambda: PRIOR.complete(None, np.zeros(DIM)), r"shape \(n, 12\), got"),
+        (lambda: PRIOR.log_likelihood(np.zeros(DIM)), "must have a likelihood"),
     ],
 )
 def test_invalid_arguments(call, message):
@@ -125,4 +116,8 @@ def test_invalid_arguments(call, message):
 
 
 def test_matching_skeleton_and_frame_rate_are_accepted():
-    assert MotionPosterior(Flat(), observed()).frames == FRAMES
+    posterior = MotionPosterior(Flat(), observed())
+    assert (posterior.dim, posterior.frames, posterior.fps) == (DIM, FRAMES, 30.0)
+    assert posterior.skeleton == CHAIN
+    points = posterior.initial(np.random.default_rng(0), 7)
+    np.testing.assert_array_equal(points, Flat().initial(np.random.default_rng(0), 7))

@@ -29,21 +29,15 @@ class LiveBrowser:
         flags += [f"--window-size={size[0]},{size[1]}", "--force-device-scale-factor=1"]
         # It reads commands from descriptor 3 and answers at 4.
         shell = ["sh", "-c", 'exec "$@" 3<&0 4>&1 </dev/null >&2', "sh"]
-        self._process = subprocess.Popen(
-            [*shell, command, *flags, "--remote-debugging-pipe"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
+        command = [*shell, command, *flags, "--remote-debugging-pipe"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._end = threading.Timer(_TIMEOUT, self._process.kill)
         self._end.start()
-        self._session = None
-        self._calls = 0
-        self._dragging = False
-        self._events = []
+        self._session, self._calls, self._dragging, self._events = {}, 0, False, []
         try:
             target = self.call("Target.createTarget", url="about:blank")["targetId"]
             attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
-            self._session = attached["sessionId"]
+            self._session = {"sessionId": attached["sessionId"]}
             for domain in ("Runtime", "Log", "Page"):
                 self.call(f"{domain}.enable")
             self.call("Page.navigate", url=path.as_uri())
@@ -68,9 +62,7 @@ class LiveBrowser:
     def call(self, method, **params):
         """Call a method of the protocol and return its result."""
         self._calls += 1
-        message = {"id": self._calls, "method": method, "params": params}
-        if self._session is not None:
-            message["sessionId"] = self._session
+        message = {"id": self._calls, "method": method, "params": params, **self._session}
         self._process.stdin.write(json.dumps(message).encode() + b"\0")
         self._process.stdin.flush()
         while True:
@@ -87,11 +79,10 @@ class LiveBrowser:
 
     def value(self, expression):
         """Return the value of an expression in the page, after waiting for a promise."""
-        found = self.call(
-            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
-        )
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
+        options = {"returnByValue": True, "awaitPromise": True}
+        result = self.call("Runtime.evaluate", expression=expression, **options)
+        assert "exceptionDetails" not in result, result["exceptionDetails"]
+        return result["result"].get("value")
 
     def wait_until(self, condition, seconds=30.0):
         """Wait until an expression of the page, or a function of the test, is true."""
@@ -115,35 +106,26 @@ class LiveBrowser:
 
     def position(self, selector, across=0.5):
         """Scroll to an element and return its position in pixels, at a fraction of its width."""
-        x, y = self.value(
-            f"(() => {{ const found = document.querySelector({json.dumps(selector)});"
-            "found.scrollIntoView({ block: 'center', behavior: 'instant' });"
-            "const box = found.getBoundingClientRect();"
+        return self.value(
+            f"(() => {{ const element = document.querySelector({json.dumps(selector)});"
+            "element.scrollIntoView({ block: 'center', behavior: 'instant' });"
+            "const box = element.getBoundingClientRect();"
             f"return [box.left + {across} * box.width, box.top + box.height / 2]; }})()"
         )
-        return x, y
 
     def press(self, key, code=0):
         """Press and release a key, by its name and its Windows key code."""
         text = {"text": key} if len(key) == 1 else {}
-        for event, params in (("keyDown", text), ("keyUp", {})):
-            self.call(
-                "Input.dispatchKeyEvent", type=event, key=key, windowsVirtualKeyCode=code, **params
-            )
+        for event in ({"type": "keyDown", **text}, {"type": "keyUp"}):
+            self.call("Input.dispatchKeyEvent", key=key, windowsVirtualKeyCode=code, **event)
 
     def errors(self):
         """Return errors and warnings of the console."""
         self.value("0")  # earlier messages have then arrived
-        return [
-            json.dumps(event["params"])
-            for event in self._events
-            if event["method"] == "Runtime.exceptionThrown"
-            or (
-                event["method"] == "Runtime.consoleAPICalled"
-                and event["params"]["type"] in ("error", "warning", "assert")
-            )
-            or (
-                event["method"] == "Log.entryAdded"
-                and event["params"]["entry"]["level"] in ("error", "warning")
-            )
-        ]
+        messages = []
+        for event in self._events:
+            params = event["params"]
+            level = params.get("type") or params.get("entry", {}).get("level")
+            if "exceptionDetails" in params or level in ("error", "warning", "assert"):
+                messages.append(json.dumps(params))
+        return messages

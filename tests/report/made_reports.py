@@ -71,7 +71,7 @@ class MadeComparison(Comparison):
             failure = Failure("obs<u>erved", f"it cannot {MARKUP}", unsupported=True)
             return RunResult(problem, sampler, seed, "", {}, failure)
         if "<" in sampler and seed == 1:
-            failure = Failure("crashed", "the floor gave way", unsupported=False)
+            failure = Failure("crashed", "singular matrix", unsupported=False)
         metrics = {"swd_ratio": swd + seed, "seconds": 3 * swd, "odd_one": 7.0, "rhat": np.nan}
         return RunResult(problem, sampler, seed, "", {} if failure else metrics, failure)
 

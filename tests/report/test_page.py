@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import io
-import json
 import re
 from html.parser import HTMLParser
 
@@ -15,21 +14,16 @@ from made_reports import (
     MARKUP,
     WALK,
     MadeComparison,
-    Named,
     filmed_problem,
     generation_problem,
     joints_problem,
-    walk_prior,
 )
 from PIL import Image
 
-from probmotion import MotionDraws, MotionPosterior, seeds
 from probmotion.calibration import calibrate
 from probmotion.comparison.results.stored_problems import StoredProblem, read_stored, store_problem
 from probmotion.comparison.results.table import ComparisonTable
-from probmotion.data.synthetic.gaits import make_gait
 from probmotion.plots.motion_data import Shown, motion_numbers
-from probmotion.posteriors.problem import Problem
 from probmotion.report.animations import BUDGET, shown_problems
 from probmotion.report.page import write_report
 from probmotion.samplers import ScoreDistillation
@@ -40,30 +34,29 @@ SAMPLERS = {"good": 1.25, "b<i>ad": 5.5, "none": None}
 class Tags(HTMLParser):
     """Parser that checks nesting and collects tags, ids, links and table rows."""
 
-    def __init__(self) -> None:
+    def __init__(self, page: str) -> None:
         super().__init__()
         self.open: list[str] = []
+        self.kinds: list[str] = []
         self.ids: list[str] = []
         self.links: list[str] = []
-        self.kinds: list[str] = []
         self.rows: list[list[str]] = []
+        self.feed(page)
+        self.close()
+        assert self.open == []
 
     def handle_starttag(self, tag, attrs):
         self.kinds.append(tag)
-        attributes = dict(attrs)
-        assert not any(name.startswith("on") for name in attributes)
-        self.ids += [attributes["id"]] if "id" in attributes else []
-        self.links += [attributes["href"]] if "href" in attributes else []
+        for name, value in attrs:
+            assert not name.startswith("on")
+            self.ids += [value] * (name == "id")
+            self.links += [value] * (name == "href")
         if tag == "tr":
             self.rows.append([])
         if tag in ("td", "th"):
             self.rows[-1].append("")
         if tag not in ("meta", "input", "img", "br"):
             self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.handle_starttag(tag, attrs)
-        self.handle_endtag(tag)
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -73,16 +66,8 @@ class Tags(HTMLParser):
             self.rows[-1][-1] += words
 
 
-def parse(page: str) -> Tags:
-    tags = Tags()
-    tags.feed(page)
-    tags.close()
-    assert tags.open == []
-    return tags
-
-
 def rows_of(page: str) -> list[list[str]]:
-    return [[entry.strip() for entry in row] for row in parse(page).rows]
+    return [[entry.strip() for entry in row] for row in Tags(page).rows]
 
 
 def write(comparison, folder, calibration=None) -> str:
@@ -91,8 +76,8 @@ def write(comparison, folder, calibration=None) -> str:
 
 def decode(motion: dict, joints: int) -> np.ndarray:
     """Return an encoded motion, (L, J, 3), metres."""
-    found = np.frombuffer(base64.b64decode(motion["numbers"]), "<i2").astype(float)
-    return motion["unit"] / 1000 * found.reshape(-1, joints, 3)
+    numbers = np.frombuffer(base64.b64decode(motion["numbers"]), "<i2")
+    return motion["unit"] / 1000 * numbers.reshape(-1, joints, 3)
 
 
 @pytest.fixture(scope="module")
@@ -106,21 +91,16 @@ def page(made) -> str:
     return write(made, made.folder)
 
 
-def test_page_is_well_formed_and_self_contained(page):
-    tags = parse(page)
+def test_page_is_well_formed_self_contained_and_escaped(page):
+    tags = Tags(page)
     assert len(tags.ids) == len(set(tags.ids))
     assert {link.removeprefix("#") for link in tags.links} <= set(tags.ids)
     assert not re.search(r"https?:|src=\"(?!data:)|@import|url\(", page)
     assert "default-src 'none'" in page
     assert len(page) < 400_000
-
-
-def test_names_and_messages_are_escaped(page):
-    tags = parse(page)
     # The data of three problems, and the script of the page.
     assert tags.kinds.count("script") == 4
     assert not {"b", "i", "u"} & set(tags.kinds)
-    assert "alert(1)" in page
     assert html.escape(MARKUP) in page
 
 
@@ -152,7 +132,7 @@ def test_unfinished_runs_are_reported(tmp_path):
     made.results = [result for result in made.results if result.sampler != "good"]
     assert ["good", "unfinished"] in rows_of(write(made, tmp_path))
     made.results = []
-    assert parse(write(made, tmp_path)).ids
+    assert Tags(write(made, tmp_path)).ids
 
 
 @pytest.mark.parametrize("n_seeds", [1, 2])
@@ -170,14 +150,13 @@ def test_motions_are_encoded_in_millimetres(made):
     shown = shown_problems(made)["joints"]
     data = motion_numbers(shown)
     path = WALK.positions[:, list(WALK.skeleton.roots)].mean(axis=1) * [1, 0, 1]
-    np.testing.assert_allclose(
-        decode(data["truth"], data["joints"]), WALK.positions - path[:, None], atol=6e-4
-    )
+    truth = decode(data["truth"], data["joints"])
+    np.testing.assert_allclose(truth, WALK.positions - path[:, None], atol=6e-4)
     assert list(shown.rows) == ["reference draws", "good", "b<i>ad"]
     drawn = made.draws("joints", "good").flat()
-    found = decode(data["rows"][1][1], data["joints"])
+    second = decode(data["rows"][1][1], data["joints"])
     # Of 8 draws every second is shown.
-    np.testing.assert_allclose(found, drawn[2] - path[:, None], atol=6e-4)
+    np.testing.assert_allclose(second, drawn[2] - path[:, None], atol=6e-4)
     dots = np.frombuffer(base64.b64decode(data["dots"]), "<f4").reshape(WALK.positions.shape)
     np.testing.assert_allclose(dots, shown.problem.joints - path[:, None], atol=1e-6)
 
@@ -237,39 +216,35 @@ def test_invalid_paths_raise_and_write_nothing(made, tmp_path):
 
 
 class Calibrated:
-    """Calibration with a noisy figure of a given height and an empty table."""
+    """Calibration with a noisy figure and an empty table."""
 
     ranked = True
-
-    def __init__(self, height: int) -> None:
-        self.height = height
 
     def table(self) -> ComparisonTable:
         return ComparisonTable([], columns=["problem", "sampler", "seed", "metric", "value"])
 
     def plot(self, path) -> None:
-        shades = np.random.default_rng(0).integers(0, 12, (self.height, 2000))
+        shades = np.random.default_rng(0).integers(0, 12, (100, 2000))
         colours = np.random.default_rng(1).integers(0, 256, (12, 3))
         Image.fromarray(colours[shades].astype(np.uint8)).save(path)
 
 
 def test_calibration_figure_is_in_the_page(made, tmp_path):
-    page = write(made, tmp_path, Calibrated(100))
-    assert "calibration" in parse(page).ids
+    page = write(made, tmp_path, Calibrated())
+    assert "calibration" in Tags(page).ids
     source = re.search(r'<img class="plot calibration" src="data:image/png;base64,([^"]*)"', page)
-    calibration = base64.b64decode(source[1])
-    Calibrated(100).plot(tmp_path / "drawn.png")
-    assert len(calibration) < (tmp_path / "drawn.png").stat().st_size / 2
-    with Image.open(io.BytesIO(calibration)) as shown, Image.open(tmp_path / "drawn.png") as drawn:
-        shown, drawn = np.asarray(shown.convert("RGB"), float), np.asarray(drawn, float)
-    assert np.abs(shown - drawn).max() < 64
+    encoded, drawn = base64.b64decode(source[1]), tmp_path / "drawn.png"
+    Calibrated().plot(drawn)
+    assert len(encoded) < drawn.stat().st_size / 2
+    images = [Image.open(file).convert("RGB") for file in (io.BytesIO(encoded), drawn)]
+    one, other = (np.asarray(image, float) for image in images)
+    assert np.abs(one - other).max() < 64
 
 
 def test_a_calibration_without_ranks_has_no_figure(made, tmp_path):
-    settings = {"draws": 10, "chains": 1, "workers": 0, "progress": False}
-    calibration = calibrate(
-        "gait-monocular(frames=4)", ScoreDistillation(), simulations=10, **settings
-    )
+    sampler = ScoreDistillation(iterations=3)
+    settings = {"simulations": 10, "draws": 10, "chains": 1, "workers": 0, "progress": False}
+    calibration = calibrate("gait-monocular(frames=4)", sampler, **settings)
     assert not calibration.ranked
     page = write(made, tmp_path, calibration)
     assert "No sampler has ranks" in page
@@ -277,23 +252,11 @@ def test_a_calibration_without_ranks_has_no_figure(made, tmp_path):
     assert 'class="plot calibration"' not in page
 
 
-class Long(MadeComparison):
-    """Motions of several minutes."""
-
-    def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
-        posterior = self.problems[problem].posterior
-        drawn = posterior.prior.sample(seeds.generator(seed, problem, sampler), 4)
-        return MotionDraws.of(posterior, Named(), drawn[None], seed=seed, seconds=1.0)
-
-
-def test_size_of_the_page_is_limited(tmp_path):
-    posterior = MotionPosterior(walk_prior(make_gait("walk", frames=8700)))
-    long = Long(tmp_path, [Problem("long", "minutes", posterior)], SAMPLERS)
-    rows = shown_problems(long)["long"].rows
-    assert [len(row) for row in rows.values()] == [2, 4, 4]
-    assert 0.95 * BUDGET < 2 * sum(row.size for row in rows.values()) < BUDGET
-    page = write(long, tmp_path, Calibrated(2500))
-    # The figure takes more than 2 MB from the budget of the motions.
-    (data,) = (json.loads(each) for each in re.findall(r'json">(.*?)</script>', page))
-    assert sum(map(len, data["rows"])) < 10
-    assert 4 / 3 * 6e6 < len(page) < 13e6
+def test_figures_reduce_the_budget_of_the_motions(made, tmp_path, monkeypatch):
+    budgets = []
+    shown = "probmotion.report.page.shown_problems"
+    monkeypatch.setattr(shown, lambda comparison, budget: budgets.append(budget) or {})
+    page = write(made, tmp_path, Calibrated())
+    figures = [base64.b64decode(text) for text in re.findall(r'png;base64,([^"]*)"', page)]
+    assert len(figures) == len(made.plan.problems) + 1
+    assert budgets == [BUDGET - sum(map(len, figures))]

@@ -1,4 +1,4 @@
-"""Tests of `ExactSampler`: independent draws, priors without observations, refusals."""
+"""Tests of `ExactSampler`: priors without observations, unsupported posteriors."""
 
 from __future__ import annotations
 
@@ -31,24 +31,14 @@ class Normal:
         return rng.normal(7.0, 2.0, (n, 6))
 
 
-def test_seeds_and_chains_are_independent(mixture_posterior):
-    runs = [
-        ExactSampler().sample(mixture_posterior, draws=2, chains=2, seed=seed, progress=False)
-        for seed in (0, 1)
-    ]
-    assert runs[0].independent
-    values = np.concatenate([run.flat() for run in runs]).reshape(8, -1)
-    assert len(np.unique(values, axis=0)) == 8
-
-
 def test_prior_without_observations_is_sampled_directly():
     posterior = MotionPosterior(Normal())
     draws = ExactSampler().sample(posterior, draws=500, chains=2, progress=False)
     assert draws.flat().mean() == pytest.approx(7, abs=0.2)
     assert draws.flat().std() == pytest.approx(2, rel=0.1)
     assert "exact" in suited(posterior)
-    whole = TruncatedPosterior(Normal(), seed=np.full(6, 7.0))
-    assert ExactSampler().sample(whole, draws=3, progress=False).independent
+    untruncated = TruncatedPosterior(Normal(), seed=np.full(6, 7.0))
+    assert ExactSampler().sample(untruncated, draws=3, progress=False).independent
 
 
 def test_posteriors_without_a_closed_form_are_refused(mixture, mixture_posterior, two_modes):

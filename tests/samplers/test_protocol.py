@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from probmotion.posteriors.sampling import (
     Sampler,
     UnsupportedPosterior,
     load_sampler,
-    sampler_names,
     suited,
 )
 from probmotion.problems import load_problem
@@ -53,25 +52,12 @@ def run(sampler, mixture_posterior):
     return draw
 
 
-def test_registered_samplers():
-    assert set(QUICK) <= set(sampler_names())
-    with pytest.raises(ValueError, match=r"sampler must be one of .*ensemble, exact, .*'gibbs'"):
-        load_sampler("gibbs")
-
-
-def test_samplers_are_frozen_dataclasses(sampler):
+def test_samplers_are_registered_and_their_settings_round_trip(sampler):
+    """Through JSON and text."""
     assert isinstance(sampler, Sampler)
     assert load_sampler(sampler.name) is type(sampler)
     assert getattr(probmotion.samplers, type(sampler).__name__) is type(sampler)
-    for name in ("name", *(setting.name for setting in fields(sampler))):
-        with pytest.raises(FrozenInstanceError):
-            setattr(sampler, name, None)
-    again = type(sampler)(**QUICK[sampler.name])
-    assert again == sampler
-    assert hash(again) == hash(sampler)
-
-
-def test_settings_round_trip_through_json_and_text(sampler):
+    assert hash(replace(sampler)) == hash(sampler)
     plain = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in json.loads(json.dumps(asdict(sampler))).items()
@@ -112,19 +98,21 @@ def test_saving_and_continuing(sampler, run, tmp_path):
     assert loaded.counts == draws.counts
     assert set(loaded.state) == set(draws.state)
     assert bool(draws.state) == (sampler.name in CHAIN_SAMPLERS)
-    if draws.state:
+    if not draws.state:
+        message = f"initial must be None, got MotionDraws: {sampler.name} has no starting points"
+        with pytest.raises(ValueError, match=message):
+            run(initial=draws)
+    else:
         rest = run(draws=2, chains=2, initial=draws)
         parts = np.concatenate([draws.positions.values, rest.positions.values], axis=1)
-        whole = run(draws=5, chains=2).positions.values
-        np.testing.assert_allclose(parts, whole, rtol=0, atol=1e-12)
+        at_once = run(draws=5, chains=2).positions.values
+        np.testing.assert_allclose(parts, at_once, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"draws": 0}, "draws must be an integer of at least 1, got 0"),
-        ({"draws": 1.5}, "draws must be an integer of at least 1, got 1.5"),
-        ({"chains": 0}, "chains must be an integer of at least 1, got 0"),
         ({"chains": 1.5}, "chains must be an integer of at least 1, got 1.5"),
         ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
     ],
@@ -132,13 +120,6 @@ def test_saving_and_continuing(sampler, run, tmp_path):
 def test_arguments_out_of_range(run, options, message):
     with pytest.raises(ValueError, match=message):
         run(**options)
-
-
-def test_starting_points_of_independent_samplers_are_refused(sampler, run):
-    if sampler.name not in CHAIN_SAMPLERS:
-        message = f"initial must be None, got ndarray: {sampler.name} has no starting points"
-        with pytest.raises(ValueError, match=message):
-            run(initial=np.zeros((1, 3)))
 
 
 def test_missing_protocols_are_named(sampler, mute):
@@ -155,10 +136,9 @@ def test_missing_protocols_are_named(sampler, mute):
 def test_draws_with_an_exact_denoiser_do_not_depend_on_the_batch_to_the_last_bit(kind):
     """Rounding errors would be amplified by the steps."""
     posterior, sampler = load_problem("gait").posterior, kind(steps=15)
-    whole = sampler.sample(posterior, draws=3, chains=3, seed=0, progress=False).positions.values
-    for other, draws in ((sampler, 3), (replace(sampler, batch=2), 2)):
-        alone = other.sample(posterior, draws=draws, seed=0, progress=False).positions.values
-        np.testing.assert_array_equal(alone[0], whole[0, :draws])
+    many = sampler.sample(posterior, draws=3, chains=3, progress=False).positions.values
+    fewer = replace(sampler, batch=2).sample(posterior, draws=2, progress=False)
+    np.testing.assert_array_equal(fewer.positions.values[0], many[0, :2])
 
 
 @pytest.mark.parametrize("name", ["exact", "ancestral3d", "mas", "mvpc", "sds"])

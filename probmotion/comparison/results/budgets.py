@@ -18,7 +18,7 @@ from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["Budget", "affordable", "check_budget", "effort_of"]
+__all__ = ["Budget", "affordable", "effort_of"]
 
 # Cost of an evaluation other than 1: a gradient includes the value, which costs about as much.
 _WEIGHTS = {"gradient": 2}
@@ -92,12 +92,6 @@ class Budget:
         if self.evaluations is None:
             return self.words(self.amount)
         return f"{self.words(self.amount)} (a gradient counts 2, any other 1)"
-
-
-def check_budget(budget: object) -> None:
-    """Raise ``ValueError`` unless ``budget`` is a :class:`Budget` or None."""
-    if budget is not None and not isinstance(budget, Budget):
-        raise ValueError(f"budget must be a Budget, got {budget!r}")
 
 
 def effort_of(sampler: Sampler) -> tuple[str, ...]:

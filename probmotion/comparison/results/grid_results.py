@@ -43,8 +43,8 @@ class GridResults:
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
         self.folder = folder
         self.plan = plan
-        found = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
-        self.results: list[RunResult] = [result for result in found if result is not None]
+        results = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
+        self.results: list[RunResult] = [result for result in results if result is not None]
         if temporary:
             weakref.finalize(self, shutil.rmtree, folder, True)
 

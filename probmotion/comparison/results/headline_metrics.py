@@ -12,7 +12,7 @@ from probmotion.metrics.intervals import best_and_tied
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["HEADLINE_METRICS", "best_of", "headline_metric"]
+__all__ = ["HEADLINE_METRICS", "best_of", "headline_metric", "seed_values"]
 
 HEADLINE_METRICS: Mapping[str, str] = {
     "swd_ratio": "sliced Wasserstein distance to reference draws (1: that of other references)",
@@ -61,6 +61,14 @@ def headline_metric(table: pd.DataFrame) -> str | None:
     return next((name for name in HEADLINE_METRICS if name in measured), None)
 
 
+def seed_values(table: pd.DataFrame) -> dict[tuple[str, str], pd.Series]:
+    """Return the values by seed for each sampler and metric of a problem."""
+    return {
+        (str(sampler), str(metric)): group.set_index("seed")["value"]
+        for (sampler, metric), group in table.groupby(["sampler", "metric"], sort=False)
+    }
+
+
 def best_of(
     metric: str,
     values: Mapping[str, pd.Series],
@@ -74,8 +82,8 @@ def best_of(
     fewer than two samplers or two seeds; and for distances of single draws to the truth if there
     are references, because overconfident draws are closer to the truth.
 
-    ``values`` are by sampler and seed, ``measured`` holds all metrics of the problem, and ``draws``
-    is the number of draws behind each value.
+    ``values`` are by sampler and seed, ``measured`` contains all metrics of the problem, and
+    ``draws`` is the number of draws behind each value.
     """
     rule = _RULES.get(metric)
     if rule is None and (metric.startswith(_LESS_PREFIXES) or metric.endswith(_LESS_SUFFIXES)):

@@ -23,23 +23,23 @@ AnySampler = str | Sampler
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
     """Return problems by their names in the table; registered ones by their full names."""
-    found: dict[str, str | Problem] = {}
+    named: dict[str, str | Problem] = {}
     for label, given in _labelled(problems, AnyProblem):
         if isinstance(given, str):
-            _add("problems", found, label or load_problem(given).name, given)
+            _add("problems", named, label or load_problem(given).name, given)
         elif isinstance(given, Problem):
-            _add("problems", found, label or given.name, _registered_name(given) or given)
+            _add("problems", named, label or given.name, _registered_name(given) or given)
         elif isinstance(given, MotionPosterior):
             name = label or "posterior"
-            _add("problems", found, name, Problem(name, "a user-supplied posterior", given))
+            _add("problems", named, name, Problem(name, "a user-supplied posterior", given))
         else:
             raise ValueError(
                 "problems must be names, Problem or MotionPosterior objects, got "
                 f"{type(given).__name__}"
             )
-    if not found:
+    if not named:
         raise ValueError("problems must contain at least one, got none")
-    return found
+    return named
 
 
 def _registered_name(problem: Problem) -> str | None:
@@ -56,22 +56,22 @@ def _registered_name(problem: Problem) -> str | None:
 
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
     """Return samplers by their names in the table; all registered ones for None."""
-    found: dict[str, Sampler] = {}
+    named: dict[str, Sampler] = {}
     for label, given in _labelled(
         list(importable_samplers()) if samplers is None else samplers, AnySampler
     ):
         if isinstance(given, str):
-            _add("samplers", found, label or given, default_sampler(given))
+            _add("samplers", named, label or given, default_sampler(given))
         elif isinstance(given, Sampler) and not isinstance(given, type):
-            _add("samplers", found, label or given.name, given)
+            _add("samplers", named, label or given.name, given)
         else:
             kind = f"the class {given.__name__}" if isinstance(given, type) else f"{given!r}"
             raise ValueError(
                 f"samplers must be names or objects with name, requires and sample(), got {kind}"
             )
-    if not found:
+    if not named:
         raise ValueError("samplers must contain at least one, got none")
-    return found
+    return named
 
 
 def _labelled(given: Any, one: Any) -> list[tuple[str | None, Any]]:
@@ -82,8 +82,8 @@ def _labelled(given: Any, one: Any) -> list[tuple[str | None, Any]]:
     return [(None, item) for item in given]
 
 
-def _add(argument: str, found: dict[str, Any], name: str, value: Any) -> None:
-    if name in found:
+def _add(argument: str, named: dict[str, Any], name: str, value: Any) -> None:
+    if name in named:
         raise ValueError(
             f"{argument} must have different names, got {name!r} twice; pass a mapping, such as "
             f"{{'{name}-a': …, '{name}-b': …}}"
@@ -96,4 +96,4 @@ def _add(argument: str, found: dict[str, Any], name: str, value: Any) -> None:
         raise ValueError(
             f"names of {argument} must have at most {_LONGEST} bytes, got {length}: {name[:20]}…"
         )
-    found[name] = value
+    named[name] = value

@@ -96,16 +96,15 @@ class Plan:
     def load(cls, folder: Path) -> Plan:
         """Read the plan in ``folder``."""
         path = folder / _PLAN
+        cls.check_folder(folder)
         try:
             stored = json.loads(path.read_text(encoding="utf-8"))
-            _check_format(folder, stored)
+            del stored["format"]
             return cls(**stored | {name: tuple(stored[name]) for name in ("notes", "references")})
         except OSError as error:
             raise ValueError(
                 f"folder must be one that compare() wrote, got {str(folder)!r} without {_PLAN}"
             ) from error
-        except _OtherVersionError:
-            raise
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
@@ -116,21 +115,12 @@ class Plan:
             stored = json.loads((folder / _PLAN).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return
-        _check_format(folder, stored)
-
-
-class _OtherVersionError(ValueError):
-    """Another version of this package wrote the folder."""
-
-
-def _check_format(folder: Path, stored: Any) -> None:
-    """Remove the format from a stored plan and check it."""
-    found = stored.pop("format", 1) if isinstance(stored, dict) else _FORMAT
-    if found != _FORMAT:
-        raise _OtherVersionError(
-            f"out is {folder}, which another version of probmotion wrote (format {found}, not "
-            f"{_FORMAT}); use another folder"
-        )
+        version = stored.get("format", 1) if isinstance(stored, dict) else _FORMAT
+        if version != _FORMAT:
+            raise ValueError(
+                f"out is {folder}, which another version of probmotion wrote (format {version}, "
+                f"not {_FORMAT}); use another folder"
+            )
 
 
 def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:

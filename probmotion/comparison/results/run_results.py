@@ -22,7 +22,7 @@ DRAWS, RESULT = "draws.nc", "run.json"
 class RunResult:
     """Result of a finished run.
 
-    ``budget`` holds the budget in words, the settings it paid for and the amount used;
+    ``budget`` contains the budget in words, the chosen settings and the amount used;
     ``draws_bytes`` is the size of the draws file.
     """
 

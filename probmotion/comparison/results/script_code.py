@@ -34,9 +34,9 @@ def is_user_code(module: str | None) -> bool:
 def class_content(kind: type) -> dict[str, Any]:
     """Return methods and simple attributes of a user's class and its user-defined bases.
 
-    Fields and generated methods of dataclasses are left out; instances hold the fields.
+    Fields and generated methods of dataclasses are left out; the fields belong to the instances.
     """
-    found: dict[str, Any] = {}
+    content: dict[str, Any] = {}
     for each in reversed(kind.__mro__):
         if each is object or not is_user_code(each.__module__):
             continue
@@ -45,10 +45,10 @@ def class_content(kind: type) -> dict[str, Any]:
             function = getattr(value, "__func__", getattr(value, "fget", value))
             if isinstance(function, FunctionType):
                 if not function.__code__.co_filename.startswith("<string>"):
-                    found[name] = function
+                    content[name] = function
             elif isinstance(value, SIMPLE) and name not in fields and not name.startswith("__"):
-                found[name] = value
-    return found
+                content[name] = value
+    return content
 
 
 def globals_read(function: FunctionType) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def globals_read(function: FunctionType) -> dict[str, Any]:
     and tuples of them by qualified name. Lists and mappings, which functions may fill, and other
     objects are left out.
     """
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     waiting = [function] if is_user_code(function.__module__) else []
     while waiting:
         each = waiting.pop()
@@ -67,22 +67,22 @@ def globals_read(function: FunctionType) -> dict[str, Any]:
             # Compiled or cached functions wrap the original one.
             value = getattr(value, "__wrapped__", value)
             key = f"{each.__module__}.{name}"
-            if key in found or value is function:
+            if key in variables or value is function:
                 continue
             if isinstance(value, FunctionType) and is_user_code(value.__module__):
-                found[key] = _code_and_defaults(value)
+                variables[key] = _code_and_defaults(value)
                 waiting.append(value)
             elif isinstance(value, type) and is_user_code(value.__module__):
                 content = class_content(value)
                 methods = [part for part in content.values() if isinstance(part, FunctionType)]
-                found[key] = {
+                variables[key] = {
                     part: _code_and_defaults(value) if isinstance(value, FunctionType) else value
                     for part, value in content.items()
                 }
                 waiting += methods
             elif _is_plain(value):
-                found[key] = value
-    return found
+                variables[key] = value
+    return variables
 
 
 def _code_and_defaults(function: FunctionType) -> list[Any]:

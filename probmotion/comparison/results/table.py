@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from probmotion.comparison.results.headline_metrics import best_of
+from probmotion.comparison.results.headline_metrics import best_of, seed_values
 
 __all__ = ["BLOCKS", "ComparisonTable", "mean_and_sd"]
 
@@ -82,7 +82,7 @@ overconfident below); mean error (sd): error of the mean in posterior standard d
 (ideal: 0); off-manifold ratio: variance off the prior's manifold, divided by the references'
 (ideal: 1); log-density gap: mean log density minus the references', nats (ideal: 0); mode
 proportions TV: total variation distance of the mode proportions from the references' (ideal: 0).
-The data frame and table.csv hold further metrics."""
+The data frame and table.csv contain further metrics."""
 _SEEDS_LEGEND = """\
 ±: standard deviation over seeds; *: best of the column among samplers with draws at every seed;
 °: statistically tied with the best (95 % Student intervals of the paired differences over seeds,
@@ -121,7 +121,7 @@ _NARROWEST = 10
 class ComparisonTable(pd.DataFrame):
     """Data frame with columns problem, sampler, seed, metric, value; prints mean ± sd over seeds.
 
-    ``attrs`` hold the descriptions of the problems, the words for runs without draws, and notes.
+    ``attrs`` contain problem descriptions, the words for runs without draws, and notes.
     Slices are plain data frames.
     """
 
@@ -164,10 +164,7 @@ class ComparisonTable(pd.DataFrame):
         samplers = list(dict.fromkeys(rows["sampler"]))
         seeds = sorted(set(rows["seed"]))
         words = self.attrs.get("words", {})
-        values: dict[tuple[str, str], pd.Series] = {
-            (str(sampler), str(metric)): group.set_index("seed")["value"]
-            for (sampler, metric), group in rows.groupby(["sampler", "metric"])
-        }
+        values = seed_values(rows)
         lines = [f"{problem}: {self.attrs.get('problems', {}).get(problem, '')}"]
         for title, columns in BLOCKS.items():
             shown = {key: head for key, head in columns.items() if key in set(rows["metric"])}
@@ -197,12 +194,12 @@ class ComparisonTable(pd.DataFrame):
         seeds: Sequence[int],
     ) -> dict[str, str]:
         """Return the symbol after each sampler's number; empty if the metric has no best value."""
-        own = {name: values[name, metric] for name in samplers if (name, metric) in values}
+        by_sampler = {name: values[name, metric] for name in samplers if (name, metric) in values}
         measured = {other for _, other in values}
-        best, tied = best_of(metric, own, seeds, measured, self.attrs.get("draws"))
+        best, tied = best_of(metric, by_sampler, seeds, measured, self.attrs.get("draws"))
         if best is None:
             return {}
-        return {name: "*" if name == best else "°" if name in tied else " " for name in own}
+        return {name: "*" if name == best else "°" if name in tied else " " for name in by_sampler}
 
 
 def mean_and_sd(values: pd.Series | None) -> str:

@@ -38,7 +38,7 @@ _FARTHEST = 1e100
 class GridRun(GridTask):
     """One sampler on one problem with one seed; ``path`` is the folder of draws and result.
 
-    With a budget, ``settings`` are those that the pilot chose, or ``pilot_failure`` is its failure.
+    With a budget, ``settings`` were chosen by the pilot, or ``pilot_failure`` is its failure.
     """
 
     stores_draws: ClassVar[bool] = True
@@ -51,7 +51,6 @@ class GridRun(GridTask):
         return f"{self.problem}/{self.sampler}/{self.seed}"
 
     def result(self) -> RunResult | None:
-        """Return the stored result, possibly for other inputs, or None."""
         return read_result(self.path)
 
     def finished(self) -> bool:
@@ -61,17 +60,16 @@ class GridRun(GridTask):
             return False
         if result.failure is not None or not self.stores_draws:
             return True
-        return _has_size(self.path / DRAWS, result.draws_bytes)
+        draws = self.path / DRAWS
+        return draws.exists() and result.draws_bytes in (None, draws.stat().st_size)
 
     def prepare(self) -> None:
-        """Load the problem and the libraries of the metrics."""
         from probmotion.metrics.measures import load_libraries
 
         load_libraries()
         super().prepare()
 
     def fail(self, error: BaseException) -> None:
-        """Store a failure."""
         self._store({}, None, Failure.of(error))
 
     def run(self, progress: bool) -> None:
@@ -112,22 +110,16 @@ class GridRun(GridTask):
 
     def _draw(self, posterior: MotionPosterior, seed: int, progress: bool) -> MotionDraws:
         """Return the sampler's draws after checking their number and values."""
-        draws = self.with_sampler.sample(
-            posterior,
-            draws=self.draws // self.chains,
-            chains=self.chains,
-            seed=seed,
-            progress=progress,
-        )
+        draws = self.sample(self.with_sampler, posterior, seed, progress)
         if not isinstance(draws, MotionDraws):
             raise TypeError(f"{self.sampler} must return MotionDraws, got {type(draws).__name__}")
         if draws.skeleton != posterior.skeleton:
             raise ValueError(f"{self.sampler} must return draws of the posterior's skeleton")
-        found = tuple(draws.positions.sizes[axis] for axis in ("chain", "draw"))
-        if found != (wanted := (self.chains, self.draws // self.chains)):
+        returned = tuple(draws.positions.sizes[axis] for axis in ("chain", "draw"))
+        if returned != (expected := (self.chains, self.draws // self.chains)):
             raise ValueError(
-                f"{self.sampler} must return {wanted[0]} chains of {wanted[1]} draws, got "
-                f"{found[0]} of {found[1]}"
+                f"{self.sampler} must return {expected[0]} chains of {expected[1]} draws, got "
+                f"{returned[0]} of {returned[1]}"
             )
         if not (math.isfinite(draws.seconds) and draws.seconds >= 0):
             raise ValueError(
@@ -177,14 +169,6 @@ class GridRun(GridTask):
             self.fail(error)
 
 
-def _has_size(file: Path, size: int | None) -> bool:
-    """Whether a file exists with the given size; None allows any size."""
-    try:
-        return size in (None, file.stat().st_size)
-    except OSError:
-        return False
-
-
 def forget_unfinished(folder: Path, problems: Iterable[str]) -> None:
     """Remove the incomplete files and folders that a killed process left in a grid's folder."""
     for problem in problems:
@@ -200,8 +184,7 @@ def _remove_unfinished(place: Path, seed: str) -> None:
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _without_nan(value: Any) -> Any:
-    """Replace NaN and infinite values, which JSON cannot hold, by None."""
-    if isinstance(value, dict):
-        return {name: _without_nan(entry) for name, entry in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _without_nan(stored: dict[str, Any]) -> dict[str, Any]:
+    """Replace NaN and infinite values, which JSON does not allow, by None."""
+    without: dict[str, Any] = json.loads(json.dumps(stored), parse_constant=lambda _: None)
+    return without

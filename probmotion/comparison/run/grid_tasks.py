@@ -1,23 +1,31 @@
-"""Tasks of a grid: one sampler on one problem, with its inputs and its stored result."""
+"""Tasks of a grid, one sampler on one problem, and the pilots that choose settings for a budget."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
-from probmotion.comparison.results.budgets import Budget
-from probmotion.comparison.results.failures import Failure
+from probmotion import seeds
+from probmotion.comparison.results.budgets import Budget, affordable
+from probmotion.comparison.results.failures import Failure, ResultNotWritten
 from probmotion.comparison.results.run_results import RunResult
+from probmotion.comparison.run.time_limits import time_limit
+from probmotion.files import written_whole
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.catalogue import load_problem
+from probmotion.threads import one_thread
 
-__all__ = ["GridTask", "PilotResult"]
+__all__ = ["GridTask", "Pilot", "PilotResult"]
 
 
 @dataclass(frozen=True)
 class PilotResult:
-    """Settings with which a sampler spends a budget, or the failure to find them.
+    """Settings with which a sampler spends a budget, or the failure of the pilot.
 
     ``settings`` are empty if the sampler has no effort setting.
     """
@@ -58,16 +66,14 @@ class GridTask:
     def finished(self) -> bool:
         """Whether a result for the same inputs is stored that need not be retried."""
         result = self.result()
-        if result is None or result.fingerprint != self.fingerprint:
+        if result is None or not self.has_result():
             return False
         return result.failure is None or result.failure.unsupported
 
     def conflicts(self) -> bool:
         """Whether a result for other inputs is stored, which must not be replaced."""
         result = self.result()
-        return (
-            result is not None and result.failure is None and result.fingerprint != self.fingerprint
-        )
+        return result is not None and result.failure is None and not self.has_result()
 
     def run(self, progress: bool) -> None:
         """Run and store the result or the failure."""
@@ -84,3 +90,58 @@ class GridTask:
     def prepare(self) -> None:
         """Load everything that the time limit does not cover."""
         self.load()
+
+    def sample(
+        self, sampler: Sampler, posterior: MotionPosterior, seed: int, progress: bool
+    ) -> MotionDraws:
+        """Return draws of a sampler."""
+        draws = self.draws // self.chains
+        return sampler.sample(
+            posterior, draws=draws, chains=self.chains, seed=seed, progress=progress
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pilot(GridTask):
+    """Pilot of a sampler on a problem, which chooses the settings of runs with all seeds."""
+
+    def __str__(self) -> str:
+        return f"{self.problem}/{self.sampler}"
+
+    def result(self) -> PilotResult | None:
+        try:
+            stored = json.loads(self.path.read_text(encoding="utf-8"))
+            failure = stored.pop("failure")
+            return PilotResult(**stored, failure=None if failure is None else Failure(**failure))
+        except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+            return None
+
+    def fail(self, error: BaseException) -> None:
+        self._store(PilotResult(self.fingerprint, {}, Failure.of(error)))
+
+    def run(self, progress: bool) -> None:
+        assert self.budget is not None
+        try:
+            with one_thread():
+                problem = self.load()
+                with time_limit(self.limit):
+                    settings = affordable(
+                        self.budget, self.with_sampler, partial(self._cost, problem)
+                    )
+        except (Exception, SystemExit) as error:
+            self.fail(error)
+        else:
+            self._store(PilotResult(self.fingerprint, settings))
+
+    def _cost(self, problem: Problem, sampler: Sampler) -> float:
+        assert self.budget is not None
+        seed = seeds.integer(0, "pilot", self.problem, self.sampler)
+        return self.budget.spent(self.sample(sampler, problem.posterior, seed, progress=False))
+
+    def _store(self, result: PilotResult) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(self.path) as unfinished:
+                unfinished.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
+        except OSError as error:
+            raise ResultNotWritten(str(error)) from error

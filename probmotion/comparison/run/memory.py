@@ -58,7 +58,7 @@ def _trim() -> None:
 
 
 def _kibibytes(name: str) -> float:
-    found = re.search(rf"^{name}:\s+(\d+) kB$", _STATUS.read_text(), re.MULTILINE)
-    if found is None:
+    match = re.search(rf"^{name}:\s+(\d+) kB$", _STATUS.read_text(), re.MULTILINE)
+    if match is None:
         raise ValueError(f"{_STATUS} has no entry {name}")
-    return float(found[1])
+    return float(match[1])

@@ -6,7 +6,6 @@ sent by value, so that a script needs no ``if __name__ == "__main__"``.
 
 from __future__ import annotations
 
-import io
 import multiprocessing
 import os
 import pickle
@@ -17,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import ModuleType
@@ -26,7 +26,6 @@ import cloudpickle
 
 from probmotion.comparison.results.failures import TimeLimitExceeded, WorkerDied
 from probmotion.comparison.run.grid_tasks import GridTask
-from probmotion.posteriors.problem import Problem
 from probmotion.threads import one_thread
 
 __all__ = ["Done", "run_in_processes"]
@@ -57,14 +56,13 @@ class _Worker:
         self.task: GridTask | None = None
         self.until: float | None = None
 
-    def give(self, task: GridTask) -> None:
+    def send(self, task: GridTask) -> None:
         """Send a task; each problem is sent once, so that its caches serve all of its tasks."""
+        key = id(task.source)  # unique while tasks refer to the problem
+        problem = None if key in self.known else cloudpickle.dumps(task.source)
         # multiprocessing's pickler would share the memory of tensors and send classes by name.
-        packed = io.BytesIO()
-        pickler = _TaskPickler(packed, known=self.known)
-        pickler.dump(task)
-        self.connection.send_bytes(pickle.dumps((pickler.new, packed.getvalue())))
-        self.known |= pickler.new.keys()
+        self.connection.send_bytes(cloudpickle.dumps((key, problem, replace(task, source=""))))
+        self.known.add(key)
         self.task = task
 
     def message(self) -> bytes | None:
@@ -74,13 +72,6 @@ class _Worker:
         except (EOFError, OSError):
             self.process.join()
             return None
-
-    def start_clock(self) -> None:
-        """Start the clock of the task."""
-        assert self.task is not None
-        if self.task.limit is not None:
-            factor, more = _GRACE
-            self.until = time.monotonic() + factor * self.task.limit + more
 
     def take_task(self) -> GridTask:
         """Remove and return the finished task."""
@@ -93,38 +84,6 @@ class _Worker:
         self.process.kill()
         self.process.join()
         self.connection.close()
-
-
-class _TaskPickler(cloudpickle.Pickler):
-    """Replaces problems by numbers; ``new`` holds those that the worker does not know yet."""
-
-    def __init__(self, file: io.BytesIO, known: set[int]) -> None:
-        super().__init__(file)
-        self.known = known
-        self.new: dict[int, bytes] = {}
-
-    def persistent_id(self, value: Any) -> int | None:
-        """Return the id of a problem, which stays unique while tasks refer to it."""
-        if not isinstance(value, Problem):
-            return None
-        if id(value) not in self.known:
-            self.new[id(value)] = cloudpickle.dumps(value)
-        return id(value)
-
-
-class _TaskUnpickler(pickle.Unpickler):
-    """Replaces numbers by problems, each unpickled once."""
-
-    def __init__(self, packed: bytes, problems: dict[int, bytes | Problem]) -> None:
-        super().__init__(io.BytesIO(packed))
-        self.problems = problems
-
-    def persistent_load(self, number: Any) -> Problem:
-        """Return the problem with a number."""
-        problem = self.problems[number]
-        if isinstance(problem, bytes):
-            problem = self.problems[number] = pickle.loads(problem)
-        return problem
 
 
 def run_in_processes(tasks: Sequence[GridTask], workers: int, done: Done) -> None:
@@ -142,43 +101,38 @@ def run_in_processes(tasks: Sequence[GridTask], workers: int, done: Done) -> Non
             f"workers must be 0 in a daemonic process, which may have no children, got {workers}"
         )
     waiting = deque(tasks)
-    crew: list[_Worker] = []
+    pool: list[_Worker] = []
     try:
         # Libraries read the number of threads from the environment when they are loaded.
         with one_thread():
-            while waiting or any(worker.task for worker in crew):
-                missing = min(workers, len(waiting) + sum(w.task is not None for w in crew))
-                crew += [_Worker() for _ in range(missing - len(crew))]
-                _hand_out(crew, waiting, done)
-                _listen(crew, done)
+            while waiting or any(worker.task for worker in pool):
+                missing = min(workers, len(waiting) + sum(w.task is not None for w in pool))
+                pool += [_Worker() for _ in range(missing - len(pool))]
+                _hand_out(pool, waiting, done)
+                _listen(pool, done)
     finally:
-        for worker in crew:
+        for worker in pool:
             worker.kill()
 
 
-def _hand_out(crew: list[_Worker], waiting: deque[GridTask], done: Done) -> None:
-    for worker in crew:
+def _hand_out(pool: list[_Worker], waiting: deque[GridTask], done: Done) -> None:
+    for worker in pool:
         while waiting and worker.ready and worker.task is None:
             task = waiting.popleft()
             try:
-                worker.give(task)
+                worker.send(task)
             except OSError:
                 # It died between two tasks; _listen removes it.
                 waiting.appendleft(task)
                 break
             except Exception as error:
-                done(
-                    task,
-                    TypeError(
-                        f"{task} cannot be sent to a worker process: {error}; make it "
-                        "picklable or use workers=0"
-                    ),
-                )
+                message = f"{task} cannot be sent to a worker process: {error}; make it picklable"
+                done(task, TypeError(f"{message} or use workers=0"))
 
 
-def _listen(crew: list[_Worker], done: Done) -> None:
+def _listen(pool: list[_Worker], done: Done) -> None:
     """Wait for a message or a time limit of a worker and handle it."""
-    active = [worker for worker in crew if worker.task is not None or not worker.ready]
+    active = [worker for worker in pool if worker.task is not None or not worker.ready]
     if not active:
         return
     limits = [worker.until for worker in active if worker.until is not None]
@@ -186,27 +140,29 @@ def _listen(crew: list[_Worker], done: Done) -> None:
     ready = wait([worker.connection for worker in active], timeout)
     for worker in active:
         if worker.connection in ready:
-            _handle(crew, worker, done)
+            _handle(pool, worker, done)
         elif worker.until is not None and time.monotonic() > worker.until:
-            crew.remove(worker)
+            pool.remove(worker)
             worker.kill()
             task = worker.take_task()
             assert task.limit is not None
             done(task, TimeLimitExceeded(task.limit))
 
 
-def _handle(crew: list[_Worker], worker: _Worker, done: Done) -> None:
+def _handle(pool: list[_Worker], worker: _Worker, done: Done) -> None:
     message = worker.message()
     if message == _READY:
         worker.ready = True
     elif message == _STARTED:
-        worker.start_clock()
+        if worker.task is not None and worker.task.limit is not None:
+            factor, more = _GRACE
+            worker.until = time.monotonic() + factor * worker.task.limit + more
     elif message is not None:
         done(worker.take_task(), pickle.loads(message))
     elif not worker.ready:
         raise RuntimeError("a worker process ended before it was ready; see its error above")
     else:
-        crew.remove(worker)
+        pool.remove(worker)
         worker.connection.close()
         if worker.task is not None:
             killed = worker.process.exitcode == -getattr(signal, "SIGKILL", 9)
@@ -216,7 +172,7 @@ def _handle(crew: list[_Worker], worker: _Worker, done: Done) -> None:
 def _work(connection: Connection) -> None:
     """Run tasks until the parent closes the connection."""
     _begin_worker()
-    problems: dict[int, bytes | Problem] = {}
+    problems: dict[int, Any] = {}
     connection.send_bytes(_READY)
     while True:
         error: BaseException | None = None
@@ -226,9 +182,12 @@ def _work(connection: Connection) -> None:
             sys.stdout.flush()
             os._exit(0)
         try:
-            new, packed = pickle.loads(sent)
-            problems |= new
-            task = _TaskUnpickler(packed, problems).load()
+            key, packed, task = pickle.loads(sent)
+            if packed is not None:
+                problems[key] = packed
+            if isinstance(packed := problems[key], bytes):
+                problems[key] = pickle.loads(packed)
+            task = replace(task, source=problems[key])
             with suppress(Exception):  # run() raises it again
                 task.prepare()
             connection.send_bytes(_STARTED)

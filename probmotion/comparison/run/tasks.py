@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from probmotion.comparison.results.budgets import Budget, check_budget
+from probmotion.comparison.results.budgets import Budget
 from probmotion.comparison.results.failures import ResultNotWritten
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.run.grid_runs import GridRun, forget_unfinished
-from probmotion.comparison.run.grid_tasks import GridTask
-from probmotion.comparison.run.pilots import Pilot
+from probmotion.comparison.run.grid_tasks import GridTask, Pilot
 from probmotion.comparison.run.workers import run_tasks
 from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
@@ -39,37 +38,32 @@ def check_grid_options(
         raise ValueError(f"draws must be a multiple of chains, {chains}, got {draws}")
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    check_budget(budget)
+    if budget is not None and not isinstance(budget, Budget):
+        raise ValueError(f"budget must be a Budget, got {budget!r}")
 
 
+@dataclass(eq=False)
 class Grid:
     """Tasks of a comparison, whose results are stored in ``folder``.
 
-    ``budget`` is that of a run, ``limit`` the time limit of a task in seconds.
+    ``budget`` applies to each run, ``limit`` (seconds) to each task.
     """
 
     run_class: ClassVar[type[GridRun]] = GridRun
 
-    def __init__(
-        self,
-        folder: Path,
-        plan: Plan,
-        problems: Mapping[str, str | Problem],
-        samplers: Mapping[str, Sampler],
-        budget: Budget | None = None,
-        limit: float | None = None,
-    ) -> None:
-        self.folder = folder
-        self.plan = plan
-        self.problems = problems
-        self.samplers = samplers
-        self.budget = budget
-        self.limit = limit
+    folder: Path
+    plan: Plan
+    problems: Mapping[str, str | Problem]
+    samplers: Mapping[str, Sampler]
+    budget: Budget | None = None
+    limit: float | None = None
+
+    def __post_init__(self) -> None:
         self._fingerprints = {
             name: _fingerprint(name, load_problem(source) if isinstance(source, str) else source)
-            for name, source in problems.items()
+            for name, source in self.problems.items()
         }
-        for name, sampler in samplers.items():
+        for name, sampler in self.samplers.items():
             _fingerprint(name, sampler)
         self._versions = library_versions()
 
@@ -100,9 +94,9 @@ class Grid:
     def _grid_run(self, problem: str, sampler: str, seed: int) -> GridRun:
         with_sampler: Any = self.samplers[sampler]
         pilot = None if self.budget is None else self._pilot(problem, sampler)
-        found = pilot.result() if pilot is not None and pilot.has_result() else None
-        if found is not None and found.settings:
-            with_sampler = replace(with_sampler, **found.settings)
+        result = pilot.result() if pilot is not None and pilot.has_result() else None
+        if result is not None and result.settings:
+            with_sampler = replace(with_sampler, **result.settings)
         inputs: list[Any] = [
             *(problem, self._fingerprints[problem], sampler, fingerprint(with_sampler), seed),
             *(self.plan.draws, self.plan.chains, self._versions),
@@ -112,8 +106,8 @@ class Grid:
             seed=seed,
             with_sampler=with_sampler,
             fingerprint=fingerprint(inputs if self.budget is None else [*inputs, self.budget]),
-            settings=None if found is None else found.settings,
-            pilot_failure=None if found is None else found.failure,
+            settings=None if result is None else result.settings,
+            pilot_failure=None if result is None else result.failure,
             **self._common(problem, sampler),
         )
 
@@ -163,12 +157,12 @@ def run_grid(
 
 
 def refuse_other_settings(folder: Path, tasks: Iterable[GridTask]) -> None:
-    """Raise ``ValueError`` if a folder holds results of tasks made with other inputs."""
+    """Raise ``ValueError`` if a folder contains results of tasks made with other inputs."""
     if conflicting := [task for task in tasks if task.conflicts()]:
         runs = [task for task in conflicting if isinstance(task, GridRun)]
         what = f"{len(runs)} finished runs" if runs else f"{len(conflicting)} pilots of a budget"
         raise ValueError(
-            f"out is {folder}, which holds {what} made with other settings, observations or "
+            f"out is {folder}, which contains {what} made with other settings, observations or "
             f"library versions, the first {(runs or conflicting)[0]}; use another folder"
         )
 

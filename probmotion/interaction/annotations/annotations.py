@@ -74,18 +74,22 @@ class Annotations:
                 f"{keypoints[index, joint]} in annotation {index}, joint "
                 f"{self.skeleton.joint_names[joint]}"
             )
-        self._check_people(visible)
-        neighbours = np.asarray(self.neighbours, dtype=np.float64)
-        check_shape("neighbours", neighbours, (n, 2, self.skeleton.n_joints, 2))
-        if np.isinf(neighbours).any():
-            raise ValueError("neighbours must be finite, or NaN if missing, got infinite values")
+        for root in self.skeleton.roots:
+            missing = ~visible[:, np.equal(joint_roots(self.skeleton), root)].any(axis=-1)
+            if missing.any():
+                raise ValueError(
+                    "visible must have at least one joint per person, got none of the person of "
+                    f"{self.skeleton.joint_names[root]} in annotation {int(np.argmax(missing))}"
+                )
+        for name, shape in (("neighbours", (n, 2, self.skeleton.n_joints, 2)), ("views", (n, 2))):
+            if getattr(self, name) is None:
+                continue
+            values = np.asarray(getattr(self, name), dtype=np.float64)
+            check_shape(name, values, shape)
+            if np.isinf(values).any():
+                raise ValueError(f"{name} must be finite, or NaN if unknown, got infinite values")
+            object.__setattr__(self, name, values)
         check_positive("fps", self.fps)
-        if self.views is not None:
-            views = np.asarray(self.views, dtype=np.float64)
-            check_shape("views", views, (n, 2))
-            if np.isinf(views).any():
-                raise ValueError("views must be finite, or NaN if unknown, got infinite values")
-            object.__setattr__(self, "views", views)
         if self.sources is not None:
             sources = tuple(str(source) for source in self.sources)
             if len(sources) != n:
@@ -93,7 +97,6 @@ class Annotations:
             object.__setattr__(self, "sources", sources)
         object.__setattr__(self, "keypoints", np.where(visible[..., np.newaxis], keypoints, 0.0))
         object.__setattr__(self, "visible", visible)
-        object.__setattr__(self, "neighbours", neighbours)
         object.__setattr__(self, "fps", float(self.fps))
         object.__setattr__(self, "dropped", dict(self.dropped))
 
@@ -126,7 +129,7 @@ class Annotations:
     def joined(cls, several: Sequence[Annotations]) -> Annotations:
         """Concatenate annotations of several videos with the same skeleton and frame rate.
 
-        Views are kept if all sets have them, sources if any set has them.
+        The result has views if all sets have them, and sources if any set has them.
         """
         if not several:
             raise ValueError("several must contain at least one set of annotations, got none")
@@ -134,8 +137,7 @@ class Annotations:
         for number, other in enumerate(several):
             if other.skeleton != first.skeleton or other.fps != first.fps:
                 raise ValueError(
-                    f"several[{number}] must have the skeleton ({first.skeleton.n_joints} joints) "
-                    f"and frame rate ({first.fps:g}) of several[0], got "
+                    f"several[{number}] must have the skeleton and frame rate of several[0], got "
                     f"{other.skeleton.n_joints} joints and {other.fps:g} frames per second"
                 )
         views = [other.views for other in several if other.views is not None]
@@ -174,9 +176,11 @@ class Annotations:
         stretch : ndarray, (n, J)
             Change of the bone's length (at a root: its displacement), metres.
         """
-        own = np.where(self.visible[..., np.newaxis], self.keypoints, np.nan)
-        times = np.stack([self.neighbours[:, 0], own, self.neighbours[:, 1]])
-        base, tip = self._bones()
+        current = np.where(self.visible[..., np.newaxis], self.keypoints, np.nan)
+        times = np.stack([self.neighbours[:, 0], current, self.neighbours[:, 1]])
+        base, tip = list(self.skeleton.parents), list(range(self.skeleton.n_joints))
+        for root, chest in zip(self.skeleton.roots, chest_joints(self.skeleton), strict=True):
+            base[root], tip[root] = root, chest
         bones = times[:, :, tip] - times[:, :, base]
         lengths = np.linalg.norm(bones, axis=-1, keepdims=True)
         turn = _change(bones / np.where(lengths > 0, lengths, 1.0))
@@ -237,30 +241,13 @@ class Annotations:
                 f"({str(why)[:120]})"
             ) from why
 
-    def _bones(self) -> tuple[list[int], list[int]]:
-        """Return the start and end joint of each joint's bone; a root's ends at its chest."""
-        base, tip = list(self.skeleton.parents), list(range(self.skeleton.n_joints))
-        for root, chest in zip(self.skeleton.roots, chest_joints(self.skeleton), strict=True):
-            base[root], tip[root] = root, chest
-        return base, tip
-
-    def _check_people(self, visible: np.ndarray) -> None:
-        for root in self.skeleton.roots:
-            missing = ~visible[:, np.equal(joint_roots(self.skeleton), root)].any(axis=-1)
-            if missing.any():
-                raise ValueError(
-                    "visible must have at least one joint per person, got none of the person of "
-                    f"{self.skeleton.joint_names[root]} in annotation {int(np.argmax(missing))}"
-                )
-
 
 def _change(values: np.ndarray) -> np.ndarray:
     """Return the norm of the change per frame, ``(3, …, d) → (…)``."""
-    before, own, after = values
-    central, first, last = (
-        np.linalg.norm(change, axis=-1)
-        for change in ((after - before) / 2, own - before, after - own)
-    )
-    # A difference is NaN if either frame is missing.
-    known = np.where(np.isnan(central), np.where(np.isnan(first), last, first), central)
-    return np.nan_to_num(known, nan=0.0)
+    before, current, after = values
+    result = np.zeros(current.shape[:-1])
+    # From the last to the first choice; a difference is NaN if either frame is missing.
+    for change in (after - current, current - before, (after - before) / 2):
+        size = np.linalg.norm(change, axis=-1)
+        result = np.where(np.isnan(size), result, size)
+    return result

@@ -30,7 +30,7 @@ import numpy as np
 
 from probmotion.interaction.annotations.local_frames import (
     chest_joints,
-    joint_roots,
+    joints_named,
     local_frames,
     pair_frames,
     valid_frames,
@@ -43,13 +43,13 @@ from probmotion.validation import check_finite, check_shape
 if TYPE_CHECKING:
     from probmotion.interaction.annotations.annotations import Annotations
 
-__all__ = ["LEAST_JOINTS", "BackboneEstimate", "annotation_views", "lift_torsos", "torso_joints"]
+__all__ = ["TORSO", "BackboneEstimate", "annotation_views", "lift_torsos"]
 
-LEAST_JOINTS = 3
-"""Minimum number of visible torso joints per person; two would leave a rotation undetermined."""
+# Minimum number of visible torso joints per person; two would leave a rotation undetermined.
+_LEAST_JOINTS = 3
 
-_TORSO = {"pelvis", "spine", "chest", "neck", "head"}
-_TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
+TORSO = {"pelvis", "spine", "chest", "neck", "head"}
+TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +67,7 @@ class BackboneEstimate:
     residuals : ndarray, (n, K)
         Root-mean-square residual of the visible torso joints, metres.
     lifted : ndarray, (n,)
-        Whether every person has at least :data:`LEAST_JOINTS` visible torso joints. The other
-        rows are NaN.
+        Whether every person has at least three visible torso joints. The other rows are NaN.
     """
 
     backbones: np.ndarray
@@ -76,15 +75,6 @@ class BackboneEstimate:
     roots: np.ndarray
     residuals: np.ndarray
     lifted: np.ndarray
-
-
-def torso_joints(skeleton: Skeleton) -> tuple[tuple[int, ...], ...]:
-    """Return the torso joints of each person, in the order of the roots."""
-    joints_by_root: dict[int, list[int]] = {root: [] for root in skeleton.roots}
-    for joint, name in enumerate(skeleton.canonical_names):
-        if name.rpartition(":")[2] in _TORSO:
-            joints_by_root[joint_roots(skeleton)[joint]].append(joint)
-    return tuple(tuple(joints) for joints in joints_by_root.values())
 
 
 def lift_torsos(
@@ -113,9 +103,9 @@ def lift_torsos(
             "seed must have distinct roots and backbones not parallel to their line, got a "
             "degenerate pair"
         )
-    torsos = [list(joints) for joints in torso_joints(skeleton)]
+    torsos = [list(joints) for joints in joints_named(skeleton, TORSO)]
     seen = np.stack([visible[:, joints].sum(axis=-1) for joints in torsos])
-    lifted = np.asarray((seen >= LEAST_JOINTS).all(axis=0))
+    lifted = np.asarray((seen >= _LEAST_JOINTS).all(axis=0))
     shape = (len(keypoints), len(torsos))
     estimate = BackboneEstimate(
         backbones=np.full((*shape, 3), np.nan),

@@ -9,6 +9,7 @@ with roots r and backbones B = chest − root. The frame is not orthogonal and k
 
 from __future__ import annotations
 
+from collections.abc import Set
 from functools import lru_cache
 
 import numpy as np
@@ -17,43 +18,22 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_shape
 
 __all__ = [
-    "SMALLEST_SINE",
-    "chest_joints",
-    "cross",
-    "joint_roots",
-    "local_frames",
-    "pair_frames",
-    "unit",
-    "valid_frames",
-]
+    "SMALLEST_SINE", "chest_joints", "cross", "joint_roots", "joints_named", "local_frames",
+    "pair_frames", "unit", "valid_frames",
+]  # fmt: skip
 
 SMALLEST_SINE = 1e-6
 """Sine of the angle between i and j below which a frame is degenerate."""
 
-_TINY = 1e-300
-
 
 def local_frames(roots: np.ndarray, backbones: np.ndarray) -> np.ndarray:
-    """Return the local frame of each pair (eq. 3).
+    """Return the local frames (eq. 3) with columns i, j, k, (…, 3, 3).
 
-    Parameters
-    ----------
-    roots : ndarray, (…, K, 3)
-        Root joints of K ≥ 2 people, metres. The first two define i.
-    backbones : ndarray, (…, K, 3)
-        Chest minus root of each person, metres.
-
-    Returns
-    -------
-    frames : ndarray, (…, 3, 3)
-        Columns i, j, k. An undefined column (roots coincide, backbones cancel) is 0; see
-        :func:`valid_frames`.
+    ``roots`` and ``backbones`` (…, K, 3) of K ≥ 2 people; the first two roots define i. An
+    undefined column (roots coincide, backbones cancel) is 0; see :func:`valid_frames`.
     """
-    roots = np.asarray(roots, dtype=np.float64)
-    backbones = np.asarray(backbones, dtype=np.float64)
     check_shape("roots", roots, ("…", "K", 3))
     check_shape("backbones", backbones, roots.shape)
-    _check_people("roots", roots.shape[-2])
     i = unit(roots[..., 1, :] - roots[..., 0, :])
     j = unit(unit(backbones).sum(axis=-2))
     return np.stack([i, j, cross(i, j)], axis=-1)
@@ -69,7 +49,8 @@ def pair_frames(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("…", skeleton.n_joints, 3))
-    _check_people("skeleton", len(skeleton.roots))
+    if len(skeleton.roots) < 2:
+        raise ValueError(f"skeleton must have at least 2 people, got {len(skeleton.roots)}")
     roots = positions[..., list(skeleton.roots), :]
     return local_frames(roots, positions[..., list(chest_joints(skeleton)), :] - roots)
 
@@ -83,17 +64,21 @@ def joint_roots(skeleton: Skeleton) -> tuple[int, ...]:
 @lru_cache(maxsize=32)
 def chest_joints(skeleton: Skeleton) -> tuple[int, ...]:
     """Return the chest joint of each tree, by canonical name, in the order of the roots."""
-    joints_by_root: dict[int, list[int]] = {root: [] for root in skeleton.roots}
-    for joint, name in enumerate(skeleton.canonical_names):
-        if name.rpartition(":")[2] == "chest":
-            joints_by_root[joint_roots(skeleton)[joint]].append(joint)
-    for root, joints in joints_by_root.items():
+    chests = joints_named(skeleton, {"chest"})
+    for root, joints in zip(skeleton.roots, chests, strict=True):
         if len(joints) != 1:
             raise ValueError(
                 f"skeleton must have one chest per tree, got {len(joints)} in the tree of "
                 f"{skeleton.joint_names[root]}"
             )
-    return tuple(joints[0] for joints in joints_by_root.values())
+    return tuple(joint for (joint,) in chests)
+
+
+def joints_named(skeleton: Skeleton, names: Set[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the joints of each tree with a canonical name in ``names``, in the order of roots."""
+    wanted = [j for j, n in enumerate(skeleton.canonical_names) if n.rpartition(":")[2] in names]
+    roots = joint_roots(skeleton)
+    return tuple(tuple(j for j in wanted if roots[j] == root) for root in skeleton.roots)
 
 
 def valid_frames(frames: np.ndarray) -> np.ndarray:
@@ -112,14 +97,9 @@ def valid_frames(frames: np.ndarray) -> np.ndarray:
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Return normalised vectors (…, 3); 0 stays 0."""
     length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
-    return vectors / np.maximum(length, _TINY)[..., np.newaxis]
+    return vectors / np.maximum(length, 1e-300)[..., np.newaxis]
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a × b over the last axis; faster than NumPy's for few vectors."""
     return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
-
-
-def _check_people(name: str, count: int) -> None:
-    if count < 2:
-        raise ValueError(f"{name} must have at least 2 people, got {count}")

@@ -33,7 +33,7 @@ class DrawnAnnotations:
         True views (φ, θ) in the local frames, radians.
     world_views : ndarray, (n, 2)
         Azimuth and elevation of the cameras, radians.
-    clips, frames : ndarray, (n,), int
+    clips, frames : ndarray of int, (n,)
         Index of the motion and of its frame.
     positions : ndarray, (n, J, 3)
         Pose-pairs, metres.
@@ -83,15 +83,16 @@ def draw_annotations(
     """
     skeleton, fps = _common(motions)
     check_count("n", n)
-    rng = {
-        name: seeds.generator(seed, "annotations", name)
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}")
+    frame_rng, view_rng, noise_rng, hidden_rng = (
+        seeds.generator(seed, "annotations", name)
         for name in ("frames", "views", "noise", "hidden")
-    }
-    clips, numbers = _drawn_frames(motions, n, frames, rng["frames"])
+    )
+    clips, numbers = _drawn_frames(motions, n, frames, frame_rng)
     if world_views is None:
-        uniform = rng["views"].random((n, 2))
-        low = np.array([-np.pi, ELEVATIONS[0]])
-        world_views = low + uniform * (np.array([np.pi, ELEVATIONS[1]]) - low)
+        low, high = np.array([(-np.pi, np.pi), ELEVATIONS]).T
+        world_views = low + view_rng.random((n, 2)) * (high - low)
     world_views = np.asarray(world_views, dtype=np.float64)
     check_shape("world_views", world_views, (n, 2))
     check_finite("world_views", world_views)
@@ -107,8 +108,9 @@ def draw_annotations(
             f"degenerate pair in frame {numbers[first]} of clip {clips[first]}"
         )
     views = view_angles(local, axes[:, 2])
-    visible = _visible(n, skeleton, hidden, rng["hidden"])
-    projections = _projections(poses, axes, noise, rng["noise"])
+    visible = _visible(n, skeleton, hidden, hidden_rng)
+    projections = np.einsum("nai,ntji->ntja", axes[:, :2], poses)
+    projections = projections + noise * noise_rng.standard_normal(projections.shape)
     projections = np.where(visible[:, np.newaxis, :, np.newaxis], projections, np.nan)
     annotations = Annotations(
         projections[:, 1],
@@ -125,11 +127,9 @@ def draw_annotations(
 def world_axes(world_views: np.ndarray) -> np.ndarray:
     """Return the camera axes right, up and towards the viewer as rows: ``(n, 2) → (n, 3, 3)``."""
     azimuth, elevation = np.asarray(world_views, dtype=np.float64).T
-    sin_a, cos_a, sin_e, cos_e = (
-        np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
-    )  # fmt: skip
-    right = np.stack([cos_a, 0 * cos_a, -sin_a], axis=-1)
-    towards = np.stack([cos_e * sin_a, sin_e, cos_e * cos_a], axis=-1)
+    sine, cosine, level = np.sin(azimuth), np.cos(azimuth), np.cos(elevation)
+    right = np.stack([cosine, 0 * cosine, -sine], axis=-1)
+    towards = np.stack([level * sine, np.sin(elevation), level * cosine], axis=-1)
     return np.stack([right, np.cross(towards, right), towards], axis=1)
 
 
@@ -138,12 +138,11 @@ def _common(motions: Sequence[Motion]) -> tuple[Skeleton, float]:
         raise ValueError("motions must contain at least one clip, got none")
     skeleton, fps = motions[0].skeleton, motions[0].fps
     for number, motion in enumerate(motions):
-        if motion.skeleton != skeleton:
-            raise ValueError(f"motions[{number}] must have the skeleton of motions[0]")
-        if motion.fps != fps:
+        if motion.skeleton != skeleton or motion.fps != fps:
             raise ValueError(
-                f"motions[{number}] must have the frame rate of motions[0], {fps:g}, got "
-                f"{motion.fps:g}: resample it"
+                f"motions[{number}] must have the skeleton and frame rate of motions[0], got "
+                f"{motion.skeleton.n_joints} joints and {motion.fps:g} frames per second: retarget "
+                "or resample it"
             )
     return skeleton, fps
 
@@ -159,41 +158,27 @@ def _drawn_frames(
         frames = [np.ones(motion.frames, dtype=bool) for motion in motions]
     if len(frames) != len(motions):
         raise ValueError(f"frames must have {len(motions)} masks, one per clip, got {len(frames)}")
-    for number, (motion, chosen) in enumerate(zip(motions, frames, strict=True)):
-        check_shape(f"frames[{number}]", chosen, (motion.frames,))
-        if chosen.dtype != np.bool_:
-            raise ValueError(f"frames[{number}] must be bool, got {chosen.dtype}")
-    clips = np.repeat(np.arange(len(frames)), [int(chosen.sum()) for chosen in frames])
-    numbers = np.concatenate([np.flatnonzero(chosen) for chosen in frames])
+    for number, (motion, mask) in enumerate(zip(motions, frames, strict=True)):
+        check_shape(f"frames[{number}]", mask, (motion.frames,))
+        if mask.dtype != np.bool_:
+            raise ValueError(f"frames[{number}] must be bool, got {mask.dtype}")
+    clips = np.repeat(np.arange(len(frames)), [int(mask.sum()) for mask in frames])
+    numbers = np.concatenate([np.flatnonzero(mask) for mask in frames])
     if n > len(clips):
         raise ValueError(f"n must be at most {len(clips)}, the number of frames, got {n}")
-    drawn = rng.permutation(len(clips))[:n]
-    return clips[drawn], numbers[drawn]
-
-
-def _projections(
-    poses: np.ndarray, axes: np.ndarray, noise: float, rng: np.random.Generator
-) -> np.ndarray:
-    """Return noisy orthographic projections: ``(n, 3, J, 3) → (n, 3, J, 2)``."""
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}")
-    projections = np.einsum("nai,ntji->ntja", axes[:, :2], poses)
-    return projections + noise * rng.standard_normal(projections.shape)
+    chosen = rng.permutation(len(clips))[:n]
+    return clips[chosen], numbers[chosen]
 
 
 def _with_neighbours(
     motions: Sequence[Motion], clips: np.ndarray, frames: np.ndarray
 ) -> np.ndarray:
     """Return positions before, at and after each frame, (n, 3, J, 3); NaN beyond the ends."""
-    first = motions[0].positions
-    poses = np.full((len(clips), 3, *first.shape[1:]), np.nan)
-    for number, motion in enumerate(motions):
-        (rows,) = np.nonzero(clips == number)
-        for slot, offset in enumerate((-1, 0, 1)):
-            at = frames[rows] + offset
-            inside = (at >= 0) & (at < motion.frames)
-            poses[rows[inside], slot] = motion.positions[at[inside]]
-    return poses
+    padded = [
+        np.pad(motion.positions, ((1, 1), (0, 0), (0, 0)), constant_values=np.nan)
+        for motion in motions
+    ]
+    return np.stack([padded[c][f : f + 3] for c, f in zip(clips, frames, strict=True)])
 
 
 def _visible(n: int, skeleton: Skeleton, hidden: float, rng: np.random.Generator) -> np.ndarray:

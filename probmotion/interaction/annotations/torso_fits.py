@@ -29,36 +29,22 @@ _ROWS = 1024
 
 
 class BodyFit(NamedTuple):
-    """Fit of n projections.
+    """Fit of n projections."""
 
-    ``rotations`` R (n, 3, 3), from the body's axes to the image's; ``translations`` c (n, 2);
-    ``residuals`` (n,), root-mean-square residual of the visible points.
-    """
-
-    rotations: np.ndarray
-    translations: np.ndarray
-    residuals: np.ndarray
+    rotations: np.ndarray  # R, (n, 3, 3), from the body's axes to the image's
+    translations: np.ndarray  # c, (n, 2)
+    residuals: np.ndarray  # (n,), root-mean-square residual of the visible points
 
 
 def fit_body(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
     """Return the least-squares rotation and translation of a rigid body for each projection.
 
-    Parameters
-    ----------
-    points : ndarray, (n, M, 2)
-        Projections, x right and y up; occluded points are ignored.
-    visible : ndarray, (n, M)
-        Mask of visible points, at least one per projection.
-    body : ndarray, (M, 3)
-        Points of the body, in the unit of the projections.
+    ``points`` (n, M, 2), x right and y up, and their mask ``visible`` (n, M), with at least one
+    visible point per projection; ``body`` (M, 3), in the unit of the projections.
     """
-    n = len(points)
-    fit = BodyFit(np.empty((n, 3, 3)), np.empty((n, 2)), np.empty(n))
-    for start in range(0, n, _ROWS):
-        rows = slice(start, start + _ROWS)
-        for whole, part in zip(fit, _fit(points[rows], visible[rows], body), strict=True):
-            whole[rows] = part
-    return fit
+    starts = range(0, max(len(points), 1), _ROWS)
+    blocks = [_fit(points[s : s + _ROWS], visible[s : s + _ROWS], body) for s in starts]
+    return BodyFit(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
@@ -72,10 +58,9 @@ def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
     t = (body - body_mean[:, np.newaxis]) * weights[..., np.newaxis]
     start = _best_start(x, t)
     rotations, squares = _descend(start, x, t)
-    mirrored, squares_mirrored = _descend(_mirrored(start, t), x, t)
-    better = squares_mirrored < squares
-    rotations = np.where(better[:, np.newaxis, np.newaxis], mirrored, rotations)
-    squares = np.where(better, squares_mirrored, squares)
+    mirrored, mirrored_squares = _descend(_mirrored(start, t), x, t)
+    rotations = np.where((mirrored_squares < squares)[:, None, None], mirrored, rotations)
+    squares = np.minimum(squares, mirrored_squares)
     translations = point_mean - np.einsum("naj,nj->na", rotations[:, :2], body_mean)
     return BodyFit(rotations, translations, np.sqrt(squares / count))
 
@@ -123,8 +108,7 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
     Gauss-Newton would overshoot for a flat body in frontal view, where tilt has no first-order
     effect.
     """
-    residual = x - _projections(rotations, t)
-    squares = (residual**2).sum(axis=(1, 2))
+    residual, squares = _residuals(rotations, x, t)
     damping = np.full(len(x), _DAMPING)
     for _ in range(_STEPS):
         # P R exp([ω]) t ≈ P R t + P R (ω × t), and a · (ω × t) = ω · (t × a).
@@ -135,16 +119,18 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
         slope = np.einsum("nmai,nma->ni", jacobian, residual)
         step = np.linalg.solve(normal, slope[..., np.newaxis])[..., 0]
         tried = rotations @ vector_to_matrix(step)
-        left = x - _projections(tried, t)
-        tried_squares = (left**2).sum(axis=(1, 2))
+        tried_residual, tried_squares = _residuals(tried, x, t)
         better = tried_squares < squares
         rotations = np.where(better[:, np.newaxis, np.newaxis], tried, rotations)
-        residual = np.where(better[:, np.newaxis, np.newaxis], left, residual)
+        residual = np.where(better[:, np.newaxis, np.newaxis], tried_residual, residual)
         squares = np.where(better, tried_squares, squares)
         damping = np.maximum(np.where(better, damping / 10, damping * 10), _LEAST_DAMPING)
     return rotations, squares
 
 
-def _projections(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return P R t: ``(n, M, 2)``."""
-    return np.matmul(t, np.swapaxes(rotations[:, :2], 1, 2))
+def _residuals(
+    rotations: np.ndarray, x: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return x − P R t, (n, M, 2), and the sums of its squares, (n,)."""
+    residual = x - np.matmul(t, np.swapaxes(rotations[:, :2], 1, 2))
+    return residual, (residual**2).sum(axis=(1, 2))

@@ -54,12 +54,18 @@ def annotations_of_tracks(
     annotations : Annotations
         ``dropped`` counts the frames in which a person has no visible joint.
     """
-    skeleton = Skeleton.preset("pair17")
+    skeleton, person = Skeleton.preset("pair17"), Skeleton.preset("person17")
     seed = np.asarray(seed, dtype=np.float64)
     check_close_people("seed", seed, skeleton)
-    _check_tracks(tracks, len(skeleton.roots))
+    if len(tracks) != len(skeleton.roots):
+        raise ValueError(f"tracks must have 2 tracks, one per person, got {len(tracks)}")
+    for number, track in enumerate(tracks):
+        if (track.frames, track.fps) != (tracks[0].frames, tracks[0].fps):
+            raise ValueError(
+                f"tracks[{number}] must have {tracks[0].frames} frames at {tracks[0].fps:g} frames "
+                f"per second, as tracks[0], got {track.frames} at {track.fps:g}"
+            )
     check_positive("least_confidence", least_confidence)
-    person = Skeleton.preset("person17")
     keypoints = np.concatenate(
         [
             _person_joints(track, seed[root : root + person.n_joints], person, least_confidence)
@@ -69,9 +75,8 @@ def annotations_of_tracks(
     )
     keypoints *= [1.0, -1.0]  # y up
     visible = np.isfinite(keypoints).all(axis=-1)
-    seen = np.stack([part.any(axis=-1) for part in np.split(visible, len(tracks), axis=1)])
-    kept = np.flatnonzero(seen.all(axis=0))
-    if len(kept) == 0:
+    complete = visible.reshape(len(visible), len(tracks), -1).any(axis=-1).all(axis=-1)
+    if not complete.any():
         raise ValueError(
             f"tracks must have a frame in which all {len(tracks)} people are visible, got none"
         )
@@ -79,30 +84,16 @@ def annotations_of_tracks(
         metres_per_pixel = _scale(keypoints, seed, skeleton)
     check_positive("metres_per_pixel", metres_per_pixel)
     keypoints *= metres_per_pixel
-    gap = np.full((1, *keypoints.shape[1:]), np.nan)
-    before = np.concatenate([gap, keypoints[:-1]])
-    after = np.concatenate([keypoints[1:], gap])
+    padded = np.pad(keypoints, ((1, 1), (0, 0), (0, 0)), constant_values=np.nan)
     return Annotations(
-        keypoints[kept],
-        visible[kept],
+        keypoints[complete],
+        visible[complete],
         skeleton,
-        np.stack([before, after], axis=1)[kept],
+        np.stack([padded[:-2], padded[2:]], axis=1)[complete],
         tracks[0].fps,
-        sources=[tracks[0].name] * len(kept),
-        dropped={"one person missing": len(keypoints) - len(kept)},
+        sources=[tracks[0].name] * int(complete.sum()),
+        dropped={"one person missing": int((~complete).sum())},
     )
-
-
-def _check_tracks(tracks: Sequence[KeypointTrack], count: int) -> None:
-    if len(tracks) != count:
-        raise ValueError(f"tracks must have {count} tracks, one per person, got {len(tracks)}")
-    first = tracks[0]
-    for number, track in enumerate(tracks):
-        if (track.frames, track.fps) != (first.frames, first.fps):
-            raise ValueError(
-                f"tracks[{number}] must have {first.frames} frames at {first.fps:g} frames per "
-                f"second, as tracks[0], got {track.frames} at {track.fps:g}"
-            )
 
 
 def _person_joints(
@@ -130,17 +121,13 @@ def _trunk(
     joints: dict[str, np.ndarray], seed: np.ndarray, person: Skeleton
 ) -> dict[str, np.ndarray]:
     """Return pelvis, spine, chest and neck on the line from mid-hips to mid-shoulders."""
-    low, high = (
-        (joints[f"left_{part}"] + joints[f"right_{part}"]) / 2 for part in ("hip", "shoulder")
-    )
-    seed_low, seed_high = (
-        (seed[person.index(f"left_{part}")] + seed[person.index(f"right_{part}")]) / 2
-        for part in ("hip", "shoulder")
+    reference = dict(zip(person.joint_names, seed, strict=True))
+    (low, high), (seed_low, seed_high) = (
+        [(pose[f"left_{part}"] + pose[f"right_{part}"]) / 2 for part in ("hip", "shoulder")]
+        for pose in (joints, reference)
     )
     line = seed_high - seed_low
-    fractions = {
-        name: float((seed[person.index(name)] - seed_low) @ line / (line @ line)) for name in _TRUNK
-    }
+    fractions = {name: (reference[name] - seed_low) @ line / (line @ line) for name in _TRUNK}
     return {name: low + fraction * (high - low) for name, fraction in fractions.items()}
 
 

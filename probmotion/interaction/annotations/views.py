@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from probmotion.arrays import logsumexp
 from probmotion.interaction.annotations.local_frames import (
@@ -26,13 +26,7 @@ from probmotion.interaction.annotations.local_frames import (
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive, check_shape
 
-__all__ = [
-    "ViewDistribution",
-    "image_axes",
-    "project_to_views",
-    "view_angles",
-    "view_vectors",
-]
+__all__ = ["ViewDistribution", "image_axes", "project_to_views", "view_angles", "view_vectors"]
 
 _MAX_ELEMENTS = 1 << 20  # largest temporary array
 _DEVIATIONS = 9.0  # bandwidths beyond which a kernel is below machine precision
@@ -85,14 +79,15 @@ class ViewDistribution:
         check_shape("views", views, ("…", 2))
         flat = views.reshape(-1, 2)
         centres = self.views[self.known]
-        rows = max(1, _MAX_ELEMENTS // len(centres))
+        n_rows = max(1, _MAX_ELEMENTS // len(centres))
         log_f = np.empty(len(flat))
-        for start in range(0, len(flat), rows):
-            phi, theta = np.moveaxis(flat[start : start + rows, np.newaxis] - centres, -1, 0)
-            over = flat[start : start + rows, np.newaxis, 1] + centres[:, 1]
+        for start in range(0, len(flat), n_rows):
+            rows = slice(start, start + n_rows)
+            phi, theta = np.moveaxis(flat[rows, np.newaxis] - centres, -1, 0)
+            over = flat[rows, np.newaxis, 1] + centres[:, 1]
             direct = self._log_wrapped(phi) + self._log_wrapped(theta)
             across = self._log_wrapped(phi + np.pi) + self._log_wrapped(over)
-            log_f[start : start + rows] = logsumexp(np.logaddexp(direct, across), axis=-1)
+            log_f[rows] = logsumexp(np.logaddexp(direct, across), axis=-1)
         log_f -= math.log(len(centres))
         log_f[~((flat[:, 1] >= 0) & (flat[:, 1] <= np.pi))] = -np.inf
         return log_f.reshape(views.shape[:-1])
@@ -111,17 +106,7 @@ class ViewDistribution:
     def near(self, views: np.ndarray, n: int) -> np.ndarray:
         """Return the n annotations with the smallest angle to each view (:func:`view_vectors`).
 
-        Parameters
-        ----------
-        views : ndarray, (V, 2)
-            Query views.
-        n : int
-            Number of annotations.
-
-        Returns
-        -------
-        indices : ndarray, (V, min(n, m)), int
-            Nearest first; ties go to the lower index.
+        ``(V, 2) → (V, min(n, m))``, nearest first; ties go to the lower index.
         """
         check_count("n", n)
         check_shape("views", views, ("V", 2))
@@ -143,9 +128,7 @@ class ViewDistribution:
         return view_vectors(self.views[self.known])
 
     @cached_property
-    def _tree(self) -> Any:
-        from scipy.spatial import cKDTree
-
+    def _tree(self) -> cKDTree:
         return cKDTree(self._vectors)
 
     def _log_wrapped(self, angle: np.ndarray) -> np.ndarray:
@@ -177,9 +160,14 @@ def view_angles(frames: np.ndarray, direction: np.ndarray) -> np.ndarray:
     frames = np.asarray(frames, dtype=np.float64)
     direction = np.asarray(direction, dtype=np.float64)
     check_shape("direction", direction, ("…", 3))
-    _check_all("frames", valid_frames(frames), "non-degenerate")
     length = np.linalg.norm(direction, axis=-1)
-    _check_all("direction", np.isfinite(length) & (length > 0), "finite and nonzero")
+    for name, valid, requirement in (
+        ("frames", valid_frames(frames), "non-degenerate"),
+        ("direction", np.isfinite(length) & (length > 0), "finite and nonzero"),
+    ):
+        if not valid.all():
+            index = np.argwhere(~valid)[0].tolist()
+            raise ValueError(f"{name} must be {requirement}, violated at index {index}")
     solved = np.linalg.solve(frames, direction[..., np.newaxis])[..., 0]
     a, b, c = np.moveaxis(solved, -1, 0)
     # Equals arccos(b/√(a² + b² + c²)), but is accurate near the poles.
@@ -198,27 +186,15 @@ def view_vectors(views: np.ndarray) -> np.ndarray:
 def image_axes(frames: np.ndarray, views: np.ndarray) -> np.ndarray:
     """Return the image axes of every pose in every view; finite for degenerate frames too.
 
-    Up is the projection of j, or of i at the poles θ = 0 and π.
-
-    Parameters
-    ----------
-    frames : ndarray, (B, 3, 3)
-        Local frames.
-    views : ndarray, (V, 2)
-        φ and θ.
-
-    Returns
-    -------
-    axes : ndarray, (B, 3, V, 2)
-        Unit vectors e₁ (right) and e₂ (up) in the last axis; e₁ × e₂ points to the viewer.
+    ``(B, 3, 3), (V, 2) → (B, 3, V, 2)``: the unit vectors e₁ (right) and e₂ (up) are in the last
+    axis, and e₁ × e₂ points to the viewer. Up is the projection of j, or of i at the poles θ = 0
+    and π.
     """
     towards = unit(np.matmul(view_vectors(views), np.swapaxes(frames, -1, -2)))
     up = _across(frames[:, np.newaxis, :, 1], towards)
-    flat = np.einsum("bvi,bvi->bv", up, up) < SMALLEST_SINE**2
-    if flat.any():
-        up[flat] = np.broadcast_to(_across(frames[:, np.newaxis, :, 0], towards), towards.shape)[
-            flat
-        ]
+    pole = np.einsum("bvi,bvi->bv", up, up) < SMALLEST_SINE**2
+    if pole.any():
+        up[pole] = _across(frames[:, np.newaxis, :, 0], towards)[pole]
     up = unit(up)
     return np.moveaxis(np.stack([cross(up, towards), up], axis=-1), 1, 2)
 
@@ -247,9 +223,8 @@ def project_to_views(positions: np.ndarray, views: np.ndarray, skeleton: Skeleto
     check_shape("views", views, ("V", 2))
     axes = image_axes(pair_frames(positions, skeleton), views)
     # One matrix product per pose: one per view would dominate the run time.
-    n_poses, n_joints, n_views = len(positions), skeleton.n_joints, len(views)
-    projections = np.matmul(positions, axes.reshape(n_poses, 3, 2 * n_views))
-    projections = projections.reshape(n_poses, n_joints, n_views, 2)
+    projections = np.matmul(positions, axes.reshape(len(positions), 3, 2 * len(views)))
+    projections = projections.reshape(len(positions), skeleton.n_joints, len(views), 2)
     return np.ascontiguousarray(np.swapaxes(projections, 1, 2))
 
 
@@ -257,9 +232,3 @@ def _across(vectors: np.ndarray, units: np.ndarray) -> np.ndarray:
     """Return the components of vectors orthogonal to unit vectors."""
     along = np.einsum("...i,...i->...", vectors, units)
     return vectors - along[..., np.newaxis] * units
-
-
-def _check_all(name: str, fine: np.ndarray, requirement: str) -> None:
-    if not fine.all():
-        index = np.argwhere(~fine)[0].tolist()
-        raise ValueError(f"{name} must be {requirement}, violated at index {index}")

@@ -5,8 +5,6 @@ Edges come from :mod:`probmotion.interaction.geometry.graphs`; the number of peo
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, to_numpy
@@ -14,13 +12,9 @@ from probmotion.interaction.geometry.graphs import check_graph, graph_edges
 from probmotion.validation import check_positive, check_shape
 
 __all__ = [
-    "align_motions",
-    "align_rigidly",
-    "cartesian_distance",
-    "dissimilarity",
-    "interaction_coordinates",
-    "interaction_distance",
-]
+    "align_motions", "align_rigidly", "cartesian_distance", "dissimilarity",
+    "interaction_coordinates", "interaction_distance",
+]  # fmt: skip
 
 
 def align_rigidly(source: Array, target: Array, visible: Array | None = None) -> Array:
@@ -30,18 +24,17 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
 
     Parameters
     ----------
-    source, target : Array
-        Joints, shape (…, J, D), D = 2 or 3, metres; batch axes broadcast.
-    visible : Array, optional
-        Mask of the joints to fit, bool, shape (…, J); all by default. Occluded joints of
-        ``target`` are ignored.
+    source, target : Array, (…, J, D)
+        Joints, D = 2 or 3, metres; batch axes broadcast.
+    visible : Array of bool, (…, J), optional
+        Mask of the joints to fit; all by default. Occluded joints of ``target`` are ignored.
 
     Returns
     -------
-    Array
-        Shape (…, J, D), metres.
+    Array, (…, J, D)
+        Metres.
     """
-    visible = _check_pairs(source, target, visible)
+    _check_pairs(source, target, visible)
     xp = array_namespace(source, target)
     counted = _weights(source, visible)[..., None]
     total = xp.sum(counted, axis=-2, keepdims=True)
@@ -63,7 +56,7 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
 def align_motions(motions: Array, target: Array) -> Array:
     """Return each motion aligned to ``target`` by one rigid transform for all its frames.
 
-    Shapes (…, L, J, 3) and (L, J, 3), metres; see :func:`align_rigidly`.
+    ``motions`` (…, L, J, 3) and ``target`` (L, J, 3), metres; see :func:`align_rigidly`.
     """
     xp = array_namespace(motions, target)
     points = xp.reshape(motions, (*motions.shape[:-3], -1, 3))
@@ -71,14 +64,14 @@ def align_motions(motions: Array, target: Array) -> Array:
 
 
 def interaction_coordinates(points: Array, edges: Array) -> Array:
-    """Return the edge vectors ``p_i − p_j`` (eq. 7), shape (…, E, D), metres.
+    """Return the edge vectors ``p_i − p_j`` (eq. 7), (…, E, D), metres.
 
     Parameters
     ----------
-    points : Array
-        Joints, shape (…, J, D), metres.
-    edges : Array
-        Edges (i, j), integers, shape (E, 2).
+    points : Array, (…, J, D)
+        Joints, metres.
+    edges : Array of int, (E, 2)
+        Edges (i, j).
     """
     check_shape("points", points, ("…", "J", "D"))
     first, second = _ends(edges, points)
@@ -101,35 +94,34 @@ def dissimilarity(
 
     Parameters
     ----------
-    first, second : Array
-        Joints, shape (…, J, D), metres; batch axes broadcast.
-    first_edges, second_edges : Array
-        Edges of each pair's graph, integers, shape (E, 2); E may differ.
+    first, second : Array, (…, J, D)
+        Joints, metres; batch axes broadcast.
+    first_edges, second_edges : Array of int, (E, 2)
+        Edges of each pair's graph; E may differ.
     epsilon : float
         ε, metres.
-    visible : Array, optional
-        Mask of visible joints, bool, shape (…, J). Edges with an occluded end are left out of
-        the sums and of W.
+    visible : Array of bool, (…, J), optional
+        Mask of visible joints. Edges with an occluded end are left out of the sums and of W.
 
     Returns
     -------
-    Array
-        Shape (…), metres; infinite if a graph has no visible edge.
+    Array, (…)
+        Metres; infinite if a graph has no visible edge.
     """
-    visible = _check_pairs(first, second, visible)
+    _check_pairs(first, second, visible)
     check_positive("epsilon", epsilon)
     xp = array_namespace(first, second)
     counted = _weights(first, visible)
     total = None
-    for own, edges in ((first, first_edges), (second, second_edges)):
-        i, j = _ends(edges, own)
-        between = interaction_coordinates(first, edges) - interaction_coordinates(second, edges)
-        length = _norm(interaction_coordinates(own, edges))
+    for pair, edges in ((first, first_edges), (second, second_edges)):
+        i, j = _ends(edges, pair)
+        difference = interaction_coordinates(first, edges) - interaction_coordinates(second, edges)
+        length = _norm(interaction_coordinates(pair, edges))
         both = xp.take(counted, i, axis=-1) * xp.take(counted, j, axis=-1)
         weight = both / xp.where(length > epsilon, length, xp.full_like(length, epsilon))
         # Occluded joints may be NaN; a zero weight alone would not remove them.
-        apart = xp.where(both > 0, _norm(between), xp.zeros_like(_norm(between)))
-        term = _mean(apart, weight)
+        distance = _norm(difference)
+        term = _mean(xp.where(both > 0, distance, xp.zeros_like(distance)), weight)
         total = term if total is None else total + term
     return total
 
@@ -143,8 +135,8 @@ def interaction_distance(
 
     Parameters
     ----------
-    first, second : Array
-        Joints, shape (…, J, D), D = 2 or 3, metres; batch axes broadcast.
+    first, second : Array, (…, J, D)
+        Joints, D = 2 or 3, metres; batch axes broadcast.
     graph : str
         One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
     epsilon : float
@@ -153,20 +145,16 @@ def interaction_distance(
     _check_pairs(first, second, None)
     check_graph(graph)
     xp = array_namespace(first, second)
-    batch = np.broadcast_shapes(tuple(first.shape[:-2]), tuple(second.shape[:-2]))
-    joints = tuple(first.shape[-2:])
-    first = xp.reshape(xp.broadcast_to(first, batch + joints), (-1, *joints))
-    second = xp.reshape(xp.broadcast_to(second, batch + joints), (-1, *joints))
+    first, second = xp.broadcast_arrays(first, second)
+    *batch, n_joints, n_axes = first.shape
+    first, second = (xp.reshape(pairs, (-1, n_joints, n_axes)) for pairs in (first, second))
     aligned = align_rigidly(first, second)
-    dissimilarities = []
-    for k in range(math.prod(batch)):
-        own, other = (graph_edges(to_numpy(pair[k, ...]), graph) for pair in (first, second))
-        dissimilarities.append(dissimilarity(aligned[k, ...], second[k, ...], own, other, epsilon))
-    return (
-        xp.reshape(xp.stack(dissimilarities), batch)
-        if dissimilarities
-        else xp.zeros(batch, dtype=first.dtype)
-    )
+    distances = [xp.zeros(0, dtype=first.dtype)]
+    for k in range(first.shape[0]):
+        edges = [graph_edges(to_numpy(pairs[k, ...]), graph) for pairs in (first, second)]
+        distance = dissimilarity(aligned[k, ...], second[k, ...], *edges, epsilon)
+        distances.append(distance[None])
+    return xp.reshape(xp.concat(distances), tuple(batch))
 
 
 def cartesian_distance(first: Array, second: Array, visible: Array | None = None) -> Array:
@@ -176,28 +164,26 @@ def cartesian_distance(first: Array, second: Array, visible: Array | None = None
 
     Parameters
     ----------
-    first, second : Array
-        Joints, shape (…, J, D), metres; batch axes broadcast.
-    visible : Array, optional
-        Mask of visible joints, bool, shape (…, J); all by default.
+    first, second : Array, (…, J, D)
+        Joints, metres; batch axes broadcast.
+    visible : Array of bool, (…, J), optional
+        Mask of visible joints; all by default.
     """
-    visible = _check_pairs(first, second, visible)
+    _check_pairs(first, second, visible)
     xp = array_namespace(first, second)
     weight = _weights(first, visible)
     if visible is not None:
         second = xp.where(weight[..., None] > 0, second, xp.zeros_like(second))
-    apart = align_rigidly(first, second, visible) - second
-    squared = xp.where(weight > 0, xp.sum(apart**2, axis=-1), xp.zeros_like(apart[..., 0]))
+    squared = xp.sum((align_rigidly(first, second, visible) - second) ** 2, axis=-1)
+    squared = xp.where(weight > 0, squared, xp.zeros_like(squared))
     return _root(_mean(squared, weight))
 
 
-def _check_pairs(first: Array, second: Array, visible: Array | None) -> Array | None:
-    """Check the shapes and return ``visible``."""
+def _check_pairs(first: Array, second: Array, visible: Array | None) -> None:
     check_shape("first", first, ("…", "J", "D"))
     check_shape("second", second, ("…", *first.shape[-2:]))
     if visible is not None:
         check_shape("visible", visible, ("…", first.shape[-2]))
-    return visible
 
 
 def _weights(points: Array, visible: Array | None) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from probmotion.interaction.geometry.graphs import JOGGLE, joggle_offsets
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["delaunay_edges", "max_planar_edges", "write_delaunay"]
+__all__ = ["delaunay_edges", "is_obtuse", "max_planar_edges", "write_delaunay"]
 
 # Determinants of joints in the unit box have errors of about 1e-15; below this size their sign is
 # uncertain.
@@ -29,13 +29,13 @@ def delaunay_edges(points: np.ndarray) -> tuple[np.ndarray, bool]:
 
     Parameters
     ----------
-    points : numpy.ndarray
-        Joints, shape (J, 2), in any unit.
+    points : ndarray, (J, 2)
+        Joints, in any unit.
 
     Returns
     -------
-    edges : numpy.ndarray
-        Shape (E, 2), integers, the smaller joint first, rows in lexicographic order.
+    edges : ndarray of int, (E, 2)
+        The smaller joint first, rows in lexicographic order.
     degenerate : bool
         Whether the joints were joggled.
     """
@@ -45,8 +45,7 @@ def delaunay_edges(points: np.ndarray) -> tuple[np.ndarray, bool]:
     n_joints = points.shape[0]
     edges = np.empty((max_planar_edges(n_joints), 2), dtype=np.uint16)
     n_edges, degenerate = write_delaunay(points, joggle_offsets(n_joints, 2), edges)
-    found = edges[:n_edges].astype(np.int64)
-    return found[np.lexsort((found[:, 1], found[:, 0]))], bool(degenerate)
+    return np.array(sorted(edges[:n_edges].tolist())).reshape(-1, 2), bool(degenerate)
 
 
 @numba.njit(cache=True)
@@ -59,28 +58,25 @@ def max_planar_edges(n_joints: int) -> int:
 def write_delaunay(points: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> tuple[int, bool]:
     """Write the triangulation's edges; return their number and whether it was degenerate.
 
-    Parameters
-    ----------
-    points, offsets : numpy.ndarray
-        Joints and joggle offsets, shape (J, 2), float64.
-    edges : numpy.ndarray
-        Output, uint16, at least :func:`max_planar_edges` rows; smaller joint first.
+    ``points`` and joggle ``offsets`` (J, 2); ``edges`` uint16, :func:`max_planar_edges` rows.
     """
     n_joints = points.shape[0]
-    if n_joints < 3:
-        if n_joints == 2:
-            edges[0, 0], edges[0, 1] = 0, 1
-        repeated = n_joints == 2 and (points[0] == points[1]).all()
-        return (1 if n_joints == 2 else 0), repeated
+    if n_joints == 2:
+        edges[0, 0], edges[0, 1] = 0, 1
+        return 1, points[0, 0] == points[1, 0] and points[0, 1] == points[1, 1]
+    if n_joints < 2:
+        return 0, False
     unit = np.empty((n_joints, 3))
     _into_unit_box(points, unit)
-    n_edges = _triangulate(unit, False, edges)
-    if n_edges > 0:
-        return n_edges, False
-    for joint in range(n_joints):
-        unit[joint, 0] += JOGGLE * offsets[joint, 0]
-        unit[joint, 1] += JOGGLE * offsets[joint, 1]
-    return _triangulate(unit, True, edges), True
+    n_edges = 0
+    for exact in (False, True):
+        n_edges = _triangulate(unit, exact, edges)
+        if n_edges > 0:
+            break
+        for joint in range(n_joints):
+            unit[joint, 0] += JOGGLE * offsets[joint, 0]
+            unit[joint, 1] += JOGGLE * offsets[joint, 1]
+    return n_edges, exact
 
 
 @numba.njit(cache=True)
@@ -108,23 +104,22 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
     Otherwise each triangle stores the plane through its joints lifted to the paraboloid
     z = x² + y²; a joint below the plane is inside the circumcircle.
     """
-    n_joints = unit.shape[0]
-    ghost = n_joints
+    n_joints = ghost = unit.shape[0]
     order = np.empty(n_joints, dtype=np.int64)
     if not _first_triangle(unit, order, exact):
         return 0
-    room = 4 * n_joints + 8
-    corner = np.empty((room, 3), dtype=np.int64)
-    plane = np.empty((4, room))
-    inside = np.empty(room)
+    capacity = 4 * n_joints + 8
+    corner = np.empty((capacity, 3), dtype=np.int64)
+    plane = np.empty((4, capacity))
+    inside = np.empty(capacity)
     seen = np.full((n_joints + 1) * (n_joints + 1), -1, dtype=np.int64)
-    cavity = np.empty(room, dtype=np.int64)
-    boundary = np.empty((3 * room, 2), dtype=np.int64)
+    cavity = np.empty(capacity, dtype=np.int64)
+    boundary = np.empty((3 * capacity, 2), dtype=np.int64)
     a, b, c = order[0], order[1], order[2]
-    _set_triangle(unit, corner, plane, 0, a, b, c)
-    _set_triangle(unit, corner, plane, 1, b, a, ghost)
-    _set_triangle(unit, corner, plane, 2, c, b, ghost)
-    _set_triangle(unit, corner, plane, 3, a, c, ghost)
+    first = ((a, b, c), (b, a, ghost), (c, b, ghost), (a, c, ghost))
+    for slot in range(4):
+        a, b, c = first[slot]
+        _set_triangle(unit, corner, plane, slot, a, b, c)
     n_triangles = 4
     for position in range(3, n_joints):
         joint = order[position]
@@ -141,12 +136,12 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
                 if corner[t, 2] != ghost:
                     return 0
                 # Collinear with a hull edge: include the ghost if the joint splits the edge.
-                within = _between(unit, corner[t, 0], corner[t, 1], joint)
+                within = is_obtuse(unit, corner[t, 0], corner[t, 1], joint)
             if within:
                 cavity[n_cavity] = t
                 n_cavity += 1
         n_boundary = _boundary(corner, cavity, n_cavity, seen, position, n_joints + 1, boundary)
-        if n_cavity == 0 or n_boundary != n_cavity + 2 or n_triangles + 2 > room:
+        if n_cavity == 0 or n_boundary != n_cavity + 2 or n_triangles + 2 > capacity:
             return 0
         for edge in range(n_boundary):
             slot = cavity[edge] if edge < n_cavity else n_triangles + edge - n_cavity
@@ -185,17 +180,15 @@ def _first_triangle(unit: np.ndarray, order: np.ndarray, exact: bool) -> bool:
 @numba.njit(cache=True)
 def _turn(unit: np.ndarray, a: int, b: int, c: int) -> float:
     """Return twice the signed area of a triangle, positive if counter-clockwise."""
-    return (unit[b, 0] - unit[a, 0]) * (unit[c, 1] - unit[a, 1]) - (unit[b, 1] - unit[a, 1]) * (
-        unit[c, 0] - unit[a, 0]
-    )
+    x, y = unit[a, 0], unit[a, 1]
+    return (unit[b, 0] - x) * (unit[c, 1] - y) - (unit[b, 1] - y) * (unit[c, 0] - x)
 
 
 @numba.njit(cache=True)
-def _between(unit: np.ndarray, a: int, b: int, joint: int) -> bool:
-    """Return whether ``joint``, collinear with a and b, lies between them."""
-    return (unit[a, 0] - unit[joint, 0]) * (unit[b, 0] - unit[joint, 0]) + (
-        unit[a, 1] - unit[joint, 1]
-    ) * (unit[b, 1] - unit[joint, 1]) < 0
+def is_obtuse(points: np.ndarray, a: int, b: int, vertex: int) -> bool:
+    """Return whether the angle at ``vertex`` is obtuse; if collinear, whether it is between."""
+    x, y = points[vertex, 0], points[vertex, 1]
+    return (points[a, 0] - x) * (points[b, 0] - x) + (points[a, 1] - y) * (points[b, 1] - y) < 0
 
 
 @numba.njit(cache=True)

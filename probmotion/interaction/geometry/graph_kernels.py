@@ -5,10 +5,10 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from probmotion.interaction.geometry.delaunay import max_planar_edges, write_delaunay
+from probmotion.interaction.geometry.delaunay import is_obtuse, max_planar_edges, write_delaunay
 from probmotion.interaction.geometry.graphs import GRAPHS, N_NEIGHBOURS
 
-__all__ = ["count_degenerate", "graphs_of_visible", "max_edges", "write_graph"]
+__all__ = ["graphs_of_visible", "max_edges", "write_graph"]
 
 _DELAUNAY, _NEAREST_NEIGHBOURS, _GABRIEL, _COMPLETE = range(len(GRAPHS))
 
@@ -25,14 +25,9 @@ def write_graph(
 ) -> tuple[int, bool]:
     """Write a graph's edges; return their number and whether joints were joggled.
 
-    Parameters
-    ----------
-    points, offsets : numpy.ndarray
-        Joints and joggle offsets, shape (J, 2), float64.
-    graph : int
-        Index into :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
-    edges : numpy.ndarray
-        Output, uint16, (E, 2) with at least :func:`max_edges` rows; smaller joint first.
+    ``points`` and joggle ``offsets`` (J, 2); ``graph``, index into
+    :data:`~probmotion.interaction.geometry.graphs.GRAPHS`; ``edges`` (E, 2) uint16 with at least
+    :func:`max_edges` rows.
     """
     if graph == _DELAUNAY:
         return write_delaunay(points, offsets, edges)
@@ -71,11 +66,8 @@ def _mark_neighbours(points: np.ndarray, near: np.ndarray) -> None:
 @numba.njit(cache=True)
 def _is_gabriel(points: np.ndarray, i: int, j: int) -> bool:
     """Return whether no joint is strictly inside the circle with diameter i–j."""
-    for k in range(points.shape[0]):
-        toward = (points[i, 0] - points[k, 0]) * (points[j, 0] - points[k, 0]) + (
-            points[i, 1] - points[k, 1]
-        ) * (points[j, 1] - points[k, 1])
-        if toward < 0:
+    for k in range(points.shape[0]):  # noqa: SIM110  Numba has no `all` of a generator.
+        if is_obtuse(points, i, j, k):
             return False
     return True
 
@@ -86,21 +78,8 @@ def graphs_of_visible(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the graphs over the visible joints of n pose-pairs and the weights of eq. 8.
 
-    Parameters
-    ----------
-    points, visible : numpy.ndarray
-        Shapes (n, J, 2) and (n, J).
-    graph : int
-        Index into :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
-    epsilon : float
-        ε of eq. 8, in the unit of ``points``.
-    offsets : numpy.ndarray
-        Joggle offsets, (J, 2).
-
-    Returns
-    -------
-    n_edges, edges, weights : numpy.ndarray
-        (n,), (n, E, 2) uint16 and (n, E); the weights of each graph sum to 1.
+    Of ``points`` (n, J, 2) and ``visible`` (n, J): the numbers of edges (n,), the edges (n, E, 2)
+    uint16 and their weights (n, E), which sum to 1 for each graph.
     """
     n, n_joints = visible.shape
     most = max_edges(n_joints, graph)
@@ -118,15 +97,6 @@ def graphs_of_visible(
             edges[k, edge, 0], edges[k, edge, 1] = shown[i], shown[j]
             weights[k, edge] = 1.0 / max(epsilon, np.sqrt(x * x + y * y))
             total += weights[k, edge]
-        weights[k, : n_edges[k]] /= max(total, 1e-300)
+        for edge in range(n_edges[k]):
+            weights[k, edge] /= max(total, 1e-300)
     return n_edges, edges, weights
-
-
-@numba.njit(cache=True)
-def count_degenerate(points: np.ndarray, graph: int, offsets: np.ndarray) -> int:
-    """Return the number of joint sets, of (n, J, 2), that were joggled."""
-    edges = np.empty((max_edges(points.shape[1], graph), 2), dtype=np.uint16)
-    count = 0
-    for k in range(points.shape[0]):
-        count += write_graph(points[k], graph, offsets, edges)[1]
-    return count

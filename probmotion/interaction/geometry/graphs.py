@@ -13,14 +13,9 @@ from probmotion.seeds import generator
 from probmotion.validation import check_finite, check_shape
 
 __all__ = [
-    "GRAPHS",
-    "JOGGLE",
-    "N_NEIGHBOURS",
-    "check_graph",
-    "graph_edges",
-    "is_degenerate",
+    "GRAPHS", "JOGGLE", "N_NEIGHBOURS", "check_graph", "graph_edges", "is_degenerate",
     "joggle_offsets",
-]
+]  # fmt: skip
 
 GRAPHS = ("delaunay", "nearest-neighbours", "gabriel", "complete")
 N_NEIGHBOURS = 6
@@ -43,19 +38,18 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
 
     Parameters
     ----------
-    points : numpy.ndarray
-        Joints, shape (J, D), D = 2 or 3, in any unit.
+    points : ndarray, (J, D)
+        Joints, D = 2 or 3, in any unit.
     graph : str
         One of :data:`GRAPHS`.
 
     Returns
     -------
-    numpy.ndarray
-        Shape (E, 2), integers, i < j, rows in lexicographic order.
+    ndarray of int, (E, 2)
+        i < j, rows in lexicographic order.
     """
     points = _checked(points)
     check_graph(graph)
-    first, second = np.triu_indices(points.shape[0], 1)
     if graph == "delaunay":
         adjacent = _delaunay_adjacency(points)
     elif graph == "nearest-neighbours":
@@ -64,8 +58,7 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
         adjacent = _gabriel_adjacency(points)
     else:
         adjacent = np.ones((points.shape[0],) * 2, dtype=bool)
-    kept = adjacent[first, second]
-    return np.stack([first[kept], second[kept]], axis=-1)
+    return np.argwhere(np.triu(adjacent, 1))
 
 
 def is_degenerate(points: np.ndarray) -> bool:
@@ -116,14 +109,15 @@ def _triangulation(points: np.ndarray) -> np.ndarray | None:
     """Return the joints of each triangle or tetrahedron, None if degenerate."""
     unit = _in_unit_box(points)
     try:
-        found = Delaunay(unit)
+        triangulation = Delaunay(unit)
     except QhullError:
         return None
-    if len(np.unique(found.simplices)) < len(unit) or _has_ties(unit, found):
+    simplices = triangulation.simplices
+    if len(np.unique(simplices)) < len(unit) or _has_ties(unit, triangulation):
         return None
     # Rounding can produce a flat triangle from a joint between two others on the hull.
-    legs = unit[found.simplices[:, 1:]] - unit[found.simplices[:, :1]]
-    return found.simplices[np.abs(np.linalg.det(legs)) >= _TIE]
+    legs = unit[simplices[:, 1:]] - unit[simplices[:, :1]]
+    return simplices[np.abs(np.linalg.det(legs)) >= _TIE]
 
 
 def _in_unit_box(points: np.ndarray) -> np.ndarray:
@@ -133,9 +127,9 @@ def _in_unit_box(points: np.ndarray) -> np.ndarray:
     return (points - 0.5 * (low + high)) / (extent if extent > 1e-150 else 1.0)
 
 
-def _has_ties(unit: np.ndarray, found: Delaunay) -> bool:
+def _has_ties(unit: np.ndarray, triangulation: Delaunay) -> bool:
     """Return whether a joint lies on the circumcircle (sphere) of a neighbouring triangle."""
-    simplices, neighbours = found.simplices, found.neighbors
+    simplices, neighbours = triangulation.simplices, triangulation.neighbors
     which, side = np.nonzero(neighbours >= 0)
     other = simplices[neighbours[which, side]]
     opposite = other[~(other[:, :, None] == simplices[which][:, None, :]).any(axis=-1)]
@@ -147,11 +141,10 @@ def _has_ties(unit: np.ndarray, found: Delaunay) -> bool:
 
 def _neighbour_adjacency(points: np.ndarray) -> np.ndarray:
     """Return the symmetric nearest-neighbour matrix, (J, J) bool; ties go to the lower index."""
-    n_joints = len(points)
     squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(squared, np.inf)
-    nearest = np.argsort(squared, axis=1, kind="stable")[:, : min(N_NEIGHBOURS, n_joints - 1)]
-    near = np.zeros((n_joints, n_joints), dtype=bool)
+    nearest = np.argsort(squared, axis=1, kind="stable")[:, : min(N_NEIGHBOURS, len(points) - 1)]
+    near = np.zeros(squared.shape, dtype=bool)
     np.put_along_axis(near, nearest, True, axis=1)
     return near | near.T
 

@@ -6,12 +6,10 @@ Compiled counterpart of :mod:`probmotion.interaction.geometry.coordinates` and
 
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
 
-from probmotion.interaction.geometry.graph_kernels import count_degenerate, graphs_of_visible
+from probmotion.interaction.geometry.graph_kernels import graphs_of_visible, max_edges, write_graph
 from probmotion.interaction.geometry.graphs import GRAPHS, check_graph, joggle_offsets
 from probmotion.interaction.geometry.nearest_kernels import (
     Prepared,
@@ -41,10 +39,10 @@ class PairComparer:
 
     Parameters
     ----------
-    keypoints : numpy.ndarray
-        Annotations, shape (n, J, 2), metres; occluded joints are ignored.
-    visible : numpy.ndarray
-        Mask of annotated joints, bool, shape (n, J).
+    keypoints : ndarray, (n, J, 2)
+        Annotations, metres; occluded joints are ignored.
+    visible : ndarray of bool, (n, J)
+        Mask of annotated joints.
     measure : str
         One of :data:`MEASURES`.
     graph : str
@@ -97,25 +95,25 @@ class PairComparer:
 
         Parameters
         ----------
-        projections : numpy.ndarray
-            Projections of pose-pairs to V views, shape (B, V, J, 2), metres.
-        candidates : numpy.ndarray
-            Annotations to compare in each view, integers, shape (V, N), N at least 1.
+        projections : ndarray, (B, V, J, 2)
+            Projections of pose-pairs to V views, metres.
+        candidates : ndarray of int, (V, N)
+            Annotations to compare in each view, at least one.
 
         Returns
         -------
-        distances : numpy.ndarray
-            Shape (B, V); infinite if no candidate shares an edge (for measures without a graph: a
-            joint) with the projection.
-        indices : numpy.ndarray
-            Shape (B, V); ties go to the first candidate.
+        distances : ndarray, (B, V)
+            Infinite if no candidate shares an edge (for measures without a graph: a joint) with the
+            projection.
+        indices : ndarray of int, (B, V)
+            Ties go to the first candidate.
         """
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])
         # Avoid starting a thread pool for one thread: a process cannot fork after that.
-        alone = only_one_thread() or numba.get_num_threads() == 1
-        several = projections.shape[0] * projections.shape[1] > 1
-        kernel = nearest_in_batch_on_threads if several and not alone else nearest_in_batch
+        serial = only_one_thread() or numba.get_num_threads() == 1
+        serial = serial or projections.shape[0] * projections.shape[1] < 2
+        kernel = nearest_in_batch if serial else nearest_in_batch_on_threads
         return kernel(projections, candidates, self.prepared)
 
     def distances(self, projections: np.ndarray) -> np.ndarray:
@@ -126,14 +124,15 @@ class PairComparer:
     def degenerate(self, projections: np.ndarray) -> int:
         """Return the number of projections, (…, J, 2), with a degenerate Delaunay graph."""
         projections = self._checked(projections, ("…", self.n_joints, 2))
-        flat = projections.reshape(math.prod(projections.shape[:-2]), self.n_joints, 2)
-        return int(count_degenerate(flat, self.prepared.graph, self.prepared.offsets))
+        graph, offsets = self.prepared.graph, self.prepared.offsets
+        edges = np.empty((max_edges(self.n_joints, graph), 2), dtype=np.uint16)
+        flat = projections.reshape(-1, self.n_joints, 2)
+        return sum(bool(write_graph(points, graph, offsets, edges)[1]) for points in flat)
 
     def _checked(self, projections: np.ndarray, expected: tuple[int | str, ...]) -> np.ndarray:
         projections = np.ascontiguousarray(projections, dtype=np.float64)
         check_shape("projections", projections, expected)
-        if not np.isfinite(projections).all():
-            check_finite("projections", projections)
+        check_finite("projections", projections)
         return projections
 
     def _checked_candidates(self, candidates: np.ndarray, n_views: int) -> np.ndarray:
@@ -142,11 +141,8 @@ class PairComparer:
         if candidates.dtype.kind not in "iu":
             raise ValueError(f"candidates must be integers, got {candidates.dtype}")
         if candidates.shape[1] == 0:
-            raise ValueError(
-                "candidates must contain at least one annotation per view, got shape "
-                f"{candidates.shape}"
-            )
-        if candidates.size and (candidates.min() < 0 or candidates.max() >= self.n_annotations):
+            raise ValueError("candidates must contain at least one annotation per view, got none")
+        if candidates.size and not 0 <= candidates.min() <= candidates.max() < self.n_annotations:
             raise ValueError(
                 f"candidates must be from 0 to {self.n_annotations - 1}, got "
                 f"{candidates.min()} to {candidates.max()}"
@@ -169,15 +165,15 @@ def _prepare(
     n_edges, edges, weights = graphs_of_visible(
         keypoints[graphed], visible[graphed], graph, epsilon, offsets
     )
-    kept = np.arange(weights.shape[1]) < n_edges[:, None]
+    used = np.arange(weights.shape[1]) < n_edges[:, None]
     return Prepared(
         joints=np.ascontiguousarray(np.swapaxes(centred, 1, 2)),
         seen=visible.astype(np.float64),
         n_visible=n_visible,
         square=(centred**2).sum(axis=(1, 2)),
         edge_start=np.concatenate([[0], np.cumsum(n_edges)]),
-        edges=np.ascontiguousarray(edges[kept].T),
-        weights=weights[kept],
+        edges=np.ascontiguousarray(edges[used].T),
+        weights=weights[used],
         contexts=shape_contexts(keypoints[binned], visible[binned]),
         shared=shared_table(n_joints - 1),
         offsets=offsets,

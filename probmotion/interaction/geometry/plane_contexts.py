@@ -45,25 +45,14 @@ def context_cost(
 ) -> float:
     """Return the mean χ² cost of a rotated projection, infinite once it exceeds ``best``.
 
-    Parameters
-    ----------
-    bins : numpy.ndarray
-        From :func:`polar_bins`, (2, J, J).
-    turn : float
-        Rotation of the projection, radians.
-    seen, contexts : numpy.ndarray
-        The annotation's visibility, (J,), and shape contexts, (J, 60) uint8.
-    shared : numpy.ndarray
-        :func:`~probmotion.interaction.geometry.shape_context.shared_table` of J − 1.
-    best : float
-        Smallest cost so far.
+    ``bins`` from :func:`polar_bins`, (2, J, J); ``turn``, the rotation, radians; ``seen`` (J,) and
+    ``contexts`` (J, 60) uint8 of the annotation; ``shared``, the
+    :func:`~probmotion.interaction.geometry.shape_context.shared_table` of J − 1.
     """
-    n_joints, n_visible = contexts.shape[0], 0
-    for joint in range(n_joints):
-        n_visible += 1 if seen[joint] > 0 else 0
+    n_joints, n_visible = contexts.shape[0], int(seen.sum())
     if n_visible < 2:
         return np.inf
-    total, looked_at, turned = 0.0, 0, turn * _PER_RADIAN
+    total, n_rows, turned = 0.0, 0, turn * _PER_RADIAN
     # The tolerance keeps ties despite rounding.
     enough = (best + 1e-9) * n_visible * (n_visible - 1)
     counts = np.empty(contexts.shape[1], dtype=np.uint8)
@@ -82,8 +71,8 @@ def context_cost(
                 counts[np.int64(bins[0, i, j]) + sector] += 1
         for k in range(counts.size):
             total += shared[counts[k], contexts[i, k]]
-        looked_at += 1
+        n_rows += 1
         # Lower bound of the cost: the remaining joints may match exactly.
-        if looked_at * (n_visible - 1) - total > enough:
+        if n_rows * (n_visible - 1) - total > enough:
             return np.inf
     return 1.0 - total / (n_visible * (n_visible - 1))

@@ -23,11 +23,14 @@ _MARGIN = 1.0 + 1e-6
 @numba.njit(cache=True)
 def cartesian_minima(truths: np.ndarray, draws: np.ndarray, least: np.ndarray) -> None:
     """Lower ``least`` (G,) to the RMS joint distance of each true pose to its nearest draw."""
-    rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
+    rotation, horn, difference = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
         for s in range(draws.shape[0]):
-            found = _cartesian(truths[g], draws[s], least[g], rotation, horn, apart)
-            least[g] = min(least[g], found)
+            # The sum of squares from the alignment is cheap but less accurate.
+            bound = _MARGIN * least[g] * least[g] * draws.shape[1] + 1e-12
+            if align(truths[g], draws[s], rotation, horn) <= bound:
+                square = residual(truths[g], draws[s], rotation, difference)
+                least[g] = min(least[g], math.sqrt(square / draws.shape[1]))
 
 
 @numba.njit(cache=True)
@@ -43,39 +46,27 @@ def interaction_minima(
     least: np.ndarray,
 ) -> None:
     """Lower ``least`` (G,) to the dissimilarity (eq. 8) of each true pose to its nearest draw."""
-    rotation, horn, apart = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
+    rotation, horn, difference = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
-        here = slice(truth_starts[g], truth_starts[g + 1])
+        truth_slice = slice(truth_starts[g], truth_starts[g + 1])
         for s in range(draws.shape[0]):
-            there = slice(draw_starts[s], draw_starts[s + 1])
+            draw_slice = slice(draw_starts[s], draw_starts[s + 1])
             limit = least[g]
             align(truths[g], draws[s], rotation, horn)
-            residual(truths[g], draws[s], rotation, apart)
-            found = _along(apart, truth_edges[here], truth_weights[here], 0.0, limit)
-            if found < limit:
-                found = _along(apart, draw_edges[there], draw_weights[there], found, limit)
-                least[g] = min(limit, found)
-
-
-@numba.njit(cache=True)
-def _cartesian(
-    first: np.ndarray,
-    second: np.ndarray,
-    limit: float,
-    rotation: np.ndarray,
-    horn: np.ndarray,
-    apart: np.ndarray,
-) -> float:
-    joints = first.shape[0]
-    # The sum of squares from the alignment is cheap but less accurate.
-    if align(first, second, rotation, horn) > _MARGIN * limit * limit * joints + 1e-12:
-        return np.inf
-    return math.sqrt(residual(first, second, rotation, apart) / joints)
+            residual(truths[g], draws[s], rotation, difference)
+            total = _along(
+                difference, truth_edges[truth_slice], truth_weights[truth_slice], 0.0, limit
+            )
+            if total < limit:
+                total = _along(
+                    difference, draw_edges[draw_slice], draw_weights[draw_slice], total, limit
+                )
+                least[g] = min(limit, total)
 
 
 @numba.njit(cache=True)
 def _along(
-    apart: np.ndarray, edges: np.ndarray, weights: np.ndarray, total: float, limit: float
+    difference: np.ndarray, edges: np.ndarray, weights: np.ndarray, total: float, limit: float
 ) -> float:
     """Add one graph's sum of eq. 8, Σ w_ij ‖a_i − a_j‖, to ``total``; stop beyond ``limit``.
 
@@ -83,9 +74,9 @@ def _along(
     """
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]
-        x = apart[i, 0] - apart[j, 0]
-        y = apart[i, 1] - apart[j, 1]
-        z = apart[i, 2] - apart[j, 2]
+        x = difference[i, 0] - difference[j, 0]
+        y = difference[i, 1] - difference[j, 1]
+        z = difference[i, 2] - difference[j, 2]
         total += weights[e] * math.sqrt(x * x + y * y + z * z)
         if total > limit:
             break

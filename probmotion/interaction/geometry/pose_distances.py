@@ -11,7 +11,6 @@ The second pose is first rigidly aligned to the first by least squares (no refle
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,34 +24,21 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["MEASURES", "Measure", "check_measure", "pose_distances"]
 
-_SHORTEST_EDGE = 0.05
-"""ε of eq. 8, metres."""
+_SHORTEST_EDGE = 0.05  # ε of eq. 8, metres
 
 
-class Measure(NamedTuple):
-    """Functions of a distance: ``prepare`` poses (n, J, 3), then lower the ``minima`` (n,).
+Measure = tuple[Callable[[np.ndarray], tuple[np.ndarray, ...]], Callable[..., None]]
+"""Functions ``prepare`` and ``minima`` of a distance.
 
-    ``minima(*prepare(truths), *prepare(draws), least)`` updates ``least`` in place.
-    """
-
-    prepare: Callable[[np.ndarray], tuple[np.ndarray, ...]]
-    minima: Callable[..., None]
+``minima(*prepare(truths), *prepare(draws), least)`` lowers ``least`` (n,) to the distance of each
+of the truths (n, J, 3) to its nearest draw.
+"""
 
 
 def pose_distances(first: np.ndarray, second: np.ndarray, measure: str) -> np.ndarray:
-    """Return the distances between two sets of poses.
+    """Return the distances between poses: ``(n, J, 3), (m, J, 3) → (n, m)``, metres.
 
-    Parameters
-    ----------
-    first, second : ndarray, (n, J, 3) and (m, J, 3)
-        Poses, metres.
-    measure : str
-        One of :data:`MEASURES`.
-
-    Returns
-    -------
-    distances : ndarray, (n, m)
-        Metres; dimensionless for shape contexts.
+    ``measure`` is one of :data:`MEASURES`; shape-context distances are dimensionless.
     """
     check_measure(measure)
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
@@ -83,10 +69,9 @@ def _triangulated(poses: np.ndarray) -> tuple[np.ndarray, ...]:
     (centred,) = _centred(poses)
     edges, weights = [np.empty((0, 2), dtype=np.int32)], [np.empty(0)]
     for pose in centred:
-        found = graph_edges(pose, "delaunay").astype(np.int32)
-        lengths = np.linalg.norm(pose[found[:, 0]] - pose[found[:, 1]], axis=1)
-        weight = 1 / np.maximum(_SHORTEST_EDGE, lengths)
-        edges.append(found)
+        edges.append(graph_edges(pose, "delaunay").astype(np.int32))
+        first, second = edges[-1].T
+        weight = 1 / np.maximum(_SHORTEST_EDGE, np.linalg.norm(pose[first] - pose[second], axis=1))
         weights.append(weight / weight.sum())
     starts = np.cumsum([0, *map(len, weights[1:])], dtype=np.int64)
     return centred, starts, np.concatenate(edges), np.concatenate(weights)
@@ -99,8 +84,8 @@ def _ringed(poses: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 MEASURES: Mapping[str, Measure] = {
-    "interaction": Measure(_triangulated, interaction_minima),
-    "cartesian": Measure(_centred, cartesian_minima),
-    "shape-context": Measure(_ringed, shape_minima),
+    "interaction": (_triangulated, interaction_minima),
+    "cartesian": (_centred, cartesian_minima),
+    "shape-context": (_ringed, shape_minima),
 }
 """The distances by name."""

@@ -21,14 +21,7 @@ def align(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, horn: np.
     Horn's (1987) quaternion, the leading eigenvector of a traceless symmetric 4×4 matrix. The
     eigenvalue comes from Newton's method on the characteristic polynomial, the eigenvector from
     the adjugate (Theobald 2005). The returned sum has an error of about 1e-16 of the sum of
-    squares of the poses, which must be centred.
-
-    Parameters
-    ----------
-    first, second : ndarray, (J, 3)
-        Poses centred on their mean joint, metres.
-    rotation, horn : ndarray, (3, 3) and (4, 4)
-        Output and workspace.
+    squares of the poses (J, 3), which must be centred. ``horn`` (4, 4) is a workspace.
     """
     square = _fill(first, second, horn)
     # λ⁴ + c₂ λ² + c₁ λ + c₀.
@@ -36,13 +29,14 @@ def align(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, horn: np.
     for i in range(4):
         for k in range(4):
             c2 -= 0.5 * horn[i, k] * horn[i, k]
-    c1 = _linear_coefficient(horn)
-    c0 = _determinant(horn)
+    c1, c0 = _linear_coefficient(horn), _determinant(horn)
     top = 0.5 * square
     for _ in range(_NEWTON_STEPS):
         slope = (4.0 * top * top + 2.0 * c2) * top + c1
         if slope <= _FLAT * top * top * top:
-            return square - 2.0 * _eigenvector_rotation(horn, rotation)
+            values, v = np.linalg.eigh(horn)
+            _write_rotation(v[0, 3], v[1, 3], v[2, 3], v[3, 3], rotation)
+            return square - 2.0 * values[3]
         step = (((top * top + c2) * top + c1) * top + c0) / slope
         top -= step
         if abs(step) <= _CONVERGED * top:
@@ -55,15 +49,15 @@ def align(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, horn: np.
 
 @numba.njit(cache=True)
 def residual(
-    first: np.ndarray, second: np.ndarray, rotation: np.ndarray, apart: np.ndarray
+    first: np.ndarray, second: np.ndarray, rotation: np.ndarray, differences: np.ndarray
 ) -> float:
-    """Write ``first − rotation · second`` to ``apart`` (J, 3); return the sum of its squares."""
+    """Write ``first − rotation · second`` to ``differences`` (J, 3); return its sum of squares."""
     total = 0.0
     for j in range(first.shape[0]):
         for i in range(3):
             turned = rotation[i, 0] * second[j, 0] + rotation[i, 1] * second[j, 1]
             difference = first[j, i] - turned - rotation[i, 2] * second[j, 2]
-            apart[j, i] = difference
+            differences[j, i] = difference
             total += difference * difference
     return total
 
@@ -76,19 +70,11 @@ def _fill(first: np.ndarray, second: np.ndarray, horn: np.ndarray) -> float:
         a, b, c = first[j, 0], first[j, 1], first[j, 2]
         x, y, z = second[j, 0], second[j, 1], second[j, 2]
         square += (a * a + b * b + c * c) + (x * x + y * y + z * z)
-        xx += x * a
-        xy += x * b
-        xz += x * c
-        yx += y * a
-        yy += y * b
-        yz += y * c
-        zx += z * a
-        zy += z * b
-        zz += z * c
-    horn[0, 0] = xx + yy + zz
-    horn[1, 1] = xx - yy - zz
-    horn[2, 2] = yy - xx - zz
-    horn[3, 3] = zz - xx - yy
+        xx, xy, xz = xx + x * a, xy + x * b, xz + x * c
+        yx, yy, yz = yx + y * a, yy + y * b, yz + y * c
+        zx, zy, zz = zx + z * a, zy + z * b, zz + z * c
+    horn[0, 0], horn[1, 1] = xx + yy + zz, xx - yy - zz
+    horn[2, 2], horn[3, 3] = yy - xx - zz, zz - xx - yy
     horn[0, 1] = horn[1, 0] = yz - zy
     horn[0, 2] = horn[2, 0] = zx - xz
     horn[0, 3] = horn[3, 0] = xy - yx
@@ -133,14 +119,6 @@ def _determinant(m: np.ndarray) -> float:
 
 
 @numba.njit(cache=True)
-def _eigenvector_rotation(horn: np.ndarray, rotation: np.ndarray) -> float:
-    """Write the rotation from a full eigendecomposition; return the largest eigenvalue."""
-    values, vectors = np.linalg.eigh(horn)
-    _write_rotation(vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3], rotation)
-    return values[3]
-
-
-@numba.njit(cache=True)
 def _adjugate_rotation(m: np.ndarray, rotation: np.ndarray) -> None:
     """Write the rotation of the quaternion q in the null space of m.
 
@@ -176,9 +154,6 @@ def _write_rotation(w: float, x: float, y: float, z: float, rotation: np.ndarray
     rotation[0, 0] = 1.0 - scale * (y * y + z * z)
     rotation[1, 1] = 1.0 - scale * (x * x + z * z)
     rotation[2, 2] = 1.0 - scale * (x * x + y * y)
-    rotation[0, 1] = scale * (x * y - w * z)
-    rotation[1, 0] = scale * (x * y + w * z)
-    rotation[0, 2] = scale * (x * z + w * y)
-    rotation[2, 0] = scale * (x * z - w * y)
-    rotation[1, 2] = scale * (y * z - w * x)
-    rotation[2, 1] = scale * (y * z + w * x)
+    rotation[0, 1], rotation[1, 0] = scale * (x * y - w * z), scale * (x * y + w * z)
+    rotation[0, 2], rotation[2, 0] = scale * (x * z + w * y), scale * (x * z - w * y)
+    rotation[1, 2], rotation[2, 1] = scale * (y * z - w * x), scale * (y * z + w * x)

@@ -14,18 +14,15 @@ import numpy as np
 from probmotion.validation import check_finite, check_shape
 
 __all__ = [
-    "N_ANGLES",
-    "RING_EDGES",
-    "shape_context_distance",
-    "shape_contexts",
+    "N_ANGLES", "N_BANDS", "N_SECTORS", "RING_EDGES", "shape_context_distance", "shape_contexts",
     "shared_table",
-]
+]  # fmt: skip
 
 RING_EDGES = (0.15, 0.3, 0.6, 1.2)
 """Boundaries of the five distance rings, metres; the last ring is unbounded."""
 N_ANGLES = 12
 """Angular bins in 2D."""
-_N_BANDS, _N_SECTORS = 4, 8
+N_BANDS, N_SECTORS = 4, 8
 """Bins in 3D: sine of the elevation (equal areas) and azimuth."""
 
 
@@ -38,15 +35,15 @@ def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.
 
     Parameters
     ----------
-    points : numpy.ndarray
-        Joints, shape (…, J, D), metres; D = 2, or D = 3 with Y up. At most 256 joints.
-    visible : numpy.ndarray, optional
-        Mask of visible joints, bool, shape (…, J); all by default.
+    points : ndarray, (…, J, D)
+        Joints, metres; D = 2, or D = 3 with Y up. At most 256 joints.
+    visible : ndarray of bool, (…, J), optional
+        Mask of visible joints; all by default.
 
     Returns
     -------
-    numpy.ndarray
-        Shape (…, J, 60) or (…, J, 160), uint8; 0 in the rows of occluded joints.
+    ndarray of uint8, (…, J, 60) or (…, J, 160)
+        0 in the rows of occluded joints.
     """
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, ("…", "J", 3 if points.shape[-1:] == (3,) else 2))
@@ -58,13 +55,12 @@ def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.
     check_shape("visible", visible, ("…", n_joints))
     flat = points.reshape(-1, n_joints, n_axes)
     shown = np.broadcast_to(visible, (*batch, n_joints)).reshape(-1, n_joints)
-    n_bins = (len(RING_EDGES) + 1) * (N_ANGLES if n_axes == 2 else _N_BANDS * _N_SECTORS)
+    n_bins = (len(RING_EDGES) + 1) * (N_ANGLES if n_axes == 2 else N_BANDS * N_SECTORS)
     counts = np.zeros((len(flat), n_joints, n_bins), dtype=np.uint8)
-    rows = np.arange(n_joints)[:, None]
     for item, (joints, seen) in enumerate(zip(flat, shown, strict=True)):
         bins = _bins_in_plane(joints) if n_axes == 2 else _bins_in_space(joints)
-        counted = seen[:, None] & seen[None, :] & ~np.eye(n_joints, dtype=bool)
-        np.add.at(counts[item], (np.broadcast_to(rows, bins.shape)[counted], bins[counted]), 1)
+        i, j = np.nonzero(seen[:, None] & seen[None, :] & ~np.eye(n_joints, dtype=bool))
+        np.add.at(counts[item], (i, bins[i, j]), 1)
     return counts.reshape(*batch, n_joints, n_bins)
 
 
@@ -78,15 +74,15 @@ def shape_context_distance(
 
     Parameters
     ----------
-    first, second : numpy.ndarray
-        From :func:`shape_contexts` with the same visible joints, shape (…, J, K).
-    visible : numpy.ndarray, optional
-        Mask of visible joints, bool, shape (…, J); all by default.
+    first, second : ndarray, (…, J, K)
+        From :func:`shape_contexts` with the same visible joints.
+    visible : ndarray of bool, (…, J), optional
+        Mask of visible joints; all by default.
 
     Returns
     -------
-    numpy.ndarray
-        Shape (…); infinite where fewer than two joints are visible.
+    ndarray, (…)
+        Infinite where fewer than two joints are visible.
     """
     check_shape("first", first, ("…", "J", "K"))
     check_shape("second", second, ("…", *first.shape[-2:]))
@@ -117,28 +113,28 @@ def _normalised(counts: np.ndarray) -> np.ndarray:
 
 def _bins_in_plane(joints: np.ndarray) -> np.ndarray:
     """Return the bin of joint j in the context of joint i, (J, J)."""
-    apart = joints[None] - joints[:, None]
-    angle = np.arctan2(apart[..., 1], apart[..., 0])
-    return _rings(apart) * N_ANGLES + _sectors(angle, N_ANGLES)
+    difference = joints[None] - joints[:, None]
+    angle = np.arctan2(difference[..., 1], difference[..., 0])
+    return _rings(difference) * N_ANGLES + _sectors(angle, N_ANGLES)
 
 
 def _bins_in_space(joints: np.ndarray) -> np.ndarray:
     """Return the bin of joint j in the context of joint i, (J, J)."""
     half = len(joints) // 2
     heading = joints[-half:].sum(axis=0) - joints[:half].sum(axis=0) if half else np.zeros(3)
-    apart = joints[None] - joints[:, None]
-    distance = np.sqrt((apart**2).sum(axis=-1))
-    sine = apart[..., 1] / np.where(distance > 0, distance, 1.0)
-    band = np.clip(np.floor(0.5 * _N_BANDS * (sine + 1)), 0, _N_BANDS - 1).astype(np.int64)
+    difference = joints[None] - joints[:, None]
+    distance = np.sqrt((difference**2).sum(axis=-1))
+    sine = difference[..., 1] / np.where(distance > 0, distance, 1.0)
+    band = np.clip(np.floor(0.5 * N_BANDS * (sine + 1)), 0, N_BANDS - 1).astype(np.int64)
     # Components of the azimuth relative to the heading.
-    along = apart[..., 0] * heading[0] + apart[..., 2] * heading[2]
-    across = apart[..., 0] * heading[2] - apart[..., 2] * heading[0]
-    sector = _sectors(np.arctan2(across, along), _N_SECTORS)
-    return (_rings(apart) * _N_BANDS + band) * _N_SECTORS + sector
+    along = difference[..., 0] * heading[0] + difference[..., 2] * heading[2]
+    across = difference[..., 0] * heading[2] - difference[..., 2] * heading[0]
+    sector = _sectors(np.arctan2(across, along), N_SECTORS)
+    return (_rings(difference) * N_BANDS + band) * N_SECTORS + sector
 
 
-def _rings(apart: np.ndarray) -> np.ndarray:
-    distance = np.sqrt((apart**2).sum(axis=-1))
+def _rings(difference: np.ndarray) -> np.ndarray:
+    distance = np.sqrt((difference**2).sum(axis=-1))
     return np.searchsorted(RING_EDGES, distance, side="right")
 
 

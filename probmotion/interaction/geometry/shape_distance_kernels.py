@@ -11,13 +11,12 @@ import numba
 import numpy as np
 
 from probmotion.interaction.geometry.rigid_kernels import align
-from probmotion.interaction.geometry.shape_context import RING_EDGES
+from probmotion.interaction.geometry.shape_context import N_BANDS, N_SECTORS, RING_EDGES
 
 __all__ = ["ring_counts", "shape_minima"]
 
 _N_RINGS = len(RING_EDGES) + 1
-_N_BANDS, _N_SECTORS = 4, 8
-_N_BINS = _N_RINGS * _N_BANDS * _N_SECTORS
+_N_BINS = _N_RINGS * N_BANDS * N_SECTORS
 _SQUARED_EDGES = tuple(edge**2 for edge in RING_EDGES)
 _TOLERANCE = 1e-12
 """Tolerance of the early stop, for rounding errors."""
@@ -63,8 +62,8 @@ def shape_minima(
                 continue
             align(truths[g], draws[s], rotation, horn)
             _turn(draws[s], rotation, turned)
-            found = _cost(turned, contexts, gains, spare, least[g], counts, bins)
-            least[g] = min(least[g], found)
+            cost = _cost(turned, contexts, gains, spare, least[g], counts, bins)
+            least[g] = min(least[g], cost)
 
 
 @numba.njit(cache=True)
@@ -164,7 +163,7 @@ def _fill_bins(
         steep = 4.0 * y * abs(y)
         band = int(steep >= -squared) + int(y >= 0.0) + int((steep >= squared) & (squared > 0.0))
         sector = _octant(x * heading_z - z * heading_x, x * heading_x + z * heading_z)
-        bins[j] = (_ring(squared) * _N_BANDS + band) * _N_SECTORS + sector
+        bins[j] = (_ring(squared) * N_BANDS + band) * N_SECTORS + sector
 
 
 # The functions below are branch-free so that the compiler can vectorise them.
@@ -172,13 +171,8 @@ def _fill_bins(
 
 @numba.njit(cache=True)
 def _ring(squared: float) -> int:
-    near, next_near, next_far, far = _SQUARED_EDGES
-    return (
-        int(squared >= near)
-        + int(squared >= next_near)
-        + int(squared >= next_far)
-        + int(squared >= far)
-    )
+    a, b, c, d = _SQUARED_EDGES
+    return int(squared >= a) + int(squared >= b) + int(squared >= c) + int(squared >= d)
 
 
 @numba.njit(cache=True)

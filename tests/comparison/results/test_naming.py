@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,13 +13,12 @@ from toy_samplers import generation, monocular
 
 from probmotion.comparison.results.naming import named_problems
 from probmotion.comparison.results.plan import Plan
-from probmotion.posteriors.problem import Problem
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral
 
 
 def settings_of(sampler: Any) -> dict[str, str]:
-    return Plan.of({}, {"it": sampler}, draws=10, chains=1, seeds=1).samplers["it"]
+    return Plan.of({}, {"a": sampler}, draws=10, chains=1, seeds=1).samplers["a"]
 
 
 @pytest.mark.parametrize("name", ["gait(mine)", "gait(frames=2, mine=3)", "gait(frames=0)", "gait"])
@@ -28,9 +28,7 @@ def test_user_problems_may_have_the_name_of_a_registered_one(name):
 
 
 def test_user_problems_need_no_data_of_a_registered_namesake(monkeypatch):
-    def absent(name: str) -> Problem:
-        raise FileNotFoundError(f"{name} needs data")
-
+    absent = Mock(side_effect=FileNotFoundError("gait needs data"))
     monkeypatch.setattr("probmotion.comparison.results.naming.load_problem", absent)
     mine = replace(generation(), name="gait")
     assert named_problems(mine) == {"gait": mine}
@@ -38,10 +36,8 @@ def test_user_problems_need_no_data_of_a_registered_namesake(monkeypatch):
 
 def test_registered_problems_are_sent_by_their_full_name():
     scaled = load_problem("gait", frames=8)
-    assert named_problems([load_problem("gait"), scaled]) == {
-        "gait": "gait",
-        scaled.name: scaled.name,
-    }
+    names = {"gait": "gait", scaled.name: scaled.name}
+    assert named_problems([load_problem("gait"), scaled]) == names
     ways = "gait-monocular(noise=0.1, frames=4)", "gait-monocular(frames=4, noise=0.1)"
     assert list(named_problems(ways[0])) == list(named_problems(ways[1])) == [ways[1]]
     with pytest.raises(ValueError, match="must have different names, got 'gait-monocular"):
@@ -77,11 +73,9 @@ CHANGED[1500] = 0  # where a printed array shows "..."
         ({"numbers": NUMBERS.copy(), "tensor": torch.ones(4)}, []),
         ({"several": (np.ones(2), np.zeros(3))}, []),
         ({"numbers": CHANGED}, ["numbers"]),
-        ({"numbers": np.ones(2)}, ["numbers"]),
         ({"numbers": None, "tensor": None}, ["numbers", "tensor"]),
         ({"several": (np.ones(2), np.ones(3))}, ["several"]),
         ({"tensor": torch.zeros(4)}, ["tensor"]),
-        ({"scale": 2}, []),
         ({"scale": 3}, ["scale"]),
     ],
 )

@@ -16,7 +16,6 @@ from toy_samplers import (
     SMALL,
     Failing,
     PriorDraws,
-    count,
     finish,
     generation,
     monocular,
@@ -36,7 +35,7 @@ from probmotion.comparison.run.time_limits import time_limit
 from probmotion.models import GaussianMixtureMotion
 
 FAILURES = {
-    "raise": ("RuntimeError", "the floor gave way"),
+    "raise": ("RuntimeError", "singular matrix"),
     "nan": ("nan", "nan returned 1 positions that are not finite or beyond 1e+100 metres"),
     "diverged": ("nan", "diverged returned 36 positions that are not finite or beyond 1e+100"),
     "infinite": ("nan", "positions must be finite, got 720 values that are NaN or infinite"),
@@ -44,7 +43,6 @@ FAILURES = {
     "exit": ("SystemExit", "3"),
     "unwritable": ("TypeError", "Invalid value for attr 'odd'"),
     "none": ("TypeError", "none must return MotionDraws, got NoneType"),
-    "array": ("TypeError", "array must return MotionDraws, got ndarray"),
     "other skeleton": ("ValueError", "other skeleton must return draws of the posterior's skele"),
     "too few": ("ValueError", "too few must return 2 chains of 10 draws, got 2 of 9"),
     "one chain": ("ValueError", "one chain must return 2 chains of 10 draws, got 1 of 20"),
@@ -52,22 +50,22 @@ FAILURES = {
 }
 
 
-def failures_of(comparison):
-    return {(r.sampler, r.seed): r.failure and r.failure.word for r in comparison.results}
-
-
 def test_every_failure_is_recorded_with_word_and_message(tmp_path):
     samplers = {how: Failing(how=how) for how in FAILURES} | {"right": PriorDraws()}
-    found = compare(generation(), samplers, out=tmp_path, **SMALL)
-    failures = {result.sampler: result.failure for result in found.results}
+    comparison = compare(generation(), samplers, out=tmp_path, **SMALL)
+    failures = {result.sampler: result.failure for result in comparison.results}
     assert failures.pop("right") is None
+    table = comparison.table()
     for how, (word, message) in FAILURES.items():
         assert failures[how].word == word
         assert failures[how].message.startswith(message)
-        assert word in str(found.table())
-    table = found.table()
+        assert word in str(table)
     assert set(table[table["metric"] == "failed"]["sampler"]) == set(FAILURES)
     assert not list(tmp_path.glob("runs/*/*/.unfinished*"))
+
+
+class OutOfMemoryError(RuntimeError):
+    """Error of the name that torch uses."""
 
 
 @pytest.mark.parametrize(
@@ -75,33 +73,26 @@ def test_every_failure_is_recorded_with_word_and_message(tmp_path):
     [
         (RuntimeError("RESOURCE_EXHAUSTED: out of memory"), "memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "memory"),
-        (type("OutOfMemoryError", (RuntimeError,), {})("CUDA"), "memory"),
+        (OutOfMemoryError("CUDA"), "memory"),
         (WorkerDied(killed=True), "memory"),
         (WorkerDied(killed=False), "died"),
         (FloatingPointError("overflow"), "nan"),
         (ValueError("theta is wrong"), "ValueError"),
         (TimeLimitExceeded(3.0), "time"),
+        (ResultNotWritten("the disk is full"), "ResultNotWritten"),
     ],
 )
-def test_word_of_an_error(error, word):
+def test_errors_have_a_word_and_can_be_pickled(error, word):
     assert Failure.of(error).word == word
-
-
-def test_errors_can_be_pickled():
-    for error in (TimeLimitExceeded(2.5), ResultNotWritten("the disk is full")):
-        assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_runs_beyond_the_time_limit_are_recorded():
     samplers = {"hang": Failing(how="hang"), "right": PriorDraws()}
-    start = time.monotonic()
     comparison = compare(generation(), samplers, time_limit=2.0, **SMALL)
-    assert time.monotonic() - start < 30
-    for result in comparison.results:
-        if result.sampler == "hang":
-            assert str(result.failure) == "time: took longer than time_limit, 2 seconds"
-        else:
-            assert result.failure is None
+    failures = {result.sampler: result.failure for result in comparison.results}
+    assert failures["right"] is None
+    assert str(failures["hang"]) == "time: took longer than time_limit, 2 seconds"
 
 
 def test_failures_of_worker_processes_are_recorded():
@@ -110,7 +101,7 @@ def test_failures_of_worker_processes_are_recorded():
         name: ClassVar[str] = "local"
 
         def __reduce__(self):
-            raise TypeError("Local holds a telescope")
+            raise TypeError("Local refuses")
 
     samplers = {
         "hang": Failing(how="hang without signals"),
@@ -120,22 +111,20 @@ def test_failures_of_worker_processes_are_recorded():
         "local": Local(),
         "right": PriorDraws(),
     }
-    settings = SMALL | {"workers": 2}
-    found = compare(generation(), samplers, time_limit=5.0, **settings)
-    assert failures_of(found) == {
-        ("hang", 0): "time",
-        ("die", 0): "died",
-        ("interrupt", 0): "KeyboardInterrupt",
-        ("unwritable", 0): "TypeError",
-        ("local", 0): "TypeError",
-        ("right", 0): None,
+    comparison = compare(generation(), samplers, time_limit=3.0, **SMALL | {"workers": 2})
+    failures = {result.sampler: result.failure for result in comparison.results}
+    assert failures.pop("right") is None
+    assert {sampler: failure.word for sampler, failure in failures.items()} == {
+        "hang": "time",
+        "die": "died",
+        "interrupt": "KeyboardInterrupt",
+        "unwritable": "TypeError",
+        "local": "TypeError",
     }
-    messages = {
-        result.sampler: result.failure and result.failure.message for result in found.results
-    }
-    assert messages["die"] == "a worker process died during this run, possibly out of memory"
-    assert messages["local"] == (
-        "generation/local/0 cannot be sent to a worker process: Local holds a telescope; make it "
+    message = "a worker process died during this run, possibly out of memory"
+    assert failures["die"].message == message
+    assert failures["local"].message == (
+        "generation/local/0 cannot be sent to a worker process: Local refuses; make it "
         "picklable or use workers=0"
     )
 
@@ -163,43 +152,28 @@ from probmotion.metrics.measures import load_libraries, measure
 problem = generation()
 draws = PriorDraws().sample(problem.posterior, draws=10, chains=2, seed=0, progress=False)
 draws.dataset.attrs["independent"] = 0  # so that ESS is measured
-if {prepared}:
-    load_libraries()
-known = set(sys.modules)
-measure(problem, draws, 0)
-heavy = {{name.partition(".")[0] for name in set(sys.modules) - known}}
-print(sorted(heavy & {{"arviz_stats", "scipy", "sklearn"}}))
+modules = [set(sys.modules)]
+for call in (load_libraries, lambda: measure(problem, draws, 0)):
+    call()
+    modules.append(set(sys.modules))
+heavy = [{name.partition(".")[0] for name in new - old} for old, new in zip(modules, modules[1:])]
+print([sorted({"arviz_stats", "scipy", "sklearn"} & names) for names in heavy])
 """
-    processes = [start("-c", program.format(prepared=prepared)) for prepared in (True, False)]
-    first, second = (ast.literal_eval(finish(process)[0]) for process in processes)
-    assert first == []
-    assert {"arviz_stats", "sklearn"} <= set(second)
-
-
-def test_runs_are_reused_with_another_time_limit(tmp_path):
-    diary = tmp_path / "diary"
-    for limit in (None, 50.0, None):
-        sampler = PriorDraws(diary=str(diary))
-        compare(generation(), sampler, time_limit=limit, out=tmp_path, **SMALL)
-    assert count(diary) == 1
+    loaded, later = ast.literal_eval(finish(start("-c", program))[0])
+    assert {"arviz_stats", "sklearn"} <= set(loaded)
+    assert later == []
 
 
 def test_a_time_limit_resumes_the_timer_of_the_caller():
-    rung = []
-    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
+    handler = signal.getsignal(signal.SIGALRM)
+    signal.setitimer(signal.ITIMER_REAL, 100.0)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.5)
-        start = time.monotonic()
         with pytest.raises(TimeLimitExceeded), time_limit(0.1):
             time.sleep(20)
-        assert time.monotonic() - start < 10
-        with time_limit(60.0):
-            pass
-        time.sleep(max(0.0, 0.7 - (time.monotonic() - start)))
-        assert rung == [1]
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        left, _ = signal.setitimer(signal.ITIMER_REAL, 0)
+    assert 80 < left < 99.95
+    assert signal.getsignal(signal.SIGALRM) is handler
 
 
 def test_a_time_limit_that_a_library_wraps_is_recognised():
@@ -216,35 +190,32 @@ def test_a_time_limit_that_a_library_wraps_is_recognised():
 
 
 def test_a_time_limit_on_another_thread_raises_at_the_end():
-    found = []
+    events = []
 
     def work():
         try:
             with time_limit(0.05):
                 time.sleep(0.2)
-                found.append("ended")
+                events.append("ended")
         except TimeLimitExceeded:
-            found.append("raised")
+            events.append("raised")
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert found == ["ended", "raised"]
+    assert events == ["ended", "raised"]
 
 
-@pytest.mark.parametrize(("workers", "how"), [(0, ()), (2, ("slow",))])
-def test_a_full_disk_loses_no_finished_run(tmp_path, workers, how):
-    script = tmp_path / "run.py"
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_full_disk_loses_no_finished_run(tmp_path, workers):
+    script, out = tmp_path / "run.py", tmp_path / "out"
     script.write_text(FULL_DISK)
-    out = tmp_path / "out"
-    last = finish(start(script, out, workers, *how), returncode=1)[1].strip().splitlines()[-1]
+    last = finish(start(script, out, workers), returncode=1)[1].strip().splitlines()[-1]
     assert "OSError: cannot write to out" in last
     finished = int(re.search(r"with (\d) of 4 runs finished and stored in", last)[1])
     # One of two workers may still be in its first run when the disk is full.
     assert finished == 2 if workers == 0 else 1 <= finished <= 2
     assert len(Comparison.load(out).results) == finished
-    # Nor do workers that were killed while writing leave anything.
-    assert (out / "began to write").exists() == bool(how)
     assert not list(out.glob("runs/*/*/.unfinished*"))
     if workers == 0:  # with space on the disk the same command continues
         finish(start(script, out, workers, "room"))
@@ -252,21 +223,12 @@ def test_a_full_disk_loses_no_finished_run(tmp_path, workers, how):
 
 
 FULL_DISK = """
-import resource, sys, time
+import resource, sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 from toy_samplers import PriorDraws, generation
 from probmotion.comparison import compare
 from probmotion.comparison.results.plan import Plan
-from probmotion.posteriors.draws import MotionDraws
-
-
-def save_slowly(draws, path, save=MotionDraws.save):
-    save(draws, path)
-    if path.parent.name.startswith(".unfinished-0"):
-        Path(sys.argv[1], "began to write").touch()
-        time.sleep(100)
 
 
 @dataclass(frozen=True)
@@ -275,11 +237,7 @@ class Filling(PriorDraws):
     room: ClassVar[bool] = "room" in sys.argv
 
     def sample(self, posterior, **settings):
-        if "slow" in sys.argv:
-            MotionDraws.save = save_slowly
         if self.spread > 1 and not self.room:
-            while "slow" in sys.argv and not Path(sys.argv[1], "began to write").exists():
-                time.sleep(0.01)
             resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
         return super().sample(posterior, **settings)
 
@@ -305,13 +263,13 @@ class Broken(GaussianMixtureMotion):
 
 @pytest.mark.parametrize("observed", [True, False])
 def test_failing_reference_draws_do_not_stop_other_problems(observed):
-    whole = small_prior()
-    prior = Broken(**{each.name: getattr(whole, each.name) for each in fields(whole) if each.init})
+    given = small_prior()
+    prior = Broken(**{each.name: getattr(given, each.name) for each in fields(given) if each.init})
     likelihood = monocular().posterior.likelihood if observed else None
-    problems = {"broken": MotionPosterior(prior, likelihood), "whole": generation()}
-    found = compare(problems, PriorDraws(), **SMALL)
-    words = {result.problem: result.failure and result.failure.word for result in found.results}
-    assert words == {"broken": "observations" if observed else "NotImplementedError", "whole": None}
+    problems = {"broken": MotionPosterior(prior, likelihood), "right": generation()}
+    results = compare(problems, PriorDraws(), **SMALL).results
+    words = {result.problem: result.failure and result.failure.word for result in results}
+    assert words == {"broken": "observations" if observed else "NotImplementedError", "right": None}
 
 
 def test_scripts_need_no_main_guard_in_worker_processes(tmp_path):
@@ -347,6 +305,6 @@ class Greedy(Mine):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-found = compare(toy_samplers.generation(), [Mine(), Greedy()], draws=20, progress=False)
-print({result.sampler: result.failure and result.failure.word for result in found.results})
+comparison = compare(toy_samplers.generation(), [Mine(), Greedy()], draws=20, progress=False)
+print({result.sampler: result.failure and result.failure.word for result in comparison.results})
 """

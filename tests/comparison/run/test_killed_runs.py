@@ -12,17 +12,14 @@ from toy_samplers import finish, start
 
 from probmotion.files import forget_killed, written_whole
 
-# In a pilot, between the files of a run, before a run, in a simulation, in a table.
+# In a pilot, between the files of a run, before a run, in the table.
 MOMENTS = [
-    ("comparison", r"open pilots/generation/\.walking"),
-    ("comparison", r"os\.rename pilots/generation/\.walking"),
-    ("comparison", r"os\.rename runs/generation/walking/\.unfinished-1-\d+/\.draws"),
-    ("comparison", r"open runs/generation/walking/\.unfinished-1-\d+/run\.json"),
-    ("comparison", r"os\.rename runs/generation/walking/\.unfinished-1-\d+$"),
-    ("comparison", r"os\.rename \.table"),
-    ("calibration", r"open calibration/runs/generation/prior-draws/.*/run\.json"),
-    ("calibration", r"os\.rename calibration/runs/generation/prior-draws/\.unfinished-\d-\d+$"),
-    ("calibration", r"os\.rename calibration/\.table"),
+    r"open pilots/generation/\.walking",
+    r"os\.rename pilots/generation/\.walking",
+    r"os\.rename runs/generation/walking/\.unfinished-1-\d+/\.draws",
+    r"open runs/generation/walking/\.unfinished-1-\d+/run\.json",
+    r"os\.rename runs/generation/walking/\.unfinished-1-\d+$",
+    r"os\.rename \.table",
 ]
 
 
@@ -32,13 +29,11 @@ def test_a_grid_killed_at_any_file_can_be_continued(tmp_path):
     kills = [json.loads(line) for line in output.splitlines()]
     for kill in kills:
         # Runs are complete or absent; finished ones are neither repeated nor written again.
-        assert kill["broken"] == [], kill
-        assert kill["written again"] == [], kill
+        assert kill["broken"] == kill["changed"] == kill["left"] == [], kill
         assert kill["run"] == kill["missing"], kill
-        assert kill["left"] == [], kill
         assert kill["same table"], kill
-    for grid, moment in MOMENTS:
-        assert any(kill["grid"] == grid and re.match(moment, kill["event"]) for kill in kills)
+    for moment in MOMENTS:
+        assert any(re.match(moment, kill["event"]) for kill in kills), moment
     # Kills happen before the first run is finished and after the last.
     assert {kill["missing"] for kill in kills} == {0, 1, 2, 5}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from unittest.mock import Mock
 
 import pytest
 from toy_samplers import SMALL, PriorDraws, count, generation, monocular, start
@@ -40,24 +41,16 @@ def test_locks_are_released_after_errors(tmp_path):
     for _ in range(2):
         with pytest.raises(ValueError, match="stop"), locked(tmp_path, ["a", "b"]):
             raise ValueError("stop")
-    with (
-        locked(tmp_path, ["a"]),
-        pytest.raises(ValueError, match="running a;"),
-        locked(tmp_path, "ba"),
-    ):
-        pass
-    # Problems locked before the failing one are released.
-    with locked(tmp_path, ["b"]):
-        pass
+    with locked(tmp_path, ["a"]):
+        with pytest.raises(ValueError, match="running a;"), locked(tmp_path, "ba"):
+            pass
+        # Problems locked before the failing one are released.
+        with locked(tmp_path, ["b"]):
+            pass
 
 
 def test_a_file_system_without_locks_raises(tmp_path, monkeypatch):
-    import fcntl
-
-    def no_locks(*_):
-        raise OSError(38, "Function not implemented")
-
-    monkeypatch.setattr(fcntl, "flock", no_locks)
+    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(38, "Function not implemented")))
     with pytest.raises(OSError, match=r"out is .* files cannot be locked: Function not impl"):
         compare(generation(), PriorDraws(), out=tmp_path, **SMALL)
 
@@ -82,9 +75,9 @@ def test_folders_of_other_versions_raise(tmp_path, monkeypatch):
     plan = tmp_path / "comparison.json"
     stored = json.loads(plan.read_text())
     first = {name: value for name, value in stored.items() if name != "format"}
-    for other, found in ((stored | {"format": 7}, 7), (first, 1)):
+    for other, version in ((stored | {"format": 7}, 7), (first, 1)):
         plan.write_text(json.dumps(other))
-        message = rf"out is .*, which another version of probmotion wrote \(format {found}, not 2"
+        message = rf"out is .*, which another version of probmotion wrote \(format {version}, not 2"
         with pytest.raises(ValueError, match=message):
             compare(generation(), sampler, out=tmp_path, **SMALL)
         with pytest.raises(ValueError, match=message):

@@ -20,44 +20,28 @@ ARRAYS = ("keypoints", "visible", "neighbours", "views")
 
 
 def smooth_motion(frames=12, seed=0):
-    rng = np.random.default_rng(seed)
-    start, pace = rng.standard_normal((2, 1, 34, 3))
+    start, pace = np.random.default_rng(seed).standard_normal((2, 1, 34, 3))
     time = np.arange(frames)[:, None, None]
     positions = start + 0.02 * pace * time + 0.1 * np.sin(time / 3 + pace)
     return Motion(positions, PAIR, 30.0, name=f"walk {seed}")
 
 
-def one_annotation(before, own, after, visible=None):
-    visible = np.ones((1, 34), dtype=bool) if visible is None else visible
-    return Annotations(own[None], visible, PAIR, np.stack([before, after])[None], 30.0)
+def one_annotation(before, current, after, visible=True):
+    neighbours = np.stack([before, after])[None]
+    return Annotations(current[None], np.full((1, 34), visible), PAIR, neighbours, 30.0)
 
 
 def random_annotations(**changes):
     rng = np.random.default_rng(0)
-    fields = {
-        "keypoints": rng.standard_normal((5, 34, 2)),
-        "visible": np.ones((5, 34), dtype=bool),
-        "skeleton": PAIR,
-        "neighbours": rng.standard_normal((5, 2, 34, 2)),
-        "fps": 30.0,
-    }
-    return Annotations(**fields | changes)
+    keypoints, neighbours = rng.standard_normal((5, 34, 2)), rng.standard_normal((5, 2, 34, 2))
+    visible = np.ones((5, 34), dtype=bool)
+    return Annotations(keypoints, visible, PAIR, neighbours, 30.0, **changes)
 
 
 def changed(array, index, value):
     array = array.copy()
     array[index] = value
     return array
-
-
-def test_occluded_joints_are_set_to_zero():
-    given = random_annotations()
-    keypoints = changed(changed(given.keypoints, (2, 3), np.nan), (1, 5), 7.0)
-    visible = changed(given.visible, ([2, 1], [3, 5]), False)
-    held = replace(given, keypoints=keypoints, visible=visible)
-    assert (held.keypoints[[2, 1], [3, 5]] == 0).all()
-    np.testing.assert_array_equal(held.keypoints[visible], given.keypoints[visible])
-    assert held.describe() == "5 annotations, 2 of 170 joints occluded"
 
 
 @pytest.mark.parametrize(
@@ -81,10 +65,7 @@ def test_occluded_joints_are_set_to_zero():
         (lambda a: a.subset([0.7, 1.2]), "indices must be integers or a mask, got float64"),
         (lambda a: a.subset(np.ones(3, bool)), r"indices must have shape \(5\), got \(3,\)"),
         (lambda a: Annotations.joined([]), "several must contain at least one set"),
-        (
-            lambda a: Annotations.joined([a, replace(a, fps=25.0)]),
-            r"several\[1\] must have the skeleton .* got 34 joints and 25 frames per second",
-        ),
+        (lambda a: Annotations.joined([a, replace(a, fps=25.0)]), r"several\[1\] .* 25 frames per"),
     ],
 )
 def test_invalid_annotations_are_rejected(make, message):
@@ -92,25 +73,14 @@ def test_invalid_annotations_are_rejected(make, message):
         make(random_annotations())
 
 
-def test_subset_selects_rows():
+def test_rows_are_selected_and_videos_joined():
     given = random_annotations(views=np.ones((5, 2)), sources=list("abcde"))
-    for chosen in ([3, 0], np.array([False, True, False, False, True])):
-        subset = given.subset(chosen)
-        assert len(subset) == 2
-        for name in ARRAYS:
-            np.testing.assert_array_equal(getattr(subset, name), getattr(given, name)[chosen])
-        assert subset.sources == tuple(np.array(list("abcde"))[chosen])
-
-
-def test_videos_are_joined():
-    first = draw_annotations(DANCES[:1], 7, 0, hidden=0.2).annotations
-    second = draw_annotations(DANCES[1:2], 5, 1).annotations
-    both = Annotations.joined([first, second])
-    for name in ARRAYS[:3]:
-        parts = getattr(first, name), getattr(second, name)
-        np.testing.assert_array_equal(getattr(both, name), np.concatenate(parts))
-    assert both.sources == (*first.sources, *second.sources)
-    assert both.views is None
+    indices, mask = given.subset([3, 0]), given.subset(np.array([False, True, False, False, True]))
+    joined = Annotations.joined([indices, mask])
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(joined, name), getattr(given, name)[[3, 0, 1, 4]])
+    assert joined.sources == ("d", "a", "b", "e")
+    assert Annotations.joined([given, random_annotations(dropped={"cut": 2})]).views is None
 
 
 def test_saved_annotations_are_loaded_unchanged(tmp_path):
@@ -127,17 +97,15 @@ def test_saved_annotations_are_loaded_unchanged(tmp_path):
 def test_damaged_files_are_rejected(tmp_path):
     path = tmp_path / "seen.npz"
     random_annotations().save(path)
-    whole = path.read_bytes()
+    intact = path.read_bytes()
     np.savez(tmp_path / "other.npz", positions=np.zeros(3))
-    for content in (b"", b"none", whole[: len(whole) // 2], (tmp_path / "other.npz").read_bytes()):
+    other = (tmp_path / "other.npz").read_bytes()
+    for content in (b"", b"none", intact[: len(intact) // 2], other):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"seen\.npz must be an archive written by"):
             Annotations.load(path)
     with pytest.raises(FileNotFoundError):
         Annotations.load(tmp_path / "none.npz")
-
-
-# Differences in time (eq. 12).
 
 
 def test_differences_are_those_of_angle_length_and_root():
@@ -162,56 +130,48 @@ def test_differences_are_those_of_angle_length_and_root():
 
 
 def test_differences_are_one_sided_at_cuts_and_zero_without_neighbours():
-    keypoints = smooth_motion().positions[..., :2]
-    before, own, after = keypoints[4:7]
+    before, current, after = keypoints = smooth_motion().positions[4:7, :, :2]
     gap = np.full((34, 2), np.nan)
-    joint, parent = PAIR.index("person1:left_knee"), PAIR.index("person1:left_hip")
-    lengths = np.linalg.norm(keypoints[4:7, joint] - keypoints[4:7, parent], axis=-1)
-    for annotation, expected in (
-        (one_annotation(before, own, after), abs(lengths[2] - lengths[0]) / 2),
-        (one_annotation(gap, own, after), abs(lengths[2] - lengths[1])),
-        (one_annotation(before, own, gap), abs(lengths[1] - lengths[0])),
-        (one_annotation(gap, own, gap), 0.0),
+    lengths = np.linalg.norm(keypoints[:, 13] - keypoints[:, 12], axis=-1)
+    for neighbours, expected in (
+        ((before, after), abs(lengths[2] - lengths[0]) / 2),
+        ((gap, after), abs(lengths[2] - lengths[1])),
+        ((before, gap), abs(lengths[1] - lengths[0])),
     ):
-        _, stretch = annotation.local_differences()
-        assert stretch[0, joint] == pytest.approx(expected, abs=1e-12)
-    assert (np.stack(annotation.local_differences()) == 0).all()
+        _, stretch = one_annotation(neighbours[0], current, neighbours[1]).local_differences()
+        assert stretch[0, 13] == pytest.approx(expected, abs=1e-12)
+    assert (np.stack(one_annotation(gap, current, gap).local_differences()) == 0).all()
 
 
 def test_differences_are_zero_for_occluded_joints_and_bones_of_length_zero():
-    before, own, after = smooth_motion().positions[4:7, :, :2]
+    before, current, after = smooth_motion().positions[4:7, :, :2]
     for neighbour in (before, after):
         neighbour[1] = np.nan
         neighbour[4] = neighbour[3]  # a bone along the line of sight
-    visible = np.arange(34)[None] != 1
-    turns, stretches = one_annotation(before, own, after, visible).local_differences()
+    annotation = one_annotation(before, current, after, np.arange(34) != 1)
+    turns, stretches = annotation.local_differences()
     assert (turns[0, [1, 2, 4]] == 0).all()  # the parent of 2 is occluded
     assert (stretches[0, [1, 4]] == 0).all()
     assert turns[0, 3] > 0
-
-
-# Simulation from 3D pairs.
 
 
 def test_annotations_are_projections_of_frames_and_neighbours():
     motions = [smooth_motion(seed=0), smooth_motion(20, seed=1)]
     drawn = draw_annotations(motions, 32, 0)
     assert len({*zip(drawn.clips, drawn.frames, strict=True)}) == 32  # every frame once
-    axes = world_axes(drawn.world_views)
-    annotations = drawn.annotations
+    axes, annotations = world_axes(drawn.world_views), drawn.annotations
     assert annotations.visible.all()
-    assert annotations.views is None
     for row, (clip, frame) in enumerate(zip(drawn.clips, drawn.frames, strict=True)):
-        positions = np.pad(
-            motions[clip].positions, ((1, 1), (0, 0), (0, 0)), constant_values=np.nan
-        )
         assert annotations.sources[row] == motions[clip].name
-        before, own, after = positions[frame : frame + 3] @ axes[row, :2].T
-        np.testing.assert_allclose(annotations.keypoints[row], own)
+        projections = motions[clip].positions @ axes[row, :2].T
+        before, current, after = (
+            projections[t] if 0 <= t < len(projections) else np.full((34, 2), np.nan)
+            for t in (frame - 1, frame, frame + 1)
+        )
+        np.testing.assert_allclose(annotations.keypoints[row], current)
         np.testing.assert_allclose(annotations.neighbours[row], [before, after])
-    np.testing.assert_allclose(
-        drawn.views, view_angles(pair_frames(drawn.positions, PAIR), axes[:, 2])
-    )
+    expected = view_angles(pair_frames(drawn.positions, PAIR), axes[:, 2])
+    np.testing.assert_allclose(drawn.views, expected)
 
 
 def test_camera_axes_are_upright_and_orthonormal():
@@ -224,7 +184,6 @@ def test_camera_axes_are_upright_and_orthonormal():
     products = axes @ np.swapaxes(axes, 1, 2)
     np.testing.assert_allclose(products, np.tile(np.eye(3), (100, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(axes), 1)
-    assert (axes[:, 0, 1] == 0).all()
     assert (axes[:, 1, 1] > 0).all()
     azimuth, elevation = drawn.world_views.T
     assert ELEVATIONS[0] <= elevation.min() < -0.1 < 0.6 < elevation.max() <= ELEVATIONS[1]
@@ -234,8 +193,8 @@ def test_camera_axes_are_upright_and_orthonormal():
 
 def test_given_views_and_frames_are_used():
     views = np.tile([[0.4, 0.1]], (10, 1))
-    offered = [np.arange(motion.frames) % 7 == 3 for motion in DANCES]
-    drawn = draw_annotations(DANCES, 10, 0, frames=offered, world_views=views, known_views=True)
+    masks = [np.arange(motion.frames) % 7 == 3 for motion in DANCES]
+    drawn = draw_annotations(DANCES, 10, 0, frames=masks, world_views=views, known_views=True)
     np.testing.assert_array_equal(drawn.annotations.views, drawn.views)
     np.testing.assert_array_equal(drawn.world_views, views)
     assert (drawn.frames % 7 == 3).all()
@@ -270,8 +229,8 @@ ALONE = Motion(DANCES[0].positions[:, :17], Skeleton.preset("person17"), 30.0)
     [
         ([], 1, {}, "motions must contain at least one clip, got none"),
         (DANCES, 121, {}, "n must be at most 120, the number of frames, got 121"),
-        ([*DANCES, SLOW], 5, {}, r"motions\[3\] must have the frame rate of .* 30, got 25"),
-        ([*DANCES, ALONE], 5, {}, r"motions\[3\] must have the skeleton of motions\[0\]"),
+        ([*DANCES, SLOW], 5, {}, r"motions\[3\] .*, got 34 joints and 25 frames per second"),
+        ([*DANCES, ALONE], 5, {}, r"motions\[3\] .*, got 17 joints and 30 frames per second"),
         ([ALONE], 5, {}, "skeleton must have at least 2 people, got 1"),
         ([Motion(TOUCHING, PAIR, 30.0)], 5, {}, "degenerate pair in frame .* of clip 0"),
         (DANCES, 5, {"noise": -0.1}, "noise must be a finite number of at least 0, got -0.1"),

@@ -7,38 +7,22 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from probmotion import Motion, Skeleton
+from probmotion import Skeleton
 from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth
 from probmotion.data.pairs import load_pairs
+from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
-from probmotion.interaction.annotations.backbones import annotation_views, lift_torsos, torso_joints
-from probmotion.interaction.annotations.local_frames import chest_joints, local_frames, pair_frames
+from probmotion.interaction.annotations.backbones import TORSO, annotation_views, lift_torsos
+from probmotion.interaction.annotations.local_frames import chest_joints, joints_named, pair_frames
 from probmotion.interaction.annotations.sources import draw_annotations, world_axes
 from probmotion.interaction.annotations.torso_fits import fit_body
 from probmotion.interaction.annotations.views import view_angles, view_vectors
 
 PAIR = Skeleton.preset("pair17")
 ROOTS, CHESTS = list(PAIR.roots), list(chest_joints(PAIR))
+TORSOS = joints_named(PAIR, TORSO)
 TOWARDS = np.array([0.0, 0.0, 1.0])
-# Metres from the pelvis; the person faces +z, with the left side at +x.
-BODY = {
-    "pelvis": (0, 0, 0), "spine": (0, 0.15, -0.02), "chest": (0, 0.3, -0.02),
-    "neck": (0, 0.5, -0.03), "head": (0, 0.6, 0.03), "left_shoulder": (0.2, 0.45, -0.02),
-    "left_elbow": (0.25, 0.2, 0), "left_wrist": (0.2, 0, 0.15), "left_hip": (0.1, -0.03, 0),
-    "left_knee": (0.1, -0.45, 0.05), "left_ankle": (0.1, -0.87, 0),
-}  # fmt: skip
-
-
-def standing():
-    """Return two people facing each other along z, (J, 3)."""
-    names = Skeleton.preset("person17").joint_names
-    left = np.array([BODY[name.replace("right", "left")] for name in names])
-    person = left * [[-1 if "right" in name else 1, 1, 1] for name in names]
-    facing = person * [-1, 1, -1] + [0.05, 0, 0.6]
-    return np.concatenate([person, facing]) + np.array([0, 0.9, 0])
-
-
-SEED = standing()
+SEED = synthetic_dances(1)[0].positions[10]
 
 
 def turned(turns, pair=SEED):
@@ -57,18 +41,16 @@ def degrees(a, b):
     return np.degrees(np.arctan2(cross, (a * b).sum(axis=-1)))
 
 
-def lifted(positions, seed=SEED, visible=None):
-    shown = np.ones(positions.shape[:2], dtype=bool) if visible is None else visible
-    return lift_torsos(positions[..., :2], shown, seed, PAIR)
-
-
-def annotated(positions, visible=None):
-    shown = np.ones(positions.shape[:2], dtype=bool) if visible is None else visible
+def annotated(positions, visible=True):
+    shown = np.broadcast_to(visible, positions.shape[:2])
     missing = np.full((len(positions), 2, 34, 2), np.nan)
     return Annotations(positions[..., :2], shown, PAIR, missing, 30.0)
 
 
-# Exact torsos.
+def lifted(positions, seed=SEED, visible=True):
+    return lift_torsos(
+        positions[..., :2], np.broadcast_to(visible, positions.shape[:2]), seed, PAIR
+    )
 
 
 def test_rotated_torsos_are_recovered_from_any_side():
@@ -80,7 +62,11 @@ def test_rotated_torsos_are_recovered_from_any_side():
     np.testing.assert_allclose(estimate.rotations, turns, atol=1e-4)
     truth = positions[:, CHESTS] - positions[:, ROOTS]
     np.testing.assert_allclose(estimate.backbones, truth, atol=1e-4)
-    np.testing.assert_allclose(estimate.roots[..., :2], positions[:, ROOTS, :2])
+    occluded = [PAIR.index(f"person1:{name}") for name in ("pelvis", "left_shoulder", "head")]
+    visible = ~np.isin(np.arange(34), occluded)
+    corrupted = np.where(visible[:, None], positions, np.nan)
+    for other in (estimate, lifted(corrupted, visible=visible)):
+        np.testing.assert_allclose(other.roots[..., :2], positions[:, ROOTS, :2], atol=1e-4)
 
 
 def test_views_of_the_rotated_seed_are_exact():
@@ -95,10 +81,10 @@ def test_views_of_the_rotated_seed_are_exact():
 
 
 def test_depth_ignores_the_torso_of_a_person_who_turned_alone():
-    whole = Rotation.from_rotvec(np.linspace(-1.2, -0.3, 40)[:, None] * [0, 1, 0]).as_matrix()
-    alone = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    positions = turned(np.stack([np.tile(np.eye(3), (40, 1, 1)), [alone] * 40], axis=1))
-    positions = np.einsum("nij,nmj->nmi", whole, positions)
+    both = Rotation.from_rotvec(np.linspace(-1.2, -0.3, 40)[:, None] * [0, 1, 0]).as_matrix()
+    second = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    positions = turned(np.tile([np.eye(3), second], (40, 1, 1, 1)))
+    positions = np.einsum("nij,nmj->nmi", both, positions)
     estimate = lifted(positions)
     truth = positions[:, 17, 2] - positions[:, 0, 2]
     mean = (estimate.rotations @ (SEED[17] - SEED[0]))[..., 2].mean(axis=-1)
@@ -106,21 +92,10 @@ def test_depth_ignores_the_torso_of_a_person_who_turned_alone():
     assert np.median(error) < 0.5 * np.median(np.abs(mean - truth))
 
 
-def test_flat_torsos_are_recovered_up_to_reflection():
-    seed = SEED * [1, 1, 0]
-    seed[17:, 2] = 0.6
-    positions = turned(random_turns(40, 2), seed)
-    estimate = lifted(positions, seed)
-    assert estimate.residuals.max() < 1e-6
-    truth = positions[:, CHESTS] - positions[:, ROOTS]
-    np.testing.assert_allclose(estimate.backbones[..., :2], truth[..., :2], atol=1e-4)
-    np.testing.assert_allclose(np.abs(estimate.backbones[..., 2]), np.abs(truth[..., 2]), atol=1e-4)
-
-
 def test_fit_is_the_global_minimum():
     """Against the best of several descents from random starts."""
     rng = np.random.default_rng(3)
-    body = SEED[list(torso_joints(PAIR)[0])]
+    body = SEED[list(TORSOS[0])]
     turns = Rotation.random(4, rng=4).as_matrix()
     points = np.einsum("nij,mj->nmi", turns[:, :2], body) + 0.03 * rng.standard_normal((4, 9, 2))
     fit = fit_body(points, np.ones((4, 9), dtype=bool), body)
@@ -135,44 +110,30 @@ def test_fit_is_the_global_minimum():
         best = min(minimize(rms, start, args=(observed,)).fun for start in starts)
         assert fit.residuals[index] == pytest.approx(best, abs=1e-5)
         turn = Rotation.from_matrix(fit.rotations[index]).as_rotvec()
-        own = np.concatenate([turn, fit.translations[index]])
-        assert rms(own, observed) == pytest.approx(fit.residuals[index])
+        parameters = np.concatenate([turn, fit.translations[index]])
+        assert rms(parameters, observed) == pytest.approx(fit.residuals[index])
 
 
 def test_estimates_do_not_depend_on_the_batch():
     noise = 0.02 * np.random.default_rng(0).standard_normal((1100, 34, 3))
     positions = turned(random_turns(1100, 0)) + noise
-    alone, together = lifted(positions[1050:1051]), lifted(positions)
-    np.testing.assert_allclose(alone.rotations[0], together.rotations[1050], atol=1e-9)
-
-
-# Occluded joints and degenerate pairs.
-
-
-def test_occluded_root_is_estimated_from_the_torso():
-    positions = turned(random_turns(20, 6))
-    occluded = [PAIR.index(f"person1:{name}") for name in ("pelvis", "left_shoulder", "head")]
-    visible = np.ones((20, 34), dtype=bool)
-    visible[:, occluded] = False
-    corrupted = np.where(visible[..., None], positions, np.nan)
-    estimate = lifted(corrupted, visible=visible)
-    assert estimate.lifted.all()
-    np.testing.assert_allclose(estimate.roots[..., :2], positions[:, ROOTS, :2], atol=1e-4)
+    single, batch = lifted(positions[1050:1051]), lifted(positions)
+    np.testing.assert_allclose(single.rotations[0], batch.rotations[1050], atol=1e-9)
 
 
 def test_annotations_without_a_torso_are_nan():
     positions = turned(random_turns(6, 7))
     visible = np.ones((6, 34), dtype=bool)
-    visible[2, list(torso_joints(PAIR)[1])] = False
-    visible[4, list(torso_joints(PAIR)[0][2:])] = False  # two joints are too few
+    visible[2, list(TORSOS[1])] = False
+    visible[4, list(TORSOS[0][2:])] = False  # two joints are too few
     estimate = lifted(positions, visible=visible)
     assert estimate.lifted.tolist() == [True, True, False, True, False, True]
     assert np.isnan(estimate.backbones[[2, 4]]).all()
     assert np.isnan(estimate.roots[[2, 4]]).all()
     np.testing.assert_array_equal(estimate.rotations[[0, 5]], lifted(positions).rotations[[0, 5]])
-    visible[2, 17] = visible[4, 0] = True
+    visible[2, 17] = True
     views = annotation_views(annotated(positions, visible), SEED)
-    assert np.isnan(views).any(axis=-1).tolist() == [False, False, True, False, True, False]
+    np.testing.assert_array_equal(np.isnan(views).any(axis=-1), ~estimate.lifted)
 
 
 def test_degenerate_seed_is_rejected():
@@ -180,20 +141,6 @@ def test_degenerate_seed_is_rejected():
     seed[17:] -= seed[17] - seed[0]
     with pytest.raises(ValueError, match=r"seed must have distinct roots .* degenerate pair"):
         lifted(SEED[None], seed)
-
-
-# Accuracy for other torsos and unknown depth.
-
-
-@pytest.fixture(scope="module")
-def random_pairs():
-    """Simulated annotations of pairs that bend, turn and move at random."""
-    rng = np.random.default_rng(0)
-    bends = Rotation.from_rotvec(0.3 * rng.standard_normal((600, 3))).as_matrix()
-    positions = turned(bends.reshape(300, 2, 3, 3))
-    positions[:, 17:] += 0.15 * rng.standard_normal((300, 1, 3))
-    positions += 0.01 * rng.standard_normal(positions.shape)
-    return draw_annotations([Motion(positions, PAIR, 30.0)], 300, 1)
 
 
 def errors(drawn, seed):
@@ -204,16 +151,7 @@ def errors(drawn, seed):
     truth = drawn.positions[:, CHESTS] - drawn.positions[:, ROOTS]
     backbones = degrees(estimate.backbones, np.einsum("nij,nkj->nki", axes, truth))
     views = annotation_views(annotations, seed)
-    return backbones, degrees(view_vectors(views), view_vectors(drawn.views)), estimate
-
-
-def test_errors_of_random_pairs_are_small_and_depth_helps(random_pairs):
-    backbones, views, estimate = errors(random_pairs, SEED)
-    assert np.median(backbones) < 6
-    assert np.median(views) < 15
-    flat = local_frames(estimate.roots * [1, 1, 0], estimate.backbones)
-    without = degrees(view_vectors(view_angles(flat, TOWARDS)), view_vectors(random_pairs.views))
-    assert np.median(views) < 0.7 * np.median(without)
+    return backbones, degrees(view_vectors(views), view_vectors(drawn.views))
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +171,7 @@ def test_errors_of_real_pairs_are_small(salsa, noise, hidden, most):
     """Median and 90 % quantile of the errors of backbones and views."""
     clips, frames, seed = salsa
     drawn = draw_annotations(clips, 500, 0, frames=frames, noise=noise, hidden=hidden)
-    backbones, views, _ = errors(drawn, seed)
+    backbones, views = errors(drawn, seed)
     known = np.isfinite(views)
     assert known.mean() > 0.98
     quantiles = [np.quantile(e[known], level) for e in (backbones, views) for level in (0.5, 0.9)]

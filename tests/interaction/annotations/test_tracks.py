@@ -14,6 +14,7 @@ from probmotion.interaction.annotations.tracks import annotations_of_tracks
 from probmotion.io.files import read_keypoints
 
 PAIR = Skeleton.preset("pair17")
+LINE = ("spine", "left_hip", "right_hip", "left_shoulder", "right_shoulder")
 DANCE = synthetic_dances(1, frames=40)[0]
 SEED = DANCE.positions[0]
 
@@ -22,17 +23,13 @@ def detections(layout, scale=300.0):
     """Return exact detections of a synthetic dance from the front, in pixels."""
     skeleton = Skeleton.preset(layout)
     tracks = []
-    for person in range(2):
-        pose = {
-            name: DANCE.positions[:, PAIR.index(f"person{person}:{name}"), :2]
-            for name in Skeleton.preset("person17").joint_names
-        }
-        middle = {
-            part: (pose[f"left_{part}"] + pose[f"right_{part}"]) / 2 for part in ("hip", "shoulder")
-        }
-        pose |= {"pelvis": middle["hip"], "neck": middle["shoulder"], "nose": pose["head"]}
-        for side, aside in (("left", 0.08), ("right", -0.08)):
-            pose[f"{side}_ear"] = pose["head"] + np.array([aside, 0.0])
+    for person, joints in enumerate(np.split(DANCE.positions[..., :2], 2, axis=1)):
+        names = Skeleton.preset("person17").joint_names
+        pose = dict(zip(names, np.moveaxis(joints, 1, 0), strict=True))
+        pose["pelvis"] = (pose["left_hip"] + pose["right_hip"]) / 2
+        pose["neck"] = (pose["left_shoulder"] + pose["right_shoulder"]) / 2
+        pose["nose"] = pose["head"]
+        pose |= {f"{side}_ear": pose["head"] + [x, 0] for side, x in (("left", 1), ("right", -1))}
         points = np.full((DANCE.frames, skeleton.n_joints, 2), np.nan)
         for joint, name in enumerate(skeleton.canonical_names):
             if name in pose:
@@ -57,6 +54,16 @@ def test_keypoints_are_converted_to_metres_with_y_up(layout):
     np.testing.assert_allclose(seen.keypoints[:, limbs], truth[:, limbs], atol=1e-9)
     trunk = [joint for joint in range(34) if joint not in limbs]
     assert np.abs(seen.keypoints[:, trunk] - truth[:, trunk]).max() < 0.08
+    for person in range(2):
+        # The spine divides the line from hips to shoulders as in the seed.
+        spine, *limbs = (PAIR.index(f"person{person}:{name}") for name in LINE)
+        (low, high), (seed_low, seed_high) = (
+            (pose[..., limbs[:2], :].mean(axis=-2), pose[..., limbs[2:], :].mean(axis=-2))
+            for pose in (seen.keypoints, SEED)
+        )
+        line = seed_high - seed_low
+        fraction = (SEED[spine] - seed_low) @ line / (line @ line)
+        np.testing.assert_allclose(seen.keypoints[:, spine], low + fraction * (high - low))
     np.testing.assert_allclose(seen.neighbours[1:, 0], seen.keypoints[:-1])
     np.testing.assert_allclose(seen.neighbours[:-1, 1], seen.keypoints[1:])
     assert np.isnan(seen.neighbours[0, 0]).all()
@@ -74,22 +81,6 @@ def test_keypoint_json_of_two_people_becomes_annotations(tmp_path):
     (tmp_path / "video.json").write_text(json.dumps(people))
     read = annotations_of_tracks(read_keypoints(tmp_path / "video.json", fps=30.0), SEED)
     np.testing.assert_allclose(read.keypoints, annotations_of_tracks(tracks, SEED).keypoints)
-
-
-def test_trunk_is_interpolated_from_hips_to_shoulders():
-    seen = annotations(detections("coco17"))
-    for person in ("person0", "person1"):
-        hips, shoulders = (
-            [PAIR.index(f"{person}:{side}_{part}") for side in ("left", "right")]
-            for part in ("hip", "shoulder")
-        )
-        low, high = SEED[hips].mean(axis=0), SEED[shoulders].mean(axis=0)
-        image_low, image_high = (seen.keypoints[:, at].mean(axis=1) for at in (hips, shoulders))
-        for name in ("pelvis", "spine", "chest", "neck"):
-            joint = PAIR.index(f"{person}:{name}")
-            fraction = (SEED[joint] - low) @ (high - low) / ((high - low) @ (high - low))
-            expected = image_low + fraction * (image_high - image_low)
-            np.testing.assert_allclose(seen.keypoints[:, joint], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [300.0, 75.0])
@@ -123,8 +114,8 @@ def test_occluded_shoulder_occludes_the_interpolated_trunk():
     confidence[4, first.skeleton.index("left_shoulder")] = 0
     seen = annotations([replace(first, confidence=confidence), second])
     occluded = {PAIR.joint_names[joint] for joint in np.flatnonzero(~seen.visible[4])}
-    names = ("pelvis", "spine", "chest", "neck", "left_shoulder")
-    assert occluded == {f"person0:{name}" for name in names}
+    trunk = ("pelvis", "spine", "chest", "neck", "left_shoulder")
+    assert occluded == {f"person0:{name}" for name in trunk}
 
 
 def test_tracks_with_every_joint_are_used_directly():
@@ -137,33 +128,22 @@ def test_tracks_with_every_joint_are_used_directly():
     np.testing.assert_allclose(seen.keypoints, DANCE.positions[..., :2], atol=1e-12)
 
 
-def test_invalid_tracks_are_rejected():
-    first, second = detections("coco17")
-    shorter = replace(second, keypoints=second.keypoints[:39], confidence=second.confidence[:39])
-    dark = replace(second, confidence=0 * second.confidence)
-    ball = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], [-1]), 30.0)
-    for tracks, message in (
-        ([first], "tracks must have 2 tracks, one per person, got 1"),
-        ([first, shorter], r"tracks\[1\] must have 40 frames at 30 .*, got 39 at 30"),
-        ([first, replace(second, fps=25.0)], r"tracks\[1\] must have 40 .*, got 40 at 25"),
-        ([first, dark], "tracks must have a frame in which all 2 people are visible, got none"),
-        ([first, ball], "all limb keypoints, got a track without left_shoulder, left_elbow"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            annotations_of_tracks(tracks, SEED)
-    with pytest.raises(ValueError, match="metres_per_pixel must be a finite number above 0"):
-        annotations([first, second], metres_per_pixel=-1)
+FIRST, SECOND = detections("coco17")
+SHORT = replace(SECOND, keypoints=SECOND.keypoints[:39], confidence=SECOND.confidence[:39])
+BALL = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], [-1]), 30.0)
 
 
-def test_two_people_of_a_real_video(real_data):
-    """A person and a partly visible bystander, OpenPose BODY_25B."""
-    path = next((real_data / "pose2sim_multiview").glob("*cam_01_bystander.npz"))
-    (bystander,) = read_keypoints(path)
-    (person,) = read_keypoints(path.with_name(path.name.replace("_bystander", "")))
-    seen = annotations_of_tracks([person, bystander], SEED)
-    assert len(seen) + seen.dropped["one person missing"] == person.frames
-    assert 0.5 < seen.visible.mean() < 1
-    head, ankle = (PAIR.index(f"person0:{joint}") for joint in ("head", "left_ankle"))
-    both = seen.visible[:, [head, ankle]].all(axis=1)
-    height = (seen.keypoints[:, head, 1] - seen.keypoints[:, ankle, 1])[both]
-    assert 1.0 < np.median(height) < 2.0  # metres, upright
+@pytest.mark.parametrize(
+    ("second", "options", "message"),
+    [
+        ([], {}, "tracks must have 2 tracks, one per person, got 1"),
+        ([SHORT], {}, r"tracks\[1\] must have 40 frames at 30 .*, got 39 at 30"),
+        ([replace(SECOND, fps=25.0)], {}, r"tracks\[1\] must have 40 .*, got 40 at 25"),
+        ([replace(SECOND, confidence=0 * SECOND.confidence)], {}, "all 2 people are visible, got"),
+        ([BALL], {}, "all limb keypoints, got a track without left_shoulder, left_elbow"),
+        ([SECOND], {"metres_per_pixel": -1}, "metres_per_pixel must be a finite number above 0"),
+    ],
+)
+def test_invalid_tracks_are_rejected(second, options, message):
+    with pytest.raises(ValueError, match=message):
+        annotations_of_tracks([FIRST, *second], SEED, **options)

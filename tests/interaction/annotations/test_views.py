@@ -33,15 +33,6 @@ def angle(a, b):
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))
 
 
-# Frames and angles, equations 3 and 4.
-
-
-def test_frame_of_two_upright_people_side_by_side():
-    roots = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, -2.0]])
-    frame = local_frames(roots, np.array([[0.0, 0.5, 0.0], [0.0, 0.2, 0.0]]))
-    np.testing.assert_allclose(frame.T, [[0, 0, -1], [0, 1, 0], [1, 0, 0]])
-
-
 def test_frame_of_three_people_sums_unit_backbones():
     roots, backbones = np.random.default_rng(0).standard_normal((2, 3, 3))
     i, j, k = local_frames(roots, backbones).T
@@ -62,9 +53,6 @@ def test_view_angles_equal_the_definition():
         assert theta == pytest.approx(np.arccos(b / np.sqrt(a**2 + b**2 + c**2)))
 
 
-# Projections.
-
-
 def test_projections_equal_those_of_an_explicit_camera():
     positions, views = poses(5), random_views(7)
     projections = project_to_views(positions, views, PAIR)
@@ -83,22 +71,11 @@ def test_projections_equal_those_of_an_explicit_camera():
         np.testing.assert_array_equal(alone, projections[pose])
 
 
-def test_view_angles_invert_image_axes():
-    frames, views = pair_frames(poses(9), PAIR), random_views(11)
-    right, up = np.moveaxis(image_axes(frames, views), (3, 2), (0, 1))
-    directions = np.moveaxis(np.cross(right, up), 0, 1)
-    recovered = view_angles(frames[:, np.newaxis], directions)
-    np.testing.assert_allclose(recovered, np.broadcast_to(views, recovered.shape), atol=1e-9)
-
-
-@pytest.mark.parametrize("theta", [0.0, np.pi, 1e-9, 1.0])
-def test_image_axes_are_orthonormal(theta):
-    axes = image_axes(pair_frames(poses(3), PAIR), np.array([[0.4, theta]]))[:, :, 0]
-    product = np.swapaxes(axes, -1, -2) @ axes
-    np.testing.assert_allclose(product, np.tile(np.eye(2), (3, 1, 1)), atol=1e-9)
-
-
-# Degenerate and invalid input.
+def test_image_axes_are_orthonormal_at_the_poles():
+    views = np.array([[0.4, theta] for theta in (0.0, np.pi, 1e-9, 1.0)])
+    axes = np.moveaxis(image_axes(pair_frames(poses(3), PAIR), views), 2, 1)
+    products = np.swapaxes(axes, -1, -2) @ axes
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-9)
 
 
 def test_degenerate_poses_are_detected_and_have_finite_projections():
@@ -135,11 +112,8 @@ def test_invalid_arguments_are_rejected(call, message):
         call()
 
 
-# The distribution of views, equation 5.
-
-
 @pytest.mark.parametrize(
-    ("theta", "bandwidth"), [(0.0, 0.05), (0.0, 0.5), (0.1, 1.5), (1.4, 4.0), (np.pi, 0.5)]
+    ("theta", "bandwidth"), [(0.0, 0.05), (0.1, 1.5), (1.4, 4.0), (np.pi, 0.5)]
 )
 def test_density_integrates_to_one(theta, bandwidth):
     distribution = ViewDistribution(np.array([[3.0, theta]]), bandwidth)
@@ -162,11 +136,9 @@ def test_density_is_a_gaussian_mixture_far_from_the_poles():
 
 def test_density_is_periodic():
     distribution = ViewDistribution(np.array([[np.pi - 0.1, 1.0]]))
-    queries = np.array([[np.pi - 0.1 + d, 1.0] for d in (-0.3, 0.3)])
-    left, right = distribution.log_density(queries)
-    assert left == pytest.approx(right)
-    shifted = distribution.log_density(queries + np.array([2 * np.pi, 0]))
-    np.testing.assert_allclose(shifted, [left, right], rtol=1e-12)
+    queries = np.array([[np.pi - 0.4, 1.0], [np.pi + 0.2, 1.0], [-np.pi + 0.2, 1.0]])
+    densities = distribution.log_density(queries)
+    np.testing.assert_allclose(densities, densities[0], rtol=1e-12)
     assert distribution.log_density(np.array([0.0, -0.1])) == -np.inf
 
 
@@ -177,20 +149,16 @@ def test_density_is_bit_identical_for_any_block_size(monkeypatch):
     np.testing.assert_array_equal(distribution.log_density(queries), together)
 
 
-@pytest.mark.parametrize("bandwidth", [0.5, 1.2])
-def test_samples_follow_the_density(bandwidth):
+def test_samples_follow_the_density():
     """χ² test on a grid."""
     views = np.array([[2.9, 0.15], [-1.0, 1.6], [0.3, 2.9]])
-    distribution = ViewDistribution(views, bandwidth)
-    n = 20_000
+    distribution, n = ViewDistribution(views, 1.2), 20_000
     draws = distribution.sample(np.random.default_rng(0), n)
     edges = [np.linspace(-np.pi, np.pi, 9), np.linspace(0, np.pi, 7)]
     counts, *_ = np.histogramdd(draws, bins=edges)
     assert counts.sum() == n  # all in range
-    fine = [(np.arange(k) + 0.5) / k for k in (8 * 30, 6 * 30)]
-    grid = np.stack(
-        np.meshgrid(fine[0] * 2 * np.pi - np.pi, fine[1] * np.pi, indexing="ij"), axis=-1
-    )
+    phi, theta = ((np.arange(k) + 0.5) / k for k in (8 * 30, 6 * 30))
+    grid = np.stack(np.meshgrid(2 * np.pi * phi - np.pi, np.pi * theta, indexing="ij"), axis=-1)
     density = np.exp(distribution.log_density(grid)).reshape(8, 30, 6, 30).mean(axis=(1, 3))
     expected = density / density.sum() * n
     assert stats.chisquare(counts.ravel(), expected.ravel()).pvalue > 1e-3
@@ -210,14 +178,12 @@ def test_unknown_views_are_ignored():
 def test_near_equals_brute_force():
     views, queries = random_views(400), random_views(30, seed=9)
     apart = angle(view_vectors(queries)[:, np.newaxis], view_vectors(views))
-    near = ViewDistribution(views).near(queries, 12)
-    np.testing.assert_array_equal(near, np.argsort(apart, axis=-1)[:, :12])
+    for n in (12, 500):
+        near = ViewDistribution(views).near(queries, n)
+        np.testing.assert_array_equal(near, np.argsort(apart, axis=-1)[:, :n])
 
 
-def test_near_breaks_ties_by_index_and_returns_at_most_all():
+def test_near_breaks_ties_by_index():
     views = np.tile([[0.3, 1.2]], (100, 1))
     near = ViewDistribution(views).near(np.array([[0.3, 1.2], [-2.0, 0.4]]), 7)
     np.testing.assert_array_equal(near, [range(7), range(7)])
-    distribution = ViewDistribution(np.array([[0.0, 1.0], [2.0, 1.0]]))
-    near = distribution.near(np.array([[1.9, 1.0], [0.1, 1.1]]), 32)
-    np.testing.assert_array_equal(near, [[1, 0], [0, 1]])

@@ -86,18 +86,6 @@ def test_distance_is_symmetric_and_invariant(graph, axes):
     assert interaction_distance(first[swap], second[swap], graph) == pytest.approx(distance)
 
 
-def test_distance_scales_with_the_pairs():
-    """With ε, or without it if all edges are longer."""
-    first, second = joints(J, 2), joints(J, 2, seed=1)
-
-    def distance(scale, epsilon):
-        return interaction_distance(scale * first, scale * second, epsilon=epsilon)
-
-    assert distance(3.0, 3 * 0.3) == pytest.approx(3 * distance(1.0, 0.3))
-    assert distance(2.0, 1e-4) == pytest.approx(2 * distance(1.0, 1e-4))
-    assert distance(2.0, 0.5) != pytest.approx(2 * distance(1.0, 0.5), rel=1e-3)
-
-
 def test_edges_with_an_occluded_end_are_ignored():
     visible = np.arange(J) != 4
     first, second = joints(J, 2), joints(J, 2, seed=1)

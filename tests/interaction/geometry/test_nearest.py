@@ -18,7 +18,6 @@ from probmotion.interaction.geometry.shape_context import shape_context_distance
 from probmotion.threads import one_thread
 
 J = 34
-every_measure = pytest.mark.parametrize("measure", MEASURES)
 
 
 def rng(seed=0):
@@ -32,6 +31,10 @@ def random_pairs(*shape, seed):
 def annotated_pairs(n, hidden, seed, joints=J):
     visible = rng(seed).random((n, joints)) >= hidden
     return 0.6 * rng(seed + 1).standard_normal((n, joints, 2)) + 3.0, visible
+
+
+def compared(annotations, candidates):
+    return PairComparer(*annotations).nearest(np.zeros((1, 1, J, 2)), candidates)
 
 
 def reference(projection, keypoints, visible, measure, graph, epsilon):
@@ -61,7 +64,8 @@ def test_distances_equal_the_reference(measure, graph, hidden):
     near = keypoints[:3] + 0.05 * rng(2).standard_normal((3, J, 2))
     projections = np.concatenate([near, random_pairs(3, seed=3)])
     candidates = np.array([[0, 5, 2, 9, 1, 7], [11, 3, 4, 2, 1, 0]])
-    comparer = PairComparer(keypoints, visible, measure=measure, graph=graph, epsilon=0.07)
+    given = np.where(visible[..., None], keypoints, np.nan), visible
+    comparer = PairComparer(*given, measure=measure, graph=graph, epsilon=0.07)
     annotations = list(zip(keypoints, visible, strict=True))
     expected = np.array(
         [[reference(p, k, v, measure, graph, 0.07) for k, v in annotations] for p in projections]
@@ -77,10 +81,10 @@ def test_distances_equal_the_reference(measure, graph, hidden):
 def test_results_are_bit_identical_for_any_threads_and_batch():
     comparer = PairComparer(*annotated_pairs(40, 0.1, seed=5))
     arguments = random_pairs(7, 4, seed=6), rng(7).integers(0, 40, (4, 16))
-    whole = comparer.nearest(*arguments)
+    together = comparer.nearest(*arguments)
     for pose in range(7):
         alone = comparer.nearest(arguments[0][pose : pose + 1], arguments[1])
-        for one, other in zip(alone, whole, strict=True):
+        for one, other in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one[0], other[pose])
     before = numba.get_num_threads()
     try:
@@ -88,7 +92,7 @@ def test_results_are_bit_identical_for_any_threads_and_batch():
             numba.set_num_threads(threads)
             for kernel in ("nearest_in_batch", "nearest_in_batch_on_threads"):
                 results = getattr(nearest_kernels, kernel)(*arguments, comparer.prepared)
-                for one, other in zip(results, whole, strict=True):
+                for one, other in zip(results, together, strict=True):
                     np.testing.assert_array_equal(one, other)
     finally:
         numba.set_num_threads(before)
@@ -124,16 +128,6 @@ def test_ties_go_to_the_first_candidate():
     assert indices.tolist() == [[4, 1]]
 
 
-@every_measure
-def test_occluded_keypoints_are_ignored(measure):
-    keypoints, visible = annotated_pairs(8, 0.2, seed=10)
-    projections = random_pairs(5, seed=11)
-    expected = PairComparer(keypoints, visible, measure=measure).distances(projections)
-    corrupted = np.where(visible[..., None], keypoints, np.nan)
-    distances = PairComparer(corrupted, visible, measure=measure).distances(projections)
-    np.testing.assert_array_equal(distances, expected)
-
-
 def test_distance_without_a_shared_edge_is_infinite():
     keypoints, visible = annotated_pairs(3, 0.0, seed=14)
     visible[0] = False
@@ -165,45 +159,25 @@ def test_degenerate_projections_are_compared_and_counted(graph):
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3, 5])
-@every_measure
+@pytest.mark.parametrize("measure", MEASURES)
 def test_few_joints_are_compared(measure, joints):
     keypoints, visible = annotated_pairs(3, 0.0, seed=18, joints=joints)
     distances = PairComparer(keypoints, visible, measure=measure).distances(keypoints)
-    if joints == 1 and measure != "cartesian":
-        assert np.isinf(distances).all()
-    else:
-        np.testing.assert_allclose(np.diagonal(distances), 0.0, atol=1e-12)
-        assert np.isfinite(distances).all()
+    undefined = joints == 1 and measure != "cartesian"
+    np.testing.assert_allclose(np.diagonal(distances), np.inf if undefined else 0.0, atol=1e-12)
+    assert np.isfinite(distances).all() != undefined
 
 
 @pytest.mark.parametrize(
-    ("candidates", "message"),
+    ("call", "message"),
     [
-        ([[3]], "candidates must be from 0 to 2, got 3 to 3"),
-        (np.zeros((1, 0), int), "candidates must contain at least one annotation per view"),
-        ([[0.5]], "candidates must be integers, got float64"),
+        (lambda x: compared(x, [[3]]), "candidates must be from 0 to 2, got 3 to 3"),
+        (lambda x: compared(x, np.zeros((1, 0), int)), "at least one annotation per view, got"),
+        (lambda x: compared(x, [[0.5]]), "candidates must be integers, got float64"),
+        (lambda x: PairComparer(*x, measure="angles"), "measure must be one of .*, got 'angles'"),
+        (lambda x: PairComparer(x[0][:0], x[1][:0]), r"one annotation .*, got shape \(0, 34, 2\)"),
     ],
 )
-def test_invalid_candidates_are_rejected(candidates, message):
-    comparer = PairComparer(*annotated_pairs(3, 0.0, seed=20))
+def test_invalid_arguments_are_rejected(call, message):
     with pytest.raises(ValueError, match=message):
-        comparer.nearest(np.zeros((1, 1, J, 2)), candidates)
-
-
-def test_invalid_annotations_are_rejected():
-    keypoints, visible = annotated_pairs(3, 0.0, seed=20)
-    with pytest.raises(ValueError, match=r"measure must be one of interaction, .*, got 'angles'"):
-        PairComparer(keypoints, visible, measure="angles")
-    with pytest.raises(ValueError, match=r"at least one annotation .*, got shape \(0, 34, 2\)"):
-        PairComparer(keypoints[:0], visible[:0])
-
-
-def test_distances_of_real_pairs_equal_the_reference(real_data):
-    archive = np.load(real_data / "cmu_salsa_pairs" / "cmu_60_61_02.npz")
-    pairs = archive["positions"][::40, :, :17].reshape(-1, J, 3).astype(float)
-    keypoints, projections = pairs[:8, :, :2], pairs[8:12][:, :, [2, 1]]
-    visible = rng(21).random((8, J)) > 0.1
-    distances = PairComparer(keypoints, visible).distances(projections)
-    for i, k in np.ndindex(4, 8):
-        arguments = projections[i], keypoints[k], visible[k], "interaction", "delaunay", 0.05
-        assert distances[i, k] == pytest.approx(reference(*arguments), abs=1e-12)
+        call(annotated_pairs(3, 0.0, seed=20))

@@ -65,19 +65,12 @@ def test_3d_histograms_are_invariant_to_position_and_heading():
     assert (shape_contexts(points * [1.0, -1.0, -1.0]) != expected).any()  # upside down
 
 
-@both_dimensions
-def test_distance_is_bounded_symmetric_and_invariant_to_relabelling(axes):
-    points = joints(9, J, axes)
-    counts = shape_contexts(points)
-    distances = shape_context_distance(counts[:, None], counts[None])
-    np.testing.assert_allclose(distances, distances.T, atol=1e-14)
-    np.testing.assert_array_equal(np.diagonal(distances), 0.0)
-    off = distances[~np.eye(9, dtype=bool)]
-    assert 0 < off.min() <= off.max() <= 1
-    swapped = shape_contexts(points[:, np.roll(np.arange(J), J // 2)])
-    np.testing.assert_allclose(
-        shape_context_distance(swapped[:, None], swapped[None]), distances, atol=1e-14
-    )
+def test_distance_by_hand():
+    """½ Σ (h − g)² / (h + g) of two normalised histograms, and its mean over the joints."""
+    first, second = np.array([[3, 1, 0], [2, 2, 0]]), np.array([[1, 1, 2], [2, 2, 0]])
+    expected = 0.5 * (0.5**2 / 1.0 + 0.5**2 / 0.5) / 2
+    assert shape_context_distance(first, second) == pytest.approx(expected)
+    assert shape_context_distance(second, first) == pytest.approx(expected)
 
 
 def test_distance_is_one_without_common_bins():
@@ -95,8 +88,8 @@ def test_only_visible_joints_are_compared():
     )
     expected = shape_context_distance(shape_contexts(first[17:]), shape_contexts(second[17:]))
     assert distance == pytest.approx(expected)
-    alone = np.arange(J) == 3
-    assert np.isinf(shape_context_distance(shape_contexts(first), shape_contexts(second), alone))
+    single = np.arange(J) == 3
+    assert np.isinf(shape_context_distance(shape_contexts(first), shape_contexts(second), single))
 
 
 def test_invalid_points_are_rejected():

@@ -1,7 +1,5 @@
 """Articulated body: positions against a loop over joints, rigid moves and joint ranges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -46,32 +44,27 @@ def random_pose(body, shape=(5,)):
 
 def positions_by_loop(body, turns, rotation, translation, factors):
     """Return one frame joint by joint; the end of a trunk rotates with its own bone."""
-    skeleton, which = body.skeleton, {name: at for at, name in enumerate(body.bones)}
+    skeleton = body.skeleton
+    matrices = dict(zip(body.bones, Rotation.from_rotvec(turns).as_matrix(), strict=True))
     place, turned = {}, {}
     for joint in skeleton.topological_order:
         name, parent = skeleton.joint_names[joint], skeleton.parents[joint]
         if parent < 0:
             place[joint], turned[joint] = translation, rotation
             continue
-        over = turned[parent]
-        if f"{name} trunk" in which:
-            over = over @ Rotation.from_rotvec(turns[which[f"{name} trunk"]]).as_matrix()
-        place[joint] = place[parent] + over @ (body.rest[joint] * factors[joint])
-        own = np.eye(3)
-        if name in which:
-            own = Rotation.from_rotvec(turns[which[name]]).as_matrix()
-        turned[joint] = over @ own
+        above = turned[parent] @ matrices.get(f"{name} trunk", np.eye(3))
+        place[joint] = place[parent] + above @ (body.rest[joint] * factors[joint])
+        turned[joint] = above @ matrices.get(name, np.eye(3))
     return np.stack([place[joint] for joint in range(skeleton.n_joints)])
 
 
 def test_positions_match_a_loop_over_joints(body):
-    turns, rotation, translation = random_pose(body)
+    pose = random_pose(body)
     log_lengths = 0.3 * np.random.default_rng(2).normal(size=body.n_groups)
-    joints = body.positions(turns, rotation, translation, log_lengths)
+    joints = body.positions(*pose, log_lengths)
     factors = np.exp(log_lengths)[list(body.length_groups)]
-    for frame in range(5):
-        wanted = positions_by_loop(body, turns[frame], rotation[frame], translation[frame], factors)
-        np.testing.assert_allclose(joints[frame], wanted, atol=1e-12)
+    expected = [positions_by_loop(body, *frame, factors) for frame in zip(*pose, strict=True)]
+    np.testing.assert_allclose(joints, expected, atol=1e-12)
 
 
 def test_bones_are_joints_with_children_and_trunks():
@@ -79,7 +72,10 @@ def test_bones_are_joints_with_children_and_trunks():
         "neck", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow",
         "left_hip", "left_knee", "right_hip", "right_knee", "neck trunk",
     )  # fmt: skip
-    assert ArticulatedBody(CHAIN, random_rest(CHAIN)).bones == ("c",)
+    chain = ArticulatedBody(CHAIN, random_rest(CHAIN))
+    assert chain.bones == ("c",)
+    # Joints of unknown name rotate about every axis.
+    np.testing.assert_array_equal(np.stack([chain.lower, -chain.upper]), -1.2)
     single = ArticulatedBody(Skeleton(["a"], [-1]), np.zeros((1, 3)))
     assert (single.bones, single.lower.shape) == ((), (0, 3))
 
@@ -102,17 +98,11 @@ def test_bone_lengths_are_shared_with_mirror_images(body):
     assert body.symmetric == bool(pairs)
     assert body.n_groups == body.skeleton.n_joints - len(pairs)
     assert set(body.length_groups) == set(range(body.n_groups))
-    for group in range(body.n_groups):
-        members = tuple(joint for joint, own in enumerate(body.length_groups) if own == group)
-        assert len(members) == 1 or members in pairs or members[::-1] in pairs
-
-
-def test_asymmetric_skeletons_share_no_lengths():
+    assert all(body.length_groups[left] == body.length_groups[right] for left, right in pairs)
     names = ["root", "left_hip", "right_hip", "left_knee", "right_knee"]
     skeleton = Skeleton(names, [-1, 0, 0, 1, 0])
-    body = ArticulatedBody(skeleton, random_rest(skeleton))
-    assert not body.symmetric
-    assert body.n_groups == 5
+    asymmetric = ArticulatedBody(skeleton, random_rest(skeleton))
+    assert (asymmetric.symmetric, asymmetric.n_groups) == (False, 5)
 
 
 def test_positions_and_excess_broadcast_and_agree_across_libraries(body):
@@ -124,31 +114,29 @@ def test_positions_and_excess_broadcast_and_agree_across_libraries(body):
     for a, b in np.ndindex(2, 3):
         each = [turns[0, b], np.repeat(rotation[a, b, :1], 4, 0), translation[0, 0]]
         np.testing.assert_allclose(joints[a, b], body.positions(*each, log_lengths[b]), atol=1e-12)
-    tensors = [torch.tensor(part) for part in parts]
-    np.testing.assert_allclose(body.positions(*tensors).numpy(), joints, atol=1e-12)
-    single = body.positions(*(part.float() for part in tensors))
-    assert single.dtype == torch.float32
-    np.testing.assert_allclose(single.numpy(), joints, atol=1e-4)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-4)):
+        got = body.positions(*(torch.tensor(part, dtype=dtype) for part in parts))
+        assert got.dtype == dtype
+        np.testing.assert_allclose(got.numpy(), joints, atol=tolerance)
     excess = body.range_excess(3 * turns)
     np.testing.assert_allclose(body.range_excess(torch.tensor(3 * turns)).numpy(), excess)
+    beyond = 3 * turns - np.clip(3 * turns, body.lower, body.upper)
+    np.testing.assert_allclose(excess, (beyond**2).sum((-2, -1)), atol=1e-12)
     assert body.range_excess(0 * turns).max() == 0
-    out = 3 * turns - np.clip(3 * turns, body.lower, body.upper)
-    np.testing.assert_allclose(excess, (out**2).sum((-2, -1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-4, 1.0])
-def test_gradients_are_correct_also_near_zero_rotation(scale):
+def test_gradients_are_correct_at_small_and_large_rotations(scale):
     body = ArticulatedBody(PERSON, random_rest(PERSON))
-    turns, rotation, translation = random_pose(body, (1,))
-    free = [torch.tensor(scale * turns), torch.tensor(translation), torch.zeros(body.n_groups)]
-    free = [part.double().requires_grad_() for part in free]
+    turns, rotation, translation = map(torch.tensor, random_pose(body, (1,)))
+    free = [scale * turns, translation, torch.zeros(body.n_groups, dtype=torch.float64)]
+    free = [part.requires_grad_() for part in free]
 
     def positions(turns, translation, log_lengths):
-        return body.positions(turns, torch.tensor(rotation), translation, log_lengths)
+        return body.positions(turns, rotation, translation, log_lengths)
 
     assert torch.autograd.gradcheck(positions, free, fast_mode=True)
-    far = torch.tensor(4 * turns, requires_grad=True)
-    assert torch.autograd.gradcheck(body.range_excess, far)
+    assert torch.autograd.gradcheck(body.range_excess, (4 * turns).requires_grad_())
 
 
 def body_with(skeleton, **bones):
@@ -190,19 +178,19 @@ def test_knees_bend_backwards_and_stop_when_straight(skeleton, end, side):
 
 @SIDES
 def test_elbows_bend_further_in_the_direction_of_the_rest_pose(side):
-    fore = STRAIGHT * 0.5 + np.array([0.05, 0.0, 0.1])
+    forearm = STRAIGHT * 0.5 + np.array([0.05, 0.0, 0.1])
     elbow = f"{side}_elbow"
-    for skeleton, end, lower, way in (
-        (PERSON, "wrist", fore, -1),
-        (QUADRUPED, "front_paw", fore, -1),
-        (QUADRUPED, "front_paw", fore * [1, 1, -1], 1),
+    for skeleton, end, offset, sign in (
+        (PERSON, "wrist", forearm, -1),
+        (QUADRUPED, "front_paw", forearm, -1),
+        (QUADRUPED, "front_paw", forearm * [1, 1, -1], 1),
     ):
-        body = body_with(skeleton, elbow=STRAIGHT, **{end: lower})
+        body = body_with(skeleton, elbow=STRAIGHT, **{end: offset})
         rest = body.rest[skeleton.index(f"{side}_{end}")]
         axis = np.cross(STRAIGHT, rest)
         bent = np.arctan2(np.linalg.norm(axis), STRAIGHT @ rest)
         axis /= np.linalg.norm(axis)
-        assert np.sign(axis[0]) == way
+        assert np.sign(axis[0]) == sign
         assert excess_of(body, elbow, *(1.9 * axis)) == 0
         assert excess_of(body, elbow, *(-bent * axis)) == 0
         assert excess_of(body, elbow, *(-(bent + 1.0) * axis)) > 0.2
@@ -217,7 +205,7 @@ ALONG, AHEAD = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.3])
 
 
 @pytest.mark.parametrize(
-    ("joint", "bone", "way"),
+    ("joint", "bone", "axis"),
     [
         ("left_knee", STRAIGHT, [1, 0, 0]),
         ("right_knee", STRAIGHT, [1, 0, 0]),
@@ -228,14 +216,11 @@ ALONG, AHEAD = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.3])
         ("left_elbow", AHEAD, [-1, 0, 0]),
     ],
 )
-def test_straight_limbs_of_people_bend_one_way(joint, bone, way):
+def test_straight_limbs_of_people_bend_one_way(joint, bone, axis):
     body = body_with(PERSON, knee=bone, ankle=bone, elbow=bone, wrist=bone)
-    way = np.array(way)
-    assert excess_of(body, joint, *(2.5 * way)) == 0
-    assert excess_of(body, joint, *(-0.3 * way)) == pytest.approx(0.09)
-
-
-def test_straight_limbs_of_animals_bend_both_ways():
+    assert excess_of(body, joint, *(2.5 * np.array(axis))) == 0
+    assert excess_of(body, joint, *(-0.3 * np.array(axis))) == pytest.approx(0.09)
+    # Those of animals bend both ways.
     animal = body_with(QUADRUPED, elbow=STRAIGHT, front_paw=STRAIGHT)
     assert excess_of(animal, "left_elbow", 2.5, 0, 0) == 0
     assert excess_of(animal, "left_elbow", -2.5, 0, 0) == 0
@@ -254,11 +239,6 @@ def test_straight_limbs_of_animals_bend_both_ways():
 def test_named_ranges_are_asymmetric(joint, inside):
     body = ArticulatedBody(PERSON, random_rest(PERSON))
     assert excess_of(body, joint, *inside) == 0 < excess_of(body, joint, *-np.array(inside))
-
-
-def test_joints_of_unknown_name_rotate_about_every_axis():
-    chain = ArticulatedBody(CHAIN, random_rest(CHAIN))
-    np.testing.assert_array_equal(np.stack([chain.lower, -chain.upper]), -1.2)
 
 
 def mean_excess(clips):
@@ -289,19 +269,17 @@ def test_real_walks_and_dances_are_in_range(real_data):
     assert mean_excess(clips) < 5e-3
 
 
-def test_shapes_are_checked():
+def test_invalid_bodies_and_shapes_are_rejected():
     body = ArticulatedBody(PERSON, random_rest(PERSON))
     turns, rotation, translation = random_pose(body)
     with pytest.raises(ValueError, match=r"turns must have shape \(…, L, 10, 3\), got \(5, 9, 3\)"):
         body.positions(turns[:, 1:], rotation, translation)
     with pytest.raises(ValueError, match=r"log_lengths must have shape \(…, 8\), got \(14,\)"):
         body.positions(turns, rotation, translation, np.zeros(14))
-
-
-def test_invalid_bodies_are_rejected():
-    with pytest.raises(ValueError, match="skeleton must have one root, got 2"):
-        ArticulatedBody(Skeleton.preset("pair17"), np.zeros((34, 3)))
-    with pytest.raises(ValueError, match=r"rest must have shape \(14, 3\), got \(13, 3\)"):
-        ArticulatedBody(PERSON, random_rest(PERSON)[1:])
-    with pytest.raises(ValueError, match=r"rest must have bones .* got 0 m"):
-        ArticulatedBody(PERSON, 0 * random_rest(PERSON))
+    for skeleton, rest, message in (
+        (Skeleton.preset("pair17"), np.zeros((34, 3)), "skeleton must have one root, got 2"),
+        (PERSON, body.rest[1:], r"rest must have shape \(14, 3\), got \(13, 3\)"),
+        (PERSON, 0 * body.rest, r"rest must have bones .* got 0 m"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ArticulatedBody(skeleton, rest)

@@ -21,7 +21,6 @@ from probmotion.models.training.track_batches import Augmentation
 from probmotion.models.training.trainer import train
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import DenoiserCovariance2D, Denoises2D, MotionPrior
 from probmotion.problems import load_problem
 
 BODY = Skeleton(["root", "left_hand", "right_hand", "head"], [-1, 0, 0, 0])
@@ -48,9 +47,12 @@ def prior():
     return fresh()
 
 
-def test_implements_the_prior_protocols(prior):
-    for protocol in (MotionPrior, Denoises2D, DenoiserCovariance2D):
-        assert isinstance(prior, protocol)
+def standard_units(prior):
+    """Mean and standard deviation of the joints, normalised units."""
+    return prior.standards.mean / prior.scale, prior.standards.deviation / prior.scale
+
+
+def test_theta_is_all_positions_and_the_scale_that_of_moving_joints(prior):
     assert (prior.frames, prior.fps, prior.dim) == (12, 20.0, 12 * 4 * 3)
     theta = np.arange(2.0 * prior.dim).reshape(2, -1)
     np.testing.assert_array_equal(prior.motion(theta).reshape(2, -1), theta)
@@ -62,9 +64,7 @@ def test_implements_the_prior_protocols(prior):
 def test_denoise_evaluates_the_network_in_standardised_units(prior, level):
     x_t = noisy(prior)
     alpha_bar = TINY.schedule.alpha_bar[level]
-    mean, deviation = (
-        value / prior.scale for value in (prior.standards.mean, prior.standards.deviation)
-    )
+    mean, deviation = standard_units(prior)
     unit = (x_t - math.sqrt(alpha_bar) * mean) / np.sqrt(alpha_bar * deviation**2 + 1 - alpha_bar)
     network = TINY.network(4, 0).eval()
     with torch.no_grad():
@@ -96,42 +96,27 @@ def test_levels_invert_the_schedule(power):
             size.level(wrong)
 
 
-def test_results_do_not_depend_on_the_batch(prior):
-    x_t = noisy(prior, B=40, V=3)
-    cameras = Cameras.ring(3)
-    whole = prior.denoise(x_t, 0.4, cameras)
-    for some in (slice(0, 1), slice(17, 18), slice(3, 31)):
-        np.testing.assert_array_equal(prior.denoise(x_t[some], 0.4, cameras), whole[some])
-    for order in ([2, 0, 1], [1, 0, 2]):
-        turned = prior.denoise(np.ascontiguousarray(x_t[:, order]), 0.4, cameras)
-        np.testing.assert_array_equal(turned, whole[:, order])
-    vectors = noisy(prior, B=40, V=3, seed=2)
+def test_results_do_not_depend_on_batch_threads_or_cameras(prior):
+    x_t, vectors = noisy(prior, B=40, V=3), noisy(prior, B=40, V=3, seed=2)
+    cameras = Cameras.ring(3, elevation=1.0, perspective=True)
+    together = prior.denoise(x_t, 0.4, cameras)
     product = prior.view_covariance_product(x_t, 0.4, cameras, vectors)
     for some in (slice(0, 1), slice(17, 18), slice(3, 31)):
+        alone = prior.denoise(x_t[some], 0.4, Cameras.ring(3))
+        np.testing.assert_array_equal(alone, together[some])
         alone = prior.view_covariance_product(x_t[some], 0.4, cameras, vectors[some])
         np.testing.assert_array_equal(alone, product[some])
-
-
-def test_results_do_not_depend_on_the_number_of_threads(prior):
-    x_t, cameras = noisy(prior, B=20, V=3), Cameras.ring(3)
-    one = prior.denoise(x_t, 0.4, cameras)
+    swapped = prior.denoise(np.ascontiguousarray(x_t[:, [2, 0, 1]]), 0.4, cameras)
+    np.testing.assert_array_equal(swapped, together[:, [2, 0, 1]])
     torch.set_num_threads(2)
     try:
-        two = prior.denoise(x_t, 0.4, cameras)
+        np.testing.assert_array_equal(prior.denoise(x_t, 0.4, cameras), together)
     finally:
         torch.set_num_threads(1)
-    np.testing.assert_array_equal(one, two)
-
-
-def test_cameras_are_ignored_and_precision_is_kept(prior):
-    x_t = noisy(prior, V=2)
-    wanted = prior.denoise(x_t, 0.4, Cameras.ring(2))
-    other = Cameras.ring(2, elevation=1.0, perspective=True)
-    np.testing.assert_array_equal(prior.denoise(x_t, 0.4, other), wanted)
-    single = x_t.astype(np.float32)
-    got = prior.denoise(single, 0.4, other)
-    assert got.dtype == np.float32
-    np.testing.assert_allclose(got, wanted, atol=1e-5)
+    single = prior.denoise(x_t.astype(np.float32), 0.4, cameras)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, together, atol=1e-5)
+    np.testing.assert_array_equal(prior.denoise(x_t, 1.0, cameras), x_t)
 
 
 def test_padding_has_no_effect():
@@ -169,10 +154,7 @@ def test_covariance_product_is_the_adjoint_of_the_jacobian(prior):
     x_t, v, u = (noisy(prior, B=2, seed=seed) for seed in (1, 2, 3))
     product = prior.view_covariance_product(x_t, alpha_bar, cameras, v)
     network = TINY.network(4, 0).double().eval()
-    mean, deviation = (
-        torch.tensor(value / prior.scale)
-        for value in (prior.standards.mean, prior.standards.deviation)
-    )
+    mean, deviation = map(torch.tensor, standard_units(prior))
     spread = (alpha_bar * deviation**2 + 1 - alpha_bar).sqrt()
     level = torch.full((4,), TINY.level(alpha_bar), dtype=torch.float64)
 
@@ -191,12 +173,6 @@ def test_covariance_product_is_the_adjoint_of_the_jacobian(prior):
     axes = (1, 2, 3, 4)
     left, right = (product * u).sum(axis=axes), factor * (v * along).sum(axis=axes)
     np.testing.assert_allclose(left, right, rtol=1e-3)
-    # The product of a view does not depend on the others.
-    hidden = v.copy()
-    hidden[:, 1] = 0
-    alone = prior.view_covariance_product(x_t, alpha_bar, cameras, hidden)
-    np.testing.assert_array_equal(alone[:, 1], 0)
-    np.testing.assert_allclose(alone[:, 0], product[:, 0], atol=1e-6)
     with torch.no_grad():
         again = prior.view_covariance_product(x_t, alpha_bar, cameras, v)
     np.testing.assert_array_equal(again, product)
@@ -209,11 +185,6 @@ def test_priors_of_other_lengths_share_the_network(prior):
     x_t = noisy(short)
     wanted = prior.denoise(x_t, 0.4, Cameras.ring(2))
     np.testing.assert_array_equal(short.denoise(x_t, 0.4, Cameras.ring(2)), wanted)
-
-
-def test_estimate_without_noise_is_the_input(prior):
-    x = noisy(prior, V=1)
-    np.testing.assert_array_equal(prior.denoise(x, 1.0, Cameras.ring(1)), x)
 
 
 def test_sizes_match_the_publication():
@@ -229,8 +200,6 @@ def test_sizes_match_the_publication():
     assert result == 8 * layer + ends
     assert result == pytest.approx(17.4e6, rel=0.01)
     assert DiffusionSettings.reference_code().schedule_power == 4
-    assert parameters(DiffusionSettings.small(), 14) < 2e6
-    assert parameters(DiffusionSettings.tiny(), 14) < 1e5
 
 
 @pytest.fixture(scope="module")
@@ -276,28 +245,21 @@ def test_unusable_checkpoints_are_rejected(trainee, tmp_path, kind, change, opti
 
 
 def test_invalid_input_is_rejected(prior):
-    with pytest.raises(ValueError, match="x_t must have at most 12 frames, got 13"):
-        prior.denoise(noisy(prior, L=13), 0.4, CAMERA)
-    with pytest.raises(ValueError, match=r"x_t must have shape .*got \(2, 12, 4, 2\)"):
-        prior.denoise(noisy(prior)[0], 0.4, CAMERA)
-    with pytest.raises(ValueError, match="x_t must be finite"):
-        prior.denoise(np.nan * noisy(prior), 0.4, CAMERA)
+    x_t = noisy(prior)
+    for values, message in (
+        (noisy(prior, L=13), "x_t must have at most 12 frames, got 13"),
+        (x_t[0], r"x_t must have shape .*got \(2, 12, 4, 2\)"),
+        (np.nan * x_t, "x_t must be finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            prior.denoise(values, 0.4, CAMERA)
     with pytest.raises(ValueError, match="vectors must have shape"):
-        prior.view_covariance_product(noisy(prior), 0.4, CAMERA, noisy(prior, B=2))
+        prior.view_covariance_product(x_t, 0.4, CAMERA, x_t[:2])
     with pytest.raises(ValueError, match="card must describe a trained network"):
         prior.save("no.safetensors")
-
-
-@pytest.mark.parametrize(("name", "value"), [("steps", 1), ("dropout", 1.0), ("width", 9)])
-def test_invalid_sizes_are_rejected(name, value):
-    with pytest.raises(ValueError, match=f"^{name} must be"):
-        replace(TINY, **{name: value})
-
-
-@pytest.fixture(scope="module")
-def gait():
-    """The exact prior of gaits."""
-    return load_problem("gait").posterior.prior
+    for name, value in (("steps", 1), ("dropout", 1.0), ("width", 9)):
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            replace(TINY, **{name: value})
 
 
 def projections(gait, n, seed):
@@ -307,22 +269,21 @@ def projections(gait, n, seed):
 
 
 @pytest.fixture(scope="module")
+def gait():
+    """The exact prior of gaits."""
+    return load_problem("gait").posterior.prior
+
+
+@pytest.fixture(scope="module")
 def learnt(gait, tmp_path_factory):
     """A tiny network trained on 2000 projections in about ten seconds."""
-
-    def tracks(n, seed):
-        sure = np.ones((gait.frames, gait.skeleton.n_joints))
-        return [
-            KeypointTrack(seen, sure, gait.skeleton, gait.fps, f"{seed}-{number}/0")
-            for number, seen in enumerate(projections(gait, n, seed))
-        ]
-
-    trainee = DiffusionTrainee(
-        tracks(2000, 1),
-        tracks(50, 2),
-        DiffusionSettings.tiny(gait.frames),
-        augmentation=Augmentation.none(),
-    )
+    confidence = np.ones((gait.frames, gait.skeleton.n_joints))
+    tracks = [
+        KeypointTrack(keypoints, confidence, gait.skeleton, gait.fps, f"{number}/0")
+        for number, keypoints in enumerate(projections(gait, 2050, 1))
+    ]
+    size = DiffusionSettings.tiny(gait.frames)
+    trainee = DiffusionTrainee(tracks[50:], tracks[:50], size, augmentation=Augmentation.none())
     settings = TrainingSettings(
         steps=600, batch=32, learning_rate=4e-3, warmup=50, ema=0.99, checkpoint_every=600
     )

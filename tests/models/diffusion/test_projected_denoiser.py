@@ -10,9 +10,7 @@ import torch
 
 from probmotion import MotionPosterior, Skeleton
 from probmotion.models.bodies.articulated_body import ArticulatedBody
-from probmotion.models.diffusion import projected_denoiser
 from probmotion.models.diffusion.projected_denoiser import denoiser_of
-from probmotion.models.diffusion.training import DiffusionTrainee
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.motion_vae import MotionVAE
@@ -38,34 +36,21 @@ def learnt(prior, out, **options):
     return denoiser_of(prior, out, progress=False, **settings)
 
 
-def test_mas_with_it_draws_bodies_of_the_prior_s_size_and_training_resumes(prior, tmp_path):
+def test_learnt_denoisers_are_used_by_mas_and_training_resumes(prior, tmp_path):
     denoiser = learnt(prior, tmp_path)
     assert (denoiser.skeleton, denoiser.frames, denoiser.fps) == (ARM, 4, 20.0)
+    clips = [set(denoiser.card["network"][data]["clips"]) for data in ("data", "validation_data")]
+    assert [len(names) for names in clips] == [18, 2]
+    assert not clips[0] & clips[1]
     draws = MultiViewAncestral(steps=20).sample(
         MotionPosterior(denoiser), draws=8, seed=0, progress=False
     )
     assert draws.positions.shape == (1, 8, 4, 4, 3)
     trunk = np.linalg.norm(draws.positions[..., 1, :] - draws.positions[..., 0, :], axis=-1)
     assert 0.4 < np.median(trunk) < 0.6
-    again = learnt(prior, tmp_path)
-    assert denoiser.card == again.card
+    assert learnt(prior, tmp_path).card == denoiser.card
     with pytest.raises(ValueError, match="contains a run"):
         learnt(prior, tmp_path, seed=1)
-
-
-def test_a_tenth_of_the_motions_is_held_out(prior, tmp_path, monkeypatch):
-    parts = []
-
-    class Spy(DiffusionTrainee):
-        def __init__(self, tracks, validation, *rest, **options):
-            for part in (tracks, validation):
-                parts.append({track.name.partition("/")[0] for track in part})
-            super().__init__(tracks, validation, *rest, **options)
-
-    monkeypatch.setattr(projected_denoiser, "DiffusionTrainee", Spy)
-    learnt(prior, tmp_path, training=replace(BRIEF, steps=1))
-    assert [len(part) for part in parts] == [18, 2]
-    assert not parts[0] & parts[1]
 
 
 @pytest.mark.parametrize(

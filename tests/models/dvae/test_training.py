@@ -10,15 +10,13 @@ import torch
 from scipy import stats
 from torch.distributions import Normal, kl_divergence
 
-from probmotion import Skeleton
+from probmotion import Skeleton, seeds
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.models.bodies.body_states import BodyStates, rest_pose
-from probmotion.models.dvae.layers import trust_weight
-from probmotion.models.dvae.motion_dvae import KIND, MotionDVAE
+from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.motion_windows import MotionWindows, canonical_windows
 from probmotion.models.dvae.settings import DVAESettings
-from probmotion.models.dvae.training import DVAETrainee, usual_dvae_training
-from probmotion.models.training.checkpoints import load_checkpoint
+from probmotion.models.dvae.training import DVAETrainee, refit_joint_scale, usual_dvae_training
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import Anneals, train
 from probmotion.motion.motion import Motion
@@ -65,7 +63,8 @@ def parts_by_hand(made, windows, noise):
     joints = made.states.positions(x, bodies)
     shown = (joints - network.joint_mean) / network.joint_deviation
     # Full weights and Gaussian noise.
-    frames = torch.cat([shown.flatten(2), torch.ones(B, 6, 14), torch.zeros(B, 6, 1)], -1)
+    trust = torch.ones(joints.shape[:-1])
+    frames = torch.cat([shown.flatten(2), trust, 0 * trust[..., :1]], -1)
     standard = (x - network.state_mean) / network.state_deviation
     p, q = network.generative, network.encoder
 
@@ -86,7 +85,7 @@ def parts_by_hand(made, windows, noise):
         if cumulative:
             now = network.state_mean + network.state_deviation * motion
             apart = (joints[:, t] - made.states.positions(now[:, None], bodies)[:, 0]) / STEP
-            seen = [h[0], data[0], motion, apart.flatten(1), torch.ones(B, 14)]
+            seen = [h[0], data[0], motion, apart.flatten(1), trust[:, t]]
         else:
             seen = [lat[0], data[0]]
         posterior = gaussian(q.latents(torch.cat(seen, -1)))
@@ -98,9 +97,9 @@ def parts_by_hand(made, windows, noise):
         else:
             motion, lat = p.decoder(h[0]), q.recurrent(z, lat)
         decoded.append(network.state_mean + network.state_deviation * motion)
-    found = torch.stack(decoded, 1)
-    error = found - x[:, 1:]
-    apart = made.states.positions(found, bodies) - joints[:, 1:]
+    states = torch.stack(decoded, 1)
+    error = states - x[:, 1:]
+    apart = made.states.positions(states, bodies) - joints[:, 1:]
     return [error[..., :3], error[..., 3:9], error[..., 9:], apart], divergence
 
 
@@ -187,96 +186,67 @@ def test_standardisation_and_first_poses_match_the_windows(clips, states):
 def test_windows_are_segments_of_clips_and_mirrored_clips(clips, states):
     windows = MotionWindows(clips, states, 6)
     assert len(windows) == 2 * 8 * 15
-    found = windows.at(np.arange(len(windows)))
+    every = windows.at(np.arange(len(windows)))
     order, flip = list(PERSON.mirrored_order), np.array([-1.0, 1.0, 1.0])
     for number in (0, 14, 15, 8 * 15, 8 * 15 + 16):
         clip, start = divmod(number, 15)
         poses = clips[clip % 8].positions[start : start + 6]
         poses = poses[:, order] * flip if clip >= 8 else poses
-        x = canonical_windows(states.states(poses, found.bodies[number])[None])[0]
-        np.testing.assert_allclose(found.states[number], x, atol=1e-9)
-    drawn = windows.draw(np.random.default_rng(0), 4000)
-    assert drawn.states.shape == (4000, 6, states.dim)
-    few = windows.spread(5)
-    np.testing.assert_array_equal(few.states, windows.spread(5).states)
-    with pytest.raises(
-        ValueError, match="clips must contain one of at least 50 frames, got at most 20"
-    ):
-        MotionWindows(clips, states, 50)
+        x = canonical_windows(states.states(poses, every.bodies[number])[None])[0]
+        np.testing.assert_allclose(every.states[number], x, atol=1e-9)
+
+
+def test_drawn_windows_have_a_random_tempo(clips, states):
+    """The displacement per frame of a state that is linear in time equals the tempo."""
+    windows = MotionWindows(clips, states, 6)
+    line = np.zeros((20, states.dim))
+    line[:] = states.states(clips[0].positions, windows.at(np.array([0])).bodies[0])[0]
+    line[:, 1] = np.arange(20)
+    windows._states = [line] * 16
+    drawn = windows.draw(np.random.default_rng(0), 4000).states[..., 1]
+    np.testing.assert_allclose(np.diff(drawn), np.diff(drawn)[:, :1] + np.zeros(5), atol=1e-9)
+    tempo = np.diff(drawn)[:, 0][drawn[:, -1] < 19 - 1e-9]
+    assert 0.8 <= tempo.min() < 0.81
+    assert 1.24 < tempo.max() <= 1.25
+
+
+def test_invalid_inputs_are_rejected(clips, states):
     slow = Motion(clips[0].positions, PERSON, 15.0)
-    with pytest.raises(
-        ValueError, match="clips must have the skeleton of the states and 30 frames"
+    for call, message in (
+        (lambda: MotionWindows(clips, states, 50), "one of at least 50 frames, got at most 20"),
+        (lambda: MotionWindows([clips[0], slow], states, 6), "skeleton of the states and 30 frame"),
+        (
+            lambda: DVAETrainee(clips, [slow], TINY, states),
+            "must have 30 frames per second",
+        ),
+        (lambda: usual_dvae_training("huge"), "size must be one of tiny, small, paper, got 'huge'"),
     ):
-        MotionWindows([clips[0], slow], states, 6)
-    with pytest.raises(ValueError, match="validation must have 30 frames per second, got 15"):
-        DVAETrainee(clips, [slow], TINY, states)
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
-SETTINGS = TrainingSettings(
-    steps=24, batch=16, learning_rate=3e-3, warmup=5, ema=0.9, checkpoint_every=8
-)
-
-
-def assert_same(folder, other):
-    for name, kind in (("model", KIND), ("state", f"{KIND} in training")):
-        ours, theirs = (
-            load_checkpoint(at / f"{name}.safetensors", kind).tensors for at in (folder, other)
-        )
-        assert ours.keys() == theirs.keys()
-        for key, tensor in ours.items():
-            assert torch.equal(tensor, theirs[key]), key
-
-
-def test_interrupted_run_resumes_bit_identically(clips, states, tmp_path):
-    """An interrupted and resumed run equals an uninterrupted one, including annealing."""
-    settings = replace(SETTINGS, optimiser="adamax", halve_at=(12,))
+def test_training_lowers_the_loss_and_saves_a_prior(clips, states, tmp_path):
+    settings = TrainingSettings(
+        steps=24, batch=16, learning_rate=3e-3, warmup=5, ema=0.9, checkpoint_every=12
+    )
     made = trainee(clips, states, annealing=12)
     begun = validated(made)
-    whole = train(made, settings, tmp_path / "whole", progress=False)
-    losses = [row["validation_loss"] for row in whole.history]
+    result = train(made, settings, tmp_path, progress=False)
+    losses = [row["validation_loss"] for row in result.history]
     assert losses[-1] < losses[0] < begun
-
-    class Stopped(DVAETrainee):
-        def training_loss(self, *arguments):
-            if self._step == 15:
-                raise KeyboardInterrupt
-            return super().training_loss(*arguments)
-
-        def anneal(self, step):
-            self._step = step
-            super().anneal(step)
-
-    part = trainee(clips, states, annealing=12)
-    part.__class__ = Stopped
-    with pytest.raises(KeyboardInterrupt):
-        train(part, settings, tmp_path / "parts", progress=False)
-    later = trainee(clips, states, annealing=12)
-    train(later, settings, tmp_path / "parts", progress=False)
-    assert_same(tmp_path / "whole", tmp_path / "parts")
-    # The run's folder contains a prior.
-    prior = MotionDVAE.load(tmp_path / "whole")
+    prior = MotionDVAE.load(tmp_path)
     assert (prior.fps, prior.frames, prior.rank) == (30.0, 6, made.network.initial_factor.shape[1])
-    drawn = prior.sample(np.random.default_rng(0), 200)
-    heights = drawn[:, 0, PERSON.index("pelvis"), 1]
-    truth = np.concatenate([clip.positions[:, PERSON.index("pelvis"), 1] for clip in clips])
+    pelvis = PERSON.index("pelvis")
+    heights = prior.sample(np.random.default_rng(0), 200)[:, 0, pelvis, 1]
+    truth = np.concatenate([clip.positions[:, pelvis, 1] for clip in clips])
     assert abs(heights.mean() - truth.mean()) < 0.05
-    # Other annealing is another run.
     with pytest.raises(ValueError, match="contains a run with annealing 12, expected 0"):
-        train(trainee(clips, states), settings, tmp_path / "whole", progress=False)
-
-
-def test_trust_weight_is_half_at_five_centimetres():
-    noise = torch.tensor([0.0, 0.05, 1e6])
-    torch.testing.assert_close(trust_weight(noise), torch.tensor([1.0, 0.5, 0.0]))
-
-
-def test_training_settings_match_the_paper():
-    settings, annealing = usual_dvae_training("paper")
-    # A.4
-    assert (settings.optimiser, settings.batch, annealing * 4) == ("adamax", 64, settings.steps)
-    assert settings.halve_at
-    for size in ("tiny", "small"):
-        settings, annealing = usual_dvae_training(size)
-        assert annealing < settings.steps
-    with pytest.raises(ValueError, match="size must be one of tiny, small, paper, got 'huge'"):
-        usual_dvae_training("huge")
+        train(trainee(clips, states), settings, tmp_path, progress=False)
+    # The joint scale is refitted to the validation error.
+    scale = refit_joint_scale(prior, clips[:1])
+    assert prior.joint_scale == pytest.approx(scale)
+    windows = MotionWindows(clips[:1], states, 6).spread(256)
+    noise = seeds.generator(0, "scale").standard_normal((len(windows.states), 5, 6), np.float32)
+    made.network = prior.model
+    (*_, errors), _ = parts_by_hand(made, windows, torch.tensor(noise))
+    assert scale == pytest.approx(float((errors**2).mean().sqrt()), rel=1e-4)

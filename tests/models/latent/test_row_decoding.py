@@ -1,7 +1,5 @@
 """Batched decoding by a torch decoder, for NumPy and torch arrays."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest
@@ -33,14 +31,14 @@ def decoder():
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_batches_are_decoded_in_their_own_precision(decoder, batch, dtype):
     theta = np.random.default_rng(0).normal(size=(*batch, 3)).astype(dtype)
-    wanted = np.stack([theta, theta**2], axis=-2)
+    expected = np.stack([theta, theta**2], axis=-2)
     decoded = decoder.at(theta)
     assert decoded.dtype == dtype
-    np.testing.assert_array_equal(decoded, wanted)
+    np.testing.assert_array_equal(decoded, expected)
     assert max(len(rows) for rows in decoder.inputs) <= 4
-    whole = decoder.at(torch.tensor(theta))
-    assert isinstance(whole, torch.Tensor)
-    np.testing.assert_array_equal(whole, wanted)
+    tensor = decoder.at(torch.tensor(theta))
+    assert isinstance(tensor, torch.Tensor)
+    np.testing.assert_array_equal(tensor, expected)
 
 
 def test_integers_and_strided_arrays_are_decoded_in_double_precision(decoder):

@@ -1,7 +1,5 @@
 """Standard-normal prior: density against SciPy, draws and Tweedie's formula."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest
@@ -24,12 +22,9 @@ class Doubled(StandardNormalPrior):
 PRIOR = Doubled()
 
 
-def test_subclasses_implement_the_prior_protocols():
+def test_draws_are_independent_standard_normals():
     for protocol in (Samplable, HasLogDensity, DenoisesCoordinates):
         assert isinstance(PRIOR, protocol)
-
-
-def test_draws_are_independent_standard_normals():
     theta = PRIOR.initial(np.random.default_rng(0), 4000)
     assert stats.kstest(theta.ravel(), stats.norm.cdf).pvalue > 1e-4
     # The standard error of a correlation is 1/√4000.
@@ -41,10 +36,12 @@ def test_draws_are_independent_standard_normals():
 @pytest.mark.parametrize("batch", [(), (2, 0), (2, 3)])
 def test_density_matches_scipy_in_every_library(batch):
     theta = np.random.default_rng(1).normal(size=(*batch, 3))
-    wanted = stats.norm.logpdf(theta).sum(-1)
-    np.testing.assert_allclose(PRIOR.log_density(theta), wanted, rtol=1e-13)
-    np.testing.assert_allclose(PRIOR.log_density(torch.tensor(theta)), wanted, rtol=1e-13)
-    np.testing.assert_allclose(PRIOR.log_density(jax.numpy.asarray(theta)), wanted, rtol=1e-5)
+    expected = stats.norm.logpdf(theta).sum(-1)
+    np.testing.assert_allclose(PRIOR.log_density(theta), expected, rtol=1e-13)
+    np.testing.assert_allclose(PRIOR.log_density(torch.tensor(theta)), expected, rtol=1e-13)
+    np.testing.assert_allclose(PRIOR.log_density(jax.numpy.asarray(theta)), expected, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"theta must have shape .*, got \(2, 4\)"):
+        PRIOR.log_density(np.zeros((2, 4)))
 
 
 def test_denoiser_satisfies_tweedies_formula():
@@ -53,10 +50,5 @@ def test_denoiser_satisfies_tweedies_formula():
     theta_t.requires_grad_(True)
     (score,) = torch.autograd.grad(PRIOR.log_density(theta_t).sum(), theta_t)
     for alpha_bar in (0.01, 0.3, 1.0):
-        wanted = (theta_t + (1 - alpha_bar) * score) / alpha_bar**0.5
-        torch.testing.assert_close(PRIOR.denoise_coordinates(theta_t, alpha_bar), wanted)
-
-
-def test_theta_of_another_length_is_rejected():
-    with pytest.raises(ValueError, match=r"theta must have shape .*, got \(2, 4\)"):
-        PRIOR.log_density(np.zeros((2, 4)))
+        expected = (theta_t + (1 - alpha_bar) * score) / alpha_bar**0.5
+        torch.testing.assert_close(PRIOR.denoise_coordinates(theta_t, alpha_bar), expected)

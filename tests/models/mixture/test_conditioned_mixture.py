@@ -1,7 +1,5 @@
 """Conditioned mixture: denoisers against the posterior of both observations at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -29,14 +27,10 @@ class Linear:
     """Linear observations from several likelihoods, padded to three coordinates per joint."""
 
     def __init__(self, *parts):
-        def padded(values, axis):
-            widths = [(0, 0)] * values.ndim
-            widths[axis] = (0, 3 - values.shape[axis])
-            return np.pad(values, widths)
-
         axes, target, precision = zip(*parts, strict=True)
-        rows, values = [padded(one, 1) for one in axes], [padded(one, -1) for one in target]
-        self.parts = tuple(map(np.concatenate, (rows, values, precision)))
+        axes = [np.pad(P, ((0, 0), (0, 3 - P.shape[1]), (0, 0))) for P in axes]
+        target = [np.pad(y, (*[(0, 0)] * 3, (0, 3 - y.shape[-1]))) for y in target]
+        self.parts = tuple(map(np.concatenate, (axes, target, precision)))
 
     def linear(self):
         return self.parts
@@ -70,16 +64,11 @@ def test_uninformative_likelihood_leaves_the_prior_unchanged(posterior):
     prior = posterior.prior
     known = ConditionedMixture(prior, Joints3D(np.zeros(prior.means.shape[1:]), noise=1e6))
     x_t = noisy(prior, 0.4)
-    for one in ("denoise_motion", "denoise"):
-        args = (x_t, 0.4) if one == "denoise_motion" else (seen(x_t), 0.4, VIEWS)
-        got, wanted = getattr(known, one)(*args), getattr(prior, one)(*args)
-        np.testing.assert_allclose(got, wanted, atol=1e-7)
-
-
-def test_pure_noise_gives_the_posterior_mean(posterior, known):
-    mean = posterior.prior.exact_posterior(posterior.likelihood).mean() / known.scale
-    x_t = np.random.default_rng(0).standard_normal((2, *mean.shape))
-    np.testing.assert_allclose(known.denoise_motion(x_t, 1e-14), [mean, mean], atol=1e-4)
+    np.testing.assert_allclose(
+        known.denoise_motion(x_t, 0.4), prior.denoise_motion(x_t, 0.4), atol=1e-7
+    )
+    views = [one.denoise(seen(x_t), 0.4, VIEWS) for one in (known, prior)]
+    np.testing.assert_allclose(*views, atol=1e-7)
 
 
 def test_implements_the_prior_protocols(posterior, known):
@@ -95,16 +84,15 @@ def test_implements_the_prior_protocols(posterior, known):
 
 
 def test_invalid_input_is_rejected(posterior, known):
-    prior = posterior.prior
-    x_t = noisy(prior, 0.5)
-    with pytest.raises(ValueError, match="alpha_bar must be between 0 and 1"):
-        known.denoise_motion(x_t, 1.0)
-    with pytest.raises(ValueError, match=r"x_t must have shape .*, got \(3, 2, 17, 3\)"):
-        known.denoise_motion(x_t[:, :2], 0.5)
-    with pytest.raises(ValueError, match="cameras must be orthographic, got perspective"):
-        known.denoise(x_t[:, None, ..., :2], 0.5, Cameras.around([0.0], [0.1], perspective=True))
-    with pytest.raises(NotConjugate, match="likelihood must be None"):
-        known.exact_posterior(posterior.likelihood)
-    outliers = Joints3D(prior.means[0], noise=0.1, degrees_of_freedom=4)
-    with pytest.raises(NotConjugate, match="Student-t"):
-        conditioned(MotionPosterior(prior, outliers))
+    x_t = noisy(posterior.prior, 0.5)
+    perspective = Cameras.around([0.0], [0.1], perspective=True)
+    outliers = Joints3D(posterior.prior.means[0], noise=0.1, degrees_of_freedom=4)
+    for error, message, call in (
+        (ValueError, "alpha_bar must be between 0 and 1", lambda: known.denoise_motion(x_t, 1.0)),
+        (ValueError, r"got \(3, 2, 17, 3\)", lambda: known.denoise_motion(x_t[:, :2], 0.5)),
+        (ValueError, "got perspective", lambda: known.denoise(x_t[..., :2], 0.5, perspective)),
+        (NotConjugate, "must be None", lambda: known.exact_posterior(posterior.likelihood)),
+        (NotConjugate, "Student-t", lambda: ConditionedMixture(posterior.prior, outliers)),
+    ):
+        with pytest.raises(error, match=message):
+            call()

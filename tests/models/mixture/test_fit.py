@@ -1,7 +1,5 @@
 """Fitting the mixture: windows, headings and probabilistic PCA per style."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -23,10 +21,10 @@ def synthetic_style(rng, n, turned=True):
     body = np.array([[0.0, 1.0, 0.0], [0.2, 1.0, 0.1], [-0.2, 1.0, 0.1]])
     mean = np.tile(body, (4, 1, 1)) + 0.3 * rng.normal(size=(4, 1, 3))
     factors = rng.normal(size=(2, 4, 3, 3)) * np.array([0.2, 0.1])[:, None, None, None]
-    factors[..., [0, 2]] *= 0.0  # Vertical only, so the heading does not change.
-    z = rng.normal(size=(n, 2))
-    windows = mean + np.tensordot(z, factors, 1) + 0.01 * rng.normal(size=(n, 4, 3, 3))
-    motions = [Motion(window, SIDES, 30.0, name=f"c{i}") for i, window in enumerate(windows)]
+    factors[..., [0, 2]] = 0.0  # Vertical only, so the heading does not change.
+    windows = mean + np.tensordot(rng.normal(size=(n, 2)), factors, 1)
+    windows += 0.01 * rng.normal(size=(n, 4, 3, 3))
+    motions = [Motion(window, SIDES, 30.0) for window in windows]
     if turned:
         motions = [motion.turned(rng.uniform(0, 2 * np.pi)) for motion in motions]
     return motions, mean, factors

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from probmotion import MotionPosterior, UnsupportedPosterior
 from probmotion.data.pair_sets import choose_seed
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.sources import draw_annotations
@@ -17,14 +16,6 @@ from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_poste
 from probmotion.models.pose_pairs.penetration import penetration_depth
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import (
-    HasCoordinateSpeeds,
-    HasLogDensity,
-    MotionPrior,
-    Samplable,
-)
-from probmotion.samplers import NUTS, MetropolisHastings
-from probmotion.samplers.mcmc.proposals import Isotropic
 
 PAIR = Skeleton.preset("pair17")
 DANCES = synthetic_dances(3)
@@ -37,28 +28,15 @@ def prior():
 
 
 def bent_back(pose):
-    """Bend the knees of both people forwards and their elbows backwards."""
+    """Reverse the shins and forearms of both people."""
     wrong = pose.copy()
-    for person in ("person0", "person1"):
-        across = pose[PAIR.index(f"{person}:left_hip")] - pose[PAIR.index(f"{person}:right_hip")]
-        across /= np.linalg.norm(across)
-        for side in ("left", "right"):
-            for middle, end, degrees in (("knee", "ankle", -100), ("elbow", "wrist", 120)):
-                centre, tip = (PAIR.index(f"{person}:{side}_{joint}") for joint in (middle, end))
-                turn = Rotation.from_rotvec(np.radians(degrees) * across)
-                wrong[tip] = wrong[centre] + turn.apply(pose[tip] - pose[centre])
+    for tip, centre in PAIR.bones:
+        if PAIR.joint_names[tip].endswith(("ankle", "wrist")):
+            wrong[tip] = 2 * pose[centre] - pose[tip]
     return wrong
 
 
 BROKEN = bent_back(POSES[0])
-
-
-def test_protocols_are_implemented(prior):
-    assert isinstance(prior, MotionPrior)
-    assert isinstance(prior, HasLogDensity)
-    assert isinstance(prior, HasCoordinateSpeeds)
-    assert not isinstance(prior, Samplable)
-    assert (prior.dim, prior.frames) == (108, 1)
 
 
 def test_density_equals_equation_2(prior):
@@ -66,9 +44,9 @@ def test_density_equals_equation_2(prior):
     theta = 0.25 * np.random.default_rng(0).standard_normal((200, prior.dim))
     motion = prior.motion(theta)
     pose = motion[:, 0]
-    limits = JointLimits.shipped(PAIR)
-    invalid = (~limits.is_valid(pose)).sum(axis=-1)
-    apart = ((pose - limits.nearest_valid(pose)) ** 2).sum(axis=(-2, -1))
+    valid, nearest = JointLimits.shipped(PAIR).project(pose)
+    invalid = (~valid).sum(axis=-1)
+    apart = ((pose - nearest) ** 2).sum(axis=(-2, -1))
     energy = apart + 10 * penetration_depth(pose, PAIR) ** 2
     expected = np.where(invalid > 8, -np.inf, -energy / (2 * 0.05**2))
     assert (invalid > 8).any()
@@ -77,6 +55,9 @@ def test_density_equals_equation_2(prior):
     log_density = prior.log_density(theta)
     assert np.allclose(log_density, expected + prior.log_measure(theta))
     assert prior.log_density(theta[3]) == pytest.approx(log_density[3])
+    theta[:2] = 0
+    theta[0], theta[1, -1] = 1e5, 1e5  # bone lengths overflow
+    assert np.isneginf(prior.log_density(theta)[:2]).all()
 
 
 def test_plausibility_separates_real_and_broken_poses_and_is_rigidly_invariant(prior):
@@ -88,11 +69,8 @@ def test_plausibility_separates_real_and_broken_poses_and_is_rigidly_invariant(p
     assert np.allclose(prior.log_plausibility(moved), log_f[:5], atol=1e-6)
 
 
-def test_chains_and_walkers_start_at_the_seeds():
+def test_walkers_start_at_the_seeds():
     prior = PosePairPrior(POSES[:3], PAIR)
-    sampler = MetropolisHastings(Isotropic(1e-9, None), warmup=0, thin=1)
-    draws = sampler.sample(MotionPosterior(prior), draws=1, chains=4, progress=False)
-    assert np.allclose(draws.positions.values[:, 0, 0], POSES[[0, 1, 2, 0]], atol=1e-6)
     walkers = prior.motion(prior.initial(np.random.default_rng(0), 40))[:, 0]
     apart = np.abs(walkers[:, None] - POSES[:3]).max(axis=(-2, -1))
     assert np.all(apart.min(axis=1) < 0.02)
@@ -118,27 +96,6 @@ def test_invalid_arguments_are_rejected(arguments, message):
         PosePairPrior(**{"seed": POSES[0], "skeleton": PAIR, **arguments})
 
 
-def test_gradient_samplers_are_rejected(prior):
-    with pytest.raises(UnsupportedPosterior, match="differentiable density"):
-        NUTS().sample(MotionPosterior(prior), draws=2, progress=False)
-
-
-def test_chains_stay_in_the_support(prior):
-    sampler = MetropolisHastings(Isotropic(0.02), warmup=200, thin=5)
-    draws = sampler.sample(MotionPosterior(prior), draws=20, chains=2, progress=False)
-    assert np.isfinite(prior.log_plausibility(draws.flat())).all()
-    log_density = prior.log_density(draws.dataset["theta"].values)
-    assert np.allclose(log_density, draws.dataset["log_density"].values)
-
-
-def test_extreme_points_have_no_density(prior):
-    theta = np.zeros((3, prior.dim))
-    theta[1], theta[2, -1] = 1e5, 1e5
-    log_density = prior.log_density(theta)
-    assert np.isfinite(log_density[0])
-    assert np.isneginf(log_density[1:]).all()
-
-
 def test_every_setting_reaches_the_posterior():
     annotations = draw_annotations(DANCES[:1], 30, seed=0, known_views=True).annotations
     settings = PairSettings(
@@ -157,7 +114,6 @@ def test_every_setting_reaches_the_posterior():
 
 
 def test_paper_preset():
-    assert asdict(PairSettings.paper()) == asdict(PairSettings()) | {"limit": 100.0}
     published = {"penetration_weight": 10, "position_noise": 0.05, "view_bandwidth": 0.5}
     published |= {"shortest_edge": 0.05, "noise": 0.01, "limit": 100, "max_invalid": 8}
     assert published.items() <= asdict(PairSettings.paper()).items()

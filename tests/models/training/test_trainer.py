@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+import shutil
 import signal
 import threading
 from dataclasses import replace
@@ -119,14 +120,6 @@ def whole(tmp_path_factory):
     return folder, run(Curve(), folder)
 
 
-@pytest.fixture
-def copied(whole, tmp_path):
-    """A copy of the folder of the uninterrupted run."""
-    for file in whole[0].iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    return tmp_path
-
-
 def test_regression_reaches_the_least_squares_solution(tmp_path):
     line = Line()
     result = run(line, tmp_path, PLAIN, steps=300, ema=0.9, checkpoint_every=150)
@@ -145,7 +138,6 @@ def test_warm_up_clipping_and_weight_decay(tmp_path):
     run(Line(), tmp_path / "a", settings)
     moved = tensors(tmp_path / "a", "model", "line")["weight"]
     np.testing.assert_allclose(abs(moved.numpy()), 0.01, rtol=1e-4)
-    assert [settings.rate(step) for step in (1, 5, 10, 11)] == pytest.approx([0.01, 0.05, 0.1, 0.1])
     # The optimiser's moments are those of the clipped gradient.
     run(Line(), tmp_path / "b", settings, clip=1e-3)
     state = tensors(tmp_path / "b", "state", "line")
@@ -159,7 +151,7 @@ def test_warm_up_clipping_and_weight_decay(tmp_path):
     np.testing.assert_allclose(tensors(tmp_path / "c", "model", "line")["weight"], 0.95, rtol=1e-6)
 
 
-def test_learning_rate_is_halved(tmp_path):
+def test_learning_rate_rises_and_is_halved(tmp_path):
     settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
     rates = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
     assert rates == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
@@ -175,22 +167,19 @@ def test_learning_rate_is_halved(tmp_path):
         run(Line(), tmp_path, PLAIN, steps=6, halve_at=(2,))
 
 
-def test_adamax_matches_its_definition_and_resumes(tmp_path):
+def test_adamax_matches_its_definition(tmp_path):
     """u ← max(0.999 u, |g|), m ← 0.9 m + 0.1 g, θ ← θ − rate/(1 − 0.9ᵏ) m/u (Kingma and Ba)."""
     slopes = [1.0, -4.0, 0.5]
     line, remaining = Line(), iter(slopes)
     line.training_loss = lambda network, *_: next(remaining) * network.weight.sum()
-    run(line, tmp_path / "a", PLAIN, steps=3, clip=np.inf, optimiser="adamax")
+    for steps in (2, 3):
+        # Resume before the last step.
+        run(line, tmp_path, PLAIN, steps=steps, clip=np.inf, optimiser="adamax")
     weight = largest = mean = 0.0
     for step, slope in enumerate(slopes, start=1):
         largest, mean = max(0.999 * largest, abs(slope)), 0.9 * mean + 0.1 * slope
         weight -= 0.1 / (1 - 0.9**step) * mean / largest
-    moved = tensors(tmp_path / "a", "model", "line")["weight"]
-    np.testing.assert_allclose(moved, weight, rtol=1e-5)
-    run(Curve(), tmp_path / "whole", optimiser="adamax")
-    for steps in (10, 30):
-        run(Curve(), tmp_path / "parts", optimiser="adamax", steps=steps)
-    assert_same(tmp_path / "whole", tmp_path / "parts")
+    np.testing.assert_allclose(tensors(tmp_path, "model", "line")["weight"], weight, rtol=1e-5)
 
 
 def test_frozen_weights_are_unchanged_and_anneal_receives_the_step(tmp_path):
@@ -204,11 +193,12 @@ def test_frozen_weights_are_unchanged_and_anneal_receives_the_step(tmp_path):
             self.steps.append((step, self.calls))
 
     trainee = Steps()
-    before = trainee.network[0].weight.clone()
     run(trainee, tmp_path)
     assert trainee.steps == [(step, step - 1) for step in range(1, 31)]
-    assert torch.equal(trainee.network[0].weight, before)
-    assert not torch.equal(trainee.network[4].weight, Curve().network[4].weight)
+    unchanged = [
+        torch.equal(trainee.network[part].weight, Curve().network[part].weight) for part in (0, 4)
+    ]
+    assert unchanged == [True, False]
 
 
 def test_moving_average_matches_its_recursion(tmp_path):
@@ -234,21 +224,6 @@ def test_moving_average_matches_its_recursion(tmp_path):
         assert torch.equal(value, curve.network.state_dict()[name])
 
 
-def test_more_steps_continue_the_same_run(whole, tmp_path):
-    run(Curve(), tmp_path / "parts", steps=10)
-    later = Curve()
-    parts = run(later, tmp_path / "parts")
-    assert later.calls == 20
-    assert_same(whole[0], tmp_path / "parts")
-    assert numbers(whole[1]) == numbers(parts)
-    # Dropout has an effect.
-    other = Curve()
-    other.network[3].p = 0.0
-    run(other, tmp_path / "other")
-    with pytest.raises(AssertionError):
-        assert_same(whole[0], tmp_path / "other")
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_resumes_bit_identically(whole, tmp_path, number):
     def stop(curve):
@@ -270,7 +245,6 @@ def test_finished_run_takes_no_steps(whole):
     again = Curve()
     second = train(again, SETTINGS, whole[0], progress=True)
     assert again.calls == second.steps == 0
-    assert second.model == whole[0] / "model.safetensors"
     assert second.history == whole[1].history
     with open(whole[0] / "losses.csv", encoding="utf-8") as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
@@ -278,42 +252,30 @@ def test_finished_run_takes_no_steps(whole):
     assert [row["step"] for row in rows] == [10, 20, 30]
 
 
-@pytest.mark.parametrize("steps", [15, 40])
-@pytest.mark.parametrize("content", [None, slice(-50), b"mine"])
-def test_missing_or_damaged_model_is_restored_from_the_state(copied, tmp_path, content, steps):
-    model = copied / "model.safetensors"
+@pytest.mark.parametrize(("content", "steps"), [(None, 15), (slice(-50), 40), (slice(9), 15)])
+def test_missing_or_damaged_model_is_restored_from_the_state(whole, tmp_path, content, steps):
+    shutil.copytree(whole[0], tmp_path / "run")
+    model = tmp_path / "run" / "model.safetensors"
     before = model.read_bytes()
-    if content is None:
-        model.unlink()
-    else:
-        model.write_bytes(before[content] if isinstance(content, slice) else content)
-    run(Curve(), copied, steps=steps)
-    if steps <= 30:
+    model.unlink()
+    if content is not None:
+        model.write_bytes(before[content])
+    run(Curve(), tmp_path / "run", steps=steps)
+    if steps == 15:
         assert model.read_bytes() == before
     else:
         run(Curve(), tmp_path / "whole", steps=steps)
-        assert_same(tmp_path / "whole", copied)
+        assert_same(tmp_path / "whole", tmp_path / "run")
 
 
-def test_steps_taken_are_read_from_the_state(copied, tmp_path):
+def test_other_settings_or_data_are_rejected(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "run")
+    copied = tmp_path / "run"
     (copied / "model.safetensors").unlink()
-    assert steps_taken(copied, "curve") == 30
-    assert steps_taken(tmp_path / "none", "curve") == 0
-    with pytest.raises(CheckpointError, match="contains a curve in training, expected a line in"):
-        steps_taken(copied, "line")
-
-
-def test_other_settings_or_data_are_rejected(copied):
-    (copied / "model.safetensors").unlink()
-    for changed in (
-        {"batch": 9},
-        {"seed": 1},
-        {"learning_rate": 0.1},
-        {"clip": np.inf},
-        {"optimiser": "adamax"},
-    ):
-        with pytest.raises(ValueError, match=f"contains a run with {next(iter(changed))} "):
-            run(Curve(), copied, **changed)
+    assert (steps_taken(copied, "curve"), steps_taken(tmp_path, "curve")) == (30, 0)
+    for name, value in (("batch", 9), ("seed", 1), ("clip", np.inf), ("optimiser", "adamax")):
+        with pytest.raises(ValueError, match=f"contains a run with {name} "):
+            run(Curve(), copied, **{name: value})
     other = Curve()
     other.settings = other.settings | {"data": "other"}
     with pytest.raises(ValueError, match="contains a run with data line, expected other; use ano"):
@@ -351,19 +313,12 @@ def test_divergence_leaves_the_last_good_checkpoint(tmp_path, what, step, messag
         run(Explodes(), tmp_path / "run")
     run(Curve(), tmp_path / "good", steps=10)
     assert_same(tmp_path / "good", tmp_path / "run")
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
-        "losses.csv",
-        "model.safetensors",
-        "state.safetensors",
-    ]
     if what != "validation":
         with pytest.raises(Diverged, match=r"no checkpoint yet; try a smaller learning_rate$"):
             run(Explodes(), tmp_path / "early", checkpoint_every=100)
 
 
-def test_run_depends_neither_on_thread_nor_global_generator_nor_checkpoint_interval(
-    whole, tmp_path
-):
+def test_run_does_not_depend_on_thread_global_generator_or_checkpoints(whole, tmp_path):
     torch.manual_seed(11)
     wanted = torch.rand(3)
     torch.manual_seed(11)
@@ -387,13 +342,12 @@ def test_early_stopping_saves_the_best_model(tmp_path):
     saved = load_checkpoint(whole.model, "line")
     assert saved.settings["step"] == best + 1
     assert abs(float(saved.tensors["weight"]) - 0.4) == pytest.approx(min(losses))
-    again = run(Overfits(), tmp_path / "run", EARLY)
-    assert (again.history, again.saved, again.steps) == (whole.history, whole.saved, 0)
     run(Overfits(), tmp_path / "parts", EARLY, steps=3)
-    resumed = run(Overfits(), tmp_path / "parts", EARLY)
-    assert [row["validation_loss"] for row in resumed.history] == losses
-    weight = load_checkpoint(resumed.model, "line").tensors["weight"]
-    assert weight == saved.tensors["weight"]
+    for steps in (best + 1, 0):
+        resumed = run(Overfits(), tmp_path / "parts", EARLY)
+        assert [row["validation_loss"] for row in resumed.history] == losses
+        assert (resumed.saved["step"], resumed.steps) == (best + 1, steps)
+        assert load_checkpoint(resumed.model, "line").tensors == saved.tensors
 
 
 def test_command_reports_early_stopping(tmp_path, capsys):
@@ -406,16 +360,12 @@ def test_command_reports_early_stopping(tmp_path, capsys):
     assert "is finished" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        *({"ema": 1.0}, {"clip": 0.0}, {"clip": math.nan}, {"weight_decay": -0.1}),
-        *({"weight_decay": math.inf}, {"optimiser": "sgd"}, {"halve_at": (10, 0)}, {"warmup": -1}),
-    ],
-)
-def test_invalid_settings_are_rejected(changes):
-    with pytest.raises(ValueError, match=f"^{next(iter(changes))} must be .*got"):
-        TrainingSettings(**changes)
+def test_invalid_settings_are_rejected():
+    for name, value in [("ema", 1.0), ("clip", 0.0), ("clip", math.nan), ("weight_decay", -0.1),
+                        ("weight_decay", math.inf), ("optimiser", "sgd"), ("halve_at", (10, 0)),
+                        ("warmup", -1)]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{name} must be .*got"):
+            TrainingSettings(**{name: value})
 
 
 def test_unknown_and_unavailable_devices_are_rejected(tmp_path, monkeypatch):

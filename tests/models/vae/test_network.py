@@ -1,25 +1,25 @@
-"""Networks of the motion VAE: masking, equivalences with torch, and gradients."""
+"""Networks of the motion VAE: masking, equivalences with torch, gradients and hypotheses."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
-from torch.nn.functional import scaled_dot_product_attention
 
+from probmotion.geometry.rotations import geodesic_angle, vector_to_matrix
 from probmotion.models.diffusion.motion_transformer import sinusoids
-from probmotion.models.vae import layers as motion_vae_layers
-from probmotion.models.vae.layers import BoneDecoder, FrameEncoder, TransformerLayer
+from probmotion.models.vae.layers import BoneDecoder, FrameEncoder, Readout, TransformerLayer
 from probmotion.models.vae.network import MotionVAENetwork, TimeDecoder
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.short_attention import short_attention
 
 TINY = replace(MotionVAESettings.tiny(), layers=2)
-B, T, J, BONES, F = 3, 10, 5, 4, 6
+B, T, J, BONES, G, H, F = 3, 10, 5, 4, 3, 4, 6
 DOUBLE = torch.float64
 
 
@@ -33,35 +33,22 @@ def random_input(dtype=torch.float32, seed=0):
     return keypoints, confidence, torch.randn(J, 3, generator=generator, dtype=dtype)
 
 
-def random_features(seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    sizes = (B, T, F), (B, T, J, F)
-    return tuple(torch.randn(size, generator=generator) for size in sizes)
+def random_features():
+    generator = torch.Generator().manual_seed(1)
+    return tuple(torch.randn(size, generator=generator) for size in ((B, T, F), (B, T, J, F)))
 
 
-def amplified(network):
+def amplified(network, size=0.3):
     """Increase the outputs of random networks."""
     with torch.no_grad():
         for part in network.modules():
-            if isinstance(part, motion_vae_layers.Readout):
-                part.weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+            if isinstance(part, Readout):
+                part.weight.normal_(0, size, generator=torch.Generator().manual_seed(1))
     return network
 
 
-def occluded_input(value):
-    """Return inputs with another value at occluded joints."""
-    keypoints, confidence, rest = random_input()
-    hidden = torch.where(confidence[..., None] > 0, keypoints, value)
-    return hidden, confidence, rest
-
-
-def test_published_and_shipped_sizes():
-    paper, small = MotionVAESettings.paper(), MotionVAESettings.small()
-    assert (paper.frames, paper.width, paper.layers, paper.heads, paper.latent) == (
-        *(10, 256, 4),
-        *(4, 256),
-    )
-    assert (paper.smoothness, paper.kl, paper.teacher) == (1.0, 0.001, 1.0)
+def test_shipped_networks_are_small():
+    small = MotionVAESettings.small()
     vae, pose = MotionVAENetwork(small, 21, 20), PoseNetwork(small, 21, 20, 12)
     numbers = sum(weight.numel() for part in (vae, pose) for weight in part.parameters())
     assert numbers <= 1.2e6
@@ -69,17 +56,10 @@ def test_published_and_shipped_sizes():
 
 def as_torch_layer(layer, memory=False):
     """Return torch's layer with the same weights."""
-    width, heads = layer.attended.in_features, layer.heads
-    hidden = layer.perceptron[0].out_features
-    options = {
-        "dropout": 0.0,
-        "activation": functional.gelu,
-        "batch_first": True,
-        "norm_first": True,
-        "dtype": DOUBLE,
-    }
+    width, hidden = layer.attended.in_features, layer.perceptron[0].out_features
     kind = nn.TransformerDecoderLayer if memory else nn.TransformerEncoderLayer
-    made = kind(width, heads, hidden, **options)
+    options = {"activation": functional.gelu, "batch_first": True, "norm_first": True}
+    made = kind(width, layer.heads, hidden, dropout=0.0, dtype=DOUBLE, **options)
     pairs = [
         (made.self_attn.out_proj, layer.attended),
         (made.linear1, layer.perceptron[0]),
@@ -100,27 +80,23 @@ def as_torch_layer(layer, memory=False):
     return made
 
 
-def test_layers_match_torch():
-    tokens = torch.randn(6, J, TINY.width, dtype=DOUBLE)
-    seen = torch.rand(6, J) > 0.4
+def random_mask(n):
+    seen = torch.rand(n, J, generator=torch.Generator().manual_seed(2)) > 0.4
     seen[:, 0] = True
+    return seen
+
+
+def test_layers_match_torch():
+    tokens, seen = torch.randn(6, J, TINY.width, dtype=DOUBLE), random_mask(6)
     layer = TransformerLayer(TINY).double()
     wanted = as_torch_layer(layer)(tokens, src_key_padding_mask=~seen)
     torch.testing.assert_close(layer(tokens, seen=seen), wanted)
+    for first in (1, 2):
+        torch.testing.assert_close(layer(tokens, seen=seen, first=first), wanted[:, :first])
     memory = torch.randn(6, TINY.width, dtype=DOUBLE)
     layer = TransformerLayer(TINY, TINY.width).double()
     wanted = as_torch_layer(layer, memory=True)(tokens, memory[:, None])
     torch.testing.assert_close(layer(tokens, memory), wanted)
-
-
-@pytest.mark.parametrize("first", [1, 2])
-def test_first_tokens_match_the_whole_layer(first):
-    layer, tokens = TransformerLayer(TINY).double(), torch.randn(6, J, TINY.width, dtype=DOUBLE)
-    seen = torch.rand(6, J) > 0.4
-    seen[:, 0] = True
-    for mask in (None, seen):
-        whole = layer(tokens, seen=mask)
-        torch.testing.assert_close(layer(tokens, seen=mask, first=first), whole[:, :first])
 
 
 @pytest.mark.parametrize("kind", [TimeDecoder, BoneDecoder])
@@ -151,24 +127,19 @@ def test_joint_order_matters_only_through_the_embedding():
     torch.testing.assert_close(encoder(*permuted), encoder(keypoints, confidence, rest))
 
 
-@pytest.mark.parametrize("value", [1e6, float("nan"), float("inf")])
 @pytest.mark.parametrize("spatial", [True, False])
-def test_occluded_inputs_have_no_effect(spatial, value):
-    settings = replace(TINY, spatial=spatial, image_features=F)
-    network = amplified(MotionVAENetwork(settings, J, BONES))
-    features, (keypoints, confidence, rest) = random_features(), random_input()
-    local = torch.where(confidence[..., None] > 0, features[1], value)
-    found = []
-    for read in (
-        (keypoints, confidence, rest, features),
-        (*occluded_input(value), (features[0], local)),
-    ):
+def test_occluded_inputs_have_no_effect(spatial):
+    network = MotionVAENetwork(replace(TINY, spatial=spatial, image_features=F), J, BONES)
+    keypoints, confidence, rest = random_input()
+    frames, joints = random_features()
+    seen, results = confidence[..., None] > 0, []
+    for value in (0.0, torch.nan):
         network.zero_grad()
-        answers = network.encode(*read)
-        torch.cat(answers).sum().backward()
-        encoder = network.frame_encoder
-        found.append([*answers, *(weight.grad.clone() for weight in encoder.parameters())])
-    for one, same in zip(*found, strict=True):
+        features = frames, torch.where(seen, joints, value)
+        outputs = network.encode(torch.where(seen, keypoints, value), confidence, rest, features)
+        torch.cat(outputs).sum().backward()
+        results.append([*outputs, *(w.grad.clone() for w in network.frame_encoder.parameters())])
+    for one, same in zip(*results, strict=True):
         assert torch.isfinite(same).all()
         assert torch.equal(one, same)
 
@@ -177,9 +148,11 @@ def test_occluded_inputs_have_no_effect(spatial, value):
 def test_gradients_reach_all_weights(spatial):
     network = MotionVAENetwork(replace(TINY, spatial=spatial), J, BONES)
     mean, log_variance = network.encode(*random_input())
-    turns = network.decode(mean + (0.5 * log_variance).exp())
-    (turns**2).sum().backward()
-    for name, weight in network.named_parameters():
+    network.decode(mean + (0.5 * log_variance).exp()).square().sum().backward()
+    pose = PoseNetwork(TINY, J, BONES, G)
+    outputs = vars(pose(*random_input())).values()
+    sum((part * torch.randn_like(part)).sum() for part in outputs).backward()
+    for name, weight in [*network.named_parameters(), *pose.named_parameters()]:
         assert weight.grad is not None, name
         assert weight.grad.abs().max() > 0, name
 
@@ -199,119 +172,88 @@ def test_mixed_precision_applies_in_training_only():
     """Outputs and gradients are close to single precision and of its type."""
     single = amplified(MotionVAENetwork(TINY, J, BONES))
     mixed = amplified(MotionVAENetwork(replace(TINY, mixed_precision=True), J, BONES))
-    found = []
+    results = []
     for network in (single, mixed):
-        network.train()
-        mean, log_variance = network.encode(*random_input())
+        mean, log_variance = network.train().encode(*random_input())
         turns = network.decode(mean)
-        (turns**2).mean().backward()
+        turns.square().mean().backward()
         gradient = torch.cat([w.grad.flatten() for w in network.parameters() if w.grad is not None])
-        found.append((turns, log_variance, gradient))
-    for one, near in zip(*found, strict=True):
-        assert near.dtype == torch.float32
-        assert 0 < (near - one).norm() / one.norm() < 0.05
-    with torch.no_grad():
-        for one, same in zip(
-            single.eval().encode(*random_input()), mixed.eval().encode(*random_input()), strict=True
-        ):
-            assert torch.equal(one, same)
+        results.append((turns, log_variance, gradient))
+    for one, close in zip(*results, strict=True):
+        assert close.dtype == torch.float32
+        assert 0 < (close - one).norm() / one.norm() < 0.05
+    one, same = (torch.cat(network.eval().encode(*random_input())) for network in (single, mixed))
+    assert torch.equal(one, same)
 
 
-@pytest.mark.parametrize("spatial", [True, False])
-def test_image_features_are_validated(spatial):
-    network = MotionVAENetwork(replace(TINY, image_features=F, spatial=spatial), J, BONES)
-    mean, _ = network.encode(*random_input(), random_features())
-    assert mean.shape == (B, TINY.latent)
+def test_invalid_inputs_are_rejected():
+    plain = MotionVAENetwork(TINY, J, BONES)
+    network = MotionVAENetwork(replace(TINY, image_features=F), J, BONES)
+    keypoints, confidence, rest = random_input()
     frames, joints = random_features()
-    for given, message in (
-        (None, r"features must be a tuple \(of frames, .*=6, got NoneType"),
-        ((frames[..., 1:], joints), r"features\[0\] must have shape .*, got \(3, 10, 5\)"),
-        ((frames, joints[:, :, 1:]), r"features\[1\] must have shape .*, got \(3, 10, 4, 6\)"),
-        ((frames,), "features must be a tuple .*, got tuple"),
-        (frames, "features must be a tuple .*, got Tensor"),
+    for call, message in (
+        (lambda: network.encode(*random_input()), r"features must be a tuple .*=6, got NoneType"),
+        (lambda: network.encode(*random_input(), (frames,)), "must be a tuple .*, got tuple"),
+        (
+            lambda: network.encode(*random_input(), (frames[..., 1:], joints)),
+            r"features\[0\] must have shape .*, got \(3, 10, 5\)",
+        ),
+        (
+            lambda: network.encode(*random_input(), (frames, joints[:, :, 1:])),
+            r"features\[1\] must have shape .*, got \(3, 10, 4, 6\)",
+        ),
+        (lambda: plain.encode(*random_input(), random_features()), "features must be None"),
+        (lambda: plain.encode(keypoints[:, 1:], confidence[:, 1:], rest), "keypoints must have sh"),
+        (lambda: plain.encode(keypoints, confidence[:, 1:], rest), "confidence must have shape"),
+        (lambda: plain.encode(keypoints, confidence, rest[1:]), "rest must have shape"),
+        (lambda: plain.decode(torch.zeros(2, TINY.latent + 1)), "latents must have shape"),
     ):
         with pytest.raises(ValueError, match=message):
-            network.encode(*random_input(), given)
-    with pytest.raises(ValueError, match="features must be None for image_features=0"):
-        MotionVAENetwork(TINY, J, BONES).encode(*random_input(), random_features())
+            call()
 
 
-def test_invalid_shapes_are_rejected():
-    network = MotionVAENetwork(TINY, J, BONES)
-    keypoints, confidence, rest = random_input()
-    for name, given in (
-        ("keypoints", (keypoints[:, 1:], confidence[:, 1:], rest)),
-        ("confidence", (keypoints, confidence[:, 1:], rest)),
-        ("rest", (keypoints, confidence, rest[1:])),
-    ):
-        with pytest.raises(ValueError, match=f"{name} must have shape"):
-            network.encode(*given)
-    with pytest.raises(ValueError, match="latents must have shape"):
-        network.decode(torch.zeros(2, TINY.latent + 1))
+def test_invalid_settings_are_rejected():
+    for name, value in [("frames", 1), ("width", 33), ("layers", 1.5), ("heads", 3),
+                        ("feedforward", 0), ("latent", True), ("spatial", 1),
+                        ("mixed_precision", "yes"), ("hypotheses", 5), ("image_features", -1),
+                        ("reconstruction", float("nan")), ("kl", -0.1), ("smoothness", True),
+                        ("ranges", "0.1"), ("lengths", torch.inf), ("teacher", None)]:  # fmt: skip
+        with pytest.raises(ValueError, match=name):
+            replace(TINY, **{name: value})
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("frames", 1),
-        ("width", 33),
-        ("width", 0),
-        ("layers", 1.5),
-        ("heads", 3),
-        ("feedforward", 0),
-        ("latent", True),
-        ("spatial", 1),
-        ("mixed_precision", "yes"),
-        ("hypotheses", 5),
-        ("image_features", -1),
-        ("reconstruction", float("nan")),
-        ("kl", -0.1),
-        ("smoothness", True),
-        ("ranges", "0.1"),
-        ("lengths", float("inf")),
-        ("teacher", None),
-    ],
-)
-def test_invalid_settings_are_rejected(name, value):
-    with pytest.raises(ValueError, match=name):
-        replace(TINY, **{name: value})
-
-
-def some(dtype: torch.dtype) -> torch.Tensor:
+def random_heads(dtype):
     """Return packed Q, K and V of three items, five tokens and two heads of size four."""
-    rng = torch.Generator().manual_seed(0)
-    return torch.randn(3, 5, 24, generator=rng, dtype=torch.float64).to(dtype).requires_grad_()
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(3, 5, 24, generator=generator, dtype=DOUBLE).to(dtype).requires_grad_()
 
 
-def reference(packed: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
+def torch_attention(packed, seen):
     queries, keys, values = packed.unflatten(-1, (3, 2, 4)).permute(2, 0, 3, 1, 4)
     mask = None if seen is None else seen[:, None, None]
-    found = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-    return found.transpose(1, 2).flatten(2)
+    result = functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+    return result.transpose(1, 2).flatten(2)
 
 
-def half_masked() -> torch.Tensor:
-    seen = torch.ones(3, 5, dtype=torch.bool)
-    seen[1, 2:] = False
-    return seen
-
-
-@pytest.mark.parametrize("seen", [None, half_masked()])
-def test_value_and_gradient_match_torch(seen):
-    own, other = some(torch.bfloat16), some(torch.float64)
-    found, wanted = short_attention(own, 2, seen), reference(other, seen)
-    assert found.dtype == torch.bfloat16
-    torch.testing.assert_close(found.double(), wanted, rtol=0.02, atol=0.02)
+@pytest.mark.parametrize("masked", [False, True])
+def test_attention_and_gradient_match_torch(masked):
+    seen = random_mask(3) if masked else None
+    own, other = random_heads(torch.bfloat16), random_heads(DOUBLE)
+    result, wanted = short_attention(own, 2, seen), torch_attention(other, seen)
+    assert result.dtype == torch.bfloat16
+    torch.testing.assert_close(result.double(), wanted, rtol=0.02, atol=0.02)
     pull = torch.linspace(-1, 1, wanted.numel()).reshape(wanted.shape)
-    found.backward(pull.to(torch.bfloat16))
+    result.backward(pull.to(torch.bfloat16))
     wanted.backward(pull.double())
     torch.testing.assert_close(own.grad.double(), other.grad, rtol=0.03, atol=0.03)
+    if masked:
+        assert (own.grad[..., 8:][~seen] == 0).all()
 
 
 def test_gradient_matches_finite_differences(monkeypatch):
     """In double precision, with the cast to single precision disabled."""
     monkeypatch.setattr(torch.Tensor, "float", lambda self: self.clone())
-    assert torch.autograd.gradcheck(short_attention, (some(torch.float64), 2, half_masked()))
+    assert torch.autograd.gradcheck(short_attention, (random_heads(DOUBLE), 2, random_mask(3)))
 
 
 def test_common_offset_of_values_has_no_effect_on_scores():
@@ -319,17 +261,68 @@ def test_common_offset_of_values_has_no_effect_on_scores():
     errors, in_common = [], torch.arange(24) >= 16
     pull = torch.randn(3, 5, 8, generator=torch.Generator().manual_seed(1))
     for common in (0.0, 8.0):
-        own, other = some(torch.bfloat16), some(torch.float64)
+        own, other = random_heads(torch.bfloat16), random_heads(DOUBLE)
         short_attention(own + common * in_common, 2).backward(pull.to(torch.bfloat16))
-        reference(other, None).backward(pull.double())
+        torch_attention(other, None).backward(pull.double())
         errors.append(float((own.grad.double() - other.grad)[..., :8].norm()))
     assert errors[1] < 6 * errors[0]
 
 
-def test_masked_tokens_get_no_gradient():
-    own = some(torch.bfloat16)
-    short_attention(own, 2, half_masked()).float().square().sum().backward()
-    keys, values = own.grad[..., 8:16], own.grad[..., 16:]
-    assert (keys[1, 2:] == 0).all()
-    assert (values[1, 2:] == 0).all()
-    assert (values[1, :2] != 0).any()
+@pytest.fixture(scope="module")
+def pose_network():
+    return amplified(PoseNetwork(TINY, J, BONES, G), 0.1)
+
+
+def test_initial_hypotheses_lie_in_their_quadrants():
+    poses = PoseNetwork(TINY, J, BONES, G)(*random_input())
+    for view in range(H):
+        angle = math.pi / 4 + view * math.pi / 2
+        turn = vector_to_matrix(torch.tensor([0.0, angle, 0.0])).expand(B, T, 3, 3)
+        assert geodesic_angle(poses.rotation[:, view], turn).max() < 0.3
+        # The front, +Z, faces the camera in the first and last quadrant.
+        front = poses.rotation[:, view, :, :, 2]
+        assert (front[..., 0].sign() == (1 if view < 2 else -1)).all()
+        assert (front[..., 2].sign() == (1 if view in (0, 3) else -1)).all()
+    for part in (poses.translation, poses.turns, poses.log_lengths):
+        assert part.abs().max() < 0.3
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_rotations_are_orthonormal(mixed):
+    network = amplified(PoseNetwork(replace(TINY, mixed_precision=mixed), J, BONES, G), 0.1)
+    poses = network.train()(*random_input())
+    assert {part.dtype for part in vars(poses).values()} == {torch.float32}
+    identity = torch.eye(3).expand_as(poses.rotation)
+    torch.testing.assert_close(poses.rotation @ poses.rotation.mT, identity, atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(poses.rotation), torch.ones(B, H, T))
+    assert geodesic_angle(poses.rotation[:, :, 1:], poses.rotation[:, :, :-1]).mean() > 1e-2
+
+
+def test_predicted_rotation_follows_the_quarter_turn():
+    """A camera tilt is the same for all hypotheses."""
+    network = PoseNetwork(TINY, J, BONES, G)
+    with torch.no_grad():
+        for weights in network.rigid[-1].parameters():
+            weights.zero_()
+        # Rotation about X by 0.2: its first two columns minus those of the identity.
+        tilt = [0, 0, 0, 0, math.cos(0.2) - 1, math.sin(0.2)]
+        network.rigid[-1].bias[:6] = torch.tensor(tilt)
+        rotation = network(*random_input()).rotation
+    up = torch.tensor([0.0, math.cos(0.2), math.sin(0.2)])
+    torch.testing.assert_close(rotation[..., 1], up.expand(B, H, T, 3))
+
+
+def test_frames_are_independent_except_for_lengths(pose_network):
+    keypoints, confidence, rest = random_input()
+    before = pose_network(keypoints, confidence, rest)
+    keypoints = torch.where(confidence[..., None] > 0, keypoints, torch.nan)
+    keypoints[1, 3] += 0.5
+    after = pose_network(keypoints, confidence, rest)
+    elsewhere = torch.ones(B, T, dtype=torch.bool)
+    elsewhere[1, 3] = False
+    for name in ("rotation", "translation", "turns"):
+        one, two = (getattr(poses, name).transpose(1, 2) for poses in (before, after))
+        torch.testing.assert_close(one[elsewhere], two[elsewhere], rtol=1e-5, atol=1e-6)
+        assert (one[1, 3] - two[1, 3]).abs().max() > 1e-3
+    assert (after.log_lengths - before.log_lengths)[1].abs().min() > 1e-6
+    torch.testing.assert_close(after.log_lengths[::2], before.log_lengths[::2])

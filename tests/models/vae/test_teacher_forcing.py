@@ -21,6 +21,7 @@ from probmotion.models.vae.training import MotionVAETrainee
 from probmotion.motion.rest_poses import estimate_rest_pose
 from probmotion.motion.skeleton import Skeleton
 
+CPU = torch.device("cpu")
 PERSON = Skeleton.preset("person14")
 SIZE = replace(MotionVAESettings.tiny(), frames=8, mixed_precision=True)
 
@@ -38,103 +39,97 @@ def body(tracks):
 
 
 @pytest.fixture(scope="module")
-def rest(body):
-    return torch.as_tensor(body.rest_positions, dtype=torch.float32)
-
-
-@pytest.fixture(scope="module")
 def network(body):
-    found = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
+    made = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
     with torch.no_grad():
         # Poses that vary between frames and views.
-        found.bone_decoder.leave.weight.mul_(20)
-        found.rigid[-1].weight.mul_(20)
-        found.log_lengths.weight.mul_(10)
-    return found
+        made.bone_decoder.leave.weight.mul_(20)
+        made.rigid[-1].weight.mul_(20)
+        made.log_lengths.weight.mul_(10)
+    return made
+
+
+@pytest.fixture
+def trainee(tracks, network, body):
+    return MotionVAETrainee(tracks, tracks, SIZE, body, network, distance=7.0)
 
 
 def batches_of(tracks, **augmentation):
     return TrackBatches(tracks, SIZE.frames, 0.3, replace(Augmentation.none(), **augmentation))
 
 
+def teacher_poses(network, body, batches):
+    rest = torch.as_tensor(body.rest_positions, dtype=torch.float32)
+    return TeacherForcedPoses(network, batches, rest)
+
+
 @pytest.mark.parametrize("mirror", [False, True])
-def test_poses_match_the_network_on_windows(tracks, network, rest, mirror):
+def test_poses_match_the_network_on_windows(tracks, network, body, mirror):
     batches = batches_of(tracks, mirror=mirror)
     drawn = batches.draw(np.random.default_rng(0), 12)
     # In training mode the network would use bfloat16.
-    found = TeacherForcedPoses(network.train(), batches, rest).of(drawn)
+    poses = teacher_poses(network.train(), body, batches).of(drawn)
     seen = torch.as_tensor(drawn.seen, dtype=torch.float32)
+    rest = torch.as_tensor(body.rest_positions, dtype=torch.float32)
     with torch.no_grad():
         direct = network.eval()(torch.as_tensor(drawn.keypoints), seen, rest)
-    for name in ("rotation", "translation", "turns", "log_lengths"):
-        torch.testing.assert_close(
-            getattr(found, name), getattr(direct, name), rtol=1e-4, atol=1e-5, msg=name
-        )
+    for name, values in vars(direct).items():
+        torch.testing.assert_close(getattr(poses, name), values, rtol=1e-4, atol=1e-5, msg=name)
     assert direct.log_lengths.std() > 0.01
 
 
 @pytest.mark.parametrize(("distance", "tolerance"), [(None, 1e-6), (7.0, 0.02)])
-def test_scaled_poses_have_scaled_projections(tracks, network, rest, body, distance, tolerance):
+def test_scaled_poses_have_scaled_projections(tracks, network, body, distance, tolerance):
     batches = batches_of(tracks, scale=0.4)
     drawn = batches.draw(np.random.default_rng(0), 12)
-    every = TeacherForcedPoses(network, batches, rest).of(drawn)
-    scale = torch.as_tensor(drawn.scale)
-    assert scale.std() > 0.1
+    unscaled, scale = teacher_poses(network, body, batches).of(drawn), torch.as_tensor(drawn.scale)
     projections = []
-    for poses in (scaled(every, scale), every):
+    for poses in (scaled(unscaled, scale), unscaled):
         moved = torch.nn.functional.pad(poses.translation, (0, 1))
         positions = body.positions(poses.turns, poses.rotation, moved, poses.log_lengths)
         projections.append(project_to_image(positions, distance))
     wanted = scale[:, None, None, None, None] * projections[1]
-    size = wanted.abs().mean()
-    assert (projections[0] - wanted).abs().mean() < tolerance * size
+    assert (projections[0] - wanted).abs().mean() < tolerance * wanted.abs().mean()
 
 
-@pytest.mark.parametrize("lengths", [0.0, 100.0])
-def test_selected_view_does_not_depend_on_scale(tracks, network, body, lengths):
-    size = replace(SIZE, lengths=lengths, smoothness=0.0, ranges=0.0)
-    trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
+def test_selected_view_does_not_depend_on_scale(tracks, trainee):
+    trainee.size = replace(SIZE, lengths=100.0, smoothness=0.0, ranges=0.0)
     batches = batches_of(tracks)
     drawn = batches.draw(np.random.default_rng(0), 40)
-    keypoints, seen, rest = trainee._inputs(drawn, torch.device("cpu"))
+    keypoints, seen, rest = trainee._inputs(drawn, CPU)
     plain = trainee._teacher_poses(batches, drawn, keypoints, seen, rest)
-    larger = np.geomspace(0.05, 20, 40, dtype=np.float32)
-    shown = keypoints * torch.as_tensor(larger)[:, None, None, None]
-    found = trainee._teacher_poses(batches, drawn._replace(scale=larger), shown, seen, rest)
-    torch.testing.assert_close(found.turns, plain.turns)
-    torch.testing.assert_close(found.rotation, plain.rotation)
-    torch.testing.assert_close(
-        found.log_lengths, plain.log_lengths + torch.as_tensor(larger).log()[:, None]
-    )
+    scale = np.geomspace(0.05, 20, 40, dtype=np.float32)
+    shown, log_scale = keypoints * torch.as_tensor(scale)[:, None, None, None], np.log(scale)
+    poses = trainee._teacher_poses(batches, drawn._replace(scale=scale), shown, seen, rest)
+    torch.testing.assert_close(poses.turns, plain.turns)
+    torch.testing.assert_close(poses.rotation, plain.rotation)
+    lengths = plain.log_lengths + torch.as_tensor(log_scale)[:, None]
+    torch.testing.assert_close(poses.log_lengths, lengths)
 
 
-def test_loss_ignores_the_trainer_s_autocast(tracks, network, body):
-    size = replace(SIZE, mixed_precision=False)
-    trainee = MotionVAETrainee(tracks, tracks, size, body, network, distance=7.0)
-    learner, n, device = trainee.network, 8, torch.device("cpu")
-    plain = trainee._loss(learner, trainee.batches, np.random.default_rng(0), n, device)
+def test_loss_ignores_the_trainer_s_autocast(trainee):
+    networks = trainee.network.eval()
+    plain = trainee.training_loss(networks, np.random.default_rng(0), 8, CPU)
     with torch.autocast("cpu", torch.bfloat16):
-        direct = trainee.training_loss(learner, np.random.default_rng(0), n, device)
-    torch.testing.assert_close(direct, plain, rtol=0, atol=0)
+        direct = trainee.training_loss(networks, np.random.default_rng(0), 8, CPU)
+    assert torch.equal(direct, plain)
 
 
-def test_teacher_is_evaluated_once_per_frame(tracks, network, body):
-    trainee = MotionVAETrainee(tracks, tracks, SIZE, body, network, distance=7.0)
-    direct = []
-    network.register_forward_hook(lambda _, given, __: direct.append(len(given[0])))
-    for step in range(3):
-        rng = np.random.default_rng(step)
-        trainee.training_loss(trainee.network, rng, 4, torch.device("cpu"))
+def test_teacher_is_evaluated_once_per_frame(trainee, network):
+    evaluated = []
+    hook = network.register_forward_hook(lambda _, given, __: evaluated.append(len(given[0])))
+    for step in range(2):
+        trainee.training_loss(trainee.network, np.random.default_rng(step), 4, CPU)
         with torch.no_grad():
-            trainee.validation_loss(trainee.network, torch.device("cpu"))
-    assert sum(direct) == sum(
-        len(batches.all_frames()[0]) for batches in (trainee.batches, trainee.held_out)
-    )
+            trainee.validation_loss(trainee.network, CPU)
+    hook.remove()
+    frames = [len(batches.all_frames()[0]) for batches in (trainee.batches, trainee.held_out)]
+    assert sum(evaluated) == sum(frames)
 
 
-def test_shifted_or_padded_windows_are_rejected(tracks, network, rest):
+def test_shifted_or_padded_windows_are_rejected(tracks, network, body):
     long = TrackBatches(tracks, 99, 0.3, Augmentation.none())
     with pytest.raises(ValueError, match="drawn must not contain padded windows"):
-        TeacherForcedPoses(network, long, rest).of(long.draw(np.random.default_rng(0), 2))
+        teacher_poses(network, body, long).of(long.draw(np.random.default_rng(0), 2))
     with pytest.raises(ValueError, match=r"must have shift=0 .* got 0\.1"):
-        TeacherForcedPoses(network, batches_of(tracks, shift=0.1), rest)
+        teacher_poses(network, body, batches_of(tracks, shift=0.1))

@@ -18,7 +18,6 @@ from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.transition_latents import (
     _corrected,
     _joined,
-    _shared_frames,
     greatest_acceleration,
     long_motion,
 )
@@ -60,6 +59,11 @@ def test_segments_are_unchanged(prior):
         np.testing.assert_allclose(found[16 * number : 16 * number + 10], segment, atol=1e-9)
 
 
+def test_acceleration_of_uniform_acceleration():
+    path = np.arange(6)[:, None, None] ** 2 * np.array([[0.0, 0, 0], [0.3, 0, -0.4]])
+    assert greatest_acceleration(path) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_transitions_accelerate_no_more_than_segments(seed):
     prior, z = mover(pace=0.5), codes(seed=seed)
@@ -82,15 +86,11 @@ def test_unsmooth_transition_warns():
 
 def test_exact_transition_needs_no_correction(prior):
     """A motion of the prior is the transition between its own ends."""
-    whole = codes(1, seed=3)
-    motion = torch.as_tensor(vector_to_matrix(prior.turns(whole)[0]))
-    before, after = motion[:2], motion[-2:]
-    joined, missed = _joined([motion], before, after)
+    motion, other = torch.as_tensor(vector_to_matrix(prior.turns(codes(2, seed=3))))
+    joined, missed = _joined([motion], motion[:2], motion[-2:])
     torch.testing.assert_close(joined, motion)
     assert float(missed) == pytest.approx(0.0, abs=1e-12)
-    other = torch.as_tensor(vector_to_matrix(prior.turns(codes(1, seed=4))[0]))
-    shared = _shared_frames(10)
-    assert shared == [0, 1, 8, 9]
+    shared = [0, 1, 8, 9]
     corrected = _corrected(other, motion[shared])
     torch.testing.assert_close(corrected[shared], motion[shared])
     turned = corrected @ corrected.mT
@@ -98,20 +98,19 @@ def test_exact_transition_needs_no_correction(prior):
 
 
 def test_optimisation_reduces_the_mismatch(prior, monkeypatch):
-    missed = []
-    joined = transition_latents._joined
+    """The mismatch before correction is recorded after 1 and 50 iterations."""
+    mismatches, joined = [], transition_latents._joined
 
     def spy(*parts):
-        found = joined(*parts)
-        missed.append(float(found[1].detach()))
-        return found
+        result = joined(*parts)
+        mismatches.append(float(result[1].detach()))
+        return result
 
     monkeypatch.setattr(transition_latents, "_joined", spy)
-    ended = []
-    for iterations in (1, 50):
-        long_motion(prior, codes(2), iterations=iterations, transitions=1)
-        ended.append(missed[-1])
-    assert ended[1] < 0.8 * ended[0] < 0.8 * missed[0]
+    long_motion(prior, codes(2), iterations=1, transitions=1)
+    first, few = mismatches[0], mismatches[-1]
+    long_motion(prior, codes(2), iterations=50, transitions=1)
+    assert mismatches[-1] < 0.8 * few < 0.8 * first
 
 
 def test_root_is_fixed_and_bone_lengths_are_constant(prior):
@@ -122,23 +121,18 @@ def test_root_is_fixed_and_bone_lengths_are_constant(prior):
     np.testing.assert_allclose(lengths, want, atol=1e-9)
 
 
+ZERO = np.zeros((2, 4))
+
+
 @pytest.mark.parametrize(
     ("z", "options", "sentence"),
     [
-        (np.zeros((2, 3)), {}, r"z must have shape \(S, 4\), got \(2, 3\)"),
-        (np.zeros((0, 4)), {}, "segments must be an integer of at least 1, got 0"),
-        (np.full((2, 4), np.nan), {}, "z must be finite, got 8 values that are NaN or infinite"),
-        (np.zeros((2, 4)), {"iterations": 0}, "iterations must be an integer of at least 1, got 0"),
-        (
-            np.zeros((2, 4)),
-            {"transitions": 0},
-            "transitions must be an integer of at least 1, got 0",
-        ),
-        (
-            np.zeros((2, 4)),
-            {"prior_weight": -1.0},
-            "prior_weight must be a finite number of at least 0, got -1.0",
-        ),
+        (ZERO[:, :3], {}, r"z must have shape \(S, 4\), got \(2, 3\)"),
+        (ZERO[:0], {}, "segments must be an integer of at least 1, got 0"),
+        (ZERO * np.nan, {}, "z must be finite, got 8 values that are NaN or infinite"),
+        (ZERO, {"iterations": 0}, "iterations must be an integer of at least 1, got 0"),
+        (ZERO, {"transitions": 0}, "transitions must be an integer of at least 1, got 0"),
+        (ZERO, {"prior_weight": -1.0}, "prior_weight must be a finite number of at least 0"),
     ],
 )
 def test_invalid_arguments_are_rejected(prior, z, options, sentence):

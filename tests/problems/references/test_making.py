@@ -216,9 +216,9 @@ def test_failed_write_keeps_the_old_reference(tmp_path, certified, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("certificate.json", b"{", "must hold draws.npz"),
+        ("certificate.json", b"{", "must contain draws.npz"),
         ("certificate.json", b"{}", "certificate must have problem, draws"),
-        ("draws.npz", b"PK", "must hold draws.npz"),
+        ("draws.npz", b"PK", "must contain draws.npz"),
     ],
 )
 def test_damaged_references_are_rejected(tmp_path, certified, name, content, sentence):

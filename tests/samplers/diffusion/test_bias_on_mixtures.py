@@ -44,48 +44,35 @@ def real_clips():
     return GaussianMixtureMotion.fit([clip.retarget(shared) for clip in clips], 30)
 
 
-class Truth:
-    """Exact draws from a prior, and metrics of a sampler against them."""
-
-    def __init__(self, prior, draws=DRAWS):
-        self.prior = prior
-        self.draws = draws
-        self.posterior = MotionPosterior(prior)
-        exact = prior.sample(seeds.generator(0, "exact"), 8 * draws).reshape(8, draws, -1)
-        self.sets = list(exact)
-        self.all = exact.reshape(8 * draws, -1)
-        self.directions = random_directions(
-            seeds.generator(0, "directions"), 256, self.all.shape[1]
+def metrics(prior, sampler, run_seeds, n=DRAWS):
+    """Return the metrics of ``n`` draws for each seed, compared with exact draws: (seeds,) each."""
+    exact = prior.sample(seeds.generator(0, "exact"), 8 * n).reshape(8, n, -1)
+    directions = random_directions(seeds.generator(0, "directions"), 256, exact.shape[-1])
+    rows = []
+    for seed in run_seeds:
+        draws = sampler.sample(MotionPosterior(prior), draws=n, seed=seed, progress=False)
+        X, flat = draws.flat(), draws.flat().reshape(n, -1)
+        proportions = prior.style_responsibilities(X).mean(axis=0)
+        rows.append(
+            {
+                "swd_ratio": sliced_wasserstein_ratio(flat, list(exact), directions),
+                "off_manifold_ratio": prior.off_manifold(X).mean(),
+                "variance_ratio": trace_ratio(flat, exact.reshape(8 * n, -1)),
+                "mode_proportions_tv": 0.5 * np.abs(proportions - prior.weights).sum(),
+                "calls": draws.counts["denoiser"] / n,
+            }
         )
-
-    def measure(self, sampler, seed):
-        draws = sampler.sample(self.posterior, draws=self.draws, seed=seed, progress=False)
-        X = draws.flat()
-        proportions = self.prior.style_responsibilities(X).mean(axis=0)
-        return {
-            "swd_ratio": sliced_wasserstein_ratio(
-                X.reshape(len(X), -1), self.sets, self.directions
-            ),
-            "off_manifold_ratio": float(self.prior.off_manifold(X).mean()),
-            "variance_ratio": float(trace_ratio(X.reshape(len(X), -1), self.all)),
-            "mode_proportions_tv": 0.5 * float(np.abs(proportions - self.prior.weights).sum()),
-            "calls": draws.counts["denoiser"] / len(X),
-        }
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def measured(truth, sampler, n):
-    """Return the means over ``n`` seeds and their standard errors, by metric."""
-    rows = [truth.measure(sampler, seed) for seed in range(n)]
-    values = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    return {name: (x.mean(), x.std(ddof=1) / np.sqrt(n)) for name, x in values.items()}
+# 475 calls per draw: 50 predictor and 45 corrector steps, or 95 steps, of 5 views.
+EQUAL_COST = (MultiViewPredictorCorrector(), MultiViewAncestral(steps=95))
 
 
 def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
     """The fast version of the slow test below, in reduced coordinates."""
     reduced, _ = gaits().reduced()
-    truth = Truth(reduced, draws=100)
-    ours = truth.measure(MultiViewPredictorCorrector(), 0)
-    mas = truth.measure(MultiViewAncestral(steps=95), 0)
+    ours, mas = (metrics(reduced, sampler, [0], 100) for sampler in EQUAL_COST)
     assert ours["calls"] == mas["calls"] == 475
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
         assert abs(np.log(ours[name])) < abs(np.log(mas[name])) - 0.1, name
@@ -94,8 +81,7 @@ def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
 @pytest.mark.slow
 def test_order_of_biases_on_gaits():
     """Differences between samplers exceed 3 standard errors."""
-    truth = Truth(gaits())
-    rows = {
+    samplers = {
         "ancestral3d": Ancestral3D(),
         "mas": MultiViewAncestral(elevation=ELEVATION),
         "mas T=300": MultiViewAncestral(elevation=ELEVATION, steps=300),
@@ -104,13 +90,15 @@ def test_order_of_biases_on_gaits():
         "printed": MultiViewAncestral(elevation=ELEVATION, variance_for_deviation=True),
         "sds": ScoreDistillation(elevation=ELEVATION, iterations=2000, levels="annealed"),
     }
-    found = {name: measured(truth, sampler, 5) for name, sampler in rows.items()}
+    prior = gaits()
+    values = {name: metrics(prior, sampler, range(5)) for name, sampler in samplers.items()}
 
     def less(metric, *names):
         """Assert that ``names``, or numbers, are in increasing order of ``metric``."""
-        pairs = [(x, 0.0) if isinstance(x, float) else found[x][metric] for x in names]
-        for (low, error), (high, other) in itertools.pairwise(pairs):
-            assert low + 3 * np.hypot(error, other) < high, (metric, names)
+        columns = [np.full(5, x) if isinstance(x, float) else values[x][metric] for x in names]
+        for low, high in itertools.pairwise(columns):
+            error = np.sqrt((low.var(ddof=1) + high.var(ddof=1)) / 5)
+            assert low.mean() + 3 * error < high.mean(), (metric, names)
 
     # Finitely many steps reduce the variance, that of the small noise in particular.
     less("variance_ratio", "mas", "ancestral3d", 1.0)
@@ -130,15 +118,9 @@ def test_order_of_biases_on_gaits():
 @pytest.mark.parametrize("make", [gaits, real_clips])
 def test_mvpc_is_more_accurate_than_mas_at_equal_cost(make):
     """|log| of three mean ratios; 99 % intervals by resampling the seeds."""
-    truth = Truth(make())
-    # 475 calls per draw: 50 predictor and 45 corrector steps, or 95 steps, of 5 views.
-    ours = MultiViewPredictorCorrector()
-    mas = MultiViewAncestral(steps=95)
-    a = [truth.measure(ours, seed) for seed in range(SEEDS)]
-    b = [truth.measure(mas, seed) for seed in range(SEEDS)]
-    assert {row["calls"] for row in a} == {row["calls"] for row in b} == {475}
-    again = seeds.generator(0, "resampled").integers(SEEDS, size=(20_000, SEEDS))
+    prior = make()
+    ours, mas = (metrics(prior, sampler, range(SEEDS)) for sampler in EQUAL_COST)
+    resampled = seeds.generator(0, "resampled").integers(SEEDS, size=(20_000, SEEDS))
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
-        mine, theirs = (np.array([row[name] for row in rows]) for rows in (a, b))
-        gap_mine, gap_theirs = (abs(np.log(x[again].mean(axis=1))) for x in (mine, theirs))
-        assert np.quantile(gap_theirs - gap_mine, 0.005) > 0, name
+        gaps = [abs(np.log(values[name][resampled].mean(axis=1))) for values in (mas, ours)]
+        assert np.quantile(gaps[0] - gaps[1], 0.005) > 0, name

@@ -10,12 +10,11 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from probmotion import Joints3D, MotionDraws, MotionPosterior, UnsupportedPosterior
+from probmotion import Joints3D, MotionPosterior, UnsupportedPosterior
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Denoises2D, DenoisesCoordinates
-from probmotion.posteriors.sampling import Interrupted, missing, suited
+from probmotion.posteriors.sampling import missing, suited
 from probmotion.samplers import ScoreDistillation
-from probmotion.samplers.diffusion import coordinate_distillation
 from probmotion.samplers.diffusion.coordinate_distillation import coordinate_distillation_gradient
 
 QUICK = ScoreDistillation(iterations=20)
@@ -51,9 +50,32 @@ class LinearMotion:
 @pytest.fixture(scope="module")
 def prior():
     rng = np.random.default_rng(0)
-    # The observations determine some coordinates well and others hardly.
+    # The observations determine some coordinates well and others poorly.
     matrix = rng.normal(size=(12, 5)) * [1.0, 1.0, 0.5, 0.2, 0.05]
     return LinearMotion(matrix, rng.normal(size=12))
+
+
+@pytest.mark.parametrize("alpha_bar", [0.01, 0.5, 0.999])
+def test_expected_gradient_is_the_negative_score_of_the_noisy_prior(alpha_bar):
+    """E_ε[ε_φ − ε] = −√(1−ᾱ) ∇ log p_t(√ᾱ θ) for θ ~ N(m, S), averaging ε and −ε."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(5, 5))
+    mean, covariance = rng.normal(size=5), root @ root.T + np.eye(5)
+    noisy = alpha_bar * covariance + (1 - alpha_bar) * np.eye(5)
+
+    class Correlated:
+        def denoise_coordinates(self, theta_t, alpha_bar):
+            gain = alpha_bar**0.5 * np.linalg.solve(noisy, covariance)
+            return mean + (theta_t - alpha_bar**0.5 * mean) @ gain
+
+    theta, noise = rng.normal(size=(2, 7, 5))
+    both = [
+        coordinate_distillation_gradient(Correlated(), theta, sign * noise, alpha_bar)
+        for sign in (1, -1)
+    ]
+    score = -math.sqrt(alpha_bar) * np.linalg.solve(noisy, (theta - mean).T).T
+    np.testing.assert_allclose(np.mean(both, axis=0), -((1 - alpha_bar) ** 0.5) * score, atol=1e-9)
+    assert abs(both[0] - both[1]).max() > 1e-3
 
 
 def observed(prior, noise, **options):
@@ -79,51 +101,10 @@ def thetas(draws):
     return draws.dataset["theta"].values[0]
 
 
-@pytest.mark.parametrize("alpha_bar", [0.01, 0.5, 0.999])
-def test_expected_gradient_of_a_standard_normal(prior, alpha_bar):
-    """E_ε[ε_φ − ε] = √(ᾱ(1−ᾱ)) θ = −√(ᾱ(1−ᾱ)) ∇ log p(θ), averaging ε and −ε."""
-    rng = np.random.default_rng(0)
-    theta, noise = rng.normal(size=(2, 7, 5))
-    both = [
-        coordinate_distillation_gradient(prior, theta, sign * noise, alpha_bar) for sign in (1, -1)
-    ]
-    expected = math.sqrt(alpha_bar * (1 - alpha_bar)) * theta
-    np.testing.assert_allclose(np.mean(both, axis=0), expected, atol=1e-12)
-    np.testing.assert_allclose(both[0] - expected, -alpha_bar * noise, atol=1e-12)
-
-
-def test_expected_gradient_of_a_correlated_prior_is_its_score_at_low_noise():
-    """For θ ~ N(m, S), E_ε[ε_φ − ε]/√(ᾱ(1−ᾱ)) → S⁻¹(θ − m) as ᾱ → 1."""
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(5, 5))
-    mean, covariance = rng.normal(size=5), root @ root.T + np.eye(5)
-
-    class Correlated:
-        def denoise_coordinates(self, theta_t, alpha_bar):
-            noisy = alpha_bar * covariance + (1 - alpha_bar) * np.eye(5)
-            gain = alpha_bar**0.5 * np.linalg.solve(noisy, covariance)
-            return mean + (theta_t - alpha_bar**0.5 * mean) @ gain
-
-    theta, noise = rng.normal(size=(2, 7, 5))
-    score = -np.linalg.solve(covariance, (theta - mean).T).T
-    gaps = []
-    for alpha_bar in (0.99, 0.9999):
-        both = [
-            coordinate_distillation_gradient(Correlated(), theta, sign * noise, alpha_bar)
-            for sign in (1, -1)
-        ]
-        found = np.mean(both, axis=0) / math.sqrt(alpha_bar * (1 - alpha_bar))
-        gaps.append(abs(found + score).max())
-    assert gaps[1] < 1e-3
-    assert gaps[0] > 50 * gaps[1]
-
-
 @pytest.mark.parametrize(
     ("noise", "options"),
     [
         (0.1, {}),
-        (1.0, {}),
-        (1.0, {"weighting": "variance"}),
         (1.0, {"weighting": "residual"}),
         (1.0, {"weighting": "variance", "levels": "annealed"}),
     ],
@@ -142,69 +123,33 @@ def test_draws_concentrate_at_the_exact_mode(prior, noise, options):
             assert abs(c * other - mode).max() > 0.12
 
 
-def test_mode_with_occlusion_and_outliers(prior):
+def test_modes_without_observations_and_with_outliers(prior):
+    draws = distilled(ScoreDistillation(iterations=2000), MotionPosterior(prior))
+    assert abs(thetas(draws).mean(axis=0)).max() < 0.1
+    assert thetas(draws).std() < 0.2
+    assert draws.counts == {"denoiser": 20 * 2000, "gradient": 0, "density": 20}
     confidence = np.ones((2, 2))
     confidence[0, 1] = 0
     posterior = observed(prior, 0.3, confidence=confidence, degrees_of_freedom=3.0)
     best = minimize(lambda theta: -float(posterior.log_density(theta)), np.zeros(5), tol=1e-10)
-    found = distilled(ScoreDistillation(iterations=2000), posterior)
-    np.testing.assert_allclose(thetas(found).mean(axis=0), best.x, atol=0.06)
-    assert (found.dataset["log_density"] <= -best.fun + 1e-9).all()
-
-
-def test_mode_without_observations(prior):
-    found = distilled(ScoreDistillation(iterations=2000), MotionPosterior(prior))
-    assert abs(thetas(found).mean(axis=0)).max() < 0.1
-    assert thetas(found).std() < 0.2
-    assert found.counts == {"denoiser": 20 * 2000, "gradient": 0, "density": 20}
-
-
-def test_draws_have_positions_and_log_densities(prior, tmp_path):
-    posterior = observed(prior, 0.1)
-    found = distilled(QUICK, posterior, draws=3, chains=2)
-    theta = found.dataset["theta"].values
-    assert theta.shape == (2, 3, 5)
-    np.testing.assert_allclose(found.positions.values, prior.motion(theta), atol=1e-12)
-    np.testing.assert_allclose(found.dataset["log_density"], posterior.log_density(theta))
-    assert found.independent
-    assert found.counts == {"denoiser": 120, "gradient": 120, "density": 6}
-    found.save(tmp_path / "draws.nc")
-    loaded = MotionDraws.load(tmp_path / "draws.nc")
-    np.testing.assert_array_equal(loaded.dataset["theta"], theta)
+    draws = distilled(ScoreDistillation(iterations=2000), posterior)
+    np.testing.assert_allclose(thetas(draws).mean(axis=0), best.x, atol=0.06)
+    assert (draws.dataset["log_density"] <= -best.fun + 1e-9).all()
 
 
 def test_a_draw_depends_only_on_its_seed_chain_and_number(prior):
     posterior = observed(prior, 0.1)
-    whole = distilled(QUICK, posterior, draws=5, chains=3, seed=2)
-    assert len(np.unique(whole.dataset["theta"].values.reshape(15, -1), axis=0)) == 15
+    many = distilled(QUICK, posterior, draws=5, chains=3, seed=2)
+    theta = many.dataset["theta"].values
+    assert len(np.unique(theta.reshape(15, -1), axis=0)) == 15
+    np.testing.assert_allclose(many.positions.values, prior.motion(theta), atol=1e-12)
+    np.testing.assert_allclose(many.dataset["log_density"], posterior.log_density(theta))
+    assert many.counts == {"denoiser": 300, "gradient": 300, "density": 15}
     for sampler, draws, chains in ((replace(QUICK, batch=2), 5, 3), (QUICK, 4, 2)):
         few = distilled(sampler, posterior, seed=2, draws=draws, chains=chains)
         for name in ("theta", "positions", "log_density"):
-            wanted = whole.dataset[name].values[:chains, :draws]
+            wanted = many.dataset[name].values[:chains, :draws]
             np.testing.assert_allclose(few.dataset[name].values, wanted, rtol=0, atol=1e-9)
-
-
-def test_an_interrupted_run_has_coordinates(prior, monkeypatch):
-    posterior = observed(prior, 0.1)
-    sampler = replace(QUICK, batch=4)
-    whole = distilled(sampler, posterior, draws=6, chains=3)
-    calls = []
-
-    def stopping(*arguments):
-        calls.append(arguments)
-        if len(calls) > 2 * sampler.iterations + 3:
-            raise KeyboardInterrupt
-        return coordinate_distillation_gradient(*arguments)
-
-    monkeypatch.setattr(coordinate_distillation, "coordinate_distillation_gradient", stopping)
-    with pytest.raises(Interrupted) as stopped:
-        distilled(sampler, posterior, draws=6, chains=3)
-    finished = stopped.value.draws.dataset
-    # Two batches of four contain two whole draws of three chains.
-    assert finished["theta"].shape == (3, 2, 5)
-    for name in ("theta", "positions", "log_density"):
-        wanted = whole.dataset[name].values[:, :2]
-        np.testing.assert_allclose(finished[name].values, wanted, atol=1e-9)
 
 
 def test_one_of_two_protocols_is_required(prior, gaussian, two_modes):

@@ -10,32 +10,25 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
-from probmotion.samplers.diffusion.ancestral import MotionState
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views
-from probmotion.seeds import NormalStreams
-
-BARE = {"gamma": 0.0, "corrector_steps": 0}
 
 
 def test_without_gamma_and_corrector_it_is_mas(gaussian):
     posterior = MotionPosterior(gaussian)
-    bare = MultiViewPredictorCorrector(steps=20, **BARE)
-    ours = bare.sample(posterior, draws=6, chains=2, seed=3, progress=False)
-    mas = MultiViewAncestral(steps=20).sample(posterior, draws=6, chains=2, seed=3, progress=False)
+    bare = MultiViewPredictorCorrector(steps=20, gamma=0.0, corrector_steps=0)
+    ours, mas = (
+        sampler.sample(posterior, draws=6, seed=3, progress=False)
+        for sampler in (bare, MultiViewAncestral(steps=20))
+    )
     np.testing.assert_array_equal(ours.positions, mas.positions)
     assert ours.counts == mas.counts
-    for change in ({"gamma": 0.5}, {"corrector_steps": 1}):
-        other = replace(bare, **change).sample(posterior, draws=6, chains=2, seed=3, progress=False)
-        assert abs(other.positions.values - mas.positions.values).max() > 1e-3
 
 
 @pytest.mark.parametrize(
     ("settings", "calls"),
     [
         ({}, 475),
-        ({"steps": 100}, 955),
-        ({"steps": 100, "corrector_steps": 2, "corrector_size": 0.4}, 1410),
-        ({"steps": 100, "corrector_steps": 3, "corrector_size": 0.3}, 1865),
+        ({"steps": 100, "corrector_steps": 3}, 1865),
     ],
 )
 def test_evaluations_are_counted(gaussian, settings, calls):
@@ -48,24 +41,6 @@ def test_gamma_by_noise_level():
     sampler = MultiViewPredictorCorrector()
     levels = (0.01, 0.15, 0.499, 0.5, 1.0, 50.0)
     assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 0.5, 0.5, 0.5]
-
-
-def test_noise_has_the_covariance_lambda_to_the_gamma(assert_covariance):
-    sampler = MultiViewPredictorCorrector(n_views=4, elevation=0.6, gamma=0.8)
-    views = Views(Cameras.ring(4, elevation=0.6))
-    spread = 4 * np.linalg.inv(views.gram)
-    np.testing.assert_allclose(np.trace(np.linalg.inv(spread)), 2, atol=1e-12)
-    factor = sampler._noise_factor(views)
-    assert factor(0.1) is None
-    values, vectors = np.linalg.eigh(spread)
-    expected = vectors @ np.diag(values**0.8) @ vectors.T
-    for level in (0.6, 3.0):
-        np.testing.assert_allclose(factor(level) @ factor(level).T, expected, atol=1e-12)
-        state = MotionState(MultiViewDenoiser(None, views), sampler.schedule, (1, 1, 3))
-        state.noise_factor = factor
-        t = int(np.argmin(abs(np.sqrt(1 / sampler.schedule.alpha_bar - 1) - level)))
-        streams = NormalStreams([np.random.default_rng(i) for i in range(4000)])
-        assert_covariance(state.noise(streams, t), expected)
 
 
 def mvpc_covariance(prior, sampler):
@@ -82,7 +57,7 @@ def mvpc_covariance(prior, sampler):
         return denoiser.denoise(unit, schedule.alpha_bar[t]).reshape(n, n).T
 
     def noise(t):
-        power = 0.5 if sigma[t] >= 0.5 else 0.0
+        power = sampler.gamma if sigma[t] >= 0.5 else 0.0
         return np.kron(np.eye(n // 3), (vectors * values**power) @ vectors.T)
 
     covariance = noise(schedule.steps)
@@ -98,16 +73,23 @@ def mvpc_covariance(prior, sampler):
     return matrix(1) @ covariance @ matrix(1).T
 
 
-@pytest.mark.parametrize("corrector_steps", [0, 2])
-def test_draws_have_the_exact_covariance(gaussian, assert_covariance, corrector_steps):
-    sampler = MultiViewPredictorCorrector(steps=8, corrector_steps=corrector_steps)
+@pytest.mark.parametrize("options", [{"corrector_steps": 0, "gamma": 0.8}, {"corrector_steps": 2}])
+def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
+    sampler = MultiViewPredictorCorrector(steps=8, **options)
     draws = sampler.sample(MotionPosterior(gaussian), draws=10_000, seed=4, progress=False)
     expected = mvpc_covariance(replace(gaussian, mean=np.zeros_like(gaussian.mean)), sampler)
-    mean = draws.flat().mean(axis=0)
-    assert_covariance(draws.flat() - mean, expected * gaussian.scale**2)
+    assert_covariance(draws.flat() - gaussian.mean, expected * gaussian.scale**2)
 
 
-def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion, assert_covariance):
+def test_an_isotropic_gaussian_is_not_sampled_exactly(gaussian_motion):
+    prior = gaussian_motion(np.zeros((1, 1, 3)), np.eye(3))
+    variance = np.diag(mvpc_covariance(prior, MultiViewPredictorCorrector()))
+    # Λ is about (1.9, 1, 1.9), and the variance is larger along the same axes.
+    assert variance[0] > 1.1
+    assert variance[0] > variance[1] + 0.1
+
+
+def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion):
     """Langevin dynamics with γ = 1: stationary density Π_v p_v(P_v X)^(1/V), a Gaussian here."""
     rng = np.random.default_rng(2)
     root = rng.normal(size=(6, 6))
@@ -132,43 +114,3 @@ def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion, assert_c
         after = move @ pool @ move.T + 2 * size * (1 - alpha_bar) * spread
         gaps.append(abs(after - pool).max())
     assert gaps[0] == pytest.approx(4 * gaps[1], rel=1e-9)
-
-    # The corrector of the sampler has this drift and noise.
-    sampler = MultiViewPredictorCorrector(elevation=0.4, corrector_size=0.3, gamma=1.0)
-    schedule = sampler.schedule
-    t = int(np.argmin(abs(schedule.alpha_bar - alpha_bar)))
-    state = MotionState(denoiser, schedule, (1, 2, 3), None, sampler._noise_factor(views))
-    at = schedule.alpha_bar[t]
-    pull = math.sqrt(at) * denoiser.denoise(unit, at).reshape(6, 6).T - np.eye(6)
-    correct = sampler._corrector()
-    start = rng.normal(size=(1, 1, 2, 3))
-    streams = NormalStreams([np.random.default_rng(i) for i in range(6000)])
-    moved = correct(state, streams, np.repeat(start, 6000, axis=0), t).reshape(6000, 6)
-    mean = (np.eye(6) + 0.3 * pull) @ start.ravel()
-    assert_covariance(moved - mean, 2 * 0.3 * (1 - at) * spread)
-
-
-def test_the_corrector_is_skipped_at_low_noise(gaussian):
-    sampler = MultiViewPredictorCorrector(steps=50)
-    views = Views(Cameras.ring(5, elevation=0.2))
-    state = MotionState(
-        MultiViewDenoiser(gaussian, views), sampler.schedule, (2, 2, 3), None, lambda level: None
-    )
-    x = np.ones((1, 2, 2, 3))
-    levels = np.sqrt(1 / sampler.schedule.alpha_bar - 1)
-    for t in range(1, 50):
-        streams = NormalStreams([np.random.default_rng(t)])
-        changed = not np.array_equal(sampler._corrector()(state, streams, x, t), x)
-        assert changed == (levels[t] >= 0.15)
-
-
-def test_an_isotropic_gaussian_is_not_sampled_exactly(gaussian_motion):
-    prior = gaussian_motion(np.zeros((1, 1, 3)), np.eye(3))
-    posterior = MotionPosterior(prior)
-    sampler = MultiViewPredictorCorrector(steps=50)
-    draws = sampler.sample(posterior, draws=4000, progress=False).flat()
-    variance = draws.reshape(-1, 3).var(axis=0)
-    # Λ is about 1.9, 1, 1.9 here, and the variance is larger along the same axes.
-    # A sample variance has standard deviation √(2/4000) = 0.022 of itself.
-    assert variance[0] > 1 + 4 * 0.022
-    assert variance[0] > variance[1] + 2 * 0.032

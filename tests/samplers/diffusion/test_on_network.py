@@ -33,7 +33,7 @@ SIZE = replace(DiffusionSettings.tiny(frames=10), width=24, heads=2, feedforward
 
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory):
-    """A network trained for two seconds on waving figures in random views."""
+    """A small network trained on waving figures in random views."""
     rng = np.random.default_rng(0)
     time, tracks = np.arange(10) / 10, []
     for number in range(200):
@@ -59,33 +59,23 @@ def prior(tmp_path_factory):
 def drawn(sampler, prior, likelihood=None, draws=3, seed=0):
     posterior = MotionPosterior(prior, likelihood)
     result = sampler.sample(posterior, draws=draws, seed=seed, progress=False)
-    found = result.positions.values[0]
-    assert found.shape == (draws, prior.frames, 4, 3)
-    assert np.isfinite(found).all()
-    return found
+    motions = result.positions.values[0]
+    assert motions.shape == (draws, prior.frames, 4, 3)
+    assert np.isfinite(motions).all()
+    return motions
 
 
-WEIGHTS = (5.0, 1.0, 1.0, 1.0, 1.0)
 OPTIONS = [
     (MultiViewAncestral, {"n_views": 2}),
-    (MultiViewAncestral, {"n_views": 7}),
-    (MultiViewAncestral, {"elevation": 0.6}),
     (MultiViewAncestral, {"shared_noise": False}),
-    (MultiViewAncestral, {"view_weights": WEIGHTS}),
-    (MultiViewAncestral, {"perspective": True}),
     (MultiViewAncestral, {"perspective": True, "distance": 4.0}),
-    (MultiViewAncestral, {"perspective": True, "view_weights": WEIGHTS}),
+    (MultiViewAncestral, {"perspective": True, "view_weights": (5.0, 1.0, 1.0, 1.0, 1.0)}),
     (MultiViewAncestral, {"perspective": True, "shared_noise": False}),
     (MultiViewAncestral, {"perspective": True, "trained_steps": 100}),
-    (MultiViewAncestral, {"trained_steps": 100}),
-    (MultiViewAncestral, {"variance_for_deviation": True}),
     (MultiViewAncestral, {"stop_level": 2}),
-    (MultiViewAncestral, {"schedule_power": 4}),
-    (MultiViewPredictorCorrector, {"corrector_steps": 0}),
     (MultiViewPredictorCorrector, {"corrector_steps": 2, "trained_steps": 100, "n_views": 3}),
     (ScoreDistillation, {"levels": "annealed"}),
     (ScoreDistillation, {"shared_noise": True, "n_views": 3}),
-    (ScoreDistillation, {"weighting": "variance", "n_views": 2}),
     (ScoreDistillation, {"weighting": "residual"}),
 ]
 
@@ -95,20 +85,20 @@ OPTIONS = [
 )
 def test_every_option_changes_the_draws(prior, kind, options):
     plain = {"iterations": 20} if kind is ScoreDistillation else {"steps": 6}
-    default, found = (drawn(kind(**plain, **some), prior) for some in ({}, options))
-    assert 0.05 < found.std() < 2
-    assert abs(found[0] - found[1]).max() > 1e-3
-    assert abs(found - default).max() > 1e-4
+    default, changed = (drawn(kind(**plain, **some), prior) for some in ({}, options))
+    assert 0.05 < changed.std() < 2
+    assert abs(changed[0] - changed[1]).max() > 1e-3
+    assert abs(changed - default).max() > 1e-4
 
 
 def test_motions_are_upright(prior):
     for perspective in (False, True):
         sampler = MultiViewAncestral(steps=25, trained_steps=100, perspective=perspective)
-        found = drawn(sampler, prior, draws=4)
-        height = found[..., 3, 1] - found[..., 0, 1]
+        motions = drawn(sampler, prior, draws=4)
+        height = motions[..., 3, 1] - motions[..., 0, 1]
         # Y is up in 3D and down in images.
         assert height.mean() == pytest.approx(0.6, abs=0.15)
-        np.testing.assert_allclose(found[..., 0, :], 0, atol=0.02)
+        np.testing.assert_allclose(motions[..., 0, :], 0, atol=0.02)
 
 
 def test_single_views(prior):
@@ -116,12 +106,22 @@ def test_single_views(prior):
     views = sampler.sample_views(posterior, draws=4, progress=False)
     assert views.shape == (4, 10, 4, 2)
     assert views[:, :, 3, 1].mean() == pytest.approx(-0.6, abs=0.15)
-    small = replace(sampler, batch=1).sample_views(posterior, draws=4, progress=False)
-    np.testing.assert_array_equal(small, views)
+    alone = replace(sampler, batch=1).sample_views(posterior, draws=4, progress=False)
+    np.testing.assert_array_equal(alone, views)
 
 
-def check_guidance(prior, sampler, kind="joints"):
-    """Guided draws are closer to observed motions than free ones."""
+GUIDED = [
+    *(
+        MultiViewAncestral(steps=15, trained_steps=100, guidance=guidance)
+        for guidance in (MomentMatched(), Replacement(), WeightedTriangulation(20.0), DPS(0.5))
+    ),
+    MultiViewPredictorCorrector(steps=15),
+]
+
+
+@pytest.mark.parametrize("kind", ["keypoints", "joints"])
+@pytest.mark.parametrize("sampler", GUIDED, ids=lambda some: f"{some.name}-{some.guidance.kind}")
+def test_guided_draws_are_closer_to_the_observations(prior, sampler, kind):
     truth = drawn(sampler, prior, draws=1, seed=9)[0]
     cameras = Cameras.around([0.3], [0.1])
     project = cameras.project if kind == "keypoints" else np.asarray
@@ -135,20 +135,6 @@ def check_guidance(prior, sampler, kind="joints"):
     assert guided < 0.7 * free
 
 
-@pytest.mark.parametrize("kind", ["keypoints", "joints"])
-@pytest.mark.parametrize(
-    "guidance",
-    [MomentMatched(), Replacement(), WeightedTriangulation(weight=20.0), DPS(step_size=0.5)],
-    ids=lambda guidance: guidance.kind,
-)
-def test_guided_mas(prior, guidance, kind):
-    check_guidance(prior, MultiViewAncestral(steps=15, trained_steps=100, guidance=guidance), kind)
-
-
-def test_guided_mvpc(prior):
-    check_guidance(prior, MultiViewPredictorCorrector(steps=15))
-
-
 SAMPLERS = [
     MultiViewAncestral(steps=6),
     MultiViewAncestral(steps=6, perspective=True),
@@ -160,9 +146,9 @@ SAMPLERS = [
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_draws_do_not_depend_on_the_batch_to_the_last_bit(prior, sampler):
-    whole = drawn(sampler, prior, draws=13)
-    for batch in (1, 5):
-        np.testing.assert_array_equal(drawn(replace(sampler, batch=batch), prior, draws=13), whole)
+    motions = drawn(sampler, prior, draws=13)
+    batched = drawn(replace(sampler, batch=5), prior, draws=13)
+    np.testing.assert_array_equal(batched, motions)
 
 
 def test_short_motions(prior):

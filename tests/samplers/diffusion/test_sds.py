@@ -18,10 +18,7 @@ from probmotion.samplers.diffusion.views import Views
 
 @pytest.mark.parametrize("alpha_bar", [0.05, 0.6, 0.99])
 def test_gradient_is_that_of_the_mas_loss_up_to_the_noise_level(gaussian, alpha_bar):
-    """MAS, appendix B: for x_t noised from X, ∇½‖p(X) − x̂₀‖² = √(1−ᾱ)/√ᾱ (ε_φ − ε) ∂p/∂X.
-
-    (Equation 7 prints the difference with the opposite sign, and omits the ½.)
-    """
+    """MAS, appendix B: for x_t noised from X, ∇½‖p(X) − x̂₀‖² = √(1−ᾱ)/√ᾱ (ε_φ − ε) ∂p/∂X."""
     rng = np.random.default_rng(0)
     views = Views(Cameras.around([0.3, 2.0, 4.1], [0.2, 0.5, -0.1]))
     motions = rng.normal(size=(2, 2, 2, 3))
@@ -37,9 +34,9 @@ def test_gradient_is_that_of_the_mas_loss_up_to_the_noise_level(gaussian, alpha_
     for i, direction in enumerate(np.eye(12).reshape(12, 1, 2, 2, 3)):
         up, down = loss(motions + step * direction), loss(motions - step * direction)
         slopes[:, i] = (up - down) / (2 * step)
-    found = score_distillation_gradient(gaussian, views, motions, noise, alpha_bar)
+    gradient = score_distillation_gradient(gaussian, views, motions, noise, alpha_bar)
     level = math.sqrt((1 - alpha_bar) / alpha_bar)
-    np.testing.assert_allclose(level * found.reshape(2, 12), slopes, atol=1e-7)
+    np.testing.assert_allclose(level * gradient.reshape(2, 12), slopes, atol=1e-7)
     for weighting, weight in (("residual", level), ("variance", 1 - alpha_bar), ("constant", 1)):
         assert ScoreDistillation(weighting=weighting).weight(alpha_bar) == pytest.approx(weight)
 
@@ -75,26 +72,15 @@ def test_plan_covers_levels_and_azimuths():
     assert (uniform.plan(1)[0] != uniform.plan(0)[0]).any()
 
 
-@pytest.mark.parametrize("levels", ["uniform", "annealed"])
-def test_draws_concentrate_at_the_mode(gaussian_motion, levels):
+def test_draws_concentrate_at_the_mode(gaussian_motion):
     mean = np.random.default_rng(0).normal(size=(1, 2, 3))
     prior = gaussian_motion(mean, 0.25 * np.eye(6))
-    sampler = ScoreDistillation(iterations=1500, levels=levels, elevation=0.4)
+    sampler = ScoreDistillation(iterations=1500, elevation=0.4)
     draws = sampler.sample(MotionPosterior(prior), draws=30, progress=False)
     assert draws.counts == {"denoiser": 30 * 1500}
     assert abs(draws.flat().mean(axis=0) - mean).max() < 0.1
     # The standard deviation of the prior is 0.5.
     assert draws.flat().std(axis=0).max() < 0.2
-
-
-def test_shared_noise_changes_the_draws_of_several_views(gaussian):
-    posterior = MotionPosterior(gaussian)
-    one = ScoreDistillation(iterations=20, n_views=2)
-    both = [
-        replace(one, shared_noise=shared).sample(posterior, draws=3, progress=False).flat()
-        for shared in (False, True)
-    ]
-    assert abs(both[0] - both[1]).max() > 1e-3
 
 
 def test_the_reference_code_covers_one_radian(gaussian, monkeypatch):

@@ -15,7 +15,7 @@ QUICK = Ensemble(walkers=8, warmup=20, thin=5, candidates=1)
 
 
 def emcee_run(posterior, iterations):
-    """Return emcee's own sampler after the second chain of :func:`run`."""
+    """Return emcee's sampler after the second chain of the fixture ``run``."""
     import emcee
 
     source = np.random.RandomState(np.random.MT19937(seeds.sequence(3, "chain", 1)))
@@ -35,25 +35,21 @@ def test_draws_are_those_of_emcee(posterior, run):
     # The run is shorter than 3 times its estimate: all 13 recorded iterations count as one.
     assert 65 / 3 < autocorrelation_time(chain).max() < 65 / 2
     assert long.dataset["autocorrelation_time"][1] == 13
-    # emcee counts the moves of all 65 iterations, we those between them.
+    # emcee counts the moves of all 65 iterations, `Ensemble` those between them.
     accepted = sampler.acceptance_fraction.mean()
     assert abs(long.dataset["acceptance"][1] - accepted) <= 1 / 64
 
 
 def test_long_runs_estimate_their_autocorrelation_time(posterior, run):
-    found = run(QUICK, 800).dataset["autocorrelation_time"][1]
+    time = run(QUICK, 800).dataset["autocorrelation_time"][1]
     slowest = autocorrelation_time(emcee_run(posterior, 500).get_chain()).max()
     assert 5 < slowest < 500 / 3
-    np.testing.assert_allclose(found, slowest / 5)
+    np.testing.assert_allclose(time, slowest / 5)
 
 
-def test_evaluations_are_counted(run, evaluations):
-    draws = run(QUICK, 16)
-    assert draws.counts == {"density": sum(evaluations)}
+def test_evaluations_are_counted_and_walkers_start_at_initial(run, two_modes, evaluations):
+    assert run(QUICK, 16).counts == {"density": sum(evaluations)}
     assert sum(evaluations) == 2 * 8 * (1 + 20 + 2 * 5)
-
-
-def test_walkers_start_at_initial(run, two_modes):
     points = two_modes.initial(np.random.default_rng(0), 16).reshape(2, 8, 3)
     draws = run(Ensemble(walkers=8, warmup=0, thin=1), 8, initial=points)
     same = (draws.dataset["theta"].values == points).all(axis=-1)
@@ -74,8 +70,7 @@ def test_numbers_of_walkers_and_dimensions_are_checked(run):
     assert draws.state["coordinates"].shape == (2, 12, 3)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.9])
-@pytest.mark.parametrize("iterations", [60, 4000])
+@pytest.mark.parametrize(("correlation", "iterations"), [(0.0, 60), (0.9, 60), (0.9, 4000)])
 def test_autocorrelation_time_of_an_autoregressive_process(correlation, iterations):
     """x' = ρ x + √(1−ρ²) ε has time (1 + ρ)/(1 − ρ), also in a run of three times that length."""
     rng = np.random.default_rng(0)
@@ -85,14 +80,10 @@ def test_autocorrelation_time_of_an_autoregressive_process(correlation, iteratio
         trace[t] = correlation * trace[t - 1] + np.sqrt(1 - correlation**2) * noise[t]
     wanted = (1 + correlation) / (1 - correlation)
     np.testing.assert_allclose(autocorrelation_time(trace), wanted, rtol=0.2, atol=0.1)
-
-
-def test_autocorrelation_time_of_a_constant_is_nan():
-    trace = np.zeros((20, 4, 2))
-    trace[..., 1] = np.random.default_rng(0).normal(size=(20, 4))
-    still, moving = autocorrelation_time(trace)
-    assert np.isnan(still)
-    assert np.isfinite(moving)
+    trace[..., 0] = 3.0
+    constant, varying = autocorrelation_time(trace)
+    assert np.isnan(constant)
+    assert np.isfinite(varying)
 
 
 @pytest.mark.parametrize("thin", [1, 3])
@@ -103,8 +94,8 @@ def test_short_runs_have_no_autocorrelation_time(run, tmp_path, thin):
         run(sampler, draws, chains=4).save(tmp_path / "short.nc")
         loaded = MotionDraws.load(tmp_path / "short.nc")
         diagnostics = chain_diagnostics(loaded)
-        known = np.isfinite(loaded.dataset["autocorrelation_time"].values)
-        assert known.shape == (4,)
-        assert known.any() == ("acceptance" in diagnostics) == (thin == 3 and draws == 10)
+        finite = np.isfinite(loaded.dataset["autocorrelation_time"].values)
+        assert finite.shape == (4,)
+        assert finite.any() == ("acceptance" in diagnostics) == (thin == 3 and draws == 10)
         assert "ess_tail" not in diagnostics
-        assert ("ess_bulk" in diagnostics) == known.all()
+        assert ("ess_bulk" in diagnostics) == finite.all()

@@ -34,16 +34,12 @@ def test_chains_start_at_initial(run):
         ({"seed": 4}, "seed must be 3, as in the run to be continued, got 4; to start a new run"),
         ({"chains": 3}, "chains must be 2, as in the run to be continued, got 3"),
         ({"to": replace(QUICK, thin=4)}, "settings must be .*, as in the run .*'thin': 4"),
-        (
-            {"attributes": {"sampler": "exact"}},
-            "sampler must be exact, as in the run to be continued, got mh",
-        ),
+        ({"of": "exact"}, "sampler must be exact, as in the run to be continued, got mh"),
     ],
 )
 def test_runs_with_other_settings_cannot_be_continued(run, change, message):
-    first = run(QUICK, 2)
-    if "sampler" in change.get("attributes", {}):
-        first = MotionDraws(first.dataset.assign_attrs(**change.pop("attributes")))
+    dataset = run(QUICK, 2).dataset
+    first = MotionDraws(dataset.assign_attrs(sampler=change.pop("of", "mh")))
     with pytest.raises(ValueError, match=message):
         run(change.pop("to", QUICK), 2, initial=first, **change)
 

@@ -57,13 +57,9 @@ def test_thinning_aggregates_the_statistics(run, long):
     thinned = run(replace(QUICK, thin=3), 43).dataset
     for name in ("theta", "log_density"):
         np.testing.assert_array_equal(thinned[name], long.dataset[name][:, 2:129:3])
-    by_threes = {
-        name: long.dataset[name].values[:, :129].reshape(2, 43, 3)
-        for name in ("acceptance", "divergent", "steps")
-    }
-    np.testing.assert_allclose(thinned["acceptance"], by_threes["acceptance"].mean(axis=2))
-    np.testing.assert_array_equal(thinned["divergent"], by_threes["divergent"].any(axis=2))
-    np.testing.assert_array_equal(thinned["steps"], by_threes["steps"].sum(axis=2))
+    for name, combine in (("acceptance", np.mean), ("divergent", np.any), ("steps", np.sum)):
+        threes = long.dataset[name].values[:, :129].reshape(2, 43, 3)
+        np.testing.assert_allclose(thinned[name], combine(threes, axis=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +115,7 @@ def test_jax_from_torch_has_the_value_and_gradient_of_torch(two_modes):
     np.testing.assert_allclose(several, two_modes.log_density(np.stack([at, at + 0.1])))
 
 
-def test_densities_without_a_gradient_are_refused(two_modes):
+def test_densities_without_a_gradient_are_refused(two_modes, mixture):
     class NumpyPrior(TorchPrior):
         def log_density(self, theta):
             return self.prior.log_density(np.asarray(theta))
@@ -129,9 +125,6 @@ def test_densities_without_a_gradient_are_refused(two_modes):
     ) as refused:
         sample(MotionPosterior(NumpyPrior(two_modes)), 2)
     assert refused.value.word == "gradient"
-
-
-def test_marginal_likelihoods_without_a_closed_form_are_refused(mixture):
     outliers = Joints3D(np.zeros((2, 2, 3)), noise=0.5, degrees_of_freedom=4.0)
     with pytest.raises(UnsupportedPosterior, match="cannot evaluate the log density: the noise is"):
         sample(MotionPosterior(mixture, outliers), 2)
@@ -139,15 +132,13 @@ def test_marginal_likelihoods_without_a_closed_form_are_refused(mixture):
 
 def test_code_is_compiled_once_and_not_timed(two_modes):
     likelihood = Joints3D(np.zeros((1, 1, 3)), noise=1.0)
-    observed, sampler = (
-        MotionPosterior(two_modes, likelihood),
-        NUTS(warmup=51, max_tree_depth=1, candidates=2),
-    )
+    observed = MotionPosterior(two_modes, likelihood)
+    sampler = NUTS(warmup=51, max_tree_depth=1, candidates=2)
     start = time.perf_counter()
     reported = sample(observed, 1, sampler=sampler, seed=1).seconds
     assert reported < (time.perf_counter() - start) / 2
     draws = sample(observed, 9, sampler=sampler, seed=8)
     assert (draws.dataset["steps"] == 1).all()
     with jax.enable_x64(True):
-        kernel = compiled(replace(sampler, candidates=1), observed)
+        kernel = compiled(observed, 51, 0.8, 1)
     assert kernel.advance._cache_size() == kernel.log_likelihood._cache_size() == 1

@@ -1,109 +1,13 @@
-"""Tests of symmetric proposals: detailed balance, independence of chains, adaptation."""
+"""Tests of symmetric proposals and their adaptation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from probmotion import MotionPosterior
 from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.mcmc.proposals import AdaptiveCovariance, Isotropic
-
-CHAINS = 8_000
-
-
-@dataclass(frozen=True)
-class DriftingStep:
-    """θ' ~ N(θ + d, s² I), an asymmetric proposal."""
-
-    guided: ClassVar[bool] = False
-
-    corrected: bool = True
-    drift: float = 0.3
-    scale: float = 0.6
-
-    def begin(self, theta):
-        return {}
-
-    def propose(self, generators, theta, guide, state):
-        noise = np.stack([rng.standard_normal(theta.shape[1]) for rng in generators])
-        return theta + self.drift + self.scale * noise
-
-    def log_ratio(self, theta, guide, proposed, proposed_guide, state):
-        if not self.corrected:
-            return np.zeros(len(theta))
-        # log N(−step | d, s²) − log N(step | d, s²)
-        return -2 * self.drift * (proposed - theta).sum(axis=1) / self.scale**2
-
-    def learn(self, state, theta, acceptance):
-        return state
-
-    def settled(self, state):
-        return state
-
-
-def worst_imbalance(prior, proposal):
-    """Count transitions between quartiles along (1, 1, 1) in one step of chains from the target.
-
-    Under detailed balance N(A → B) and N(B → A) have the same mean. Returns the largest of
-    |N(A → B) − N(B → A)| / √(N(A → B) + N(B → A)), each about standard normal.
-    """
-    start = prior.initial(np.random.default_rng(1), CHAINS)
-    sampler = MetropolisHastings(proposal=proposal, warmup=0, thin=1)
-    draws = sampler.sample(
-        MotionPosterior(prior), draws=1, chains=CHAINS, initial=start, progress=False
-    )
-    end = draws.dataset["theta"].values[:, 0]
-
-    edges = np.quantile(start.sum(axis=1), np.arange(1, 4) / 4)
-    flow = np.zeros((4, 4))
-    np.add.at(flow, tuple(np.digitize(theta.sum(axis=1), edges) for theta in (start, end)), 1)
-    both = flow + flow.T
-    np.fill_diagonal(both, 0)
-    counted = both > 20
-    assert counted.sum() >= 8
-    return (np.abs(flow - flow.T)[counted] / np.sqrt(both[counted])).max()
-
-
-# Family-wise failure rate 1e-3 over four two-sided tests of 6 pairs.
-LIMIT = norm.isf(1e-3 / 4 / 12)
-
-
-@pytest.mark.parametrize(
-    "proposal",
-    [Isotropic(scale=0.8), AdaptiveCovariance(scale=0.8), DriftingStep()],
-    ids=["isotropic", "adaptive", "asymmetric"],
-)
-def test_one_step_satisfies_detailed_balance(two_modes, proposal):
-    assert worst_imbalance(two_modes, proposal) < LIMIT
-
-
-def test_detailed_balance_detects_a_missing_proposal_ratio(two_modes):
-    assert worst_imbalance(two_modes, DriftingStep(corrected=False)) > LIMIT
-
-
-def generators(chains, seed=0):
-    return [np.random.default_rng([seed, chain]) for chain in range(chains)]
-
-
-@pytest.mark.parametrize("proposal", [Isotropic(), AdaptiveCovariance()])
-def test_chains_propose_independently(proposal):
-    theta = np.random.default_rng(0).normal(size=(5, 4))
-    acceptance = np.linspace(0.1, 0.9, 5)
-
-    def run(chains):
-        streams, at = generators(chains), theta[:chains]
-        state = proposal.begin(at)
-        for _ in range(120):  # more than the first window
-            at = proposal.propose(streams, at, np.empty((chains, 0)), state)
-            state = proposal.learn(state, at, acceptance[:chains])
-        return at
-
-    np.testing.assert_array_equal(run(5)[:2], run(2))
 
 
 def test_adaptive_covariance_learns_the_covariance_of_the_chain():
@@ -128,7 +32,9 @@ def test_a_chain_that_never_moved_has_a_valid_covariance():
     state = proposal.begin(np.zeros((1, 3)))
     for _ in range(50):
         state = proposal.learn(state, np.zeros((1, 3)), np.zeros(1))
-    proposed = proposal.propose(generators(1), np.zeros((1, 3)), np.empty((1, 0)), state)
+    proposed = proposal.propose(
+        [np.random.default_rng(0)], np.zeros((1, 3)), np.empty((1, 0)), state
+    )
     assert np.isfinite(proposed).all()
     assert (proposed != 0).all()
 
@@ -138,7 +44,7 @@ def test_warm_up_reaches_the_target_acceptance(two_modes, proposal):
     sampler = MetropolisHastings(proposal=proposal, warmup=1500, thin=1)
     draws = sampler.sample(MotionPosterior(two_modes), draws=1000, chains=8, progress=False)
     chains = draws.dataset["acceptance"].values.mean(axis=1)
-    # Robbins-Monro steps of size n^(−0.6) leave log s with a spread of about n^(−0.3).
+    # After Robbins-Monro steps of size n^(−0.6) log s has a spread of about n^(−0.3).
     assert np.abs(chains.mean() - 0.4) < 0.04
     assert np.abs(chains - 0.4).max() < 0.12
 

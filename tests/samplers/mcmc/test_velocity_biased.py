@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from probmotion import MotionPosterior, UnsupportedPosterior
+from probmotion import MotionDraws, MotionPosterior, UnsupportedPosterior
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import ComparesViews, HasCoordinateSpeeds
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -19,7 +19,7 @@ from probmotion.samplers import NUTS, MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic, VelocityBiased
 
 POINT = Skeleton(["point"], [-1])
-CHAINS, DRAWS, THIN = 40, 300, 20
+CHAINS, DRAWS, THIN = 40, 200, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +88,8 @@ def moments(sampler, likelihood):
     )
     draws = sampler.sample(posterior, draws=DRAWS, chains=CHAINS, initial=start, progress=False)
     x = draws.dataset["theta"].values[..., 0]
-    z = []
-    for found, truth in ((x.mean(axis=1), 0.8), (((x - 0.8) ** 2).mean(axis=1), 0.8)):
-        z.append((found.mean() - truth) / (found.std(ddof=1) / np.sqrt(CHAINS)))
-    return np.abs(z)
+    both = np.stack([x, (x - 0.8) ** 2]).mean(axis=2)
+    return np.abs(both.mean(axis=1) - 0.8) / (both.std(axis=1, ddof=1) / np.sqrt(CHAINS))
 
 
 def mh(proposal, **settings):
@@ -129,30 +127,25 @@ def test_log_ratio_is_that_of_the_normal_densities():
     rng = np.random.default_rng(1)
     theta, proposed, guide, other = rng.random((4, 5, 3))
     state = proposal.begin(theta)
-    there, back = (0.7 * np.sqrt(0.04 + 2 * some) for some in (guide, other))
-    expected = (norm.logpdf(theta, proposed, back) - norm.logpdf(proposed, theta, there)).sum(1)
-    found = proposal.log_ratio(theta, guide, proposed, other, state)
-    assert np.allclose(found, expected)
-    assert np.allclose(proposal.log_ratio(proposed, other, theta, guide, state), -expected)
+    forward, backward = (0.7 * np.sqrt(0.04 + 2 * some) for some in (guide, other))
+    expected = norm.logpdf(theta, proposed, backward) - norm.logpdf(proposed, theta, forward)
+    ratio = proposal.log_ratio(theta, guide, proposed, other, state)
+    np.testing.assert_allclose(ratio, expected.sum(axis=1))
 
 
-@pytest.mark.parametrize("pseudo_marginal", [False, True])
-def test_continuing_equals_one_run(pseudo_marginal, tmp_path):
-    sampler = MetropolisHastings(
-        proposal=VelocityBiased(), warmup=30, thin=2, pseudo_marginal=pseudo_marginal
-    )
+def test_continuing_equals_one_run(tmp_path):
+    sampler = MetropolisHastings(proposal=VelocityBiased(), warmup=30, thin=2, pseudo_marginal=True)
     posterior = MotionPosterior(Point(), Annotations(noise=0.5))
-    whole = sampler.sample(posterior, draws=20, chains=3, seed=4, progress=False)
-    first = sampler.sample(posterior, draws=8, chains=3, seed=4, progress=False)
-    first.save(tmp_path / "first.nc")
-    first = type(first).load(tmp_path / "first.nc")
-    rest = sampler.sample(posterior, draws=12, chains=3, seed=4, initial=first, progress=False)
+    complete = sampler.sample(posterior, draws=20, chains=3, progress=False)
+    sampler.sample(posterior, draws=8, chains=3, progress=False).save(tmp_path / "first.nc")
+    first = MotionDraws.load(tmp_path / "first.nc")
+    rest = sampler.sample(posterior, draws=12, chains=3, initial=first, progress=False)
     theta = [run.dataset["theta"].values for run in (first, rest)]
-    assert np.array_equal(np.concatenate(theta, axis=1), whole.dataset["theta"].values)
+    np.testing.assert_array_equal(np.concatenate(theta, axis=1), complete.dataset["theta"])
 
 
 def test_pseudo_marginal_chains_are_independent():
-    """Also if some proposals leave the support of the prior, where no views are drawn."""
+    """Also for proposals outside the support of the prior, for which no views are drawn."""
 
     class Bounded(Point):
         def log_density(self, theta):
@@ -169,18 +162,16 @@ def test_pseudo_marginal_chains_are_independent():
 
 
 def test_estimates_of_another_posterior_are_not_continued():
-    sampler = mh(Isotropic(1.0, None), pseudo_marginal=True)
-    first = sampler.sample(MotionPosterior(Point(), Annotations(0.5)), draws=3, progress=False)
-
     class Steeper(Annotations):
         def evaluate(self, positions, generators=None):
             log_density, closest = super().evaluate(positions, generators)
             return 3 * log_density - 1, closest
 
+    sampler = mh(Isotropic(1.0, None), pseudo_marginal=True)
+    posterior, other = (MotionPosterior(Point(), kind(0.5)) for kind in (Annotations, Steeper))
+    first = sampler.sample(posterior, draws=3, progress=False)
     with pytest.raises(ValueError, match="initial must be a run of the same posterior"):
-        sampler.sample(
-            MotionPosterior(Point(), Steeper(0.5)), draws=3, initial=first, progress=False
-        )
+        sampler.sample(other, draws=3, initial=first, progress=False)
 
 
 def test_unsupported_likelihoods_are_refused(two_modes):
@@ -191,9 +182,6 @@ def test_unsupported_likelihoods_are_refused(two_modes):
         UnsupportedPosterior, match="which Annotations does not have; try ensemble, mh"
     ):
         NUTS().sample(MotionPosterior(Point(), Annotations()), draws=2, progress=False)
-
-
-def test_truncated_posteriors_have_no_pseudo_marginal_chains():
     posterior = TruncatedPosterior(Point(), Annotations(noise=0.5), limit=100)
     with pytest.raises(ValueError, match="limit must be infinite"):
         mh(Isotropic(), pseudo_marginal=True).sample(posterior, draws=2, progress=False)
