@@ -46,9 +46,7 @@ class ExactSampler(IndependentSampler):
         return Batches(draw, size=1)
 
 
-def _closed_form(
-    posterior: MotionPosterior,
-) -> tuple[ExactPosterior | Samplable | None, str, str]:
+def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable | None, str, str]:
     """Return the posterior in closed form, or ``None``; the reason, and the reason in one word."""
     prior = posterior.prior
     if posterior.truncated:

@@ -61,8 +61,8 @@ class DenoiserTrainee(WindowTrainee):
         annealing: int = 0,
         seed: int = 0,
     ) -> None:
-        options = {"weight": latent_weight, "annealing": annealing, "seed": seed}
-        super().__init__(clips, validation, prior.states, prior.settings.frames, **options)
+        states, frames = prior.states, prior.settings.frames
+        super().__init__(clips, validation, states, frames, latent_weight, annealing, seed)
         self.prior = prior
         self.noise = JointNoise() if noise is None else noise
         self.network = DenoisingNetworks(prior, seed)

@@ -1,7 +1,8 @@
 """Amortised inference from noisy joints: q(x₀, z, v | y) and its evidence lower bound (B to E).
 
 q = q_ω(x₀ | y) Π_t q_φ(z_t | z_{1:t−1}, y_{t:T}, x₀) q_γ(v_t | z_{1:t}, y_t, x₀) with the networks
-of the prior fixed. q_ω also covers position and heading, which noisy joints determine only roughly.
+of the prior fixed. q_ω also covers position and heading, which noisy joints determine only
+approximately.
 """
 
 from __future__ import annotations
@@ -138,12 +139,12 @@ class Denoiser:
     ) -> InferenceDraw:
         """Return one draw from q per window.
 
-        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; 0 gives the means.
+        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; 0 for the means.
         """
         model = self.prior.model
         trust = torch.where(windows.seen, trust_weight(windows.noise), 0.0)
-        roughly = windows.in_frame(windows.heading, windows.ground)
-        mean, log_scale = self.networks.first_state(model.observed(roughly, trust, windows.tails))
+        placed = windows.in_frame(windows.heading, windows.ground)
+        mean, log_scale = self.networks.first_state(model.observed(placed, trust, windows.tails))
         drawn = mean + torch.exp(log_scale) * first_noise
         heading = windows.heading + _TURN * drawn[:, 2]
         moved = on_ground(_GROUND * drawn[:, :2])[:, None, None, :]
@@ -154,17 +155,13 @@ class Denoiser:
             joints, trust, windows.tails, self.prior.states, windows.bodies
         )
         start = model.first_states(drawn[:, 3:])
-        rolled = rollout(
-            model.generative,
-            model.standardised(start),
-            noise,
-            self.networks.encoder.conditioned(inputs),
-        )
+        standard, encoder = model.standardised(start), self.networks.encoder.conditioned(inputs)
+        rolled = rollout(model.generative, standard, noise, encoder)
         states = torch.cat([start[:, None], model.decoded(rolled)], dim=1)
         canonical = self.prior.states.positions(states, windows.bodies)
         positions = turned_about_vertical(canonical, heading) + on_ground(ground)[:, None, None, :]
-        begun = model.generative.start(model.standardised(start)).hidden
-        hidden = torch.stack([begun, *(state.hidden for state in rolled.states)], dim=1)
+        first_hidden = model.generative.start(standard).hidden
+        hidden = torch.stack([first_hidden, *(state.hidden for state in rolled.states)], dim=1)
         kl = self._first_kl(windows, mean, log_scale)
         return InferenceDraw(
             positions, rolled, drawn[:, 3:], heading, ground, inputs.observed, hidden, kl
@@ -185,9 +182,9 @@ class Denoiser:
             alpha, beta = self._noise_shape(windows, inferred, heavy)
             expected = expected_log_normal(residual, alpha, beta, scale)
             prior = _half_freedom(windows, heavy)[:, None, None, None].expand_as(alpha)
-            apart = inverse_gamma_kl(alpha, beta, prior, prior)
+            divergence = inverse_gamma_kl(alpha, beta, prior, prior)
             data = torch.where(heavy, torch.where(seen, expected, 0.0).sum((1, 2, 3)), data)
-            kl = torch.where(heavy, torch.where(seen, apart, 0.0).sum((1, 2, 3)), kl)
+            kl = torch.where(heavy, torch.where(seen, divergence, 0.0).sum((1, 2, 3)), kl)
         start = inferred.first_kl if first else torch.zeros_like(data)
         return Bound(data, inferred.rolled.kl, kl, start)
 
@@ -219,9 +216,8 @@ class Denoiser:
         spread = self.prior.spread / _GROUND
         at_origin = -on_ground(windows.ground)[:, None, None, :]
         origin = turned_about_vertical(at_origin, -windows.heading)[:, 0, 0, [0, 2]] / _GROUND
-        place = gaussian_kl(
-            mean[:, :2], log_scale[:, :2], origin, torch.full_like(origin, math.log(spread))
-        )
+        log_spread = torch.full_like(origin, math.log(spread))
+        place = gaussian_kl(mean[:, :2], log_scale[:, :2], origin, log_spread)
         zero = torch.zeros_like(mean[:, 3:])
         pose = gaussian_kl(mean[:, 3:], log_scale[:, 3:], zero, zero)
         entropy = 0.5 * math.log(2 * math.pi * math.e) + log_scale[:, 2] + math.log(_TURN)

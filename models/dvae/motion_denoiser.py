@@ -92,23 +92,12 @@ class MotionDenoiser:
         degrees_of_freedom: float | None = None,
         overlap: int = 10,
     ) -> NoisyMotion:
-        """Return the inference of one recording, with its own copy of the networks.
+        """Return the inference of one recording, with a copy of the networks.
 
-        Parameters
-        ----------
-        prior : MotionDVAE
-            This denoiser's prior, with any length and body.
-        likelihood : Joints3D
-            Observations.
-        degrees_of_freedom : float, optional
-            Assumed λ of the noise; ``inf`` for Gaussian. By default the likelihood's.
-        overlap : int
-            Overlap of windows in frames, less than the window length.
-
-        Raises
-        ------
-        ValueError
-            If the prior is another one, a whole window is occluded, or ``overlap`` is out of range.
+        ``prior`` is this denoiser's prior, with any length and body. ``degrees_of_freedom``
+        overrides the likelihood's λ (``inf``: Gaussian noise). Windows overlap by ``overlap``
+        frames, fewer than their length. Raises ``ValueError`` for another prior, a window without a
+        visible joint, or an overlap out of range.
         """
         _check_kind(prior)
         same = prior.model is self.prior.model

@@ -20,6 +20,7 @@ from probmotion.arrays import Array
 from probmotion.models.bodies.body_states import BodyStates, check_bones, turned_about_vertical
 from probmotion.models.dvae.latent_rollouts import rollout
 from probmotion.models.dvae.network import DVAEModel
+from probmotion.models.dvae.noisy_windows import on_ground
 from probmotion.models.dvae.settings import DVAESettings
 from probmotion.models.latent.row_decoding import decode_rows
 from probmotion.models.latent.standard_normal import StandardNormalPrior
@@ -201,8 +202,7 @@ class MotionDVAE(StandardNormalPrior):
         rolled = rollout(model.generative, model.standardised(start), noise)
         states = torch.cat([start[:, None], model.decoded(rolled)], dim=1)
         result = turned_about_vertical(self.states.positions(states, self.body), heading)
-        moved = torch.stack([ground[:, 0], torch.zeros_like(heading), ground[:, 1]], dim=-1)
-        return result + moved[:, None, None, :]
+        return result + on_ground(ground)[:, None, None, :]
 
     @cached_property
     def _double(self) -> DVAEModel:

@@ -122,7 +122,6 @@ class WindowTrainee:
         validation: Sequence[Motion],
         states: BodyStates,
         frames: int,
-        *,
         weight: float,
         annealing: int,
         seed: int,

@@ -106,7 +106,7 @@ class DVAEModel(nn.Module):
         return self.state_mean + self.state_deviation * self.generative.decode(rolled.states)
 
     def first_states(self, coordinates: torch.Tensor) -> torch.Tensor:
-        """Return x₀ from its coordinates, ``(…, r) → (…, D)``; N(0, I) coordinates give p(x₀)."""
+        """Return x₀ from its coordinates, ``(…, r) → (…, D)``; N(0, I) maps to p(x₀)."""
         return self.initial_mean + coordinates @ self.initial_factor.T
 
     def observed(

@@ -105,16 +105,16 @@ def rough_placement(
     visible = np.where(seen[..., None], joints, 0.0).sum(axis=2) / np.maximum(count, 1)[..., None]
     rooted = seen[:, :, root].sum(axis=1) > 0
     points = np.where(rooted[:, None, None], np.nan_to_num(joints[:, :, root]), visible)
-    there = np.where(rooted[:, None], seen[:, :, root], count > 0)
-    first = _over_first(np.ones_like(there, dtype=float)[..., None], there)
+    valid = np.where(rooted[:, None], seen[:, :, root], count > 0)
+    first = _over_first(np.ones_like(valid, dtype=float)[..., None], valid)
     ground = (first * points).sum(axis=1) / first.sum(axis=1)
     return heading, ground[:, [0, 2]]
 
 
-def _over_first(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+def _over_first(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Zero values (B, L, …) outside the first valid frames of each window."""
-    order = np.cumsum(there, axis=1)
-    return np.where((there & (order <= _PLACEMENT_FRAMES))[..., None], values, 0.0)
+    order = np.cumsum(valid, axis=1)
+    return np.where((valid & (order <= _PLACEMENT_FRAMES))[..., None], values, 0.0)
 
 
 @dataclass(frozen=True)

@@ -72,9 +72,7 @@ class DVAETrainee(WindowTrainee):
         annealing: int = 0,
         seed: int = 0,
     ) -> None:
-        super().__init__(
-            clips, validation, states, size.frames, weight=1.0, annealing=annealing, seed=seed
-        )
+        super().__init__(clips, validation, states, size.frames, 1.0, annealing, seed)
         self.size, self.states = size, states
         windows = self.windows.spread(_STATISTICS_WINDOWS)
         factor = _first_poses(windows.states[:, 0])
@@ -155,16 +153,8 @@ def _reconstruct(
 def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0) -> float:
     """Set the joint decoder scale to its RMS error on held-out clips and return it, metres.
 
-    The training error underestimates this scale, which weights the decoder in eq. 11.
-
-    Parameters
-    ----------
-    prior : MotionDVAE
-        Trained prior, changed in place.
-    clips : sequence of Motion
-        Held-out clips.
-    seed : int
-        Seed of the encoder draws.
+    Changes the prior in place. The training error underestimates this scale, which weights the
+    decoder in eq. 11. ``seed`` is that of the encoder draws.
     """
     windows = MotionWindows(clips, prior.states, prior.settings.frames).spread(VALIDATION_BATCH)
     rng, device = seeds.generator(seed, "scale"), torch.device("cpu")

@@ -151,11 +151,7 @@ class LifterTrainee(PoseTrainee):
         }
 
     def _loss(
-        self,
-        network: nn.Module,
-        poses: np.ndarray,
-        rng: np.random.Generator,
-        device: torch.device,
+        self, network: nn.Module, poses: np.ndarray, rng: np.random.Generator, device: torch.device
     ) -> torch.Tensor:
         azimuth = torch.as_tensor(rng.uniform(0, 2 * np.pi, len(poses)), dtype=torch.float32)
         order = torch.as_tensor(rng.permutation(len(poses)))

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from torch import nn
 
-from probmotion.models.training.checkpoints import Checkpoint, CheckpointError, load_checkpoint
+from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, valid_settings
 from probmotion.models.training.standardisation import Standards
 from probmotion.models.training.trainer import check_device
 from probmotion.motion.skeleton import Skeleton
@@ -54,13 +54,10 @@ def load_track_checkpoint(
 ) -> tuple[Checkpoint, Size, Standards, Skeleton, float]:
     """Return a checkpoint and the settings, standards, skeleton and frame rate in it."""
     checkpoint = load_checkpoint(source, kind)
-    try:
+    with valid_settings(source, kind):
         stored = checkpoint.settings["network"]
         settings = size(**stored["size"])
         skeleton = Skeleton(stored["joint_names"], stored["parents"])
         standards = Standards(np.array(stored["mean"]), np.array(stored["deviation"]))
-        return checkpoint, settings, standards, skeleton, float(stored["fps"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{source} does not have the settings of a {kind}: {error}"
-        ) from error
+        fps = float(stored["fps"])
+    return checkpoint, settings, standards, skeleton, fps

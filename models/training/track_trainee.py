@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -11,11 +11,7 @@ import torch
 from torch import nn
 
 from probmotion import seeds
-from probmotion.models.training.track_batches import (
-    Augmentation,
-    TrackBatches,
-    learning_and_held_out,
-)
+from probmotion.models.training.track_batches import Augmentation, learning_and_held_out
 from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["TrackTrainee"]
@@ -33,6 +29,7 @@ class TrackTrainee:
     """
 
     network: nn.Module
+    _loss: Callable[..., torch.Tensor]
 
     def __init__(
         self,
@@ -75,13 +72,3 @@ class TrackTrainee:
         """Return the loss of a fixed batch of held-out tracks."""
         rng = seeds.generator(self._seed, "validation")
         return float(self._loss(network, self.held_out, rng, _VALIDATION_BATCH, device))
-
-    def _loss(
-        self,
-        network: nn.Module,
-        batches: TrackBatches,
-        rng: np.random.Generator,
-        n: int,
-        device: torch.device,
-    ) -> torch.Tensor:
-        raise NotImplementedError

@@ -23,7 +23,7 @@ _AVERAGED = 64
 class VAEEncoder:
     """Encoder q(z | keypoints) of a motion VAE, for keypoints of one view.
 
-    It has no weights of its own. The rigid path of the prior gives the subject's position; see
+    Uses the weights of the prior. The rigid path of the prior sets the subject's position; see
     :meth:`~probmotion.models.vae.motion_vae.MotionVAE.placed_by`.
     """
 

@@ -1,7 +1,7 @@
 """Networks of the motion VAE: joints of frames → one latent code → bone rotations.
 
 Source: Ponymation, section 3.3 and table 5. Transformers over the joints of a frame, E_s, and over
-frames, E_t, give q(z); transformers with timestamp queries, D_t, and bone queries, D_s, decode z.
+frames, E_t, encode q(z); transformers with timestamp queries, D_t, and bone queries, D_s, decode z.
 """
 
 from __future__ import annotations
@@ -141,17 +141,10 @@ class MotionVAENetwork(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log variance of q(z), (B, Z) each.
 
-        Parameters
-        ----------
-        keypoints : Tensor, (B, T, J, 2)
-            Relative to the root, metres at the subject's distance; ignored where occluded.
-        confidence : Tensor, (B, T, J)
-            Joint confidences; 0 where occluded.
-        rest : Tensor, (J, 3)
-            Rest positions relative to the root, metres.
-        features : tuple of Tensor, optional
-            Image features of frames, (B, T, F), and at joints, (B, T, J, F); required if and only
-            if ``image_features`` is set.
+        ``keypoints`` (B, T, J, 2): relative to the root, metres at the subject's distance, ignored
+        where occluded; ``confidence`` (B, T, J): 0 where occluded; ``rest`` (J, 3): rest positions
+        relative to the root, metres; ``features``: image features of frames, (B, T, F), and at
+        joints, (B, T, J, F), required if and only if ``image_features`` is set.
         """
         check_shape("keypoints", keypoints, ("B", self.settings.frames, self.n_joints, 2))
         with mixed_precision(self, keypoints.device):

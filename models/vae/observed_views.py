@@ -6,7 +6,7 @@ origin of every frame. The root position in the camera is stored separately.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,9 +44,8 @@ class ObservedView:
             raise ValueError("camera must be perspective to change the distance, got orthographic")
         check_positive("distance", distance)
         ratio = distance / self.distance
-        return ObservedView(
-            ratio * self.keypoints, self.confidence, ratio * self.root, self.camera, distance
-        )
+        keypoints, root = ratio * self.keypoints, ratio * self.root
+        return replace(self, keypoints=keypoints, root=root, distance=distance)
 
     def seen(self, offsets: np.ndarray) -> np.ndarray:
         """Project points relative to the root, ``(…, L, J, 3) → (…, L, J, 2)``.
@@ -112,14 +111,12 @@ def _check_observations(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
     visible = _visibility(likelihood)
     if (empty := ~visible.any(axis=1)).any():
         raise ValueError(
-            f"likelihood must have a visible joint per frame, got none in frame "
-            f"{int(np.argmax(empty))}"
+            f"likelihood must have a visible joint per frame, got none in frame {np.argmax(empty)}"
         )
     root = skeleton.roots[0]
     if not visible[:, root].any():
-        raise ValueError(
-            f"likelihood must show the root {skeleton.joint_names[root]} in at least one frame"
-        )
+        name = skeleton.joint_names[root]
+        raise ValueError(f"likelihood must show the root {name} in at least one frame")
 
 
 def _visibility(likelihood: Keypoints2D) -> np.ndarray:

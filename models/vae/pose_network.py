@@ -51,16 +51,9 @@ class PoseHypotheses:
 class PoseNetwork(nn.Module):
     """Predicts the pose of a frame from its 2D joints, for each view hypothesis.
 
-    Frames are independent, except that bone lengths are predicted from their mean.
-
-    Parameters
-    ----------
-    settings : MotionVAESettings
-        Network size.
-    n_joints, n_bones, n_groups : int
-        Joints J, bones, and groups G of bones with a common length.
-    seed : int
-        Seed of the initial weights.
+    Frames are independent, except that bone lengths are predicted from their mean. The body has
+    ``n_joints`` joints, ``n_bones`` bones and ``n_groups`` groups of bones with a common length;
+    ``seed`` is that of the initial weights.
     """
 
     quarters: torch.Tensor

@@ -141,14 +141,14 @@ def _best_hypothesis(
 def _first_distance(view: ObservedView, body: ArticulatedBody) -> float:
     """Return an initial distance: the mean projection of a bone is π/4 of its length."""
     joints, parents = (list(side) for side in zip(*body.skeleton.bones, strict=True))
-    shown = (view.confidence[:, joints] > 0) & (view.confidence[:, parents] > 0)
+    visible = (view.confidence[:, joints] > 0) & (view.confidence[:, parents] > 0)
     bones = np.linalg.norm(view.keypoints[:, joints] - view.keypoints[:, parents], axis=-1)
     lengths = np.linalg.norm(body.rest[joints], axis=-1)
-    seen = (shown * bones).sum()
-    if not seen > 0:
+    projected = (visible * bones).sum()
+    if not projected > 0:
         raise ValueError("likelihood must show both ends of at least one bone")
     assert view.distance is not None
-    return float(math.pi / 4 * (shown * lengths).sum() / seen * view.distance)
+    return float(math.pi / 4 * (visible * lengths).sum() / projected * view.distance)
 
 
 def _size_ratio(best: PoseHypotheses, body: ArticulatedBody, view: ObservedView) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -103,19 +103,18 @@ class MotionVAESettings:
     @classmethod
     def tiny(cls) -> MotionVAESettings:
         """Return a size for tests that trains in seconds."""
-        weights = {"smoothness": 0.01, "teacher": 0.1}
-        return cls(width=32, layers=1, heads=2, latent=8, mixed_precision=False, **weights)
+        size = cls(width=32, layers=1, heads=2, latent=8, mixed_precision=False)
+        return replace(size, smoothness=0.01, teacher=0.1)
 
     @classmethod
     def small(cls) -> MotionVAESettings:
         """Return the size of the shipped priors, which trains in minutes on two cores.
 
-        Smoothness and teacher weights are .01 and .1 instead of the published 1: reconstruction
-        is in m² here, some hundredths, and a weight of 1 suppressed all motion.
+        Smoothness and teacher weights are .01 and .1 instead of the published 1, which suppresses
+        all motion: the reconstruction loss is in m² here, a few hundredths.
         """
-        return cls(
-            width=96, layers=2, heads=2, feedforward=96, latent=48, smoothness=0.01, teacher=0.1
-        )
+        size = cls(width=96, layers=2, heads=2, feedforward=96, latent=48)
+        return replace(size, smoothness=0.01, teacher=0.1)
 
     @classmethod
     def paper(cls) -> MotionVAESettings:

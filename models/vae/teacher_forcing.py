@@ -38,7 +38,7 @@ class TeacherForcedPoses:
         with torch.autocast(rest.device.type, enabled=False):
             outputs = [vars(network(*part, rest)).values() for part in parts]
         *poses, log_lengths = (torch.cat(part) for part in zip(*outputs, strict=True))
-        self._poses = PoseHypotheses(*(part[:, :, 0] for part in poses), log_lengths)
+        self._poses = PoseHypotheses(*[*(part[:, :, 0] for part in poses), log_lengths])
 
     def of(self, drawn: Batch) -> PoseHypotheses:
         """Return the teacher poses of drawn windows, before scaling; none may be padded."""
@@ -47,7 +47,8 @@ class TeacherForcedPoses:
         frames = torch.as_tensor(drawn.frames, device=self._poses.turns.device)
         *poses, log_lengths = vars(self._poses.at(frames)).values()
         # The network predicts lengths linearly from the mean over frames.
-        return PoseHypotheses(*(part.transpose(1, 2) for part in poses), log_lengths.mean(dim=1))
+        windows = [part.transpose(1, 2) for part in poses]
+        return PoseHypotheses(*[*windows, log_lengths.mean(dim=1)])
 
 
 def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:

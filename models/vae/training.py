@@ -335,8 +335,8 @@ class MotionVAETrainee(_VAETrainee):
         hypotheses = self._poses[batches].of(drawn)
         scale = torch.as_tensor(drawn.scale, device=keypoints.device)
         # Undo the scaling, which must not affect the choice of the view.
-        shown = keypoints / scale[:, None, None, None]
-        terms = hypothesis_losses(self.body, hypotheses, shown, confidence, self.distance)
+        unscaled = keypoints / scale[:, None, None, None]
+        terms = hypothesis_losses(self.body, hypotheses, unscaled, confidence, self.distance)
         return scaled(best_hypothesis(hypotheses, weighted_sum(terms, self.size)), scale)
 
 
@@ -346,16 +346,13 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
     The paper trains for 120 and 180 epochs of its data; ``paper`` counts 1000 steps per epoch.
     Raises ``ValueError`` for an unknown size.
     """
+    tiny = TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97)
+    small = replace(tiny, steps=2000, batch=32, learning_rate=1e-3, ema=0.995)
+    paper = TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000)
     known = {
-        "tiny": (TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97),) * 2,
-        "small": (
-            TrainingSettings(steps=2000, batch=32, learning_rate=1e-3, ema=0.995),
-            TrainingSettings(steps=2500, batch=32, learning_rate=1e-3, ema=0.995),
-        ),
-        "paper": (
-            TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000),
-            TrainingSettings(steps=180_000, learning_rate=1e-4, warmup=1000),
-        ),
+        "tiny": (tiny, tiny),
+        "small": (small, replace(small, steps=2500)),
+        "paper": (paper, replace(paper, steps=180_000)),
     }
     if size not in known:
         raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")
@@ -367,10 +364,10 @@ def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float)
     root = tracks[0].skeleton.roots[0]
     for track in tracks:
         seen = (track.confidence[:, root] >= threshold) & (track.confidence[:, root] > 0)
-        away = np.linalg.norm(track.keypoints[seen, root], axis=-1).max(initial=0.0)
-        if away > _CENTRED:
+        offset = np.linalg.norm(track.keypoints[seen, root], axis=-1).max(initial=0.0)
+        if offset > _CENTRED:
             raise ValueError(
-                f"{name} must have the root at the origin in every frame, got {away:.2g} m in "
+                f"{name} must have the root at the origin in every frame, got {offset:.2g} m in "
                 f"{track.name or 'one'}; use prepare_tracks"
             )
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import to_numpy
 from probmotion.metrics.credible_sets import DENSITY
+from probmotion.metrics.measures import visible_joints
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 
@@ -51,12 +51,14 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
         direction = rng.standard_normal(shape)
         direction /= np.sqrt((direction**2).sum())
         found.append(Quantity(f"direction {k + 1}", partial(_along, direction, root)))
-    frame, joint = int(rng.integers(shape[0])), _other_than(rng, root, shape[1])
+    others = [joint for joint in range(shape[1]) if joint != root] or [root]
+    frame, joint = int(rng.integers(shape[0])), int(rng.choice(others))
     name = posterior.skeleton.joint_names[joint]
     found.append(Quantity(f"height of {name}", partial(_height, frame, joint)))
-    occluded = _occluded(posterior)
+    visible = visible_joints(posterior)
     direction = rng.standard_normal(3)
-    if len(occluded):
+    if visible is not None and not visible.all():
+        occluded = np.argwhere(~visible)
         frame, joint = (int(index) for index in occluded[rng.integers(len(occluded))])
         at = np.zeros(shape)
         at[frame, joint] = direction / np.sqrt((direction**2).sum())
@@ -68,27 +70,20 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
 
 
 def log_densities(simulation: Problem, positions: np.ndarray) -> dict[str, np.ndarray]:
-    """Return ``log likelihood`` and ``log density`` of motions, if defined.
+    """Return ``log likelihood`` and ``log density`` of motions, (n, L, J, 3) → (n,), if defined.
 
-    Quantities that depend on the observations detect errors that coordinates miss, such as draws
-    from the prior (Modrák et al. 2023, "Simulation-based calibration checking for Bayesian
+    Quantities that depend on the simulated observations detect errors that coordinates miss, such
+    as draws from the prior (Modrák et al. 2023, "Simulation-based calibration checking for Bayesian
     computation: the choice of test quantities shapes sensitivity").
-
-    Parameters
-    ----------
-    simulation : Problem
-        Problem with simulated observations.
-    positions : ndarray, (n, L, J, 3)
-        Metres.
     """
-    found: dict[str, np.ndarray] = {}
+    values: dict[str, np.ndarray] = {}
     likelihood = simulation.posterior.likelihood
     if likelihood is not None:
-        found["log likelihood"] = to_numpy(likelihood.log_density(positions))
+        values["log likelihood"] = to_numpy(likelihood.log_density(positions))
     density = simulation.log_density_of(positions)
     if density is not None:
-        found[DENSITY] = density
-    return found
+        values[DENSITY] = density
+    return values
 
 
 def _along(direction: np.ndarray, root: int, positions: np.ndarray) -> np.ndarray:
@@ -103,17 +98,3 @@ def _height(frame: int, joint: int, positions: np.ndarray) -> np.ndarray:
 def _speed(positions: np.ndarray) -> np.ndarray:
     steps = np.diff(positions, axis=1)
     return np.sqrt((steps**2).sum(axis=-1)).mean(axis=(1, 2))
-
-
-def _other_than(rng: np.random.Generator, root: int, n_joints: int) -> int:
-    others = [joint for joint in range(n_joints) if joint != root] or [root]
-    return int(rng.choice(others))
-
-
-def _occluded(posterior: MotionPosterior) -> np.ndarray:
-    """Return frames and joints observed in no view, (n, 2); empty if unknown."""
-    entries: Any = getattr(posterior.likelihood, "entries", None)
-    if entries is None:
-        return np.zeros((0, 2), dtype=int)
-    seen = entries.visible.reshape(-1, *entries.visible.shape[-2:]).any(axis=0)
-    return np.argwhere(~seen)

@@ -17,8 +17,7 @@ __all__ = ["write_bvh"]
 
 _ORDER = "ZYX"
 _DECIMALS = 8
-# Metres; larger than the rounding of constant bones in float32 files, 1e-7 m.
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-6  # metres; larger than the rounding of constant bones in float32 files, 1e-7 m
 
 
 def write_bvh(motion: Motion, path: str | Path) -> None:

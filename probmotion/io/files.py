@@ -121,10 +121,9 @@ def read_keypoints(
         raise FileNotFoundError(f"there is no file {path}")
     archive = path.suffix.lower() == ".npz"
     table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
-    unused = {"people": people} if archive or table else {}
-    unused |= {"skeleton": skeleton} if archive else {}
+    unused = {"people": people, "skeleton": skeleton if archive else None}
     for name, value in unused.items():
-        if value is not None:
+        if value is not None and (archive or table):
             raise ValueError(f"{name} must be None for {path.suffix} files, got {value!r}")
     if archive:
         return read_keypoint_npz(path, fps)

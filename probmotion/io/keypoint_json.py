@@ -219,10 +219,9 @@ def _folder(path: Path) -> tuple[list[Detection], Frames]:
 
 
 def _load(path: Path) -> Any:
+    content = read_bytes(path)
     try:
-        return json.loads(read_bytes(path))
-    except MotionFileError:
-        raise
+        return json.loads(content)
     except (ValueError, RecursionError) as error:
         raise MotionFileError(f"{path}: expected JSON ({str(error)[:80]})") from error
 

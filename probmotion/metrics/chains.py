@@ -45,22 +45,22 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
     n_chains, n_draws = data.sizes["chain"], data.sizes["draw"]
     values = monitored_coordinates(draws) if values is None else values
     axes = {"chain_axis": 0, "draw_axis": 1}
-    found: dict[str, float] = {}
+    diagnostics: dict[str, float] = {}
     if "autocorrelation_time" in data:
         slowest = float(np.max(data["autocorrelation_time"].values))
         if not np.isnan(slowest):
-            found["ess_bulk"] = n_chains * n_draws / slowest
+            diagnostics["ess_bulk"] = n_chains * n_draws / slowest
     elif n_draws >= _TO_CORRELATE:
-        found["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
+        diagnostics["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
-        found["ess_tail"] = float(np.min(tails))
+        diagnostics["ess_tail"] = float(np.min(tails))
     if n_chains > 1 or "autocorrelation_time" not in data:
-        found["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
+        diagnostics["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance" in data:
-        found["acceptance"] = float(data["acceptance"].mean())
+        diagnostics["acceptance"] = float(data["acceptance"].mean())
     if "divergent" in data:
-        found["divergent"] = float(data["divergent"].sum())
-    return found
+        diagnostics["divergent"] = float(data["divergent"].sum())
+    return diagnostics
 
 
 def principal_coordinates(values: np.ndarray) -> np.ndarray:
@@ -79,17 +79,9 @@ def principal_coordinates(values: np.ndarray) -> np.ndarray:
 def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
     """Return the upper ``level`` quantile of R-hat over converged runs.
 
-    It is that of the largest R-hat over as many coordinates as are monitored, estimated from 100
-    runs of independent draws; short chains exceed 1 by far.
-
-    Parameters
-    ----------
-    chains, draws : int
-        Chains, and draws of each, at least 4.
-    level : float
-        Between 0 and 1.
-    seed : int
-        Seed of the simulated runs.
+    R-hat is the largest over as many coordinates as are monitored, in 100 simulated runs of
+    ``chains`` chains with ``draws`` (at least 4) independent draws each. For short chains the
+    quantile is far above 1.
     """
     from arviz_stats.base import array_stats
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -20,17 +21,14 @@ __all__ = [
     "COLLAPSED_BELOW",
     "EncodesViews",
     "GenerationReference",
-    "GenerationScores",
     "diversity",
     "frechet_distance",
-    "score_features",
-    "score_generation",
 ]
 
 # Recall below which a generator has collapsed (MAS, table 2).
 COLLAPSED_BELOW = 0.1
 _CHAMFER_FRAMES = 10  # as published
-# Mean and standard deviation over repeats, by the names of GenerationScores.
+# Mean and standard deviation over repeats, by score.
 Scores = dict[str, tuple[float, float]]
 
 
@@ -48,33 +46,6 @@ class EncodesViews(Protocol):
 
     def features(self, views: np.ndarray, lengths: np.ndarray | None = None) -> np.ndarray:
         """Return features: ``(N, L, J, 2) → (N, D)``; views in metres, centred on the root."""
-
-
-@dataclass(frozen=True)
-class GenerationScores:
-    """Scores of a set of motions against real ones.
-
-    Parameters
-    ----------
-    fid : float
-        Fréchet distance of features; 0 is ideal.
-    diversity : float
-        Mean distance of two motions; ideally that of real motions.
-    precision : float
-        Fraction of motions on the manifold of real ones; 1 is best.
-    recall : float
-        Fraction of real motions on the manifold of these; 1 is best.
-    """
-
-    fid: float
-    diversity: float
-    precision: float
-    recall: float
-
-    @property
-    def collapsed(self) -> bool:
-        """Whether the generator has collapsed: recall < 0.1."""
-        return self.recall < COLLAPSED_BELOW
 
 
 def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -121,62 +92,6 @@ def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) 
     first = rng.integers(0, len(features), pairs)
     second = (first + rng.integers(1, len(features), pairs)) % len(features)
     return float(np.linalg.norm(features[first] - features[second], axis=1).mean())
-
-
-def score_features(
-    features: np.ndarray, held_out: np.ndarray, rng: np.random.Generator
-) -> GenerationScores:
-    """Return the scores of motions against held-out real ones, from features (N, D), (M, D).
-
-    ``rng`` draws the pairs for the diversity.
-    """
-    precision, recall = precision_recall(features, held_out)
-    fid = frechet_distance(features, held_out)
-    return GenerationScores(fid, diversity(features, rng), precision, recall)
-
-
-def score_generation(
-    features_of: Callable[[np.ndarray], np.ndarray],
-    draw_views: Callable[[np.random.Generator, int], np.ndarray],
-    held_out_features: np.ndarray,
-    *,
-    seed: int,
-    samples: int = 1000,
-    repeats: int = 10,
-) -> Scores:
-    """Return mean and standard deviation of every score over repeats.
-
-    The standard deviation (ddof 1) is that of one repeat. (The MAS authors' code prints the 95 %
-    interval of the mean, 1.96 standard deviations / √repeats.)
-
-    Parameters
-    ----------
-    features_of : callable
-        Computes features of views: ``(N, L, J, 2) → (N, D)``.
-    draw_views : callable
-        Returns views, given a generator and their largest number.
-    held_out_features : ndarray, (M, D)
-        Features of real motions.
-    seed : int
-        Seed; repeat r does not depend on ``repeats``.
-    samples : int
-        Motions per repeat.
-    repeats : int
-        At least 2.
-    """
-    check_count("samples", samples, least=2)
-    check_count("repeats", repeats, least=2)
-    found = []
-    for repeat in range(repeats):
-        views = draw_views(seeds.generator(seed, "views", repeat), samples)
-        pairs = seeds.generator(seed, "pairs", repeat)
-        found.append(score_features(features_of(views), held_out_features, pairs))
-    columns = np.array([astuple(scores) for scores in found]).T
-    names = [field.name for field in fields(GenerationScores)]
-    return {
-        name: (float(column.mean()), float(column.std(ddof=1)))
-        for name, column in zip(names, columns, strict=True)
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,19 +149,28 @@ class GenerationReference:
         repeats: int = 10,
         angles: Angles = "all",
     ) -> Scores:
-        """Return the scores of 3D motions, (N, L, J, 3) metres.
+        """Return mean and standard deviation of the scores of 3D motions, (N, L, J, 3) metres.
 
-        Every repeat views up to ``samples`` of them from new azimuths. The standard deviation
-        covers azimuths and subsets, not training or the choice of held-out motions.
+        - ``fid``: Fréchet distance of features; 0 is ideal
+        - ``diversity``: mean distance of two motions; ideally that of real motions
+        - ``precision``: fraction of motions on the manifold of real ones; 1 is best
+        - ``recall``: fraction of real motions on the manifold of these; 1 is best
+
+        Every repeat views up to ``samples`` of them from new azimuths; repeat r does not depend on
+        ``repeats``. The standard deviation (ddof 1) is that of one repeat and covers azimuths and
+        subsets, not training or the choice of held-out motions. (The MAS authors' code prints the
+        95 % interval of the mean, 1.96 standard deviations / √repeats.)
 
         Scores from the ``side`` require motions whose azimuth 0 is not a fixed body direction, such
         as motions lifted from random views; if all motions face +Z, even real ones score badly.
         """
+        return self._score(positions, partial(self._film, angles=angles), seed, samples, repeats)
 
-        def film(rng: np.random.Generator, n: int) -> np.ndarray:
-            return self._film(positions[_subset(rng, len(positions), n)], rng, angles)
-
-        return self._score(film, seed, samples, repeats)
+    def score_views(
+        self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10
+    ) -> Scores:
+        """Return the scores of 2D motions, (N, L, J, 2) metres, from subsets of ``samples``."""
+        return self._score(views, lambda chosen, rng: chosen, seed, samples, repeats)
 
     def chamfer(self, positions: np.ndarray, *, seed: int) -> MotionChamfer:
         """Return the Motion Chamfer Distance of one view of each motion, (N, L, J, 3) metres.
@@ -255,14 +179,16 @@ class GenerationReference:
         """
         if self.held_out_views is None:
             raise ValueError("held_out_views must be given, got None")
-        views = self._film(positions, seeds.generator(seed, "chamfer"), "all")
+        views = self._film(positions, seeds.generator(seed, "chamfer"))
         frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
         shown, real = (
             some[:, : some.shape[1] // frames * frames] for some in (views, self.held_out_views)
         )
         return motion_chamfer_distance(shown, real, frames=frames)
 
-    def _film(self, positions: np.ndarray, rng: np.random.Generator, angles: Angles) -> np.ndarray:
+    def _film(
+        self, positions: np.ndarray, rng: np.random.Generator, angles: Angles = "all"
+    ) -> np.ndarray:
         return film_motions(
             positions,
             rng,
@@ -272,33 +198,23 @@ class GenerationReference:
             root=self.evaluator.skeleton.roots[0],
         )
 
-    def score_views(
-        self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10
-    ) -> Scores:
-        """Return the scores of 2D motions, (N, L, J, 2) metres, from subsets of ``samples``."""
-
-        def take(rng: np.random.Generator, n: int) -> np.ndarray:
-            return views[_subset(rng, len(views), n)]
-
-        return self._score(take, seed, samples, repeats)
-
     def _score(
         self,
-        draw_views: Callable[[np.random.Generator, int], np.ndarray],
+        motions: np.ndarray,
+        view: Callable[[np.ndarray, np.random.Generator], np.ndarray],
         seed: int,
         samples: int,
         repeats: int,
     ) -> Scores:
-        return score_generation(
-            self.evaluator.features,
-            draw_views,
-            self.held_out_features,
-            seed=seed,
-            samples=samples,
-            repeats=repeats,
-        )
-
-
-def _subset(rng: np.random.Generator, n: int, most: int) -> np.ndarray:
-    """Return a random subset of n indices, at most ``most``."""
-    return rng.permutation(n)[:most]
+        check_count("samples", samples, least=2)
+        check_count("repeats", repeats, least=2)
+        rows = []
+        for repeat in range(repeats):
+            rng = seeds.generator(seed, "views", repeat)
+            views = view(motions[rng.permutation(len(motions))[:samples]], rng)
+            features = self.evaluator.features(views)
+            fid = frechet_distance(features, self.held_out_features)
+            spread = diversity(features, seeds.generator(seed, "pairs", repeat))
+            rows.append([fid, spread, *precision_recall(features, self.held_out_features)])
+        columns = zip(("fid", "diversity", "precision", "recall"), np.transpose(rows), strict=True)
+        return {name: (float(row.mean()), float(row.std(ddof=1))) for name, row in columns}

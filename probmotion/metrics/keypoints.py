@@ -66,10 +66,9 @@ def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np
 
     The box contains the visible keypoints of all frames; its sides must not both be 0.
     """
-    seen = _check_keypoints(keypoints, keypoints, visible, names=("keypoints", "keypoints"))
-    axes = (-3, -2)
-    low = np.where(seen[..., None], keypoints, np.inf).min(axis=axes)
-    high = np.where(seen[..., None], keypoints, -np.inf).max(axis=axes)
+    seen = _check_keypoints(keypoints, keypoints, visible, ("keypoints", "keypoints"))[..., None]
+    low = np.where(seen, keypoints, np.inf).min(axis=(-3, -2))
+    high = np.where(seen, keypoints, -np.inf).max(axis=(-3, -2))
     sides: np.ndarray = (high - low).max(axis=-1)
     if not (sides > 0).all():
         raise ValueError(
@@ -148,8 +147,7 @@ def fit_linear_map(
     seen = seen.reshape(-1, n_keypoints)
     used = (joints != 0).any(axis=(0, 2))
     weights = np.zeros((n_keypoints, n_joints))
-    for keypoint in range(n_keypoints):
-        frames = seen[:, keypoint]
+    for keypoint, frames in enumerate(seen.T):
         system = joints[frames][:, used].transpose(0, 2, 1).reshape(-1, int(used.sum()))
         solution, _, rank, _ = np.linalg.lstsq(system, targets[frames, keypoint].ravel())
         if rank < system.shape[1]:

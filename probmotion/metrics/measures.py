@@ -25,15 +25,12 @@ if TYPE_CHECKING:
     from probmotion.posteriors.posterior import MotionPosterior
     from probmotion.posteriors.problem import Problem
 
-__all__ = ["accuracy_of", "load_libraries", "measure"]
+__all__ = ["accuracy_of", "load_libraries", "measure", "visible_joints"]
 
 _LIBRARIES = (
-    "arviz_stats.base",
-    "scipy.spatial.distance",
-    "sklearn.decomposition",
-    "sklearn.model_selection",
-    "sklearn.svm",
-)
+    "arviz_stats.base", "scipy.spatial.distance", "sklearn.decomposition",
+    "sklearn.model_selection", "sklearn.svm",
+)  # fmt: skip
 
 _DIRECTIONS = 256
 # Sets of exact draws, each as large as the run, about 4000 in all.
@@ -91,23 +88,23 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     seed : int
         Seed of reference draws and directions, shared by all samplers.
     """
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     positions = draws.flat()
     if problem.has_reference:
-        found |= _against_reference(problem, positions, seed)
-    found |= _against_density(problem, draws)
+        values |= _against_reference(problem, positions, seed)
+    values |= _against_density(problem, draws)
     if problem.truth is not None:
-        found |= accuracy_of(positions, problem.truth, problem.posterior)
-        found |= _image_errors(positions, problem.truth, problem.posterior)
+        values |= accuracy_of(positions, problem.truth, problem.posterior)
+        values |= _image_errors(positions, problem.truth, problem.posterior)
     if problem.held_out is not None:
-        found |= _coverage_of(positions, problem.held_out)
+        values |= _coverage_of(positions, problem.held_out)
     if problem.generation is not None:
-        found |= _against_real_views(problem.generation, positions, seed)
+        values |= _against_real_views(problem.generation, positions, seed)
     for name in ("at_cap", "near_floor"):
         if name in draws.dataset:
-            found[name] = float(draws.dataset[name].mean())
-    found |= _degenerate(problem, positions)
-    return found | chain_diagnostics(draws) | costs(draws)
+            values[name] = float(draws.dataset[name].mean())
+    values |= _degenerate(problem, positions)
+    return values | chain_diagnostics(draws) | costs(draws)
 
 
 def costs(draws: MotionDraws) -> dict[str, float]:
@@ -254,11 +251,10 @@ def _coverage_of(positions: np.ndarray, held_out: np.ndarray) -> dict[str, float
 
 
 def _degenerate(problem: Problem, positions: np.ndarray) -> dict[str, float]:
-    likelihood = problem.posterior.likelihood
-    counted = getattr(likelihood, "degenerate_fraction", None)
-    if counted is None:
+    fraction = getattr(problem.posterior.likelihood, "degenerate_fraction", None)
+    if fraction is None:
         return {}
-    return {"degenerate": float(counted(positions[:: max(1, len(positions) // _MOST_DEGENERATE)]))}
+    return {"degenerate": float(fraction(positions[:: max(1, len(positions) // _MOST_DEGENERATE)]))}
 
 
 def accuracy_of(
@@ -276,33 +272,34 @@ def accuracy_of(
     root = posterior.skeleton.roots[0]
     target = accuracy.aligned_by_root(truth, root)
     errors = accuracy.joint_errors(accuracy.aligned_by_root(positions, root), target)
-    middle = accuracy.aligned_by_root(positions.mean(axis=0), root)
+    mean = positions.mean(axis=0)
+    mean_errors = accuracy.joint_errors(accuracy.aligned_by_root(mean, root), target)
     per_draw = accuracy.mean_over(errors)
-    far = accuracy.joint_errors(positions, truth)
-    far_mean = accuracy.joint_errors(positions.mean(axis=0), truth)
+    unaligned = accuracy.joint_errors(positions, truth)
+    unaligned_mean = accuracy.joint_errors(mean, truth)
+    nearest = accuracy.aligned_by_similarity(positions, truth)
     metres = {
         "mpjpe": per_draw.mean(),
-        "mpjpe_mean": accuracy.joint_errors(middle, target).mean(),
+        "mpjpe_mean": mean_errors.mean(),
         "mpjpe_best": per_draw.min(),
+        "g_mpjpe": unaligned.mean(),
+        "g_mpjpe_mean": unaligned_mean.mean(),
+        "pa_mpjpe": accuracy.joint_errors(nearest, truth).mean(),
     }
-    metres |= {"g_mpjpe": far.mean(), "g_mpjpe_mean": far_mean.mean()}
-    seen = _visible(posterior)
-    if seen is not None and not seen.all() and seen.any():
-        for where, mask in (("visible", seen), ("occluded", ~seen)):
+    visible = visible_joints(posterior)
+    if visible is not None and not visible.all() and visible.any():
+        for where, mask in (("visible", visible), ("occluded", ~visible)):
             metres[f"mpjpe_{where}"] = accuracy.mean_over(errors, mask).mean()
-            metres[f"g_mpjpe_{where}"] = accuracy.mean_over(far, mask).mean()
-            metres[f"g_mpjpe_mean_{where}"] = accuracy.mean_over(far_mean, mask)
-    nearest = accuracy.aligned_by_similarity(positions, truth)
-    metres["pa_mpjpe"] = accuracy.joint_errors(nearest, truth).mean()
-    found = {f"{name}_mm": float(value) * _MILLIMETRES for name, value in metres.items()}
+            metres[f"g_mpjpe_{where}"] = accuracy.mean_over(unaligned, mask).mean()
+            metres[f"g_mpjpe_mean_{where}"] = accuracy.mean_over(unaligned_mean, mask)
+    values = {f"{name}_mm": float(value) * _MILLIMETRES for name, value in metres.items()}
     if len(truth) >= 3:
-        bend = accuracy.acceleration_error(positions, truth, posterior.fps)
-        found["acceleration_error"] = float(bend.mean())
+        differences = accuracy.acceleration_error(positions, truth, posterior.fps)
+        values["acceleration_error"] = float(differences.mean())
         if np.diff(truth, 2, axis=0).any():
-            found["acceleration_ratio"] = float(
-                accuracy.acceleration_ratio(positions, truth).mean()
-            )
-    return found
+            ratios = accuracy.acceleration_ratio(positions, truth)
+            values["acceleration_ratio"] = float(ratios.mean())
+    return values
 
 
 def _image_errors(
@@ -318,23 +315,22 @@ def _image_errors(
     except ValueError:
         return {"pck": math.nan, "velocity_error": math.nan}
     true = np.broadcast_to(true, shown.shape)
-    found = {}
+    values = {}
     # A single joint in a single frame has no extent.
     if np.ptp(true, axis=(-3, -2)).any(axis=-1).all():
         size = keypoints.image_extent(true)
-        found["pck"] = keypoints.percentage_of_correct_keypoints(shown, true, size)
+        values["pck"] = keypoints.percentage_of_correct_keypoints(shown, true, size)
     if np.diff(true, axis=-3).any():
-        found["velocity_error"] = keypoints.velocity_error(shown, true)
-    return found
+        values["velocity_error"] = keypoints.velocity_error(shown, true)
+    return values
 
 
-def _visible(posterior: MotionPosterior) -> np.ndarray | None:
+def visible_joints(posterior: MotionPosterior) -> np.ndarray | None:
     """Return the mask (L, J) of joints observed in any view; ``None`` if unknown."""
     entries = getattr(posterior.likelihood, "entries", None)
     if entries is None:
         return None
-    shape = (math.prod(entries.visible.shape[:-2]), *entries.visible.shape[-2:])
-    return entries.visible.reshape(shape).any(axis=0)
+    return entries.visible.reshape(-1, *entries.visible.shape[-2:]).any(axis=0)
 
 
 def load_libraries() -> None:

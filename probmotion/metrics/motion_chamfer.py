@@ -6,7 +6,6 @@ projected to 2D, against annotated ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +75,13 @@ def motion_chamfer_distance(
     check_finite("generated", generated)
     filled = np.where(seen[..., None], real, 0.0)
     check_finite("real", filled)
-    _check_length("generated", generated, frames)
-    _check_length("real", real, frames)
+    for name, sequences in (("generated", generated), ("real", real)):
+        if sequences.size == 0:
+            raise ValueError(f"{name} must contain at least one sequence, got {sequences.shape}")
+        if sequences.shape[1] % frames:
+            raise ValueError(
+                f"{name} must have a multiple of frames={frames} frames, got {sequences.shape[1]}"
+            )
     targets = filled.reshape(-1, frames, *filled.shape[2:])
     weights = _weights(seen.reshape(-1, frames, seen.shape[2]))
     places = [
@@ -86,15 +90,6 @@ def motion_chamfer_distance(
     ]
     of_generated, of_real = np.mean(places, axis=0)
     return MotionChamfer(float(of_generated), float(of_real))
-
-
-def _check_length(name: str, sequences: np.ndarray, frames: int) -> None:
-    if sequences.size == 0:
-        raise ValueError(f"{name} must contain at least one sequence, got shape {sequences.shape}")
-    if sequences.shape[1] % frames:
-        raise ValueError(
-            f"{name} must have a multiple of frames={frames} frames, got {sequences.shape[1]}"
-        )
 
 
 def _weights(seen: np.ndarray) -> np.ndarray:
@@ -110,18 +105,11 @@ def _weights(seen: np.ndarray) -> np.ndarray:
 
 
 def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """Return the mean nearest-neighbour errors in both directions."""
+    """Return the mean nearest-neighbour errors in both directions.
+
+    The error of a pair is Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖², computed in blocks.
+    """
     of_generated, of_real = np.full(len(generated), np.inf), np.full(len(real), np.inf)
-    for rows, columns, block in _blocks(generated, real, weights):
-        of_generated[rows] = np.minimum(of_generated[rows], block.min(axis=1))
-        of_real[columns] = np.minimum(of_real[columns], block.min(axis=0))
-    return float(of_generated.mean()), float(of_real.mean())
-
-
-def _blocks(
-    generated: np.ndarray, real: np.ndarray, weights: np.ndarray
-) -> Iterator[tuple[slice, slice, np.ndarray]]:
-    """Yield rows, columns and their errors Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖²."""
     constant = (weights * (real**2).sum(axis=-1)).sum(axis=(1, 2))
     factor = np.concatenate([weights[..., None], -2 * weights[..., None] * real], axis=-1)
     right = factor.reshape(len(real), -1)
@@ -135,12 +123,11 @@ def _blocks(
             block = left @ _padded(right[columns]).T
             block = block[: rows.stop - row, : columns.stop - column] + constant[columns]
             # Rounding may make the error of copies negative.
-            yield rows, columns, np.maximum(block, 0.0)
+            block = np.maximum(block, 0.0)
+            of_generated[rows] = np.minimum(of_generated[rows], block.min(axis=1))
+            of_real[columns] = np.minimum(of_real[columns], block.min(axis=0))
+    return float(of_generated.mean()), float(of_real.mean())
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:
-    if len(rows) == _BLOCK:
-        return rows
-    padded = np.zeros((_BLOCK, rows.shape[1]))
-    padded[: len(rows)] = rows
-    return padded
+    return np.pad(rows, ((0, _BLOCK - len(rows)), (0, 0)))

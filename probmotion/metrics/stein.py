@@ -72,17 +72,7 @@ def kernel_stein_discrepancy(
 def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     """Return ∇ log p(θ | y) by automatic differentiation with torch, else JAX.
 
-    Parameters
-    ----------
-    posterior : MotionPosterior
-        Target.
-    theta : ndarray, (n, dim)
-        Evaluation points.
-
-    Returns
-    -------
-    score : ndarray, (n, dim)
-        float64.
+    ``(n, dim) → (n, dim)``, float64.
 
     Raises
     ------

@@ -139,20 +139,10 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
 
 
 def principal_coordinates(points: np.ndarray, most: int) -> np.ndarray:
-    """Return the leading principal coordinates of a set, and the residual, standardised.
+    """Return standardised principal coordinates, ``(n, D) → (n, k) or (n, k + 1)``.
 
-    Parameters
-    ----------
-    points : ndarray, (n, D)
-        The set.
-    most : int
-        Largest number of coordinates.
-
-    Returns
-    -------
-    features : ndarray, (n, k) or (n, k + 1)
-        k principal coordinates; then, if there are more dimensions, the log squared distance from
-        their subspace, which reveals errors off the manifold.
+    The ``most`` leading ones; then, if there are more dimensions, the log squared distance from
+    their subspace, which reveals errors off the manifold.
     """
     from sklearn.decomposition import PCA
 

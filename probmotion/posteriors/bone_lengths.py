@@ -13,8 +13,7 @@ __all__ = ["bone_lengths"]
 
 # Simulated bones per median, at least; its standard error is then a fifth of that of 300 frames.
 _SIMULATED = 8000
-# Bisection steps: to a hundredth of a millimetre.
-_HALVINGS = 16
+_HALVINGS = 16  # bisection steps, to a hundredth of a millimetre
 
 
 def bone_lengths(

@@ -88,7 +88,8 @@ class MotionDraws:
         )
         check_finite("positions", positions)
         shape = positions.shape[:2]
-        data = {"positions": (("chain", "draw", "frame", "joint", "axis"), positions)}
+        axes: tuple[str, ...] = ("chain", "draw", "frame", "joint", "axis")
+        data = {"positions": (axes, positions)}
         if theta is not None:
             check_shape("theta", theta, (*shape, posterior.dim))
             data["theta"] = (("chain", "draw", "coordinate"), theta)

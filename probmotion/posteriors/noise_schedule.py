@@ -14,8 +14,7 @@ from probmotion.validation import check_count
 
 __all__ = ["NoiseSchedule", "PosteriorStep"]
 
-# Prevents β_t from vanishing at small t.
-_OFFSET = 0.008
+_OFFSET = 0.008  # prevents β_t from vanishing at small t
 
 
 class PosteriorStep(NamedTuple):

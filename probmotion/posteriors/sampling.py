@@ -76,8 +76,8 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, draws: MotionDraws) -> None:
-        finished = draws.dataset.sizes["draw"]
-        super().__init__(f"interrupted after {finished} draws per chain, stored in .draws")
+        n = draws.dataset.sizes["draw"]
+        super().__init__(f"interrupted after {n} draws per chain, stored in .draws")
         self.draws = draws
 
 
@@ -134,8 +134,8 @@ def importable_samplers() -> dict[str, type[Any]]:
         except ValueError as error:
             errors[name] = error
             del samplers[name]
-    for error in errors.values():
-        warnings.warn(f"{error}; sampler skipped", stacklevel=2)
+    for reason in errors.values():
+        warnings.warn(f"{reason}; sampler skipped", stacklevel=2)
     return samplers
 
 

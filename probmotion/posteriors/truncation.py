@@ -13,8 +13,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["TruncatedPosterior", "limit_for_dimension"]
 
-# Distance to the floor, nats, below which a draw is flagged.
-_NEAR = 1.0
+_NEAR = 1.0  # distance to the floor, nats, below which a draw is flagged
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,15 +38,13 @@ def problem_names() -> list[str]:
 
 def available_problems() -> tuple[list[str], dict[str, str]]:
     """Return the names of loadable problems, and error messages by name of those without data."""
-    available, missing = [], {}
+    missing = {}
     for name in problem_names():
         try:
             load_problem(name)
         except FileNotFoundError as error:
             missing[name] = str(error)
-        else:
-            available.append(name)
-    return available, missing
+    return [name for name in problem_names() if name not in missing], missing
 
 
 def problem_descriptions() -> dict[str, str]:
@@ -78,9 +76,9 @@ def load_problem(name: str, **scale: Any) -> Problem:
     return _load(*_resolve(name, scale))
 
 
-def problem_without_reference(name: str, **scale: Any) -> Problem:
+def problem_without_reference(name: str) -> Problem:
     """Load a problem without its stored reference draws."""
-    return _load_without_reference(*_resolve(name, scale))
+    return _load_without_reference(*_resolve(name, {}))
 
 
 Scale = tuple[tuple[str, Any], ...]
@@ -92,16 +90,18 @@ def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
         name, scale = scaled["name"], _parse(scaled["scale"]) | scale
     if name not in problem_names():
         raise ValueError(f"problem must be one of {', '.join(problem_names())}, got {name!r}")
-    known = _GAITS[name].defaults if name in _GAITS else {}
-    for number in scale:
-        if number not in known:
-            allowed = f"be one of {', '.join(known)}" if known else "not be set"
-            raise ValueError(f"parameters of {name} must {allowed}, got {number!r}")
-        if not isinstance(scale[number], Hashable):
-            raise ValueError(
-                f"{number} must be a number such as {known[number]!r}, got {scale[number]!r}"
-            )
-    return name, tuple((n, scale[n]) for n in known if n in scale and scale[n] != known[n])
+    defaults = _GAITS[name].defaults if name in _GAITS else {}
+    for key, value in scale.items():
+        if key not in defaults:
+            allowed = f"be one of {', '.join(defaults)}" if defaults else "not be set"
+            raise ValueError(f"parameters of {name} must {allowed}, got {key!r}")
+        if not isinstance(value, Hashable):
+            raise ValueError(f"{key} must be a number such as {defaults[key]!r}, got {value!r}")
+    return name, tuple(
+        (key, scale[key])
+        for key, default in defaults.items()
+        if key in scale and scale[key] != default
+    )
 
 
 def _parse(words: str) -> dict[str, Any]:
@@ -116,10 +116,6 @@ def _parse(words: str) -> dict[str, Any]:
         ) from error
 
 
-def _full_name(name: str, scale: Scale) -> str:
-    return f"{name}({', '.join(f'{n}={value}' for n, value in scale)})" if scale else name
-
-
 @cache
 def _load(name: str, scale: Scale) -> Problem:
     problem = _load_without_reference(name, scale)
@@ -132,10 +128,10 @@ def _load(name: str, scale: Scale) -> Problem:
 def _load_without_reference(name: str, scale: Scale) -> Problem:
     # One thread makes problems bit-identical in every process of a comparison.
     with one_thread():
-        if name in _GAITS:
-            problem = _GAITS[name](_full_name(name, scale), **dict(scale))
-            if not scale:
-                return problem
-            numbers = ", ".join(f"{number}={value}" for number, value in scale)
-            return replace(problem, description=f"{problem.description}, but with {numbers}")
-        return _OTHERS[name][1]()
+        if name not in _GAITS:
+            return _OTHERS[name][1]()
+        if not scale:
+            return _GAITS[name]()
+        parameters = ", ".join(f"{key}={value}" for key, value in scale)
+        problem = _GAITS[name](f"{name}({parameters})", **dict(scale))
+        return replace(problem, description=f"{problem.description}, but with {parameters}")

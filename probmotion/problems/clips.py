@@ -11,7 +11,7 @@ from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem, simulated
-from probmotion.problems.observations import OBSERVATIONS, observe
+from probmotion.problems import observations
 from probmotion.threads import one_thread
 from probmotion.validation import check_count, check_positive
 
@@ -72,8 +72,6 @@ def clips_problem(
     """
     check_count("frames", frames, least=2)
     check_positive("noise", noise)
-    if observe not in OBSERVATIONS:
-        raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {observe!r}")
     if len(motions) < 2:
         raise ValueError(
             "motions must contain at least 2 clips, one to hold out and others to fit the prior, "
@@ -83,9 +81,11 @@ def clips_problem(
     index = _index(motions, held_out)
     with one_thread():
         clips = _harmonised(motions, fps)
-        hidden = clips.pop(index)
-        if hidden.frames < frames:
-            raise ValueError(f"held_out must be a clip of at least frames={frames}, got {hidden}")
+        unseen = clips.pop(index)
+        if unseen.frames < frames:
+            raise ValueError(f"held_out must be a clip of at least frames={frames}, got {unseen}")
+        truth = unseen.window((unseen.frames - frames) // 2, frames).centred()
+        likelihood = observations.observe(truth, observe, noise, seed)
         long = [clip for clip in clips if clip.frames >= frames]
         if not long:
             raise ValueError(
@@ -101,18 +101,13 @@ def clips_problem(
             stride=min(frames, max(1, starts // _WINDOWS)),
             seed=seed,
         )
-        truth = hidden.window((hidden.frames - frames) // 2, frames).centred()
-        likelihood = _observe(truth, observe, noise, seed)
     problem = Problem(
         name,
-        _description(long, len(clips) - len(long), hidden, frames, observe, noise),
+        _description(long, len(clips) - len(long), unseen, frames, observe, noise),
         MotionPosterior(prior, likelihood),
         None if likelihood is None else truth.positions,
     )
     return simulated(problem)
-
-
-_observe = observe  # shadowed by the argument of the same name
 
 
 def _check_distinct(motions: Sequence[Motion]) -> None:
@@ -145,31 +140,27 @@ def _harmonised(motions: Sequence[Motion], fps: float | None) -> list[Motion]:
     """Return the clips with a common frame rate and skeleton."""
     from probmotion.motion.retargeting import common_skeleton
 
-    rates = sorted({motion.fps for motion in motions})
     if fps is not None:
         motions = [motion.resample(fps) for motion in motions]
-    elif len(rates) > 1:
-        listed = ", ".join(f"{rate:.6g}" for rate in rates)
+    if len(rates := sorted({motion.fps for motion in motions})) > 1:
         raise ValueError(
-            f"motions must have one frame rate, got {listed} frames per second; set fps= to "
-            "resample them"
+            f"motions must have one frame rate, got {', '.join(f'{rate:.6g}' for rate in rates)} "
+            "frames per second; set fps= to resample them"
         )
     skeleton = common_skeleton([motion.skeleton for motion in motions])
     return [motion.retarget(skeleton) for motion in motions]
 
 
 def _description(
-    fitted: Sequence[Motion], too_short: int, hidden: Motion, frames: int, how: str, noise: float
+    fitted: Sequence[Motion], too_short: int, held_out: Motion, frames: int, how: str, noise: float
 ) -> str:
     clips = f"{len(fitted)} clip{'s' * (len(fitted) != 1)}"
     left_out = f" ({too_short} shorter than {frames} frames left out)" if too_short else ""
     prior = f"prior fitted to {clips} of {fitted[0].skeleton.n_joints} joints{left_out}"
+    name = held_out.name or "the one held out"
     if how == "none":
-        return f"{prior}, without {hidden.name or 'the one held out'}; no observations"
-    return (
-        f"{prior}; {how} keypoints (σ {100 * noise:g} cm) of {hidden.name or 'the one held out'}, "
-        "which was held out"
-    )
+        return f"{prior}, without {name}; no observations"
+    return f"{prior}; {how} keypoints (σ {100 * noise:g} cm) of {name}, which was held out"
 
 
 def _cmu_problem(name: str, description: str, observe: str) -> Problem:

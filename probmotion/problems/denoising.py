@@ -32,7 +32,6 @@ __all__ = [
 ]
 
 _CLIP = "cmu_02_02"
-_SEED = 0
 
 
 def body_prior(name: str = "body-dvae") -> MotionDVAE:
@@ -91,27 +90,23 @@ def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
     """
     from probmotion.data.joint_filters import kalman_smooth
 
-    seen = likelihood.entries.visible
-    usual = np.linalg.norm(prior.body, axis=-1)
+    joints, entries = likelihood.joints, likelihood.entries
     lengths = bone_lengths(
-        likelihood.joints,
-        likelihood.entries.confidence,
+        joints,
+        entries.confidence,
         prior.skeleton,
         likelihood.noise,
-        likelihood.entries.degrees_of_freedom,
-        typical=usual,
+        entries.degrees_of_freedom,
+        typical=np.linalg.norm(prior.body, axis=-1),
     )
-    if not seen.any(axis=0).all():
+    if not entries.visible.any(axis=0).all():
         return prior.states.of_lengths(lengths)
-    smooth, _ = kalman_smooth(
-        likelihood.joints,
-        likelihood.entries.confidence,
-        noise=gaussian_noise(likelihood),
-        fps=prior.fps,
-    )
-    shown = prior.states.body(smooth[seen.all(axis=1)] if seen.all(axis=1).any() else smooth)
-    bones = np.linalg.norm(shown, axis=-1)
-    return shown * (lengths / np.where(bones > 0, bones, 1.0))[:, None]
+    noise = gaussian_noise(likelihood)
+    smooth, _ = kalman_smooth(joints, entries.confidence, noise=noise, fps=prior.fps)
+    complete = entries.visible.all(axis=1)
+    body = prior.states.body(smooth[complete] if complete.any() else smooth)
+    bones = np.linalg.norm(body, axis=-1)
+    return body * (lengths / np.where(bones > 0, bones, 1.0))[:, None]
 
 
 def gaussian_noise(likelihood: Joints3D) -> float:
@@ -144,7 +139,11 @@ def limb_occlusions(motion: Motion, *, cut_off: bool = False) -> np.ndarray:
 
 
 def _problem(
-    name: str, description: str, noise: float, freedom: float | None, occluded: bool
+    name: str,
+    description: str,
+    noise: float,
+    degrees_of_freedom: float | None = None,
+    occluded: bool = False,
 ) -> Problem:
     prior = body_prior()
     clip = cmu_clip(_CLIP).retarget(prior.skeleton)
@@ -156,40 +155,35 @@ def _problem(
         truth,
         prior,
         noise=noise,
-        degrees_of_freedom=freedom,
+        degrees_of_freedom=degrees_of_freedom,
         hidden=limb_occlusions(truth) if occluded else None,
-        seed=_SEED,
         name=name,
         description=description,
     )
 
 
-def _named(
-    name: str, description: str, noise: float, freedom: float | None = None, occluded: bool = False
-) -> tuple[str, tuple[str, Callable[[], Problem]]]:
-    return name, (description, partial(_problem, name, description, noise, freedom, occluded))
-
-
-DENOISING_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = dict(
-    [
-        _named(
+DENOISING_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
+    name: (description, partial(_problem, name, description, *options))
+    for name, description, *options in (
+        (
             "denoise-cmu",
             f"noisy 3D joints (σ 4 cm) of {_CLIP}, which was held out; a prior learnt from motion "
             "capture",
             0.04,
         ),
-        _named(
+        (
             "denoise-cmu-outliers",
             "the same, Student-t noise with 3 degrees of freedom (scale 3 cm)",
             0.03,
             3.0,
         ),
-        _named(
+        (
             "denoise-cmu-occluded",
             "the same (σ 4 cm), an arm and then a leg hidden for a third of a second each",
             0.04,
-            occluded=True,
+            None,
+            True,
         ),
-    ]
-)
+    )
+}
 """Description and factory of each problem, by name."""

@@ -43,9 +43,10 @@ _QUADRUPEDS = {"quadruped-walk": 0.6, "quadruped-trot": 0.4}
 _RANK, _SEED = 10, 0
 _AZIMUTHS = 36
 _FREEDOM = 3.0
-_DENSE: dict[str, Any] = {"joints": 17, "noise": 0.02, "hidden": 0.0}
+_DENSE = {"joints": 17, "noise": 0.02, "hidden": 0.0}
 
 Coordinates = Literal["latent", "positions"]
+Observed = Literal["nothing", "keypoints", "one frame", "joints"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class GaitProblem:
 
     name: str
     description: str
-    observes: Literal["nothing", "keypoints", "one frame", "joints"]
+    observes: Observed
     quadruped: bool
     defaults: Mapping[str, Any]
 
@@ -69,14 +70,13 @@ class GaitProblem:
         check_count("frames", parameters["frames"], least=2)
         coordinates: Coordinates = "positions" if self.observes == "joints" else "latent"
         prior = _prior(self.quadruped, parameters["frames"], parameters["components"], coordinates)
-        called = name or self.name
+        name = name or self.name
         if self.observes == "nothing":
-            return simulated(Problem(called, self.description, MotionPosterior(prior)))
-        drawn = prior.sample(seeds.generator(parameters["seed"], "truth"), 1)[0]
-        truth = Motion(drawn, prior.skeleton, prior.fps, name=called)
-        likelihood = self._observe(truth, parameters)
-        posterior = MotionPosterior(prior, likelihood)
-        return simulated(Problem(called, self.description, posterior, truth.positions))
+            return simulated(Problem(name, self.description, MotionPosterior(prior)))
+        positions = prior.sample(seeds.generator(parameters["seed"], "truth"), 1)[0]
+        truth = Motion(positions, prior.skeleton, prior.fps, name=name)
+        posterior = MotionPosterior(prior, self._observe(truth, parameters))
+        return simulated(Problem(name, self.description, posterior, truth.positions))
 
     def _observe(self, truth: Motion, parameters: Mapping[str, Any]) -> Keypoints2D | Joints3D:
         noise, seed = parameters["noise"], parameters["seed"]
@@ -86,8 +86,8 @@ class GaitProblem:
         hidden[:, visible] = False
         if self.observes == "one frame":
             hidden |= ~middle_frame(truth)
-            return one_camera_keypoints(truth, noise, seed, hidden)
-        hidden |= limb_occlusion(truth, parameters["hidden"])
+        else:
+            hidden |= limb_occlusion(truth, parameters["hidden"])
         if self.observes == "joints":
             return Joints3D.observe(truth, noise, seed, hidden=hidden, degrees_of_freedom=_FREEDOM)
         return one_camera_keypoints(truth, noise, seed, hidden)
@@ -106,19 +106,16 @@ def _prior(
             f"{components}"
         )
     fitted = _fitted(quadruped, frames)
-    n_kept = min(components, K)
-    weights = fitted.weights
-    if n_kept < K:
-        weights = weights[:n_kept] / weights[:n_kept].sum()
-    azimuths = max(1, components // K)
-    if (n_kept, azimuths, coordinates) == (K, fitted.azimuths, fitted.coordinates):
+    n_styles, azimuths = min(components, K), max(1, components // K)
+    if (n_styles, azimuths, coordinates) == (K, fitted.azimuths, fitted.coordinates):
         return fitted
+    weights = fitted.weights[:n_styles]
     return replace(
         fitted,
-        means=fitted.means[:n_kept],
-        factors=fitted.factors[:n_kept],
-        weights=weights,
-        styles=fitted.styles[:n_kept],
+        means=fitted.means[:n_styles],
+        factors=fitted.factors[:n_styles],
+        weights=weights / weights.sum() if n_styles < K else weights,
+        styles=fitted.styles[:n_styles],
         azimuths=azimuths,
         coordinates=coordinates,
     )
@@ -135,55 +132,56 @@ def _fitted(quadruped: bool, frames: int) -> GaussianMixtureMotion:
     )
 
 
-def _named(
-    name: str, description: str, observes: Any, quadruped: bool = False, **defaults: Any
-) -> tuple[str, GaitProblem]:
-    own: dict[str, Any] = {"frames": 30, "components": _AZIMUTHS * (2 if quadruped else 3)}
-    known = own | defaults | ({} if observes == "nothing" else {"seed": _SEED})
-    return name, GaitProblem(name, description, observes, quadruped, known)
+def _problems(
+    *rows: tuple[str, str, Observed, Mapping[str, float]], quadruped: bool = False
+) -> dict[str, GaitProblem]:
+    defaults = {"frames": 30, "components": _AZIMUTHS * (2 if quadruped else 3)}
+    return {
+        name: GaitProblem(
+            name,
+            description,
+            observes,
+            quadruped,
+            {**defaults, **parameters, **({} if observes == "nothing" else {"seed": _SEED})},
+        )
+        for name, description, observes, parameters in rows
+    }
 
 
-GAIT_PROBLEMS: Mapping[str, GaitProblem] = dict(
-    [
-        _named("gait", "people who walk, run and march, with no likelihood: generation", "nothing"),
-        _named(
-            "gait-monocular", "the same, 2D keypoints of one camera (σ 2 cm)", "keypoints", **_DENSE
-        ),
-        _named(
-            "gait-occluded",
-            "the same as gait-monocular, one leg hidden for half of the frames",
-            "keypoints",
-            **_DENSE | {"hidden": 0.5},
-        ),
-        _named(
-            "gait-sparse",
-            "the same gaits, six joints in one frame of one camera (σ 5 cm): many modes",
-            "one frame",
-            joints=6,
-            noise=0.05,
-        ),
-        _named("quadruped", "quadrupeds that walk and trot, with no likelihood", "nothing", True),
-        _named(
-            "quadruped-monocular",
-            "the same quadrupeds, 2D keypoints of one camera (σ 2 cm)",
-            "keypoints",
-            True,
-            **_DENSE,
-        ),
-    ]
+GAIT_PROBLEMS: Mapping[str, GaitProblem] = _problems(
+    ("gait", "people who walk, run and march, with no likelihood: generation", "nothing", {}),
+    ("gait-monocular", "the same, 2D keypoints of one camera (σ 2 cm)", "keypoints", _DENSE),
+    (
+        "gait-occluded",
+        "the same as gait-monocular, one leg hidden for half of the frames",
+        "keypoints",
+        {**_DENSE, "hidden": 0.5},
+    ),
+    (
+        "gait-sparse",
+        "the same gaits, six joints in one frame of one camera (σ 5 cm): many modes",
+        "one frame",
+        {"joints": 6, "noise": 0.05},
+    ),
+) | _problems(
+    ("quadruped", "quadrupeds that walk and trot, with no likelihood", "nothing", {}),
+    (
+        "quadruped-monocular",
+        "the same quadrupeds, 2D keypoints of one camera (σ 2 cm)",
+        "keypoints",
+        _DENSE,
+    ),
+    quadruped=True,
 )
 """Factories of the problems with an exact posterior, by name."""
 
-GAIT_OUTLIER_PROBLEMS: Mapping[str, GaitProblem] = dict(
-    [
-        _named(
-            "gait-noisy3d",
-            "a third of a second of the same gaits, noisy 3D joints with outliers (Student-t, 3 "
-            "degrees of freedom, scale 3 cm)",
-            "joints",
-            frames=10,
-            **_DENSE | {"noise": 0.03},
-        )
-    ]
+GAIT_OUTLIER_PROBLEMS: Mapping[str, GaitProblem] = _problems(
+    (
+        "gait-noisy3d",
+        "a third of a second of the same gaits, noisy 3D joints with outliers (Student-t, 3 "
+        "degrees of freedom, scale 3 cm)",
+        "joints",
+        {"frames": 10, **_DENSE, "noise": 0.03},
+    ),
 )
 """Factories of the problems with outliers, by name; their reference is a long run."""

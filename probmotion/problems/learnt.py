@@ -16,7 +16,6 @@ import numpy as np
 from probmotion import models, seeds
 from probmotion.metrics.generation import GenerationReference
 from probmotion.motion.motion import Motion
-from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem, simulated
 from probmotion.posteriors.protocols import Samplable
@@ -59,9 +58,7 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
     return simulated(problem) if isinstance(prior, Samplable) else problem
 
 
-def observed_draw_problem(
-    name: str, description: str, prior: str, how: str, *, seed: int = 0
-) -> Problem:
+def observed_draw_problem(name: str, description: str, prior: str, how: str) -> Problem:
     """Return the problem of recovering a draw of a shipped motion VAE from one camera.
 
     ``how`` is as for :func:`~probmotion.problems.observations.observe`.
@@ -69,37 +66,36 @@ def observed_draw_problem(
     vae = models.MotionVAE.load(prior)
     # The rigid path is known here.
     vae = vae.placed(vae.rigid)
-    truth = vae.motion(vae.initial(seeds.generator(seed, name), 1))[0]
-    seen = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, seed)
-    assert isinstance(seen, Keypoints2D)
-    return simulated(Problem(name, description, MotionPosterior(vae, seen), truth=truth))
+    truth = vae.motion(vae.initial(seeds.generator(0, name), 1))[0]
+    likelihood = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, 0)
+    return simulated(Problem(name, description, MotionPosterior(vae, likelihood), truth=truth))
 
 
 LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
-    name: (description, partial(make, name, description, *more))
-    for name, description, make, *more in (
+    name: (description, partial(make, name, description, *options))
+    for make, name, description, *options in (
         (
+            learnt_problem,
             "walk2d",
             "people who walk, a prior learnt from 2D tracks alone: generation",
-            learnt_problem,
             "MotionDiffusion",
         ),
         (
+            learnt_problem,
             "walk-vae",
             "people who walk, a motion VAE learnt from 2D tracks alone: generation",
-            learnt_problem,
             "MotionVAE",
         ),
         (
+            learnt_problem,
             "animal-vae",
             "four-legged animals, a motion VAE learnt from 2D tracks alone: generation",
-            learnt_problem,
             "MotionVAE",
         ),
         (
+            observed_draw_problem,
             "walk-vae-monocular",
             "a draw of walk-vae, 2D keypoints of one camera (σ 2 cm)",
-            observed_draw_problem,
             "walk-vae",
             "monocular",
         ),

@@ -53,16 +53,15 @@ def one_camera_keypoints(
     return Keypoints2D.observe(motion, camera, noise, seed, hidden=hidden)
 
 
-def limb_occlusion(motion: Motion, share: float) -> np.ndarray:
-    """Return a mask (L, J) of the longest limb in the middle ``share`` of the frames."""
-    if not 0 <= share <= 1:
-        raise ValueError(f"hidden must be between 0 and 1, got {share!r}")
-    hidden = _nothing(motion)
+def limb_occlusion(motion: Motion, fraction: float = 0.5) -> np.ndarray:
+    """Return a mask (L, J) of the longest limb in the middle ``fraction`` of the frames."""
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"hidden must be between 0 and 1, got {fraction!r}")
+    hidden = _no_occlusion(motion)
     # Whole frames, rounded down; the constant absorbs rounding errors.
-    start = int((1 - share) / 2 * motion.frames + 1e-9)
-    frames = slice(start, start + int(share * motion.frames + 1e-9))
-    for joint in _longest_limb(motion.skeleton):
-        hidden[frames, joint] = True
+    start = int((1 - fraction) / 2 * motion.frames + 1e-9)
+    stop = start + int(fraction * motion.frames + 1e-9)
+    hidden[start:stop, _longest_limb(motion.skeleton)] = True
     return hidden
 
 
@@ -77,24 +76,19 @@ def nearest_joints(skeleton: Skeleton, n: int) -> list[int]:
 
 def middle_frame(motion: Motion) -> np.ndarray:
     """Return the mask (L, J) of the middle frame."""
-    seen = _nothing(motion)
-    seen[motion.frames // 2] = True
-    return seen
+    mask = _no_occlusion(motion)
+    mask[motion.frames // 2] = True
+    return mask
 
 
-def _nothing(motion: Motion) -> np.ndarray:
+def _no_occlusion(motion: Motion) -> np.ndarray:
     return np.zeros(motion.positions.shape[:2], dtype=bool)
 
 
-def _limb_half_the_time(motion: Motion) -> np.ndarray:
-    return limb_occlusion(motion, 0.5)
-
-
 def _all_but_central_joints(motion: Motion) -> np.ndarray:
-    hidden = ~middle_frame(motion)
-    visible = nearest_joints(motion.skeleton, min(_SPARSE_JOINTS, motion.skeleton.n_joints))
-    hidden[:, [j for j in range(motion.skeleton.n_joints) if j not in visible]] = True
-    return hidden
+    n_joints = motion.skeleton.n_joints
+    visible = nearest_joints(motion.skeleton, min(_SPARSE_JOINTS, n_joints))
+    return ~middle_frame(motion) | ~np.isin(np.arange(n_joints), visible)
 
 
 def _longest_limb(skeleton: Skeleton) -> list[int]:
@@ -113,8 +107,8 @@ def _longest_limb(skeleton: Skeleton) -> list[int]:
 
 OBSERVATIONS: Mapping[str, Callable[[Motion], np.ndarray] | None] = {
     "none": None,
-    "monocular": _nothing,
-    "occluded": _limb_half_the_time,
+    "monocular": _no_occlusion,
+    "occluded": limb_occlusion,
     "sparse": _all_but_central_joints,
 }
 """Masks of occluded joints (L, J), by name.

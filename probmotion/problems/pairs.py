@@ -61,15 +61,14 @@ def pairs_problem(
     from probmotion.interaction.annotations.sources import draw_annotations
     from probmotion.models.pose_pairs.pair_posterior import pair_posterior
 
-    shown, hidden = hold_out(motions, held_out)
-    chosen = [dance_frames(motion) for motion in shown]
-    n = min(n_annotations, int(sum(frames.sum() for frames in chosen)))
-    annotations = draw_annotations(shown, n, seed, frames=chosen).annotations
-    poses, _, _ = ground_truth(shown)
+    training, test = hold_out(motions, held_out)
+    frames = [dance_frames(motion) for motion in training]
+    poses, test_poses = ground_truth(training)[0], ground_truth(test)[0]
+    n = min(n_annotations, len(poses))
+    annotations = draw_annotations(training, n, seed, frames=frames).annotations
     first = poses[choose_seed(poses)]
-    posterior = pair_posterior(first, annotations, settings, fps=shown[0].fps, view_seed=seed)
-    available = sum(int(dance_frames(motion).sum()) for motion in hidden)
-    covered, _, _ = ground_truth(hidden, min(n_held_out, available))
+    posterior = pair_posterior(first, annotations, settings, fps=training[0].fps, view_seed=seed)
+    covered, _, _ = ground_truth(test, min(n_held_out, len(test_poses)))
     return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=first[None])
 
 
@@ -92,7 +91,7 @@ def _dance() -> Problem:
     )
 
 
-def _salsa(name: str, description: str, paper: bool) -> Problem:
+def _salsa(name: str, description: str, paper: bool = False) -> Problem:
     from probmotion.data.downloads import salsa_pairs
     from probmotion.data.pair_sets import SALSA_HELD_OUT
     from probmotion.models.pose_pairs.pair_posterior import PairSettings
@@ -110,7 +109,7 @@ _PAPER = "the same with a density that is cut at 100 times the seed's, as publis
 
 PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
     "dance-pairs": (_DANCE, _dance),
-    "salsa-pairs": (_SALSA, partial(_salsa, "salsa-pairs", _SALSA, False)),
-    "salsa-pairs-paper": (_PAPER, partial(_salsa, "salsa-pairs-paper", _PAPER, True)),
+    "salsa-pairs": (_SALSA, partial(_salsa, "salsa-pairs", _SALSA)),
+    "salsa-pairs-paper": (_PAPER, partial(_salsa, "salsa-pairs-paper", _PAPER, paper=True)),
 }
 """Description and factory of each problem, by name."""

@@ -16,12 +16,7 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import UnsupportedPosterior, require
-from probmotion.samplers.diffusion.ancestral import (
-    AncestralSampler,
-    MotionState,
-    State,
-    ancestral,
-)
+from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State, ancestral
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.diffusion.separate_views import SeparateViews
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views, views_around

@@ -144,10 +144,7 @@ class MetropolisHastings:
             seconds=time.perf_counter() - start,
             theta=theta,
             log_density=log_density,
-            statistics={
-                "acceptance": acceptance,
-                **posterior.draw_statistics(theta, log_density),
-            },
+            statistics={"acceptance": acceptance, **posterior.draw_statistics(theta, log_density)},
             counts={"density": density.evaluations},
             state=state,
         )

@@ -173,10 +173,10 @@ def test_unit_is_inferred_with_a_warning_unless_metres(tmp_path, reach, unit, fa
 
 
 def test_scale_overrides_the_inferred_unit(tmp_path):
-    text = MINIMAL.replace("OFFSET 0 -1 0", "OFFSET 0 -240 0")
-    assert read_bvh(written(tmp_path, text), scale=0.5).positions[0, 1, 1] == -119.5
+    path = written(tmp_path, MINIMAL.replace("OFFSET 0 -1 0", "OFFSET 0 -240 0"))
+    assert read_bvh(path, scale=0.5).positions[0, 1, 1] == -119.5
     with pytest.raises(ValueError, match="scale must be a finite number above 0, got 0"):
-        read_bvh(written(tmp_path, text), scale=0)
+        read_bvh(path, scale=0)
 
 
 NUMBER, ROW = "expected a number between", "0 1 0 90 0 0 0 0 90"

@@ -29,11 +29,9 @@ def test_crossing_people_keep_their_ids():
         left, right = person_at(100 + 25 * frame), person_at(412 - 25 * frame)
         detections += shuffled(left, right, frame=frame)
     linked = link_people(detections, 2)
-    for detection in linked:
-        x = detection.values[:, 0].mean() - BODY[:, 0].mean()
-        expected = (
-            100 + 25 * detection.frame if detection.person == "0" else 412 - 25 * detection.frame
-        )
+    for one in linked:
+        x = one.values[:, 0].mean() - BODY[:, 0].mean()
+        expected = 100 + 25 * one.frame if one.person == "0" else 412 - 25 * one.frame
         assert x == pytest.approx(expected)
     assert len(linked) == 24
 

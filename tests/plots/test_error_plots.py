@@ -7,7 +7,6 @@ import pandas as pd
 
 from probmotion.plots.error_plots import draw_error_decomposition
 
-COLUMNS = ["setting", "measure", "part", "mean", "low", "high"]
 TABLE = pd.DataFrame(
     [
         ("V = 5", "spread", "floor", 0.1, 0.0, 0.2),
@@ -21,52 +20,38 @@ TABLE = pd.DataFrame(
         ("V = 5", "off", "guidance", -0.5, -0.6, -0.4),
         ("V = 5", "off", "whole", 0.5, -0.2, 1.2),
     ],
-    columns=COLUMNS,
+    columns=["setting", "measure", "part", "mean", "low", "high"],
 )
+NOTE = "no network part: no learnt denoiser was given"
 
 
-def test_parts_are_stacked_upwards_and_negative_ones_downwards():
-    figure = draw_error_decomposition(TABLE, words={"off": "off the manifold"})
-    spread, off = figure.axes
-    assert (spread.get_title(loc="left"), off.get_title(loc="left")) == (
-        "spread",
-        "off the manifold",
-    )
-    for axes, spans in (
-        (spread, [(-0.2, 0.0), (0.0, 0.5), (0.5, 0.8)]),
-        (off, [(-1.0, 0.0), (0.0, 2.0), (-1.5, -1.0)]),
-    ):
+def test_parts_are_stacked_and_those_whose_interval_contains_zero_pale():
+    figure = draw_error_decomposition(TABLE, words={"off": "off the manifold"}, notes=[NOTE])
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["spread", "off the manifold"]
+    stacks = [[(-0.2, 0.0), (0.0, 0.5), (0.5, 0.8)], [(-1.0, 0.0), (0.0, 2.0), (-1.5, -1.0)]]
+    for axes, stack in zip(figure.axes, stacks, strict=True):
         drawn = [sorted((bar.get_y(), bar.get_y() + bar.get_height())) for bar in axes.patches]
-        np.testing.assert_allclose(drawn, spans, atol=1e-12)
+        np.testing.assert_allclose(drawn, stack, atol=1e-12)
+    opaque = [[bar.get_alpha() > 0.5 for bar in axes.patches] for axes in figure.axes]
+    assert opaque == [[True, True, False], [True, True, True]]
+    assert figure.get_suptitle() == "V = 5"
+    (key,) = figure.legends
+    assert key.get_title().get_text() == NOTE
+    words = [text.get_text() for text in key.get_texts()]
+    assert words[:4] == ["discretisation", "single view", "guidance", "whole"]
 
 
 def test_the_sum_and_all_intervals_are_drawn():
     axes = draw_error_decomposition(TABLE).axes[0]
-    across = [line for line in axes.lines if len(set(line.get_ydata())) == 1]
-    assert any(np.allclose(line.get_ydata(), 0.6) and len(line.get_xdata()) == 2 for line in across)
-    spans = [tuple(line.get_ydata()) for line in axes.lines if len(set(line.get_ydata())) == 2]
+    lines = [(line.get_xdata(), line.get_ydata()) for line in axes.lines]
+    assert any(len(x) == 2 and np.allclose(y, 0.6) for x, y in lines)
+    spans = [tuple(y) for _, y in lines if len(set(y)) == 2]
     assert spans == [(-0.3, -0.1), (0.4, 0.6), (-0.1, 0.7), (0.5, 0.7)]
 
 
-def test_parts_whose_interval_contains_zero_are_pale():
-    figure = draw_error_decomposition(TABLE)
-    opaque = [[bar.get_alpha() > 0.5 for bar in axes.patches] for axes in figure.axes]
-    assert opaque == [[True, True, False], [True, True, True]]
-
-
 def test_colours_of_parts_do_not_depend_on_other_parts():
-    some = TABLE[TABLE["part"] != "discretisation"]
-    one, other = (draw_error_decomposition(table).axes[0].patches for table in (TABLE, some))
-    assert [bar.get_facecolor() for bar in one[1:]] == [bar.get_facecolor() for bar in other]
-    assert len({bar.get_facecolor()[:3] for bar in one}) == 3
-
-
-def test_notes_and_setting_are_shown():
-    figure = draw_error_decomposition(
-        TABLE, notes=["network is no part: no learnt denoiser was given"]
-    )
-    assert figure.get_suptitle() == "V = 5"
-    (key,) = figure.legends
-    assert key.get_title().get_text() == "network is no part: no learnt denoiser was given"
-    words = [text.get_text() for text in key.get_texts()]
-    assert words[:4] == ["discretisation", "single view", "guidance", "whole"]
+    fewer = TABLE[TABLE["part"] != "discretisation"]
+    bars, others = (draw_error_decomposition(table).axes[0].patches for table in (TABLE, fewer))
+    assert [bar.get_facecolor() for bar in bars[1:]] == [bar.get_facecolor() for bar in others]
+    assert len({bar.get_facecolor()[:3] for bar in bars}) == 3

@@ -66,18 +66,14 @@ def test_figures_are_written_as_png(draw, arguments, tmp_path):
 NAN = np.full((1, 2, 17, 3), np.nan)
 ONE_NAN = np.where(np.arange(34)[:, None] == 2, np.nan, POSES)
 NOBODY = np.full((1, 34, 2), np.nan)
-ROWS = "rows must contain at least one label with"
+TWO_SETTINGS = pd.concat([ERRORS, ERRORS.assign(setting="V = 12")])
 
 
 @pytest.mark.parametrize(
     ("draw", "arguments", "message"),
     [
         (draw_calibration, ({},), "levels must contain at least one kind of pose, got none"),
-        (
-            draw_calibration,
-            (LEVELS | {"draws": {"b": np.zeros(2)}},),
-            r"levels\['draws'\] must have the terms \['prior'\], got \['b'\]",
-        ),
+        (draw_calibration, (LEVELS | {"draws": {"b": [1]}},), r"must have the terms \['prior'\], "),
         (classical_scaling, (np.zeros((3, 4)),), r"distances must have shape \(3, 3\), got \(3,"),
         (classical_scaling, (np.zeros((1, 1)),), "must be of at least dim=2 points, got 1"),
         (draw_embedding, (POINTS, ["truth", *KINDS[1:]]), "kinds must be real, prior, .*got truth"),
@@ -86,26 +82,18 @@ ROWS = "rows must contain at least one label with"
         (draw_coverage, (COVERAGE[:0],), "table must have rows with measure, .* got no row"),
         (draw_coverage, (COVERAGE.assign(draws=0),), "draws in table must be at least 1, got 0"),
         (draw_error_decomposition, (ERRORS.drop(columns=["low"]),), "got none of low"),
-        (
-            draw_error_decomposition,
-            (pd.concat([ERRORS, ERRORS.assign(setting="V = 12")]),),
-            "table must have one setting, got 2",
-        ),
+        (draw_error_decomposition, (TWO_SETTINGS,), "table must have one setting, got 2"),
         (draw_generation, (GENERATION, {"speed": "speed"}), "got no columns speed"),
         (draw_generation, (GENERATION[:0], {"fid": "FID"}), "table must have rows .*, got no row"),
-        (draw_pairs, ({}, PAIR), f"{ROWS} pose-pairs, got none"),
+        (draw_pairs, ({}, PAIR), "rows must contain at least one label with pose-pairs, got none"),
         (draw_pairs, ({"a": POSES[:, :17]}, PAIR), r"rows\['a'\] must have shape .* \(5, 17, 3\)"),
         (draw_pairs, ({"a": POSES[:0]}, PAIR), r"rows\['a'\] must contain at least one pose-pair"),
         (draw_pairs, ({"a": ONE_NAN}, PAIR), r"rows\['a'\] must be finite, got 15 values"),
         (draw_pairs, ({"a": NOBODY}, PAIR), r"rows\['a'\]\[0\] must have at least one visible j"),
         (draw_ranks, ({},), "blocks must contain at least one sampler with ranks, got none"),
         (draw_ranks, ({"mas": {}},), r"blocks\['mas'\] must contain at least one quantity"),
-        (
-            draw_ranks,
-            ({"mas": {"speed": np.zeros((2, 2))}},),
-            r"blocks\['mas'\]\['speed'\] must have shape \(n\), got \(2, 2\)",
-        ),
-        (draw_skeletons, ({}, WALK.skeleton), f"{ROWS} motions, got none"),
+        (draw_ranks, ({"mas": {"speed": POINTS}},), r"\['speed'\] must have shape \(n\), got \(25"),
+        (draw_skeletons, ({}, WALK.skeleton), "rows must contain at least one label with motions"),
         (draw_skeletons, ({"a": POSES}, WALK.skeleton), r"rows\['a'\] must have shape"),
         (draw_skeletons, ({"a": NAN}, WALK.skeleton), r"rows\['a'\] must be finite, got 102 val"),
         (plot_quality_against_cost, (QUALITY[:1],), "table must have a sampler with a headline"),

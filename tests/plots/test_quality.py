@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,19 +19,14 @@ SAMPLERS = {
 
 def table(problems=("gait",), seeds=3, spread=0.1):
     rng = np.random.default_rng(0)
-    rows = []
-    for problem in problems:
-        for name, (seconds, swd) in SAMPLERS.items():
-            for seed in range(seeds):
-                rows.append(
-                    (problem, name, seed, "seconds", seconds * np.exp(spread * rng.normal()))
-                )
-                rows.append((problem, name, seed, "swd_ratio", swd * np.exp(spread * rng.normal())))
+    rows = [
+        (problem, name, seed, metric, value * np.exp(spread * rng.normal()))
+        for problem in problems
+        for name, values in SAMPLERS.items()
+        for seed in range(seeds)
+        for metric, value in zip(("seconds", "swd_ratio"), values, strict=True)
+    ]
     return pd.DataFrame(rows, columns=["problem", "sampler", "seed", "metric", "value"])
-
-
-def test_a_dozen_samplers_have_different_styles():
-    assert len({style_of(place) for place in range(12)}) == 12
 
 
 def words(axes):
@@ -37,6 +34,7 @@ def words(axes):
 
 
 def test_points_are_means_and_bars_span_the_seeds():
+    assert len({style_of(place) for place in range(12)}) == 12
     data = table()
     axes = plot_quality_against_cost(data).axes[0]
     drawn = sorted(
@@ -50,34 +48,28 @@ def test_points_are_means_and_bars_span_the_seeds():
     assert (mas.min(), mas.max()) in [tuple(line.get_ydata()) for line in axes.lines]
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.1, 0.4])
+@pytest.mark.parametrize("spread", [0.0, 0.4])
 def test_labels_neither_overlap_nor_leave_the_panel(spread):
     figure = plot_quality_against_cost(table(("gait", "gait-monocular"), spread=spread))
     for axes in figure.axes:
         labels = words(axes)
         assert set(labels) == set(SAMPLERS)
         boxes = [text.get_window_extent() for text in labels.values()]
-        for i, box in enumerate(boxes):
-            assert axes.bbox.x0 <= box.x0
-            assert box.x1 <= axes.bbox.x1 + 1
-            for other in boxes[:i]:
-                assert not box.overlaps(other)
+        assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 + 1 for box in boxes)
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
 def test_samplers_without_a_point_are_listed_with_the_reason():
-    data = table()
-    data = data[~data["sampler"].isin(["sds", "nuts"])]
-    data.loc[len(data) + 100] = ("gait", "sds", 0, "unsupported", 1.0)
-    data.loc[len(data) + 100] = ("gait", "nuts", 0, "failed", 1.0)
-    data.attrs["words"] = {"gait/sds": "observations"}
-    listed = plot_quality_against_cost(data).axes[0].get_title("right")
-    assert listed == "no point: sds (observations)\nno point: nuts (failed)"
-
-
-def test_values_without_a_logarithm_are_not_drawn():
     data = table(seeds=1)
+    data = data[~data["sampler"].isin(["sds", "nuts"])]
+    data.loc[100] = ("gait", "sds", 0, "unsupported", 1.0)
+    data.loc[101] = ("gait", "nuts", 0, "failed", 1.0)
+    data.attrs["words"] = {"gait/sds": "observations"}
+    # Values without a logarithm.
     data.loc[(data["sampler"] == "mas") & (data["metric"] == "swd_ratio"), "value"] = np.inf
-    data.loc[(data["sampler"] == "nuts") & (data["metric"] == "seconds"), "value"] = 0.0
+    data.loc[(data["sampler"] == "mh") & (data["metric"] == "seconds"), "value"] = 0.0
     axes = plot_quality_against_cost(data).axes[0]
-    assert set(words(axes)) == set(SAMPLERS) - {"mas", "nuts"}
-    assert "no point: mas (not measured)" in axes.get_title("right")
+    assert set(words(axes)) == set(SAMPLERS) - {"mas", "mh", "nuts", "sds"}
+    reasons = {"mas": "not measured", "mh": "not measured", "sds": "observations", "nuts": "failed"}
+    lines = [f"no point: {name} ({reason})" for name, reason in reasons.items()]
+    assert axes.get_title("right") == "\n".join(lines)

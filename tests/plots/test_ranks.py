@@ -24,15 +24,12 @@ def panels(figure, title):
 
 
 def test_histograms_contain_all_ranks_and_blocks_have_titles():
-    figure = draw_ranks({"exact: right": ranks(), "mas: overconfident": ranks(60)})
-    assert [part.get_suptitle() for part in figure.subfigs] == [
-        "exact: right",
-        "mas: overconfident",
-    ]
+    figure = draw_ranks({"exact: calibrated": ranks(), "mas: overconfident": ranks(60)})
+    titles = [part.get_suptitle() for part in figure.subfigs]
+    assert titles == ["exact: calibrated", "mas: overconfident"]
     for name in NAMES:
-        heights = [sum(bar.get_height() for bar in axes.containers[0])
-                   for axes in panels(figure, name)]  # fmt: skip
-        assert heights == [120, 60]
+        bars = [axes.containers[0] for axes in panels(figure, name)]
+        assert [sum(bar.get_height() for bar in block) for block in bars] == [120, 60]
 
 
 def test_lines_are_distribution_functions_and_coverage():
@@ -44,14 +41,12 @@ def test_lines_are_distribution_functions_and_coverage():
     drawn = [line.get_ydata() for line in difference.lines if len(line.get_xdata()) == len(points)]
     for values, line in zip(values_of.values(), drawn, strict=True):
         np.testing.assert_allclose(line, (values[:, None] <= points).mean(axis=0) - points)
-    levels = {
-        "highest density": 1 - values_of["log density"],
-        "balls (TARP)": values_of["distance"],
-    }
+    densities, distances = values_of["log density"], values_of["distance"]
+    levels = {"highest density": 1 - densities, "balls (TARP)": distances}
     for line in coverage.lines:
         if line.get_label() in levels:
-            own = levels[line.get_label()]
-            np.testing.assert_allclose(line.get_ydata(), (own[:, None] <= points).mean(axis=0))
+            inside = levels[line.get_label()][:, None] <= points
+            np.testing.assert_allclose(line.get_ydata(), inside.mean(axis=0))
     labels = [text.get_text() for text in coverage.get_legend().get_texts()]
     assert labels == ["highest density", "balls (TARP)", "central intervals"]
 
@@ -59,20 +54,17 @@ def test_lines_are_distribution_functions_and_coverage():
 def test_bands_are_those_of_the_uniformity_test():
     figure = draw_ranks({"exact": ranks()})
     points, (lower, upper) = evaluation_points(120), ecdf_band(120)
-    for title, less in (
-        ("distribution function minus uniform", 1),
-        ("coverage of credible sets", 0),
-    ):
+    titles = {"distribution function minus uniform": points, "coverage of credible sets": 0}
+    for title, shift in titles.items():
         (axes,) = panels(figure, title)
-        (band,) = axes.collections
-        corners = band.get_paths()[0].vertices
-        assert corners[:, 1].max() == pytest.approx((upper - less * points).max())
-        assert corners[:, 1].min() == pytest.approx((lower - less * points).min())
+        corners = axes.collections[0].get_paths()[0].vertices
+        assert corners[:, 1].max() == pytest.approx((upper - shift).max())
+        assert corners[:, 1].min() == pytest.approx((lower - shift).min())
 
 
 def test_panels_and_titles_do_not_overlap():
     many = {f"direction {k}": values for k, values in enumerate([*ranks().values()] * 2)}
-    figure = draw_ranks({"exact: right": many, "mas: overconfident " * 20: ranks(150)})
+    figure = draw_ranks({"exact: calibrated": many, "mas: overconfident " * 20: ranks(150)})
     FigureCanvasAgg(figure).draw()
     renderer = figure.canvas.get_renderer()
     for part in figure.subfigs:

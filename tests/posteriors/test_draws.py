@@ -27,11 +27,8 @@ class Flat:
 
 @dataclass(frozen=True)
 class Walker:
-    """A sampler with nested settings."""
-
     name: ClassVar[str] = "walker"
     step: float = 0.5
-    widths: tuple[int, ...] = (1, 2)
     inner: Any = None
 
 
@@ -62,7 +59,6 @@ def test_metadata():
     assert draws.counts == {"density": 2**40, "gradient": 0}
     assert draws.dataset.attrs["seed"] == SEED
     assert '"step": 2.0' in draws.dataset.attrs["settings"]
-    assert '"numpy"' in draws.dataset.attrs["versions"]
     np.testing.assert_array_equal(draws.state["scale"], 0.25)
 
 

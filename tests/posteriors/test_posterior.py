@@ -11,7 +11,6 @@ from probmotion.arrays import array_namespace, constant
 FRAMES, CHAIN = 2, Skeleton(["hip", "knee"], [-1, 0])
 DIM = FRAMES * 2 * 3
 BASIS = np.random.default_rng(0).standard_normal((FRAMES, 2, 3, DIM))
-OTHER = Skeleton(["hip", "ankle"], [-1, 0])
 
 
 class Flat:
@@ -90,7 +89,10 @@ def observed(skeleton=CHAIN, fps=30.0):
     [
         (Keypoints2D(np.zeros((1, 3, 2, 2)), Cameras.ring(1), 1), "the prior's frames, 2, got 3"),
         (Joints3D(np.zeros((FRAMES, 5, 3)), 0.1), "the prior's n_joints, 2, got 5"),
-        (observed(OTHER), "the prior's joints, hip, knee, got hip, ankle; retarget"),
+        (
+            observed(Skeleton(["hip", "ankle"], [-1, 0])),
+            "the prior's joints, hip, knee, got hip, ankle; retarget",
+        ),
         (observed(fps=60.0), "the prior's frame rate, 30, got 60; resample"),
         (0.3, r"likelihood must have log_density.*, got float"),
     ],

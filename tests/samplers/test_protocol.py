@@ -11,12 +11,7 @@ import pytest
 import probmotion.samplers
 from probmotion import MotionDraws, MotionPosterior
 from probmotion.cli.settings_options import object_from_text, text_of_object
-from probmotion.posteriors.sampling import (
-    Sampler,
-    UnsupportedPosterior,
-    load_sampler,
-    suited,
-)
+from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, load_sampler, suited
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 
@@ -126,8 +121,7 @@ def test_missing_protocols_are_named(sampler, mute):
     posterior = MotionPosterior(mute())
     assert suited(posterior) == []
     with pytest.raises(
-        UnsupportedPosterior,
-        match=rf"^{sampler.name} needs a prior with \w+( or \w+)?, got Mute$",
+        UnsupportedPosterior, match=rf"^{sampler.name} needs a prior with \w+( or \w+)?, got Mute$"
     ):
         sampler.sample(posterior, draws=1, progress=False)
 

@@ -230,7 +230,7 @@ def test_trained_priors_are_loaded_from_folder_and_file(trainee, tmp_path):
     [
         ("evaluator", {}, {}, "contains a evaluator, expected a motion-diffusion"),
         (KIND, {"size": vars(TINY) | {"width": 64}}, {}, "weights do not match its settings"),
-        (KIND, {"parents": None}, {}, "does not have the settings of a motion-diffusion"),
+        (KIND, {"parents": None}, {}, "does not contain valid motion-diffusion settings"),
         (KIND, {}, {"frames": 99}, "frames must be at most 12, the network's longest motion, got"),
         (KIND, {}, {"frames": 1}, "frames must be an integer of at least 2, got 1"),
         (KIND, {}, {"device": "tpu"}, "device must be cpu or cuda, got 'tpu'"),

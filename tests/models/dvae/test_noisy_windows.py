@@ -174,16 +174,13 @@ def test_noise_has_the_stated_distribution():
     assert corrupted(JointNoise.nearly_clean()).joints.std() == pytest.approx(5e-3, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_invalid_settings_are_rejected():
+    for options, message in (
         ({"least": 0.1}, "most must be at least least=0.1, got 0.08"),
         ({"outliers": 1.5}, "outliers must be between 0 and 1, got 1.5"),
         ({"least": 0.0}, "least must be a finite number above 0, got 0.0"),
         ({"most": math.inf}, "most must be a finite number above 0, got inf"),
         ({"hidden": math.nan}, "hidden must be between 0 and 1, got nan"),
-    ],
-)
-def test_invalid_settings_are_rejected(options, message):
-    with pytest.raises(ValueError, match=message):
-        JointNoise(**options)
+    ):
+        with pytest.raises(ValueError, match=message):
+            JointNoise(**options)

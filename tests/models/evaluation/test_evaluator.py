@@ -11,7 +11,7 @@ import torch
 from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.metrics.filming import film_motions
-from probmotion.metrics.generation import EncodesViews, GenerationReference, frechet_distance
+from probmotion.metrics.generation import EncodesViews, GenerationReference
 from probmotion.models.evaluation.evaluator import KIND, EvaluatorSettings, TrackEvaluator
 from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
 from probmotion.models.evaluation.track_autoencoder import TrackAutoencoder, divergence_from_normal
@@ -40,25 +40,29 @@ def views_of(style, numbers, seed=0):
     return film_motions(positions_of(style, numbers), np.random.default_rng(seed))
 
 
-def held_out_loss(trainee):
-    with torch.no_grad():
-        return trainee.validation_loss(trainee.network, CPU)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The loss before a short training, and its result."""
-    trainee = EvaluatorTrainee(tracks_of(range(12)), tracks_of(range(12, 16)), SIZE)
+    """The result of a short training."""
+    data = tracks_of(range(12)), tracks_of(range(12, 16))
+    losses = []
+    for seed in (1, 0, 0):
+        trainee = EvaluatorTrainee(*data, SIZE, seed=seed)
+        with torch.no_grad():
+            losses.append(trainee.validation_loss(trainee.network, CPU))
+    assert losses[0] != losses[1] == losses[2]
     settings = TrainingSettings(
         steps=120, batch=24, learning_rate=3e-3, warmup=10, ema=0.9, checkpoint_every=60
     )
-    before = held_out_loss(trainee)
-    return before, train(trainee, settings, tmp_path_factory.mktemp("run"), progress=False)
+    result = train(trainee, settings, tmp_path_factory.mktemp("run"), progress=False)
+    # An uninformative autoencoder has a loss of about 1.
+    assert losses[2] > 0.9
+    assert result.history[-1]["validation_loss"] < 0.75 * losses[2]
+    return result
 
 
 @pytest.fixture(scope="module")
 def evaluator(run):
-    return TrackEvaluator.load(run[1].model.parent)
+    return TrackEvaluator.load(run.model.parent)
 
 
 @pytest.fixture(scope="module")
@@ -89,11 +93,10 @@ def test_padding_has_no_effect(evaluator, views):
 
 
 def test_features_are_the_mean_of_the_encoder(evaluator, run, views):
-    stored = load_checkpoint(run[1].model, KIND)
+    stored = load_checkpoint(run.model, KIND)
     network = TrackAutoencoder(SIZE, 17).eval()
     network.load_state_dict(dict(stored.tensors))
-    deviation = np.array(stored.settings["network"]["deviation"])
-    mean = np.array(stored.settings["network"]["mean"])
+    mean, deviation = (np.array(stored.settings["network"][name]) for name in ("mean", "deviation"))
     assert (deviation[0] == 0).all()
     standardised = (views[0] - mean) / np.where(deviation > 0, deviation, np.inf)
     motion = torch.tensor(standardised, dtype=torch.float32).flatten(1)[None]
@@ -107,41 +110,15 @@ def test_features_are_the_mean_of_the_encoder(evaluator, run, views):
 
 
 def test_features_separate_styles(evaluator):
-    walk, again, run = (
-        evaluator.features(views_of(style, range(start, start + 60), start))
-        for style, start in (("walk", 100), ("walk", 200), ("run", 200))
-    )
-    assert frechet_distance(walk, walk) < 1e-9
-    assert 10 * frechet_distance(walk, again) < frechet_distance(walk, run)
-
-
-def test_generated_motions_are_scored(evaluator):
     assert isinstance(evaluator, EncodesViews)
-    reference = GenerationReference(
-        evaluator, evaluator.features(views_of("walk", range(100, 140)))
-    )
+    features = evaluator.features(views_of("walk", range(100, 140)))
+    reference = GenerationReference(evaluator, features)
     walk, run = (
         reference.score_motions(positions_of(style, range(40)), seed=0, repeats=2)
         for style in STYLES
     )
-    assert walk["fid"][0] < run["fid"][0]
+    assert 4 * walk["fid"][0] < run["fid"][0]
     assert walk["precision"][0] > 0.5 > run["precision"][0]
-
-
-def test_training_reduces_the_validation_loss(run):
-    before, result = run
-    losses = [row["validation_loss"] for row in result.history]
-    # An uninformative autoencoder has a loss of about 1.
-    assert before > 0.9
-    assert losses[-1] < 0.75 * before
-    assert losses[-1] < losses[0]
-
-
-def test_divergence_matches_torch():
-    mean, log_variance = torch.randn(2, 6, 5, generator=torch.Generator().manual_seed(0))
-    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
-    wanted = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
-    torch.testing.assert_close(divergence_from_normal(mean, log_variance), wanted.sum(dim=1))
 
 
 def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
@@ -152,51 +129,41 @@ def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
     trainee = EvaluatorTrainee(tracks, tracks, replace(SIZE, kl_weight=0.5))
     inputs = []
 
-    class Zero(torch.nn.Module):
-        def forward(self, motions, valid, noise):
-            inputs.append((motions.unflatten(2, (17, 2)), valid, noise))
-            return torch.zeros_like(motions), torch.full((len(motions),), 3.0)
+    def zero(motions, valid, noise):
+        inputs.extend((motions.unflatten(2, (17, 2)), valid, noise))
+        return torch.zeros_like(motions), torch.full((len(motions),), 3.0)
 
-    loss = trainee.training_loss(Zero(), np.random.default_rng(0), 8, CPU)
-    motions, valid, noise = inputs[0]
+    loss = trainee.training_loss(zero, np.random.default_rng(0), 8, CPU)
+    motions, valid, noise = inputs
     assert noise.shape == (8, SIZE.latent)
     # The fixed root, the occluded neck and padding do not count.
     assert (motions[:, :, [0, neck]] == 0).all()
     assert (motions[~valid] == 0).all()
     wanted = (motions**2).sum() / (valid.sum() * 15 * 2) + 0.5 * 3
     assert float(loss) == pytest.approx(float(wanted), rel=1e-5)
-
-
-def test_weights_and_losses_depend_on_the_seed():
-    tracks = tracks_of(range(1))
-    losses = [held_out_loss(EvaluatorTrainee(tracks, tracks, SIZE, seed=n)) for n in (0, 0, 1)]
-    assert losses[0] == losses[1] != losses[2]
+    mean, log_variance = torch.randn(2, 6, 5, generator=torch.Generator().manual_seed(0))
+    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    wanted = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
+    torch.testing.assert_close(divergence_from_normal(mean, log_variance), wanted.sum(dim=1))
 
 
 def test_saved_encoder_gives_the_same_features(evaluator, views, tmp_path, run, monkeypatch):
     monkeypatch.setattr(checkpoints, "WEIGHTS", tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"checkpoint whole; .* one of no names"):
-        TrackEvaluator.load("whole")
-    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
-    evaluator.save(whole)
-    again = TrackEvaluator.load("whole")
+    with pytest.raises(FileNotFoundError, match=r"checkpoint full; .* one of no names"):
+        TrackEvaluator.load("full")
+    full, half = tmp_path / "full.safetensors", tmp_path / "half.safetensors"
+    evaluator.save(full)
+    again = TrackEvaluator.load("full")
     features = again.features(views)
     np.testing.assert_array_equal(features, evaluator.features(views))
     assert (again.fps, again.frames, again.card) == (30.0, FRAMES, evaluator.card)
-    assert not any(name.startswith("decoder.") for name in load_checkpoint(whole, KIND).tensors)
+    assert not any(name.startswith("decoder.") for name in load_checkpoint(full, KIND).tensors)
     evaluator.save(half, half=True)
     error = np.abs(TrackEvaluator.load(half).features(views) - features).max()
     assert 0 < error < 0.01 * features.std()
-    assert half.stat().st_size < 0.5 * run[1].model.stat().st_size
-    with pytest.raises(FileNotFoundError, match="run or one of half, whole"):
+    assert half.stat().st_size < 0.5 * run.model.stat().st_size
+    with pytest.raises(FileNotFoundError, match="run or one of full, half"):
         TrackEvaluator.load("walk")
-
-
-def test_sizes_match_the_publication_and_the_shipped_file():
-    size = EvaluatorSettings.reference_code()
-    assert (size.layers, size.width, size.latent, size.kl_weight) == (6, 256, 256, 1e-5)
-    encoder = TrackAutoencoder(EvaluatorSettings.small(), 14).encoder
-    assert 2 * sum(p.numel() for p in encoder.parameters()) < 1e6
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -62,14 +61,14 @@ def poses_of(points):
 def test_density_integrates_to_one():
     data = seeds.generator(0, "data").normal([0.2, -0.1], [0.6, 0.3], (500, 2))
     flow = PoseFlow.of_poses(POINT, TINY, poses_of(torch.from_numpy(data)).numpy())
-    perturbed(flow, 0.15)
+    flow = perturbed(flow, 0.15)
     points, area = grid(6.0)
     with torch.no_grad():
         density = flow.log_density(poses_of(points)).exp()
     assert abs(float(density.sum()) * area - 1) < 1e-3
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("share", [0.5, 1.0])
 def test_untrained_density_is_the_gaussian_of_the_data(share):
     """Principal components outside the flow contribute as well."""
     rng = seeds.generator(0, "poses")
@@ -94,30 +93,20 @@ def mixture_tracks(seed, frames=3000):
     return [KeypointTrack(keypoints, np.ones((frames, 2)), POINT, 20.0, f"spots-{seed}/0")]
 
 
-def mixture_log_density(tip, spread):
-    parts = [stats.multivariate_normal(spot, spread**2).pdf(tip) for spot in SPOTS]
-    return np.log(np.mean(parts, axis=0))
-
-
-@pytest.fixture
-def trainee():
-    return PoseFlowTrainee(mixture_tracks(0, 100), mixture_tracks(1, 100), TINY)
-
-
 def test_training_recovers_a_mixture(tmp_path):
     """The divergence from the exact density falls to less than a quarter."""
     settings = FlowSettings(couplings=5, width=32, blur=0.05)
     trainee = PoseFlowTrainee(mixture_tracks(0), mixture_tracks(1, 500), settings)
-    blurred = math.hypot(SPREAD, settings.blur)
+    variance = SPREAD**2 + settings.blur**2
     rng = seeds.generator(2, "test")
     tip = mixture_tracks(3)[0].keypoints[:, 1] + settings.blur * rng.normal(size=(3000, 2))
-    exact = mixture_log_density(tip, blurred)
+    parts = [stats.multivariate_normal(spot, variance).pdf(tip) for spot in SPOTS]
+    exact = np.log(np.mean(parts, axis=0))
+    poses = poses_of(torch.from_numpy(tip).float())
 
+    @torch.no_grad()
     def divergence(flow):
-        with torch.no_grad():
-            return float(
-                (exact - flow.log_density(poses_of(torch.from_numpy(tip).float())).numpy()).mean()
-            )
+        return float((exact - flow.log_density(poses).numpy()).mean())
 
     before = divergence(trainee.network)
     run = TrainingSettings(
@@ -127,9 +116,6 @@ def test_training_recovers_a_mixture(tmp_path):
     flow = PoseFlow.load(result.model)
     assert before > 0.4
     assert -0.02 < divergence(flow) < before / 4
-    points, area = grid(4.0)
-    density = flow.log_density(poses_of(points.float())).exp().double()
-    assert abs(float(density.sum()) * area - 1) < 1e-3
     # The validation loss is the negative log density of blurred poses per coordinate.
     assert abs(result.history[-1]["validation_loss"] + exact.mean() / 2) < 0.1
 
@@ -148,7 +134,8 @@ def test_whole_poses_are_centred_and_mirrored():
     assert len(whole_poses([track], 0.0)) == 8
 
 
-def test_losses_depend_on_their_generator_only(trainee):
+def test_losses_depend_on_their_generator_only():
+    trainee = PoseFlowTrainee(mixture_tracks(0, 100), mixture_tracks(1, 100), TINY)
     cpu = torch.device("cpu")
     one, again, other = (
         trainee.training_loss(trainee.network, seeds.generator(0, k), 8, cpu).item()
@@ -157,18 +144,8 @@ def test_losses_depend_on_their_generator_only(trainee):
     assert one == again != other
     first, second = (trainee.validation_loss(trainee.network, cpu) for _ in range(2))
     assert first == second
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"share": 0.0}, "share must be above 0 and at most 1, got 0.0"),
-        ({"blur": -1.0}, "blur must be a number of at least 0, got -1.0"),
-    ],
-)
-def test_invalid_settings_are_rejected(changes, message):
-    with pytest.raises(ValueError, match=message):
-        replace(FlowSettings(), **changes)
+    with pytest.raises(ValueError, match=r"poses must have shape .* got \(2, 14, 2\)"):
+        trainee.network.log_density(torch.zeros(2, 14, 2))
 
 
 GOOD = mixture_tracks(0, 20)
@@ -187,11 +164,10 @@ STILL = [KeypointTrack(np.zeros((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "still
         (STILL, STILL, "blur must be above 0 for poses in a subspace, got 0"),
     ],
 )
-def test_invalid_tracks_are_rejected(tracks, validation, message):
+def test_invalid_input_is_rejected(tracks, validation, message):
     with pytest.raises(ValueError, match=message):
         PoseFlowTrainee(tracks, validation, replace(TINY, blur=0.0))
-
-
-def test_other_skeletons_are_rejected(trainee):
-    with pytest.raises(ValueError, match=r"poses must have shape .* got \(2, 14, 2\)"):
-        trainee.network.log_density(torch.zeros(2, 14, 2))
+    with pytest.raises(ValueError, match="share must be above 0 and at most 1, got 0"):
+        FlowSettings(share=0.0)
+    with pytest.raises(ValueError, match="blur must be a number of at least 0, got -1"):
+        FlowSettings(blur=-1.0)

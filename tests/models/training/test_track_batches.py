@@ -78,12 +78,12 @@ def test_joints_below_the_threshold_have_no_effect():
     keypoints, zeroed = low.keypoints.copy(), np.where(confidence < 0.3, 0, confidence)
     keypoints[3:9, 4] = np.nan
     occluded = replace(low, keypoints=keypoints, confidence=zeroed)
-    ours, theirs = (batches(one, augmentation=Augmentation()) for one in (low, occluded))
-    for one, other in zip(draw(ours, 20), draw(theirs, 20), strict=True):
+    first, second = (batches(one, augmentation=Augmentation()) for one in (low, occluded))
+    for one, other in zip(draw(first, 20), draw(second, 20), strict=True):
         np.testing.assert_array_equal(one, other)
     for name in ("mean", "deviation"):
         np.testing.assert_array_equal(
-            getattr(ours.standards, name), getattr(theirs.standards, name)
+            getattr(first.standards, name), getattr(second.standards, name)
         )
     whole = draw(batches(low))
     assert not whole.seen[0, 3:9, 4].any()

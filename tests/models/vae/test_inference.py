@@ -11,13 +11,12 @@ import torch
 
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, Skeleton
 from probmotion.models.bodies.articulated_body import ArticulatedBody
-from probmotion.models.latent.reduced_latent import ReducedLatent
 from probmotion.models.vae.inference import VAEEncoder
 from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.models.vae.rigid_paths import RigidPath
 from probmotion.models.vae.settings import MotionVAESettings
-from probmotion.samplers import DVAEInference, Ensemble, MetropolisHastings
+from probmotion.samplers import DVAEInference
 from probmotion.seeds import NormalStreams
 
 ARM = Skeleton(["pelvis", "neck", "left_shoulder", "left_elbow"], [-1, 0, 1, 2])
@@ -27,17 +26,13 @@ SIZE = replace(MotionVAESettings.tiny(), frames=4, latent=2)
 CAMERA = Cameras.around(np.array([0.4]), np.array([0.1]))
 
 
-def fresh(size=SIZE):
-    model = MotionVAEModel.of(size, BODY)
-    with torch.no_grad():
-        model.vae.bone_decoder.leave.weight.mul_(15)
-    rigid = RigidPath.upright(BODY, size.frames)
-    return MotionVAE(model.vae, model.pose, size, BODY, 20.0, rigid=rigid)
-
-
 @pytest.fixture(scope="module")
 def prior():
-    return fresh()
+    model = MotionVAEModel.of(SIZE, BODY)
+    with torch.no_grad():
+        model.vae.bone_decoder.leave.weight.mul_(15)
+    rigid = RigidPath.upright(BODY, SIZE.frames)
+    return MotionVAE(model.vae, model.pose, SIZE, BODY, 20.0, rigid=rigid)
 
 
 @pytest.fixture
@@ -159,26 +154,6 @@ def test_optimisation_agrees_with_the_posterior(prior):
     np.testing.assert_allclose(theta.mean(axis=0), mean, atol=0.35 * deviation.min())
     assert (theta.std(axis=0) < 1.25 * deviation).all()
     assert (theta.std(axis=0) > 0.3 * deviation).all()
-
-
-@pytest.mark.slow
-def test_ensemble_and_mh_agree_with_the_reduced_posterior():
-    """Two of five dimensions are kept."""
-    whole = fresh(replace(SIZE, latent=5))
-    reduced = ReducedLatent(whole, 2)
-    posterior = MotionPosterior(reduced, seen_of(reduced))
-    mean, deviation = on_a_grid(posterior)
-    # The posterior is much narrower than the prior.
-    assert deviation.max() < 0.5
-    for sampler in (
-        Ensemble(walkers=16, warmup=200, thin=10, candidates=16),
-        MetropolisHastings(warmup=200, thin=5, candidates=16),
-    ):
-        draws = sampler.sample(posterior, draws=300, chains=2, seed=0, progress=False)
-        theta = draws.dataset["theta"].values.reshape(-1, 2)
-        np.testing.assert_allclose(draws.flat(), whole.motion(reduced.latent(theta)), atol=1e-12)
-        np.testing.assert_allclose(theta.mean(axis=0), mean, atol=0.3 * deviation.min())
-        np.testing.assert_allclose(theta.std(axis=0), deviation, rtol=0.3)
 
 
 def on_a_grid(posterior):

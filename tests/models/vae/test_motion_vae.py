@@ -155,13 +155,8 @@ def test_placement_by_an_orthographic_camera(prior):
 
 
 def test_placement_by_a_perspective_camera_recovers_the_distance(prior):
-    camera = Cameras(
-        np.diag([1.0, -1.0, -1.0])[None],
-        np.array([[0.0, 0.0, 9.0]]),
-        np.array([800.0]),
-        np.array([[640.0, 360.0]]),
-        orthographic=False,
-    )
+    rotation, centre = np.diag([1.0, -1.0, -1.0])[None], np.array([[640.0, 360.0]])
+    camera = Cameras(rotation, np.array([[0, 0, 9.0]]), np.array([800.0]), centre, False)
     path = RigidPath(some_path().rotations, np.tile([0.0, 0.0, 4.0], (6, 1)))
     seen, other = observed_body(prior, camera, path, codes()[1])
     placed = other.placed_by(seen)

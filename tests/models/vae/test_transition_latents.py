@@ -53,10 +53,10 @@ def prior():
 
 def test_segments_are_unchanged(prior):
     z = codes()
-    found = long_motion(prior, z, iterations=3, transitions=1)
-    assert found.shape == (3 * 10 + 2 * 6, 6, 3)
+    result = long_motion(prior, z, iterations=3, transitions=1)
+    assert result.shape == (3 * 10 + 2 * 6, 6, 3)
     for number, segment in enumerate(prior.motion(z)):
-        np.testing.assert_allclose(found[16 * number : 16 * number + 10], segment, atol=1e-9)
+        np.testing.assert_allclose(result[16 * number : 16 * number + 10], segment, atol=1e-9)
 
 
 def test_acceleration_of_uniform_acceleration():
@@ -71,17 +71,17 @@ def test_transitions_accelerate_no_more_than_segments(seed):
     allowed = max(greatest_acceleration(segment) for segment in segments)
     side_by_side = greatest_acceleration(np.concatenate(segments))
     assert side_by_side > 1.5 * allowed
-    found = long_motion(prior, z)
-    assert greatest_acceleration(found) <= allowed * (1 + 1e-9)
+    result = long_motion(prior, z)
+    assert greatest_acceleration(result) <= allowed * (1 + 1e-9)
 
 
 def test_unsmooth_transition_warns():
     """Still bodies in distant poses must accelerate between them."""
     still, z = mover(pace=0.01), 2 * codes(2)
     with pytest.warns(UserWarning, match=r"after segment 0 has [\d.]+ times the largest accel"):
-        found = long_motion(still, z, iterations=3)
+        result = long_motion(still, z, iterations=3)
     within = max(greatest_acceleration(part) for part in still.motion(z))
-    assert greatest_acceleration(found) > within
+    assert greatest_acceleration(result) > within
 
 
 def test_exact_transition_needs_no_correction(prior):
@@ -114,9 +114,9 @@ def test_optimisation_reduces_the_mismatch(prior, monkeypatch):
 
 
 def test_root_is_fixed_and_bone_lengths_are_constant(prior):
-    found = long_motion(prior, codes(2), iterations=3)
-    np.testing.assert_allclose(found[:, 0], np.tile(prior.rigid.translations[0], (len(found), 1)))
-    lengths = np.linalg.norm(found[:, 1:] - found[:, ARMS.parents[1:]], axis=-1)
+    result = long_motion(prior, codes(2), iterations=3)
+    np.testing.assert_allclose(result[:, 0], np.tile(prior.rigid.translations[0], (len(result), 1)))
+    lengths = np.linalg.norm(result[:, 1:] - result[:, ARMS.parents[1:]], axis=-1)
     want = np.broadcast_to(np.linalg.norm(REST[1:], axis=-1), lengths.shape)
     np.testing.assert_allclose(lengths, want, atol=1e-9)
 

@@ -171,25 +171,6 @@ def test_one_of_two_protocols_is_required(prior, gaussian, two_modes):
         distilled(QUICK, MotionPosterior(WithoutDensity(np.zeros((12, 5)), np.zeros(12))))
 
 
-def test_a_2d_denoiser_takes_precedence(gaussian):
-    class Both(type(gaussian)):
-        def log_density(self, theta):
-            return -0.5 * (theta**2).sum(-1)
-
-        def initial(self, rng, n):
-            return rng.standard_normal((n, self.dim))
-
-        def denoise_coordinates(self, theta_t, alpha_bar):
-            raise AssertionError
-
-    prior = Both(gaussian.mean, gaussian.covariance, gaussian.scale)
-    assert isinstance(prior, DenoisesCoordinates)
-    np.testing.assert_array_equal(
-        distilled(QUICK, MotionPosterior(prior), draws=2).positions,
-        distilled(QUICK, MotionPosterior(gaussian), draws=2).positions,
-    )
-
-
 def test_likelihoods_without_a_finite_torch_gradient_are_refused(prior):
     @dataclass
     class Custom:

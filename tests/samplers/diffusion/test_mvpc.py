@@ -25,11 +25,7 @@ def test_without_gamma_and_corrector_it_is_mas(gaussian):
 
 
 @pytest.mark.parametrize(
-    ("settings", "calls"),
-    [
-        ({}, 475),
-        ({"steps": 100, "corrector_steps": 3}, 1865),
-    ],
+    ("settings", "calls"), [({}, 475), ({"steps": 100, "corrector_steps": 3}, 1865)]
 )
 def test_evaluations_are_counted(gaussian, settings, calls):
     sampler = MultiViewPredictorCorrector(**settings)

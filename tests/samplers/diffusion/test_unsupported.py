@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, UnsupportedPosterior
+from probmotion import Cameras, Joints3D, Keypoints2D, MotionPosterior, UnsupportedPosterior
 from probmotion.samplers import (
     Ancestral3D,
     MultiViewAncestral,
@@ -24,24 +25,15 @@ def test_elevation_0_warns(gaussian, kind):
 
 
 def test_likelihoods_that_are_not_linear_gaussian_are_refused(gaussian):
-    motion = Motion(gaussian.mean, gaussian.skeleton, gaussian.fps)
-    near = Cameras.ring(1, distance=9.0, perspective=True)
-    perspective = Keypoints2D.observe(motion, near, noise=0.1, seed=0)
-    outliers = Joints3D.observe(motion, noise=0.1, seed=0, degrees_of_freedom=3)
+    cameras = Cameras.ring(1, distance=9.0, perspective=True)
 
-    class Other:
-        frames, n_joints = 2, 2
-
-        def log_density(self, positions):
-            return 0.0
-
-        def simulate(self, rng, positions):
-            return self
+    class Other(Joints3D):
+        linear = None
 
     for likelihood, reason in (
-        (perspective, "the cameras are perspective"),
-        (outliers, "Student-t with 3 degrees"),
-        (Other(), r"but Other has no method linear\(\)"),
+        (Keypoints2D(np.zeros((1, 2, 2, 2)), cameras, noise=0.1), "the cameras are perspective"),
+        (Joints3D(gaussian.mean, 0.1, degrees_of_freedom=3), "Student-t with 3 degrees"),
+        (Other(gaussian.mean, 0.1), r"but Other has no method linear\(\)"),
     ):
         for kind in (Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector):
             with pytest.raises(UnsupportedPosterior, match=reason) as refused:
