@@ -104,11 +104,11 @@ def starting_points(
 ) -> np.ndarray:
     """Return ``initial``, or prior draws resampled in proportion to their likelihood.
 
-    Each chain draws its own ``candidates`` from the prior and resamples among them (sampling-
-    importance-resampling, Rubin 1987). With enough candidates a start is nearly a draw from the
-    posterior, so starts cover its modes in proportion to their mass and R-hat detects chains that
-    do not mix. If the prior has seeds, chains start at them in turn. ``shape`` is (chains, dim) or
-    (chains, walkers, dim).
+    Every chain draws ``candidates`` from the prior and resamples among them (sampling-importance-
+    resampling, Rubin 1987). With enough candidates a start is almost a draw from the posterior, so
+    starts cover its modes in proportion to their mass and R-hat detects chains that do not mix. If
+    the prior has seeds, chains start at them in turn. ``shape`` is (chains, dim) or (chains,
+    walkers, dim).
     """
     if initial is not None:
         assert not isinstance(initial, MotionDraws)
@@ -186,11 +186,8 @@ def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)
     out = np.empty((chains, draws, *shape))
     for chain in range(chains):
-        for numbers in batches(range(draws), _BATCH):
+        for numbers in batches(range(draws), 256):
             streams = NormalStreams.of_draws(seed, [(chain, first + draw) for draw in numbers])
-            some = slice(numbers[0], numbers[-1] + 1)
-            out[chain, some] = posterior.complete(streams, theta[chain, some])
+            batch = slice(numbers[0], numbers[-1] + 1)
+            out[chain, batch] = posterior.complete(streams, theta[chain, batch])
     return out
-
-
-_BATCH = 256

@@ -8,7 +8,7 @@ only at the network's input and output.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,10 +97,8 @@ class MotionDiffusion(TrackNetwork):
         )
         network = settings.network(skeleton.n_joints)
         load_weights(network, checkpoint.tensors)
-        card = checkpoint.settings
-        return cls(
-            network, settings, standards, skeleton, fps, frames=frames, device=device, card=card
-        )
+        data = (network, settings, standards, skeleton, fps)
+        return cls(*data, frames=frames, device=device, card=checkpoint.settings)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:
         """Write the prior as a checkpoint, optionally in half precision.
@@ -150,11 +148,11 @@ class MotionDiffusion(TrackNetwork):
         self._check(x_t)
         if alpha_bar == 1:
             return x_t.copy()
-        network, standardise, restore = self._network_at(alpha_bar)
+        network = self._network_at(alpha_bar)
         clean = np.empty_like(x_t)
         for rows, chunk in self._chunks(x_t):
             with torch.inference_mode():
-                denoised = restore(network(standardise(chunk)))
+                denoised = network(chunk)
             clean[rows] = _numbers(denoised, x_t)[: len(clean[rows])]
         return clean
 
@@ -168,15 +166,14 @@ class MotionDiffusion(TrackNetwork):
         """
         self._check(x_t)
         check_shape("vectors", vectors, x_t.shape)
-        network, standardise, restore = self._network_at(alpha_bar)
+        network = self._network_at(alpha_bar)
         factor = (1 - alpha_bar) / math.sqrt(alpha_bar)
         product = np.empty_like(vectors)
-        along = self._chunks(vectors)
-        for (rows, chunk), (_, given) in zip(self._chunks(x_t), along, strict=True):
+        chunks = zip(self._chunks(x_t), self._chunks(vectors), strict=True)
+        for (rows, chunk), (_, vector) in chunks:
             with torch.enable_grad():
                 point = chunk.requires_grad_()
-                clean = restore(network(standardise(point)))
-                (pulled,) = torch.autograd.grad(clean, point, given)
+                (pulled,) = torch.autograd.grad(network(point), point, vector)
             product[rows] = factor * _numbers(pulled, vectors)[: len(product[rows])]
         return product
 
@@ -208,26 +205,20 @@ class MotionDiffusion(TrackNetwork):
                 f"x_t must have at most {self.settings.frames} frames, got {x_t.shape[2]}"
             )
 
-    def _network_at(self, alpha_bar: float) -> tuple[Any, Any, Any]:
-        """Return the network at a level, the map to its inputs and that from its outputs."""
-        level = self.settings.level(alpha_bar)
-        scale = self.scale
-        mean = self._tensor(self.standards.mean / scale)
-        deviation = self._tensor(self.standards.deviation / scale)
-        signal = math.sqrt(alpha_bar)
+    def _network_at(self, alpha_bar: float) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return the map from noisy to clean motions (N, L, J, 2) at a noise level."""
+        level, signal = self.settings.level(alpha_bar), math.sqrt(alpha_bar)
+        mean = self._tensor(self.standards.mean / self.scale)
+        deviation = self._tensor(self.standards.deviation / self.scale)
         spread = torch.sqrt(alpha_bar * deviation**2 + (1 - alpha_bar))
 
-        def network(motions: torch.Tensor) -> torch.Tensor:
-            levels = torch.full((len(motions),), level, device=self._device)
-            return self._network(motions.flatten(2), levels).unflatten(2, (-1, 2))
+        def denoise(noisy: torch.Tensor) -> torch.Tensor:
+            standardised = (noisy - signal * mean) / spread
+            levels = torch.full((len(noisy),), level, device=self._device)
+            clean = self._network(standardised.flatten(2), levels).unflatten(2, (-1, 2))
+            return mean + deviation * clean
 
-        def standardise(noisy: torch.Tensor) -> torch.Tensor:
-            return (noisy - signal * mean) / spread
-
-        def restore(standardised: torch.Tensor) -> torch.Tensor:
-            return mean + deviation * standardised
-
-        return network, standardise, restore
+        return denoise
 
     def _chunks(self, views: np.ndarray) -> Iterator[tuple[slice, torch.Tensor]]:
         """Yield rows and the views of their motions as one batch, (n V, L, J, 2)."""
@@ -237,12 +228,11 @@ class MotionDiffusion(TrackNetwork):
         if cpu:
             n = 1 if n < 4 else 1 << (n.bit_length() - 1)
         for start in range(0, B, n):
-            some = views[start : start + n]
-            padded = some
-            if cpu and len(some) < n:
-                filler = np.zeros((n - len(some), *some.shape[1:]))
-                padded = np.concatenate([some, filler])
-            yield slice(start, start + len(some)), self._tensor(padded).flatten(0, 1)
+            chunk = views[start : start + n]
+            rows = slice(start, start + len(chunk))
+            if cpu and len(chunk) < n:
+                chunk = np.concatenate([chunk, np.zeros((n - len(chunk), *chunk.shape[1:]))])
+            yield rows, self._tensor(chunk).flatten(0, 1)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self._device)

@@ -6,7 +6,7 @@ It makes samplers that require a 2D denoiser, such as `mas`, available for prior
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from probmotion import seeds
 from probmotion.data.projections import DetectorNoise, Filming, project_clips
@@ -22,13 +22,14 @@ from probmotion.validation import check_count
 __all__ = ["denoiser_of"]
 
 _HELD_OUT = 10
+_Size = Literal["tiny", "small", "paper"]
 
 
 def denoiser_of(
     prior: MotionPrior,
     out: str | Path,
     *,
-    size: Literal["tiny", "small", "paper"] = "small",
+    size: _Size = "small",
     motions: int = 400,
     views: int = 16,
     filming: Filming | None = None,
@@ -73,26 +74,18 @@ def denoiser_of(
     if not isinstance(prior, Samplable):
         raise ValueError(f"prior must have a sample method, got {type(prior).__name__}")
     check_count("motions", motions, least=2)
-    sizes = {
-        "tiny": DiffusionSettings.tiny,
-        "small": DiffusionSettings.small,
-        "paper": DiffusionSettings.paper,
-    }
-    if size not in sizes:
-        raise ValueError(f"size must be one of {', '.join(sizes)}, got {size!r}")
-    usual = usual_training(size)
+    if size not in get_args(_Size):
+        raise ValueError(f"size must be one of {', '.join(get_args(_Size))}, got {size!r}")
     drawn = prior.sample(seeds.generator(seed, "filmed motions"), motions)
     clips = [
         Motion(positions, prior.skeleton, prior.fps, name=f"drawn-{number}")
         for number, positions in enumerate(drawn)
     ]
     # Without detection errors, which are not part of the prior.
-    tracks = project_clips(
-        clips, views=views, seed=seed, filming=filming, noise=DetectorNoise.none()
-    )
+    noise = DetectorNoise.none()
+    tracks = project_clips(clips, views=views, seed=seed, filming=filming, noise=noise)
     held_out = views * max(1, motions // _HELD_OUT)
-    trainee = DiffusionTrainee(
-        tracks[held_out:], tracks[:held_out], sizes[size](prior.frames), seed=seed
-    )
-    result = train(trainee, usual if training is None else training, out, progress=progress)
+    settings = getattr(DiffusionSettings, size)(prior.frames)
+    trainee = DiffusionTrainee(tracks[held_out:], tracks[:held_out], settings, seed=seed)
+    result = train(trainee, training or usual_training(size), out, progress=progress)
     return MotionDiffusion.load(result.model)

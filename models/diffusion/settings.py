@@ -15,6 +15,8 @@ from probmotion.validation import check_count
 
 __all__ = ["DiffusionSettings", "TransformerSettings"]
 
+_SIZES = ("layers", "width", "heads", "feedforward")
+
 
 @dataclass(frozen=True)
 class TransformerSettings:
@@ -27,10 +29,7 @@ class TransformerSettings:
     layers, width, heads, feedforward : int
         Size of the encoder; ``width`` is an even multiple of ``heads``.
 
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
+    Raises ``ValueError`` if a number is out of range.
     """
 
     frames: int = 60
@@ -41,7 +40,7 @@ class TransformerSettings:
 
     def __post_init__(self) -> None:
         check_count("frames", self.frames, least=2)
-        for name in ("layers", "width", "heads", "feedforward"):
+        for name in _SIZES:
             check_count(name, getattr(self, name))
         if self.width % self.heads or self.width % 2:
             raise ValueError(
@@ -64,10 +63,7 @@ class DiffusionSettings(TransformerSettings):
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the MAS authors' code.
 
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
+    Raises ``ValueError`` if a number is out of range.
     """
 
     dropout: float = 0.1
@@ -108,17 +104,10 @@ class DiffusionSettings(TransformerSettings):
 
     def network(self, n_joints: int, seed: int = 0) -> MotionTransformer:
         """Return an untrained network of this size."""
+        sizes = {name: getattr(self, name) for name in (*_SIZES, "dropout")}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
-            return MotionTransformer(
-                2 * n_joints,
-                self.frames,
-                layers=self.layers,
-                width=self.width,
-                heads=self.heads,
-                feedforward=self.feedforward,
-                dropout=self.dropout,
-            )
+            return MotionTransformer(2 * n_joints, self.frames, **sizes)
 
     def level(self, alpha_bar: float) -> float:
         """Return the fractional index of the noise level ᾱ, interpolated in log noise.

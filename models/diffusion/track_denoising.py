@@ -64,29 +64,22 @@ def denoise_track(
     """
     check_positive("noise", noise)
     check_count("rounds", rounds)
-    _check_track(track, prior)
     visible = (track.confidence >= threshold) & (track.confidence > 0)
-    if not visible.any():
-        raise ValueError(
-            f"track {track.name or 'unnamed'} must have a joint with a confidence of "
-            f"{threshold:g} or more, got none"
-        )
-    _check_metres(track, prior, visible)
+    _check_track(track, prior, visible, threshold)
     seen = np.where(visible[..., None], track.keypoints, prior.standards.mean) / prior.scale
     target = noise / prior.scale
     last = prior.settings.schedule.alpha_bar[-1]
-    if target > (most := math.sqrt((1 - last) / last)):
+    most = math.sqrt((1 - last) / last)
+    if target > most:
         raise ValueError(
             f"noise must be at most {most * prior.scale:.3g} m, the prior's highest level, got "
             f"{noise:g}"
         )
-    levels = np.array([target])
-    if not visible.all():
-        levels = np.geomspace(max(1.0, target), target, rounds)
     clean = seen
+    levels = [target] if visible.all() else np.geomspace(max(1.0, target), target, rounds)
     for sigma in levels:
-        given = np.where(visible[..., None], seen, clean)
-        clean = _denoise(prior, given, float(sigma))
+        filled = np.where(visible[..., None], seen, clean)
+        clean = _denoise(prior, filled, float(sigma))
     clean = _shrunk_towards(clean, seen, visible, target)
     confidence = np.where(visible, 1.0, track.confidence)
     return replace(track, keypoints=clean * prior.scale, confidence=confidence)
@@ -129,7 +122,10 @@ def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.
     return total / weight[:, None, None]
 
 
-def _check_track(track: KeypointTrack, prior: MotionDiffusion) -> None:
+def _check_track(
+    track: KeypointTrack, prior: MotionDiffusion, visible: np.ndarray, threshold: float
+) -> None:
+    name = f"track {track.name or 'unnamed'}"
     if track.skeleton.canonical_names != prior.skeleton.canonical_names:
         raise ValueError(
             f"track must have the prior's joints {', '.join(prior.skeleton.joint_names)}, got "
@@ -142,13 +138,13 @@ def _check_track(track: KeypointTrack, prior: MotionDiffusion) -> None:
         )
     if track.frames < 2:
         raise ValueError("track must have at least 2 frames, got 1")
-
-
-def _check_metres(track: KeypointTrack, prior: MotionDiffusion, visible: np.ndarray) -> None:
-    off = (track.keypoints - prior.standards.mean)[visible]
-    distance = math.sqrt((off**2).mean())
-    if distance > (most := _FARTHEST * prior.scale):
+    if not visible.any():
         raise ValueError(
-            f"track {track.name or 'unnamed'} must be in metres about the root, at most "
-            f"{most:.3g} m in root mean square, got {distance:.3g}"
+            f"{name} must have a joint with a confidence of {threshold:g} or more, got none"
+        )
+    distance = math.sqrt(((track.keypoints - prior.standards.mean)[visible] ** 2).mean())
+    if distance > _FARTHEST * prior.scale:
+        raise ValueError(
+            f"{name} must be in metres about the root, at most {_FARTHEST * prior.scale:.3g} m in "
+            f"root mean square, got {distance:.3g}"
         )

@@ -72,9 +72,8 @@ class DiffusionTrainee(TrackTrainee):
         # Standardise by the variance at each level, so that inputs have unit variance.
         spread = torch.sqrt(alpha_bar * deviation**2 + (1 - alpha_bar))
         entered = (noisy - alpha_bar.sqrt() * mean) / spread
-        estimate = network(entered.flatten(2), moved(levels), moved(drawn.valid)).unflatten(
-            2, (-1, 2)
-        )
+        estimate = network(entered.flatten(2), moved(levels), moved(drawn.valid))
+        estimate = estimate.unflatten(2, (-1, 2))
         moves = deviation > 0
         wanted = (clean - mean) / torch.where(moves, deviation, 1.0)
         weight = moved(drawn.seen)[..., None] * moves

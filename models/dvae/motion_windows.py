@@ -129,17 +129,14 @@ class WindowTrainee:
         self.windows = MotionWindows(clips, states, frames)
         self.held_out = MotionWindows(validation, states, frames)
         if self.held_out.fps != self.windows.fps:
-            raise ValueError(
-                f"validation must have {self.windows.fps:g} frames per second, got "
-                f"{self.held_out.fps:g}"
-            )
+            wanted, got = self.windows.fps, self.held_out.fps
+            raise ValueError(f"validation must have {wanted:g} frames per second, got {got:g}")
         self.annealing, self._seed = annealing, seed
         self._full_weight = self._weight = weight
 
     def anneal(self, step: int) -> None:
         """Set the loss weight of a step."""
-        risen = min(1.0, step / self.annealing) if self.annealing else 1.0
-        self._weight = self._full_weight * risen
+        self._weight = self._full_weight * min(1.0, step / max(1, self.annealing))
 
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device

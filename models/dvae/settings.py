@@ -56,11 +56,9 @@ class DVAESettings:
                 f"hidden must be a multiple of groups={self.groups}, got {self.hidden}"
             )
         for name, known in (("decoder", Decoder), ("decoder_scale", DecoderScale)):
-            if getattr(self, name) not in get_args(known):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(get_args(known))}, "
-                    f"got {getattr(self, name)!r}"
-                )
+            value, choices = getattr(self, name), get_args(known)
+            if value not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
     @classmethod
     def tiny(cls) -> DVAESettings:

@@ -23,13 +23,8 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
-    "KIND",
-    "LifterNetwork",
-    "LifterSettings",
-    "PoseLifter",
-    "project_points",
-    "raise_points",
-]
+    "KIND", "LifterNetwork", "LifterSettings", "PoseLifter", "project_points", "raise_points",
+]  # fmt: skip
 
 KIND = "pose-lifter"
 # Fixed number of poses per chunk, as rounding depends on the shape of a batch.

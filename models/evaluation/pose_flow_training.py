@@ -58,11 +58,6 @@ class PoseTrainee:
         Minimum confidence of every joint of a pose.
     seed : int
         Seed of initial weights and validation noise.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, skeletons differ, or no frame is fully visible.
     """
 
     _validation_poses: int

@@ -86,10 +86,8 @@ def hypothesis_losses(
 
 def weighted_sum(terms: Mapping[str, torch.Tensor], settings: MotionVAESettings) -> torch.Tensor:
     """Return Σ λ · term with the weights of the settings."""
-    total = torch.zeros(())
-    for name, value in terms.items():
-        total = total + getattr(settings, name) * value
-    return total
+    weighted = (getattr(settings, name) * value for name, value in terms.items())
+    return sum(weighted, torch.zeros(()))
 
 
 def best_hypothesis(hypotheses: PoseHypotheses, losses: torch.Tensor) -> PoseHypotheses:

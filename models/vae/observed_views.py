@@ -58,9 +58,8 @@ class ObservedView:
             return plane
         depth = self.distance - offsets[..., 2:]
         if not depth.min() > 0:
-            raise ValueError(
-                f"offsets must have positive depth in the camera, got {depth.min():.3g} m"
-            )
+            least = f"{depth.min():.3g} m"
+            raise ValueError(f"offsets must have positive depth in the camera, got {least}")
         return plane * self.distance / depth
 
     def world_rotations(self, rotations: np.ndarray) -> np.ndarray:
@@ -76,8 +75,8 @@ class ObservedView:
         translation = self.camera.translation[0]
         depth = translation[2] if self.distance is None else self.distance
         plane = self.root + moved * _TO_OPENCV[:2]
-        here = np.concatenate([plane, np.full((len(plane), 1), depth)], axis=-1)
-        return (here - translation) @ self.camera.rotation[0]
+        in_camera = np.concatenate([plane, np.full((len(plane), 1), depth)], axis=-1)
+        return (in_camera - translation) @ self.camera.rotation[0]
 
 
 def observed_view(

@@ -37,18 +37,24 @@ class TeacherForcedPoses:
         # Full precision, even if the first training step uses autocast.
         with torch.autocast(rest.device.type, enabled=False):
             outputs = [vars(network(*part, rest)).values() for part in parts]
-        *poses, log_lengths = (torch.cat(part) for part in zip(*outputs, strict=True))
-        self._poses = PoseHypotheses(*[*(part[:, :, 0] for part in poses), log_lengths])
+        rotation, translation, turns, log_lengths = map(torch.cat, zip(*outputs, strict=True))
+        self._poses = PoseHypotheses(
+            rotation[:, :, 0], translation[:, :, 0], turns[:, :, 0], log_lengths
+        )
 
     def of(self, drawn: Batch) -> PoseHypotheses:
         """Return the teacher poses of drawn windows, before scaling; none may be padded."""
         if (drawn.frames < 0).any():
             raise ValueError("drawn must not contain padded windows")
         frames = torch.as_tensor(drawn.frames, device=self._poses.turns.device)
-        *poses, log_lengths = vars(self._poses.at(frames)).values()
-        # The network predicts lengths linearly from the mean over frames.
-        windows = [part.transpose(1, 2) for part in poses]
-        return PoseHypotheses(*[*windows, log_lengths.mean(dim=1)])
+        poses = self._poses.at(frames)
+        return PoseHypotheses(
+            poses.rotation.transpose(1, 2),
+            poses.translation.transpose(1, 2),
+            poses.turns.transpose(1, 2),
+            # The network predicts lengths linearly from the mean over frames.
+            poses.log_lengths.mean(dim=1),
+        )
 
 
 def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:

@@ -62,40 +62,27 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     for place in places:
         for archive in (place / "cmu_single" / f"{name}.npz", place / f"{name}.npz"):
             if archive.is_file():
-                return _named_start(_archived(archive), name)
+                return _first_seconds(load(archive), name, archive)
         for originals in (place / _DATASET, place):
             skeleton = originals / f"{subject}.asf"
             motion = originals / f"{subject}_{trial}.amc"
             if skeleton.is_file() and motion.is_file():
-                return _named_start(_subsampled(read_amc(motion, skeleton, _SOURCE_FPS)), name)
-    raise FileNotFoundError(
-        f"clip {name} is not in {', '.join(map(str, places))}; {_hint(subject, trial)}"
-    )
+                clip = read_amc(motion, skeleton, _SOURCE_FPS)
+                # Rounded as in the archives.
+                positions = clip.positions[:: round(_SOURCE_FPS / _FPS)].astype(np.float32)
+                return _first_seconds(replace(clip, positions=positions, fps=_FPS), name, motion)
+    remedy = f"pass the folder with its archive {_PLACE}"
+    if subject in _SUBJECTS:
+        names = f'["{subject}.asf", "{subject}_{trial}.amc"]'
+        remedy = (
+            f'probmotion.data.downloads.download("{_DATASET}", names={names}) fetches it, or pass '
+            f"the folder with the files {_PLACE}"
+        )
+    raise FileNotFoundError(f"clip {name} is not in {', '.join(map(str, places))}; {remedy}")
 
 
-def _archived(path: Path) -> Motion:
-    motion = load(path)
+def _first_seconds(motion: Motion, name: str, path: Path) -> Motion:
+    """Return the first 30 seconds of a clip under ``name``."""
     if motion.fps != _FPS:
         raise MotionFileError(f"{path} must have {_FPS:g} frames per second, got {motion.fps:g}")
-    return motion
-
-
-def _subsampled(motion: Motion) -> Motion:
-    """Return the frames of an original at 30 fps, rounded as in the archives."""
-    step = round(motion.fps / _FPS)
-    return replace(motion, positions=motion.positions[::step].astype(np.float32), fps=_FPS)
-
-
-def _named_start(motion: Motion, name: str) -> Motion:
-    """Return the first 30 seconds of a clip under ``name``."""
     return replace(motion.window(0, min(motion.frames, _FRAMES)), name=name)
-
-
-def _hint(subject: str, trial: str) -> str:
-    if subject not in _SUBJECTS:
-        return f"pass the folder with its archive {_PLACE}"
-    names = f'["{subject}.asf", "{subject}_{trial}.amc"]'
-    return (
-        f'probmotion.data.downloads.download("{_DATASET}", names={names}) fetches it, or pass the '
-        f"folder with the files {_PLACE}"
-    )

@@ -24,21 +24,26 @@ DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
         *(f"cmu_single/cmu_01_{trial:02}" for trial in (*range(1, 9), 10, 11, 12, 14)),
         *(f"cmu_single/cmu_02_{trial:02}" for trial in (1, 3, 4, 5, 6, 8, 10)),
         "cmu_single/cmu_131_01",
-        "deepmimic_human/humanoid3d_backflip",
-        "deepmimic_human/humanoid3d_cartwheel",
-        "deepmimic_human/humanoid3d_crawl",
-        "deepmimic_human/humanoid3d_dance_a",
-        "deepmimic_human/humanoid3d_dance_spin",
-        "deepmimic_human/humanoid3d_getup_facedown",
-        "deepmimic_human/humanoid3d_long_walk1",
-        "deepmimic_human/humanoid3d_long_walk2",
-        "deepmimic_human/humanoid3d_long_zombie",
-        "deepmimic_human/humanoid3d_punch",
-        "deepmimic_human/humanoid3d_roll",
-        "deepmimic_human/humanoid3d_sideflip",
-        "deepmimic_human/humanoid3d_spin",
-        "deepmimic_human/humanoid3d_spinkick",
-        "deepmimic_human/humanoid3d_stealthy_walk0",
+        *(
+            f"deepmimic_human/humanoid3d_{name}"
+            for name in (
+                "backflip",
+                "cartwheel",
+                "crawl",
+                "dance_a",
+                "dance_spin",
+                "getup_facedown",
+                "long_walk1",
+                "long_walk2",
+                "long_zombie",
+                "punch",
+                "roll",
+                "sideflip",
+                "spin",
+                "spinkick",
+                "stealthy_walk0",
+            )  # fmt: skip
+        ),
     ),
     "validation": (
         "cmu_single/cmu_01_09",
@@ -103,20 +108,16 @@ def synthetic_denoising_clips(
     held_out = max(n // 5, len(_STYLES))
     skeleton = Skeleton.preset("person14")
     frames = max(round(seconds * _FPS), 1)
-    parts: dict[str, list[Motion]] = {}
-    first = 0
-    for part, size in (("train", n), ("validation", held_out), ("test", held_out)):
-        parts[part] = [
-            _gait(number, frames, seed).retarget(skeleton) for number in range(first, first + size)
-        ]
-        first += size
-    return parts
-
-
-def _gait(number: int, frames: int, seed: int) -> Motion:
-    """Return gait ``number``; the styles alternate."""
-    style = _STYLES[number % len(_STYLES)]
-    return make_gait(style, number // len(_STYLES), frames=frames, fps=_FPS, seed=seed)
+    clips = []
+    for number in range(n + 2 * held_out):
+        index, style = divmod(number, len(_STYLES))
+        gait = make_gait(_STYLES[style], index, frames=frames, fps=_FPS, seed=seed)
+        clips.append(gait.retarget(skeleton))
+    return {
+        "train": clips[:n],
+        "validation": clips[n : n + held_out],
+        "test": clips[n + held_out :],
+    }
 
 
 def _segments(path: Path) -> list[Motion]:
@@ -131,8 +132,7 @@ def _segments(path: Path) -> list[Motion]:
         )
     if not suspect.any():
         return [motion.resample(_FPS)]
-    edges = np.flatnonzero(np.diff(suspect, prepend=True, append=True))
-    segments = [motion.window(start, stop - start) for start, stop in edges.reshape(-1, 2).tolist()]
-    resampled = [segment.resample(_FPS) for segment in segments]
-    long = [segment for segment in resampled if segment.frames >= _FRAMES]
+    edges = np.flatnonzero(np.diff(suspect, prepend=True, append=True)).reshape(-1, 2).tolist()
+    segments = [motion.window(start, stop - start).resample(_FPS) for start, stop in edges]
+    long = [segment for segment in segments if segment.frames >= _FRAMES]
     return [replace(segment, name=f"{motion.name}-{number}") for number, segment in enumerate(long)]

@@ -9,9 +9,9 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from probmotion.data.pairs import load_pairs, read_salsa_bvh
 from probmotion.motion.motion import Motion
@@ -54,8 +54,7 @@ class DownloadError(OSError):
     """A file cannot be downloaded, or has another SHA-256; the message contains its address."""
 
 
-@dataclass(frozen=True)
-class _Entry:
+class _Entry(NamedTuple):
     dataset: str
     repository: str
     commit: str
@@ -180,10 +179,10 @@ def _registry() -> tuple[_Entry, ...]:
 
 
 def _chosen(dataset: str, names: Sequence[str] | None) -> list[_Entry]:
-    known = list(dict.fromkeys(entry.dataset for entry in _registry()))
-    if dataset not in known:
-        raise ValueError(f"dataset must be one of {', '.join(known)}, got {dataset!r}")
     entries = {entry.name: entry for entry in _registry() if entry.dataset == dataset}
+    if not entries:
+        known = dict.fromkeys(entry.dataset for entry in _registry())
+        raise ValueError(f"dataset must be one of {', '.join(known)}, got {dataset!r}")
     if names is None:
         return list(entries.values())
     if isinstance(names, str):

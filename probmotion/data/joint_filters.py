@@ -128,17 +128,16 @@ def kalman_smooth(
     passes = _forward(problem)
     mean, covariance = passes.mean[-1], passes.covariance[-1]
     means, variances = np.empty_like(problem.joints), np.empty(problem.variance.shape)
-    for frame in range(len(means) - 1, -1, -1):
-        if frame < len(means) - 1:
-            # Gᵀ = P⁻¹ F C, with C filtered and P predicted.
-            ahead = passes.predicted_covariance[frame + 1]
-            moved = problem.step @ passes.covariance[frame]
-            gain = np.swapaxes(np.linalg.solve(ahead, moved), -1, -2)
-            mean = passes.mean[frame] + gain @ (mean - passes.predicted[frame + 1])
-            change = gain @ (covariance - ahead) @ np.swapaxes(gain, -1, -2)
-            covariance = passes.covariance[frame] + change
-        means[frame] = mean[:, 0]
-        variances[frame] = covariance[:, 0, 0]
+    means[-1], variances[-1] = mean[:, 0], covariance[:, 0, 0]
+    for frame in range(len(means) - 2, -1, -1):
+        # Gᵀ = P⁻¹ F C, with C filtered and P predicted.
+        predicted = passes.predicted_covariance[frame + 1]
+        moved = problem.step @ passes.covariance[frame]
+        gain = np.swapaxes(np.linalg.solve(predicted, moved), -1, -2)
+        mean = passes.mean[frame] + gain @ (mean - passes.predicted[frame + 1])
+        change = gain @ (covariance - predicted) @ np.swapaxes(gain, -1, -2)
+        covariance = passes.covariance[frame] + change
+        means[frame], variances[frame] = mean[:, 0], covariance[:, 0, 0]
     deviation = np.sqrt(variances)[..., None]
     return means + problem.centre, np.broadcast_to(deviation, means.shape).copy()
 
@@ -172,12 +171,9 @@ def fit_acceleration(
         return -float(log_marginal_likelihood(joints[:, one], confidence[:, one], **given)[0])
 
     bounds = (math.log10(_LEAST), math.log10(_MOST))
-    fitted = []
-    for joint in range(joints.shape[1]):
-        one = (slice(joint, joint + 1),)
-        best = minimize_scalar(cost, bounds=bounds, args=one, method="bounded")
-        fitted.append(10.0**best.x)
-    return np.array(fitted)
+    slices = [slice(joint, joint + 1) for joint in range(joints.shape[1])]
+    fits = [minimize_scalar(cost, bounds=bounds, args=(one,), method="bounded") for one in slices]
+    return np.array([10.0**fit.x for fit in fits])
 
 
 class _Problem(NamedTuple):
@@ -212,14 +208,10 @@ class _Problem(NamedTuple):
             check_positive("acceleration", float(value))
         with np.errstate(divide="ignore"):
             variance = noise**2 / confidence
-        d = 1 / fps
-        return cls(
-            joints=np.where(seen[..., None], joints - centre, 0.0),
-            variance=variance,
-            centre=centre,
-            step=np.array([[1.0, d], [0.0, 1.0]]),
-            process=spread[..., None, None] ** 2 * np.array([[d**3 / 3, d**2 / 2], [d**2 / 2, d]]),
-        )
+        centred, d = np.where(seen[..., None], joints - centre, 0.0), 1 / fps
+        step = np.array([[1.0, d], [0.0, 1.0]])
+        process = spread[..., None, None] ** 2 * np.array([[d**3 / 3, d**2 / 2], [d**2 / 2, d]])
+        return cls(centred, variance, centre, step, process)
 
 
 class _Passes(NamedTuple):
@@ -252,9 +244,9 @@ def _forward(problem: _Problem) -> _Passes:
         gain = covariance[:, :, :1] / total[:, None, None]
         mean = mean + gain * innovation[:, None]
         # Joseph form, which keeps the covariance positive definite.
-        kept = np.eye(2) - gain * np.array([1.0, 0.0])
+        factor = np.eye(2) - gain * np.array([1.0, 0.0])
         added = np.where(seen, variance, 0.0)[:, None, None] * (gain @ np.swapaxes(gain, -1, -2))
-        covariance = kept @ covariance @ np.swapaxes(kept, -1, -2) + added
+        covariance = factor @ covariance @ np.swapaxes(factor, -1, -2) + added
         means[0, frame], covariances[0, frame] = mean, covariance
         square = (innovation[seen] ** 2).sum(axis=-1) / total[seen]
         log_marginal_likelihood[seen] -= 0.5 * (square + 3 * np.log(2 * math.pi * total[seen]))

@@ -34,10 +34,13 @@ _SKULL = 0.10
 _SEED_POSES = 400
 _HEIGHTS = (0.5, 3.0)  # plausible heights, m
 _FARTHEST = 5.0  # greatest distance between roots, m
+_MOST_APART, _FASTEST = 1.2, 7.0  # limits of dance frames, m and m/s
 _LEG = ("hip", "knee", "ankle")
 
 
-def dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> np.ndarray:
+def dance_frames(
+    motion: Motion, *, farthest: float = _MOST_APART, fastest: float = _FASTEST
+) -> np.ndarray:
     """Return which frames show the dance.
 
     Excluded are the opening, until the partners first come close; frames in which someone is far
@@ -64,22 +67,22 @@ def dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0)
     return ~np.any(_excluded_frames(motion, farthest, fastest), axis=0)
 
 
-def describe_dance_frames(motion: Motion, *, farthest: float = 1.2, fastest: float = 7.0) -> str:
-    """Return a sentence with the numbers of frames that :func:`dance_frames` keeps and excludes.
+def describe_dance_frames(motion: Motion) -> str:
+    """Return a sentence with the numbers of frames that :func:`dance_frames` includes and excludes.
 
     An excluded frame is counted once, under the first reason that applies.
     """
-    opening, apart, glitch = _excluded_frames(motion, farthest, fastest)
+    opening, apart, glitch = _excluded_frames(motion, _MOST_APART, _FASTEST)
     counts = opening.sum(), (apart & ~opening).sum(), (glitch & ~apart & ~opening).sum()
     return (
         f"{motion.name or 'the motion'}: {motion.frames - sum(counts)} of {motion.frames} frames "
         f"are dance; excluded are {counts[0]} of the opening, {counts[1]} with partners over "
-        f"{farthest:g} m apart and {counts[2]} next to a step faster than {fastest:g} m/s"
+        f"{_MOST_APART:g} m apart and {counts[2]} next to a step faster than {_FASTEST:g} m/s"
     )
 
 
 def ground_truth(
-    motions: Sequence[Motion], n: int | None = None, *, farthest: float = 1.2, fastest: float = 7.0
+    motions: Sequence[Motion], n: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pose pairs evenly spaced over the dance frames of several clips.
 
@@ -91,8 +94,6 @@ def ground_truth(
         Clips of one skeleton, each with two people or more.
     n : int, optional
         Number of pose pairs; all dance frames by default.
-    farthest, fastest : float
-        As in :func:`dance_frames`.
 
     Returns
     -------
@@ -114,30 +115,31 @@ def ground_truth(
                 f"motions must share one skeleton, got {motions[0]} and {motion}; use "
                 "motion.retarget(skeleton)"
             )
-    frames = [
-        np.flatnonzero(dance_frames(motion, farthest=farthest, fastest=fastest))
-        for motion in motions
-    ]
+    frames = [np.flatnonzero(dance_frames(motion)) for motion in motions]
     clip = np.repeat(np.arange(len(motions)), list(map(len, frames)))
     frame = np.concatenate(frames)
     total = len(frame)
     if total == 0:
-        first = describe_dance_frames(motions[0], farthest=farthest, fastest=fastest)
+        first = describe_dance_frames(motions[0])
         raise ValueError(f"motions must contain dance frames, got none; {first}")
-    if n is None:
-        n = total
+    n = total if n is None else n
     check_count("n", n)
     if n > total:
         raise ValueError(f"n must be at most the {total} dance frames, got {n}")
-    chosen = (2 * np.arange(n) + 1) * total // (2 * n)  # midpoints of n equal intervals
-    every = np.concatenate([m.positions[f] for m, f in zip(motions, frames, strict=True)])
-    return every[chosen], clip[chosen], frame[chosen]
+    positions = np.concatenate([m.positions[f] for m, f in zip(motions, frames, strict=True)])
+    chosen = _evenly_spaced(n, total)
+    return positions[chosen], clip[chosen], frame[chosen]
+
+
+def _evenly_spaced(n: int, total: int) -> np.ndarray:
+    """Return the midpoints of n equal intervals of ``range(total)``."""
+    return (2 * np.arange(n) + 1) * total // (2 * n)
 
 
 def hold_out(
     motions: Sequence[Motion], names: Sequence[str] = SALSA_HELD_OUT
 ) -> tuple[list[Motion], list[Motion]]:
-    """Split motions by name into those kept and those held out.
+    """Split motions by name into training motions and held-out ones.
 
     Raises
     ------
@@ -153,14 +155,14 @@ def hold_out(
                 f"names must be names of one motion each ({', '.join(dict.fromkeys(known))}), got "
                 f"{name!r}, the name of {known.count(name)}"
             )
-    held_in = [motion for motion in motions if motion.name not in names]
+    training = [motion for motion in motions if motion.name not in names]
     held_out = [motion for motion in motions if motion.name in names]
-    if not held_in or not held_out:
+    if not training or not held_out:
         raise ValueError(
             f"names must hold out at least one of {len(motions)} motions and leave one, got "
             f"{len(held_out)} names"
         )
-    return held_in, held_out
+    return training, held_out
 
 
 def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
@@ -245,13 +247,9 @@ def choose_seed(positions: np.ndarray) -> int:
     if len(positions) == 0:
         raise ValueError("positions must contain at least one pose pair, got none")
     check_finite("positions", positions)
-    n = min(len(positions), _SEED_POSES)
-    chosen = (2 * np.arange(n) + 1) * len(positions) // (2 * n)
+    chosen = _evenly_spaced(min(len(positions), _SEED_POSES), len(positions))
     centred = positions[chosen] - positions[chosen].mean(axis=1, keepdims=True)
-    total = np.zeros(n)
-    for index in range(n):
-        total[index] = _aligned_distances(centred[index], centred).sum()
-    return int(chosen[total.argmin()])
+    return int(chosen[np.argmin([_aligned_distances(pose, centred).sum() for pose in centred])])
 
 
 def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -298,12 +296,10 @@ def _height(positions: np.ndarray, skeleton: Skeleton, root: int) -> np.ndarray:
     at = {name: positions[..., tree[names.index(name)], :] for name in required}
     hips = (at["left_hip"] + at["right_hip"]) / 2
     head = tree[names.index("head")]
-    chain = [head, *skeleton.ancestors(head)]
     length = np.linalg.norm(hips - positions[..., root, :], axis=-1)
-    for joint, parent in pairwise(chain):
-        length = length + np.linalg.norm(
-            positions[..., joint, :] - positions[..., parent, :], axis=-1
-        )
+    for joint, parent in pairwise([head, *skeleton.ancestors(head)]):
+        bone = positions[..., joint, :] - positions[..., parent, :]
+        length = length + np.linalg.norm(bone, axis=-1)
     for side in ("left", "right"):
         for upper, lower in pairwise(_LEG):
             bone = at[f"{side}_{upper}"] - at[f"{side}_{lower}"]

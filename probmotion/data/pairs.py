@@ -48,9 +48,8 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
     ValueError
         As :func:`pair_of`.
     """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
     patterns: list[str | Path] = []
-    for path in map(Path, given):
+    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
         if path.is_dir() and not any(path.glob("*.npz")):
             raise FileNotFoundError(f"folder {path} contains no .npz file")
         patterns += sorted(path.glob("*.npz")) if path.is_dir() else [path]
@@ -117,12 +116,8 @@ def pair_motion(first: Motion, second: Motion, name: str = "") -> Motion:
                 "motion of two people"
             )
         people.append(_person(motion, number, roots[0]))
-    return Motion(
-        np.concatenate(people, axis=1),
-        Skeleton.preset("pair17"),
-        first.fps,
-        name=name or f"{first.name} & {second.name}",
-    )
+    name = name or f"{first.name} & {second.name}"
+    return Motion(np.concatenate(people, axis=1), Skeleton.preset("pair17"), first.fps, name=name)
 
 
 def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
@@ -152,19 +147,19 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
         If a file is missing.
     """
     trial = _salsa_trial(Path(lead), Path(follow))
-    end_sites = [
+    people = [
         read_bvh(path, scale=scale, end_sites=True)
         for path, scale in zip((lead, follow), _SALSA_SCALES, strict=True)
     ]
-    both = pair_motion(end_sites[0], end_sites[1], f"cmu_60_61_{trial}")
+    both = pair_motion(*people, name=f"cmu_60_61_{trial}")
     least = _SALSA_START + _SALSA_END + 1
     if both.frames < least:
         raise ValueError(f"lead must have at least {least} frames, got {both.frames}")
     # The floor is estimated with the toes, which are End Sites and dropped later.
-    lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in end_sites])
+    lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in people])
     floor = np.percentile(lowest, 2)
-    kept = both.positions[_SALSA_START : both.frames - _SALSA_END : 2]
-    return Motion(kept - [0.0, floor, 0.0], both.skeleton, _SALSA_FPS / 2, name=both.name)
+    positions = both.positions[_SALSA_START : both.frames - _SALSA_END : 2]
+    return Motion(positions - [0.0, floor, 0.0], both.skeleton, _SALSA_FPS / 2, name=both.name)
 
 
 def _salsa_trial(lead: Path, follow: Path) -> str:

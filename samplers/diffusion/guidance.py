@@ -19,15 +19,9 @@ from probmotion.samplers.diffusion.views import StateDenoiser, symmetric_power
 from probmotion.validation import check_count, check_positive
 
 __all__ = [
-    "DPS",
-    "AnyGuidance",
-    "Guide",
-    "MomentMatched",
-    "Replacement",
-    "WeightedTriangulation",
-    "can_guide",
-    "guide_towards",
-]
+    "DPS", "AnyGuidance", "Guide", "MomentMatched", "Replacement", "WeightedTriangulation",
+    "can_guide", "guide_towards",
+]  # fmt: skip
 
 Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
 """(x_t, ᾱ, estimate, posterior step) → the estimate given the observations, (B, L, J, 3)."""

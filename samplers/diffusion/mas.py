@@ -122,20 +122,19 @@ class MultiViewAncestral(AncestralSampler):
         if not self.shared_noise:
             raise ValueError("shared_noise must be True to project the noise to a new view")
         state = self._state(posterior)
-        views = Views(self.cameras)
-        estimates: list[np.ndarray] = []
-        noises: list[np.ndarray] = []
+        watched: list[tuple[Any, Any]] = []
 
         def watch(clean: np.ndarray | None, noise: np.ndarray | None) -> None:
-            if clean is not None:
-                estimates.append(clean)
-            if noise is not None:
-                noises.append(noise if noise.shape[-1] == 3 else views.combine(noise))
+            watched.append((clean, noise))
 
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
         ancestral(state, streams, lambda: None, watch=watch, **self._options())
+        estimates = np.stack([clean for clean, _ in watched[1:]])
+        noises = np.stack([noise for _, noise in watched[:-1]])
+        if noises.shape[-1] == 2:
+            noises = np.stack([Views(self.cameras).combine(noise) for noise in noises])
         scale = posterior.prior.scale  # type: ignore[attr-defined]
-        return MultiViewTrace(self, np.stack(estimates), np.stack(noises), scale)
+        return MultiViewTrace(self, estimates, noises, scale)
 
     def _options(self) -> dict[str, Any]:
         return {"stop": self.stop_level, "variance_for_deviation": self.variance_for_deviation}

@@ -20,13 +20,9 @@ from probmotion.posteriors.protocols import (
 )
 
 __all__ = [
-    "MotionDenoiser",
-    "MultiViewDenoiser",
-    "StateDenoiser",
-    "Views",
-    "symmetric_power",
+    "MotionDenoiser", "MultiViewDenoiser", "StateDenoiser", "Views", "symmetric_power",
     "views_around",
-]
+]  # fmt: skip
 
 
 class Views:

@@ -32,12 +32,11 @@ def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     times.
     """
     n = len(trace)
-    apart = trace - trace.mean(axis=(0, 1))
-    power = (np.abs(np.fft.rfft(apart, 2 * n, axis=0)) ** 2).mean(axis=1)
+    centred = trace - trace.mean(axis=(0, 1))
+    power = (np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2).mean(axis=1)
     covariance = np.fft.irfft(power, 2 * n, axis=0)[: n // 2]
     covariance /= np.arange(n, n - n // 2, -1)[:, None]
-    still = covariance[0] == 0
-    correlation = covariance / np.where(still, np.nan, covariance[0])
+    correlation = covariance / np.where(covariance[0] == 0, np.nan, covariance[0])
     times = 2 * np.cumsum(correlation, axis=0) - 1
     long_enough = np.arange(n // 2)[:, None] >= _WINDOW * times
     # If the run is too short for the window, the largest sum is the conservative estimate.

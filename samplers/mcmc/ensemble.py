@@ -21,7 +21,7 @@ from probmotion.validation import check_count
 __all__ = ["Ensemble"]
 
 _LEAST_TIMES = 3
-"""Length of a run, in autocorrelation times, above which its own estimate of them is used."""
+"""Minimum length of a run, in autocorrelation times, for which their estimate is used."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ class Ensemble:
         try:
             with progress_bar(warmup + iterations * self.thin, self.name, progress) as bar:
                 for _ in range(warmup):
-                    run.warm_up()
+                    for chain in run.chains:
+                        next(chain)
                     bar.update(1)
                 for _ in range(iterations):
                     run.record()
@@ -208,11 +209,6 @@ class _Run:
         self.trace: list[list[np.ndarray]] = []
         self.first_coordinates: list[list[np.ndarray]] = []
 
-    def warm_up(self) -> None:
-        """Advance every ensemble by one iteration."""
-        for chain in self.chains:
-            next(chain)
-
     def record(self) -> None:
         """Advance every ensemble by ``thin`` iterations and record the last; interruptible."""
         for iteration in range(self.thin):
@@ -230,15 +226,16 @@ class _Run:
     def draws(self, wanted: int) -> tuple[np.ndarray, np.ndarray, _State]:
         """Return θ and log densities of at most ``wanted`` draws, and the state after them."""
         walkers = self.start.coordinates.shape[1]
-        n = self.last.draws if self.last is not self.start else 0
+        finished = self.last.draws if self.last is not self.start else 0
         begin = walkers - self.start.unused
         first = (self.start.coordinates[:, begin:], self.start.log_density[:, begin:])
         theta, log_density = (
-            np.concatenate(parts, axis=1) for parts in zip(first, *self.recorded[:n], strict=True)
+            np.concatenate(parts, axis=1)
+            for parts in zip(first, *self.recorded[:finished], strict=True)
         )
-        given = min(wanted, theta.shape[1])
-        state = self.last._replace(unused=theta.shape[1] - given, draws=self.start.draws + given)
-        return theta[:, :given], log_density[:, :given], state
+        n = min(wanted, theta.shape[1])
+        state = self.last._replace(unused=theta.shape[1] - n, draws=self.start.draws + n)
+        return theta[:, :n], log_density[:, :n], state
 
     def statistics(self) -> dict[str, np.ndarray]:
         """Return the acceptance rate and autocorrelation time of every ensemble.
@@ -252,8 +249,8 @@ class _Run:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
         # An accepted stretch move changes every coordinate.
         moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
-        traces = zip(*self.trace, strict=True)
-        slowest = np.array([autocorrelation_time(np.array(trace)).max() for trace in traces])
+        traces = [np.array(trace) for trace in zip(*self.trace, strict=True)]
+        slowest = np.array([autocorrelation_time(trace).max() for trace in traces])
         times = np.maximum(slowest * self._stride / self.thin, 1.0)
         too_short = len(self.trace) < _LEAST_TIMES * slowest
         times = np.where(too_short, np.maximum(times, len(self.recorded)), times)

@@ -36,7 +36,7 @@ class MetropolisHastings:
     candidates : int
         Prior draws per chain, among which its start is resampled by likelihood.
     pseudo_marginal : bool
-        Estimate the likelihood of every proposal from freshly drawn views and keep the estimate
+        Estimate the likelihood of every proposal from freshly drawn views and store the estimate
         with the state, so that chains target the integral over views (Andrieu and Roberts 2009).
         By default the views of the likelihood are fixed.
     """
@@ -114,9 +114,8 @@ class MetropolisHastings:
         if not (self.pseudo_marginal or self.proposal.guided):
             return
         if not isinstance(posterior.likelihood, ComparesViews):
-            setting = (
-                "pseudo_marginal=True" if self.pseudo_marginal else type(self.proposal).__name__
-            )
+            name = type(self.proposal).__name__
+            setting = "pseudo_marginal=True" if self.pseudo_marginal else name
             raise UnsupportedPosterior(
                 self.name,
                 f"with {setting} needs a likelihood with ComparesViews, got "
@@ -162,7 +161,7 @@ class _Walk:
     density: Density
     generators: list[np.random.Generator]
     theta: np.ndarray
-    memory: ProposalState
+    adaptation: ProposalState
     draws: int = 0
     log_density: np.ndarray = field(init=False)
     guide: np.ndarray = field(init=False)
@@ -180,13 +179,13 @@ class _Walk:
     def resume(
         cls, sampler: MetropolisHastings, density: Density, state: Mapping[str, np.ndarray]
     ) -> _Walk:
-        memory = {
-            name.removeprefix(_MEMORY): values
+        adaptation = {
+            name.removeprefix(_PREFIX): values
             for name, values in state.items()
-            if name.startswith(_MEMORY)
+            if name.startswith(_PREFIX)
         }
         generators = [seeds.resumed_generator(words) for words in state["random"]]
-        walk = cls(sampler, density, generators, state["theta"], memory, int(state["draws"]))
+        walk = cls(sampler, density, generators, state["theta"], adaptation, int(state["draws"]))
         walk.log_density = state["log_density"]
         walk.guide = state.get("guide", np.empty((len(walk.theta), 0)))
         return walk
@@ -197,7 +196,7 @@ class _Walk:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the arrays that :meth:`resume` needs."""
-        memory = self.proposal.settled(self.memory)
+        adaptation = self.proposal.settled(self.adaptation)
         return {
             "theta": self.theta,
             "log_density": self.log_density,
@@ -207,14 +206,14 @@ class _Walk:
             **({"fixed": self.density(self.theta)} if self.sampler.pseudo_marginal else {}),
             "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
             "draws": np.array(self.draws, dtype=np.int32),
-            **{_MEMORY + name: values for name, values in memory.items()},
+            **{_PREFIX + name: values for name, values in adaptation.items()},
         }
 
     def warm_up(self, steps: int, tick: Callable[[], Any]) -> None:
         """Take steps and adapt the proposal."""
         for _ in range(steps):
             acceptance = self._step()
-            self.memory = self.proposal.learn(self.memory, self.theta, acceptance)
+            self.adaptation = self.proposal.learn(self.adaptation, self.theta, acceptance)
             tick()
 
     def advance(self, steps: int) -> _Draw:
@@ -225,9 +224,11 @@ class _Walk:
 
     def _step(self) -> np.ndarray:
         """Take one step; return its probability of acceptance, (chains,)."""
-        proposed = self.proposal.propose(self.generators, self.theta, self.guide, self.memory)
+        proposed = self.proposal.propose(self.generators, self.theta, self.guide, self.adaptation)
         log_density, guide = self.density.evaluate(proposed, *self._evaluation())
-        log_ratio = self.proposal.log_ratio(self.theta, self.guide, proposed, guide, self.memory)
+        log_ratio = self.proposal.log_ratio(
+            self.theta, self.guide, proposed, guide, self.adaptation
+        )
         log_acceptance = np.minimum(0.0, log_density - self.log_density + log_ratio)
         # −log U is standard exponential for U uniform on (0, 1].
         level = np.array([rng.standard_exponential() for rng in self.generators])
@@ -242,4 +243,4 @@ class _Walk:
         return (self.generators if self.sampler.pseudo_marginal else None), self.proposal.guided
 
 
-_MEMORY = "proposal_"
+_PREFIX = "proposal_"

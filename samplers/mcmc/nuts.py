@@ -184,7 +184,11 @@ class _Run:
                     states[chain], row = self._advance(states[chain], some, thin)
                     rows.append(row)
                     bar.update(some * thin)
-                self._record(rows, list(states))
+                chunk = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+                if self.recorded:
+                    chunk = {k: np.concatenate([self.recorded[k], chunk[k]], 1) for k in chunk}
+                self.recorded, self.chains = chunk, list(states)
+                self.finished += some
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state after the last finished draw, to continue from."""
@@ -207,13 +211,6 @@ class _Run:
         finished = {name: np.asarray(values)[:draws] for name, values in rows.items()}
         self.gradients += int(finished["steps"].sum())
         return state, finished
-
-    def _record(self, rows: list[dict[str, np.ndarray]], states: list[Any]) -> None:
-        """Append one chunk of every chain."""
-        grown = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        if self.recorded:
-            grown = {name: np.concatenate([self.recorded[name], grown[name]], 1) for name in grown}
-        self.recorded, self.chains, self.finished = grown, states, grown["log_density"].shape[1]
 
 
 def _chunks(draws: int, thin: int) -> list[int]:

@@ -101,8 +101,8 @@ class _AdaptiveScale:
         if self.target is None:
             return state
         steps = state["steps"] + 1
-        moved = _steered(state["log_scale"], acceptance - self.target, steps)
-        return {"log_scale": moved, "steps": steps}
+        log_scale = _adapted(state["log_scale"], acceptance - self.target, steps)
+        return {"log_scale": log_scale, "steps": steps}
 
     def settled(self, state: ProposalState) -> ProposalState:
         """Return log s."""
@@ -134,7 +134,7 @@ class Isotropic(_AdaptiveScale, _Symmetric):
 
 @dataclass(frozen=True)
 class AdaptiveCovariance(_Symmetric):
-    """θ' = θ + s C ε, C Cᵀ the covariance of the chain's own warm-up (Haario et al. 2001).
+    """θ' = θ + s C ε, C Cᵀ the covariance of the chain's warm-up (Haario et al. 2001).
 
     The warm-up is divided into windows of 50, 100, 200, … steps. At the end of each, C is set to
     the root of the regularised covariance of its points and s to 2.38/√dim (Gelman et al. 1996).
@@ -181,12 +181,12 @@ class AdaptiveCovariance(_Symmetric):
     ) -> ProposalState:
         """Return the state with s and the moments updated and, at the end of a window, C."""
         steps = state["steps"] + 1
-        apart = theta - state["mean"]
-        mean = state["mean"] + apart / steps[:, None]
-        scatter = state["scatter"] + apart[:, :, None] * (theta - mean)[:, None, :]
+        difference = theta - state["mean"]
+        mean = state["mean"] + difference / steps[:, None]
+        scatter = state["scatter"] + difference[:, :, None] * (theta - mean)[:, None, :]
         learnt = {
             **state,
-            "log_scale": _steered(state["log_scale"], acceptance - self.target, steps),
+            "log_scale": _adapted(state["log_scale"], acceptance - self.target, steps),
             "steps": steps,
             "mean": mean,
             "scatter": scatter,
@@ -254,9 +254,10 @@ class VelocityBiased(_AdaptiveScale):
         state: ProposalState,
     ) -> np.ndarray:
         """Return log N(θ; θ', σ²(θ')) − log N(θ'; θ, σ²(θ))."""
-        there, back = self._variances(guide, state), self._variances(proposed_guide, state)
+        forward, backward = (self._variances(some, state) for some in (guide, proposed_guide))
         square = (proposed - theta) ** 2
-        return 0.5 * (np.log(there / back) + square / there - square / back).sum(axis=1)
+        terms = np.log(forward / backward) + square / forward - square / backward
+        return 0.5 * terms.sum(axis=1)
 
     def _variances(self, guide: np.ndarray, state: ProposalState) -> np.ndarray:
         s = np.exp(state["log_scale"])[:, None]
@@ -275,7 +276,7 @@ def _shrunk(scatter: np.ndarray, n: float) -> np.ndarray:
     return (scatter + 5 * floor[:, None, None] * np.eye(dim)) / (n + 5)
 
 
-def _steered(log_scale: np.ndarray, surplus: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _adapted(log_scale: np.ndarray, surplus: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return log s after one Robbins-Monro step of size n^(−0.6)."""
     return log_scale + surplus * steps**-0.6
 

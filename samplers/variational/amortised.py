@@ -78,13 +78,13 @@ class AmortisedSettings:
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step, counted from 1."""
-        fall = 0.5 * (1 + math.cos(math.pi * step / self.steps))
-        return self.learning_rate * fall * min(1.0, step / _WARMUP)
+        decay = 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        return self.learning_rate * decay * min(1.0, step / _WARMUP)
 
     def weight(self, step: int) -> float:
         """Return the weight of KL(r ‖ p) at a step; small at first to avoid posterior collapse."""
-        done = min(1.0, step / (_ANNEALED * self.steps))
-        return _FIRST_WEIGHT + (1 - _FIRST_WEIGHT) * done
+        progress = min(1.0, step / (_ANNEALED * self.steps))
+        return _FIRST_WEIGHT + (1 - _FIRST_WEIGHT) * progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,38 +113,32 @@ class AmortisedPosterior:
         observed = observed_entries(posterior.likelihood, posterior.frames)
         with one_thread():
             motions, observations, x, y = _coordinates(posterior, settings, seed)
-            held = max(1, int(_HELD_OUT * len(x)))
+            n = max(1, int(_HELD_OUT * len(x)))
+            sizes = (settings.latent, settings.components, settings.experts, settings.hidden)
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(seeds.integer(seed, "network"))
-                network = ConditionalVAE(
-                    x.shape[1],
-                    y.shape[1],
-                    settings.latent,
-                    settings.components,
-                    settings.experts,
-                    settings.hidden,
-                )
-            _train(network, x[held:], y[held:], settings, seed, progress)
-            root = _decoder_root(network.double(), x[:held].double(), y[:held].double(), seed)
+                network = ConditionalVAE(x.shape[1], y.shape[1], *sizes)
+            _train(network, x[n:], y[n:], settings, seed, progress)
+            root = _decoder_root(network.double(), x[:n].double(), y[:n].double(), seed)
         return cls(network, motions, root, observed, observations)
 
     def draw(self, streams: NormalStreams) -> np.ndarray:
         """Return one motion per stream, (B, L, J, 3), metres."""
         B, (L, _) = len(streams.generators), self.observed.shape
         C = len(self.root)
-        chosen, z_noise = streams.uniform(), streams.normal(self.network.latent)
-        x_noise, left_noise = streams.normal(C), streams.normal(L, self.motions.root.shape[1])
+        uniform, z_noise = streams.uniform(), streams.normal(self.network.latent)
+        x_noise, remainder_noise = streams.normal(C), streams.normal(L, self.motions.root.shape[1])
         with one_thread(), torch.no_grad():
             y = self.observations.coordinates(self.observed[None]).repeat(B, axis=0)
-            given = torch.from_numpy(y)
-            mixture = self.network.prior(given[:1])
+            condition = torch.from_numpy(y)
+            mixture = self.network.prior(condition[:1])
             log_weight, means, log_scales = (part[0].numpy() for part in mixture)
             # Without the last sum, which may round to less than 1.
-            steps = np.cumsum(np.exp(log_weight))[:-1]
-            k = np.searchsorted(steps, chosen, side="right")
+            cumulative = np.cumsum(np.exp(log_weight))[:-1]
+            k = np.searchsorted(cumulative, uniform, side="right")
             z = torch.from_numpy(means[k] + np.exp(log_scales[k]) * z_noise)
-            x = self.network.decode(z, given).numpy() + x_noise @ self.root.T
-            flat = self.motions.motions(x, y, self.observed, left_noise)
+            x = self.network.decode(z, condition).numpy() + x_noise @ self.root.T
+            flat = self.motions.motions(x, y, self.observed, remainder_noise)
         return flat.reshape(B, L, -1, 3)
 
 
@@ -152,22 +146,19 @@ def _coordinates(
     posterior: MotionPosterior, settings: AmortisedSettings, seed: int
 ) -> tuple[MotionCoordinates, PrincipalCoordinates, torch.Tensor, torch.Tensor]:
     """Return the coordinates of motions and observations, and x and y of all pairs."""
-    first: list[SimulatedPairs] = []
     chunks = simulate_pairs(posterior, seed, settings.pairs)
-    for pairs in chunks:
-        first.append(pairs)
-        if sum(len(some.positions) for some in first) >= _FIRST:
-            break
-    known = SimulatedPairs(
-        np.concatenate([some.positions for some in first]),
-        np.concatenate([some.observed for some in first]),
+    chunks_of_first: list[SimulatedPairs] = []
+    while sum(len(pairs.positions) for pairs in chunks_of_first) < min(_FIRST, settings.pairs):
+        chunks_of_first.append(next(chunks))
+    first = SimulatedPairs(
+        np.concatenate([pairs.positions for pairs in chunks_of_first]),
+        np.concatenate([pairs.observed for pairs in chunks_of_first]),
     )
-    observations = PrincipalCoordinates.of(known.observed, settings.coordinates)
-    motions = MotionCoordinates.learn(
-        known, observations.coordinates(known.observed), settings.coordinates
-    )
+    most = settings.coordinates
+    observations = PrincipalCoordinates.of(first.observed, most)
+    motions = MotionCoordinates.learn(first, observations.coordinates(first.observed), most)
     x, y = [], []
-    for pairs in chain([known], chunks):
+    for pairs in chain([first], chunks):
         y.append(observations.coordinates(pairs.observed))
         x.append(motions.coordinates(pairs.positions, y[-1]))
     all_x, all_y = (torch.from_numpy(np.concatenate(part)).float() for part in (x, y))
@@ -189,9 +180,9 @@ def _train(
         for step in range(1, settings.steps + 1):
             for group in optimiser.param_groups:
                 group["lr"] = settings.rate(step)
-            chosen = torch.randint(len(x), (settings.batch,), generator=rng)
+            rows = torch.randint(len(x), (settings.batch,), generator=rng)
             noise = torch.randn(settings.batch, settings.latent, generator=rng)
-            loss = network.loss(x[chosen], y[chosen], noise, settings.weight(step))
+            loss = network.loss(x[rows], y[rows], noise, settings.weight(step))
             if not math.isfinite(loss.item()):
                 raise ValueError(
                     f"training on simulated pairs diverged at step {step} with learning_rate "

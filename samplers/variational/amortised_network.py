@@ -19,7 +19,7 @@ _LEAST, _MOST = -7.0, 2.0
 
 
 class ConditionalVAE(nn.Module):
-    """Encoder, prior and decoder networks.
+    """Encoder, prior and decoder.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ class ConditionalVAE(nn.Module):
         mean, log_scale = self.encode(x, y)
         z = mean + log_scale.exp() * noise
         log_r = (-0.5 * noise**2 - log_scale).sum(dim=1)
-        apart = (x - self.decode(z, y)) * torch.exp(-self.log_scale)
-        misfit = 0.5 * (apart**2).sum(dim=1) + self.log_scale.sum()
+        residual = (x - self.decode(z, y)) * torch.exp(-self.log_scale)
+        misfit = 0.5 * (residual**2).sum(dim=1) + self.log_scale.sum()
         return (misfit + weight * (log_r - self.prior.log_density(z, y))).mean()
 
     @torch.no_grad()
@@ -104,24 +104,22 @@ class _MixtureOfGaussians(nn.Module):
 
     def forward(self, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return log π, means and log scales: (B, K), (B, K, latent) twice."""
-        log_weight, mean = self.log_weight[None], self.mean[None]
-        log_scale = self.log_scale[None]
-        if self.network is None:
-            log_weight, mean, log_scale = (
-                part.expand(len(y), *part.shape[1:]) for part in (log_weight, mean, log_scale)
-            )
-        else:
-            weighs, moves, scales = self.network(y).split(self.sizes, dim=1)
-            log_weight = log_weight + weighs
-            mean, log_scale = mean + moves[:, None], log_scale + scales[:, None]
+        log_weight, mean, log_scale = (
+            part.expand(len(y), *part.shape)
+            for part in (self.log_weight, self.mean, self.log_scale)
+        )
+        if self.network is not None:
+            weight_shift, mean_shift, scale_shift = self.network(y).split(self.sizes, dim=1)
+            log_weight = log_weight + weight_shift
+            mean, log_scale = mean + mean_shift[:, None], log_scale + scale_shift[:, None]
         return torch.log_softmax(log_weight, dim=1), mean, log_scale.clamp(_LEAST, _MOST)
 
     def log_density(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Return log p(z | y) up to a constant: ``(B, latent), (B, E) → (B,)``."""
         log_weight, mean, log_scale = self(y)
-        apart = (z[:, None] - mean) * torch.exp(-log_scale)
-        each = log_weight - (0.5 * apart**2 + log_scale).sum(dim=2)
-        return torch.logsumexp(each, dim=1)
+        standardised = (z[:, None] - mean) * torch.exp(-log_scale)
+        log_terms = log_weight - (0.5 * standardised**2 + log_scale).sum(dim=2)
+        return torch.logsumexp(log_terms, dim=1)
 
 
 class _MixtureOfLinearMaps(nn.Module):

@@ -14,21 +14,15 @@ from probmotion import seeds
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Likelihood, Samplable
 from probmotion.posteriors.sampling import UnsupportedPosterior
-from probmotion.validation import check_count
 
 __all__ = [
-    "MotionCoordinates",
-    "PrincipalCoordinates",
-    "SimulatedPairs",
-    "observed_entries",
+    "MotionCoordinates", "PrincipalCoordinates", "SimulatedPairs", "observed_entries",
     "simulate_pairs",
-]
+]  # fmt: skip
 
-_LEAST_FREEDOM = 2.0
-_SAMPLER = "dvae"
 _CHUNK = 2000
 # Minimum variance of a coordinate relative to the largest; smaller ones are rounding errors.
-_NOTHING = 1e-12
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +47,11 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
     if likelihood is None:
         return np.zeros((frames, 0))
     freedom = getattr(likelihood, "degrees_of_freedom", None)
-    if freedom is not None and freedom <= _LEAST_FREEDOM:
+    if freedom is not None and freedom <= 2:
         raise UnsupportedPosterior(
-            _SAMPLER,
-            f"trains on simulated observations and needs more than {_LEAST_FREEDOM:g} degrees of "
-            f"freedom of the noise, got {freedom:g}",
+            "dvae",
+            "trains on simulated observations and needs more than 2 degrees of freedom of the "
+            f"noise, got {freedom:g}",
             word="outliers",
         )
     if hasattr(likelihood, "keypoints"):
@@ -65,7 +59,7 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
     if hasattr(likelihood, "joints"):
         return np.asarray(likelihood.joints).reshape(frames, -1)
     raise UnsupportedPosterior(
-        _SAMPLER,
+        "dvae",
         f"needs observed keypoints or joints, got {type(likelihood).__name__}",
         word="observations",
     )
@@ -73,7 +67,6 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
 
 def simulate_pairs(posterior: MotionPosterior, seed: int, n: int) -> Iterator[SimulatedPairs]:
     """Yield n pairs in chunks, to limit the memory."""
-    check_count("n", n)
     prior, likelihood = posterior.prior, posterior.likelihood
     assert isinstance(prior, Samplable)
     observed_entries(likelihood, posterior.frames)
@@ -113,7 +106,7 @@ class PrincipalCoordinates:
         covariance = (flat - mean).T @ (flat - mean) / len(flat)
         variance, axes = eigh(covariance, subset_by_index=[max(0, D - most), D - 1])
         variance, axes = variance[::-1], axes[:, ::-1]
-        varies = (variance > _NOTHING * variance[0]) & (variance > 0)
+        varies = (variance > _ROUNDING * variance[0]) & (variance > 0)
         return cls(mean, np.ascontiguousarray(axes[:, varies]), np.sqrt(variance[varies]))
 
     def coordinates(self, values: np.ndarray) -> np.ndarray:
@@ -164,16 +157,17 @@ class MotionCoordinates:
         n, L = pairs.observed.shape[:2]
         flat = pairs.positions.reshape(n, -1)
         linear = np.linalg.lstsq(_with_one(y), flat, rcond=None)[0]
-        missed = flat - _with_one(y) @ linear
-        basis = PrincipalCoordinates.of(missed, most)
-        left = basis.without(missed - basis.mean).reshape(n, L, -1)
-        known = _with_one(y, basis.coordinates(missed))
-        explained = np.linalg.lstsq(known, pairs.observed.reshape(n, -1), rcond=None)[0]
-        rest = pairs.observed - (known @ explained).reshape(pairs.observed.shape)
-        fits = [np.linalg.lstsq(rest[:, k], left[:, k], rcond=1e-6)[0] for k in range(L)]
-        gain = np.stack(fits)
-        left = left - np.einsum("nlm,lmj->nlj", rest, gain, optimize=True)
-        covariance = np.einsum("nli,nlj->lij", left, left, optimize=True) / n
+        residual = flat - _with_one(y) @ linear
+        basis = PrincipalCoordinates.of(residual, most)
+        remainder = basis.without(residual - basis.mean).reshape(n, L, -1)
+        inputs = _with_one(y, basis.coordinates(residual))
+        explained = np.linalg.lstsq(inputs, pairs.observed.reshape(n, -1), rcond=None)[0]
+        unexplained = pairs.observed - (inputs @ explained).reshape(pairs.observed.shape)
+        gain = np.stack(
+            [np.linalg.lstsq(unexplained[:, k], remainder[:, k], rcond=1e-6)[0] for k in range(L)]
+        )
+        remainder = remainder - np.einsum("nlm,lmj->nlj", unexplained, gain, optimize=True)
+        covariance = np.einsum("nli,nlj->lij", remainder, remainder, optimize=True) / n
         # Correction for the component along the axes, which is removed from every draw.
         dim, axes = basis.axes.shape
         variance, directions = np.linalg.eigh(covariance * dim / max(1, dim - axes))
@@ -194,10 +188,10 @@ class MotionCoordinates:
         coordinates ``y``, (B, E); ``normal``, (B, L, 3J), are standard normal numbers.
         """
         explained = _with_one(y, x) @ self.explained
-        rest = observed - explained.reshape(len(x), *observed.shape)
-        left = np.einsum("nlm,lmj->nlj", rest, self.gain, optimize=True)
-        left += np.einsum("lij,nlj->nli", self.root, normal, optimize=True)
-        noise = self.basis.without(left.reshape(len(x), -1))
+        unexplained = observed - explained.reshape(len(x), *observed.shape)
+        remainder = np.einsum("nlm,lmj->nlj", unexplained, self.gain, optimize=True)
+        remainder += np.einsum("lij,nlj->nli", self.root, normal, optimize=True)
+        noise = self.basis.without(remainder.reshape(len(x), -1))
         return _with_one(y) @ self.linear + self.basis.values(x) + noise
 
 

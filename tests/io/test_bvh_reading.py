@@ -5,6 +5,7 @@ import re
 from contextlib import nullcontext
 
 import numpy as np
+import pybvh
 import pytest
 
 from probmotion.io.bvh import read_bvh
@@ -54,17 +55,12 @@ def chain(order, rng):
     return "\n".join(lines) + "\n"
 
 
-def pybvh_positions(path):
-    import pybvh
-
-    return pybvh.read_bvh_file(path, world_up="+y").node_positions()
-
-
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
 def test_positions_agree_with_pybvh(tmp_path, order):
     path = written(tmp_path, chain(order, np.random.default_rng(7)))
     positions = read_bvh(path, scale=1.0, end_sites=True).positions
-    np.testing.assert_allclose(positions, pybvh_positions(path), atol=1e-9)
+    expected = pybvh.read_bvh_file(path, world_up="+y").node_positions()
+    np.testing.assert_allclose(positions, expected, atol=1e-9)
 
 
 def test_cmu_clip_agrees_with_its_conversion(real_data):
@@ -189,7 +185,6 @@ DEFECTS = [
     ("0.0333333", "0", "Frame Time must be 0.0001 to 1 seconds, got 0", 18),
     ("0.0333333", "33.3", "seconds, got 33.3", 18),
     (ROW, ROW[:-3], "expected 9 values, one per channel, got 8", 20),
-    (ROW, ROW + " 1", "expected 9 values, one per channel, got 10", 20),
     ("0 1 0 90", "0 nan 0 90", f"{NUMBER} -1e9 and 1e9, got 'nan'", 20),
     ("0 1 0 90", "0 1e300 0 90", NUMBER, 20),
     ("0 1 0 90", "0 1_0 0 90", NUMBER, 20),

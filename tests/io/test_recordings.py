@@ -10,7 +10,6 @@ from probmotion.io.recordings import read_recording, triangulate_seen
 
 PERSON = Skeleton.preset("person14")
 Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-TRIAL = "pose2sim_multiview/S00_P00_T01_BalancingTrial_multiview.npz"
 LENS = np.array([-0.05, 0.02, 0.003, -0.002])
 
 
@@ -125,8 +124,9 @@ def test_defects_are_reported(tmp_path, key, change, message):
 
 def test_real_recording_agrees_with_its_dlt(real_data):
     """The file's ``positions_dlt`` minimise another sum than that of squared pixels."""
-    recording = read_recording(real_data / TRIAL, Skeleton.preset("body25b"), None)
-    with np.load(real_data / TRIAL) as archive:
+    path = real_data / "pose2sim_multiview" / "S00_P00_T01_BalancingTrial_multiview.npz"
+    recording = read_recording(path, Skeleton.preset("body25b"), None)
+    with np.load(path) as archive:
         dlt = archive["positions_dlt"]
     np.testing.assert_array_equal(recording.seen, np.isfinite(dlt).all(axis=-1))
     distance = np.linalg.norm(recording.joints @ Z_UP_FROM_Y_UP.T - dlt, axis=-1)[recording.seen]

@@ -181,7 +181,6 @@ BROKEN[2, 1, 0] = np.inf
     ("call", "message"),
     [
         (lambda: Keypoints2D(BLANK[:1], Cameras.ring(2), 0.1), r"keypoints must have shape \(2, L"),
-        (lambda: Joints3D(BLANK[0], 0.1), r"joints must have shape \(L, J, 3\), got \(4, 3, 2\)"),
         (lambda: keypoints(confidence=np.ones(SHAPE)), r"confidence must have shape \(2, 4, 3\)"),
         (lambda: joints(noise="0.1"), "noise must be a finite number above 0"),
         (lambda: joints(-2.0), "degrees_of_freedom must be a finite number above 0"),

@@ -119,7 +119,6 @@ def test_invalid_arguments(call, message):
 
 def test_matching_skeleton_and_frame_rate_are_accepted():
     posterior = MotionPosterior(Flat(), observed())
-    assert (posterior.dim, posterior.frames, posterior.fps) == (DIM, FRAMES, 30.0)
-    assert posterior.skeleton == CHAIN
+    assert (posterior.dim, posterior.frames, posterior.skeleton) == (DIM, FRAMES, CHAIN)
     points = posterior.initial(np.random.default_rng(0), 7)
     np.testing.assert_array_equal(points, Flat().initial(np.random.default_rng(0), 7))

@@ -1,10 +1,10 @@
 """`make_reference`: certified reference draws from two independent runs.
 
-Each run has four chains. The draws are kept only if both runs have mixed and agree, in world
+Each run has four chains. The draws are accepted only if both runs have mixed and agree, in world
 coordinates and after rigid alignment, because large translations can hide poses that do not mix.
-Chains start where the prior says. If that is at few seeds, modes that no chain reached remain
-undetected, and the certificate records the number of seeds. Exact posteriors give two sets of exact
-draws, tested in the same way.
+If the prior starts chains at few seeds, modes that no chain reached remain undetected; the
+certificate records the number of seeds. Exact posteriors give two sets of exact draws, tested in
+the same way.
 """
 
 from __future__ import annotations
@@ -100,27 +100,24 @@ def make_reference(
     # points near the origin distinguish posteriors.
     probes = 0.1 * seeds.generator(0, "unfinished").standard_normal((_PROBES, *shape))
     fingerprint = fingerprint_of(problem.posterior, probes)
-    used = (
-        load_sampler("exact")()
-        if problem.exact_source is not None
-        else sampler or _long_run(problem)
-    )
-    made = max(draws, _LEAST) // 2
+    if problem.exact_source is not None:
+        sampler = load_sampler("exact")()
+    elif sampler is None:
+        sampler = _long_run(problem)
+    n = max(draws, _LEAST) // 2
     folder = None if unfinished is None else writable_folder(Path(unfinished))
-    key = [problem.name, fingerprint, used.name, settings_of(used), made, seed]
+    key = [problem.name, fingerprint, sampler.name, settings_of(sampler), n, seed]
     runs = []
     for half in range(2):
-        make = partial(_run, problem, used, made, seed, half, progress)
+        make = partial(_run, problem, sampler, n, seed, half, progress)
         runs.append(make(None) if folder is None else _cached_run(folder, half, key, make))
     return certify(problem, runs, seed, draws)
 
 
 def _long_run(problem: Problem) -> Sampler:
-    gibbs, tempered = OutlierGibbs(), TemperedPairs()
-    if gibbs.draws_from(problem.posterior):
-        return gibbs
-    if tempered.draws_from(problem.posterior):
-        return tempered
+    for sampler in (OutlierGibbs(), TemperedPairs()):
+        if sampler.draws_from(problem.posterior):
+            return sampler
     if problem.posterior.differentiable:
         return load_sampler("nuts")(warmup=1000, candidates=10_000)
     return load_sampler("mh")(warmup=20_000, thin=50)
@@ -135,15 +132,16 @@ def _run(
     progress: bool,
     unfinished: Path | None,
 ) -> MotionDraws:
-    sample = sampler.sample
-    if isinstance(sampler, TemperedPairs):
-        sample = partial(sampler.sample, unfinished=unfinished)
-    return sample(
+    options: dict[str, Any] = (
+        {"unfinished": unfinished} if isinstance(sampler, TemperedPairs) else {}
+    )
+    return sampler.sample(
         problem.posterior,
         draws=n // _CHAINS,
         chains=_CHAINS,
         seed=seeds.integer(seed, "reference run", half),
         progress=progress,
+        **options,
     )
 
 
@@ -186,27 +184,28 @@ def certify(
     """
     world = [run.dataset["positions"].values for run in runs]
     aligned = [align_motions(positions, world[0][0, 0]) for positions in world]
-    measured = [chain_diagnostics(run) for run in runs]
+    diagnostics = [chain_diagnostics(run) for run in runs]
     # After alignment a rigid body leaves only rounding errors.
-    several = not _alike(aligned)
-    if several:
-        measured += [
-            chain_diagnostics(*pair) for pair in zip(runs, map(_principal, aligned), strict=True)
-        ]
+    deforms = not _alike(aligned)
+    if deforms:
+        for run, positions in zip(runs, aligned, strict=True):
+            flat = positions.reshape(*positions.shape[:2], -1)
+            diagnostics.append(chain_diagnostics(run, principal_coordinates(flat)))
     elif not _is_rigid(problem):
         raise ReferenceRefused(
             f"runs on {problem.name} must contain more than one motion up to rigid motion"
         )
-    rhats = [each["rhat"] for each in measured if "rhat" in each]
+    names = (problem.name, f"{problem.name} after alignment")
+    rhats = [each["rhat"] for each in diagnostics if "rhat" in each]
     # The negation also refuses NaN.
     for number, rhat in enumerate(rhats):
         if not rhat <= _RHAT:
             raise ReferenceRefused(
-                f"R-hat of the runs on {problem.name}{_where(number > 1)} must be at most {_RHAT}, "
-                f"got {rhat:.3f}; try more draws"
+                f"R-hat of the runs on {names[number > 1]} must be at most {_RHAT}, got "
+                f"{rhat:.3f}; try more draws"
             )
-    agreed = _agreed(problem.name, world, seed, "")
-    agreed_moved = _agreed(problem.name, aligned, seed, _where(True)) if several else None
+    agreed = _agreed(names[0], world, seed)
+    agreed_after_alignment = _agreed(names[1], aligned, seed) if deforms else None
     positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
     first = runs[0].dataset.attrs
     certificate: dict[str, Any] = {
@@ -219,10 +218,10 @@ def certify(
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
         "seeds": _n_seeds(problem),
         "rhat": max(rhats, default=None),
-        "ess_bulk": _least(measured, "ess_bulk"),
-        "ess_tail": _least(measured, "ess_tail"),
+        "ess_bulk": _least(diagnostics, "ess_bulk"),
+        "ess_tail": _least(diagnostics, "ess_tail"),
         "agreement": agreed,
-        "agreement_wherever_they_stand": agreed_moved,
+        "agreement_wherever_they_stand": agreed_after_alignment,
         "seed": seed,
         "versions": library_versions(),
         "fingerprint": fingerprint_of(problem.posterior, positions),
@@ -230,20 +229,16 @@ def certify(
     return StoredReference(positions, certificate)
 
 
-def _agreed(name: str, runs: list[np.ndarray], seed: int, where: str) -> dict[str, float]:
+def _agreed(name: str, runs: list[np.ndarray], seed: int) -> dict[str, float]:
     """Return :func:`agreement` of two runs, or raise :class:`ReferenceRefused`."""
     agreed = agreement(*runs, seed=seed)
-    for measure, limit in (("swd_ratio", "swd_ratio_at_most"), ("mean_z", "mean_z_at_most")):
-        if not agreed[measure] <= agreed[limit]:
+    for measure in ("swd_ratio", "mean_z"):
+        value, limit = agreed[measure], agreed[f"{measure}_at_most"]
+        if not value <= limit:
             raise ReferenceRefused(
-                f"{measure} of two runs on {name}{where} must be at most {agreed[limit]:.3g}, "
-                f"got {agreed[measure]:.3g}"
+                f"{measure} of two runs on {name} must be at most {limit:.3g}, got {value:.3g}"
             )
     return agreed
-
-
-def _where(aligned: bool) -> str:
-    return " after alignment" if aligned else ""
 
 
 def _alike(aligned: list[np.ndarray]) -> bool:
@@ -254,15 +249,13 @@ def _alike(aligned: list[np.ndarray]) -> bool:
 def _is_rigid(problem: Problem) -> bool:
     """Whether all motions of the prior agree up to rigid motion."""
     prior, rng = problem.posterior.prior, seeds.generator(0, "rigid")
-    if isinstance(prior, Samplable):
-        positions = to_numpy(prior.sample(rng, 8))
-    else:
-        positions = to_numpy(prior.motion(rng.standard_normal((8, problem.posterior.dim))))
+    drawn = (
+        prior.sample(rng, 8)
+        if isinstance(prior, Samplable)
+        else prior.motion(rng.standard_normal((8, problem.posterior.dim)))
+    )
+    positions = to_numpy(drawn)
     return _alike([align_motions(positions, positions[0])])
-
-
-def _principal(aligned: np.ndarray) -> np.ndarray:
-    return principal_coordinates(aligned.reshape(*aligned.shape[:2], -1))
 
 
 def _n_seeds(problem: Problem) -> int | None:
@@ -273,10 +266,9 @@ def _n_seeds(problem: Problem) -> int | None:
 
 def _evenly(run: MotionDraws, draws: int | None) -> np.ndarray:
     positions = run.dataset["positions"].values
-    made = positions.shape[1]
-    n = made if draws is None else draws // (2 * len(positions))
-    chosen = positions[:, np.arange(n) * made // n]
-    return chosen.reshape(-1, *positions.shape[2:])
+    available = positions.shape[1]
+    n = available if draws is None else draws // (2 * len(positions))
+    return positions[:, np.arange(n) * available // n].reshape(-1, *positions.shape[2:])
 
 
 def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, float]:
@@ -295,15 +287,15 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     runs = [run.reshape(*run.shape[:2], -1) for run in (first, second)]
     dim = runs[0].shape[-1]
     directions = random_directions(seeds.generator(seed, "directions"), _DIRECTIONS, dim)
-    seen = np.concatenate([run @ directions.T for run in runs])
+    projected = np.concatenate([run @ directions.T for run in runs])
     chains = len(runs[0])
-    halves = [_apart(seen, chosen) for chosen in _mixed_halves(chains)]
+    halves = [_sliced_distance(projected, chosen) for chosen in _mixed_halves(chains)]
     floor = float(np.mean(halves))
     # Skip constant coordinates, such as those of a centred root.
-    spread = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _STILL
-    z = _standard_errors_apart(*(run[..., spread] for run in runs))
+    varies = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _STILL
+    z = _z_scores(*(run[..., varies] for run in runs))
     return {
-        "swd_ratio": _apart(seen, tuple(range(chains))) / floor,
+        "swd_ratio": _sliced_distance(projected, tuple(range(chains))) / floor,
         "swd_ratio_at_most": max(_RATIO, 1 + _SPREADS * float(np.std(halves)) / floor),
         "mean_z": float(np.abs(z).max()),
         "mean_z_at_most": float(norm.isf(0.5 * _LEVEL / len(z))),
@@ -312,18 +304,22 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
 
 def _mixed_halves(chains: int) -> list[tuple[int, ...]]:
     """Return halves that contain equally many chains of both runs, one of each pair."""
-    own = list(combinations(range(chains), chains // 2))
-    return [(*a, *(chains + i for i in b)) for a in own for b in own if 0 in a]
+    halves = list(combinations(range(chains), chains // 2))
+    return [(*a, *(chains + i for i in b)) for a in halves for b in halves if 0 in a]
 
 
-def _apart(seen: np.ndarray, chosen: tuple[int, ...]) -> float:
+def _sliced_distance(projected: np.ndarray, chosen: tuple[int, ...]) -> float:
     """Return the sliced Wasserstein distance of chosen chains to the others from projections."""
-    others = [chain for chain in range(len(seen)) if chain not in chosen]
-    x, y = (seen[list(some)].reshape(-1, seen.shape[-1]) for some in (chosen, others))
-    return float(np.sqrt(np.mean((np.sort(x, axis=0) - np.sort(y, axis=0)) ** 2)))
+    others = [chain for chain in range(len(projected)) if chain not in chosen]
+    x, y = (
+        np.sort(projected[list(chains)].reshape(-1, projected.shape[-1]), axis=0)
+        for chains in (chosen, others)
+    )
+    return float(np.sqrt(np.mean((x - y) ** 2)))
 
 
-def _standard_errors_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _z_scores(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the differences of the means in standard errors."""
     from arviz_stats.base import array_stats
 
     difference = first.mean(axis=(0, 1)) - second.mean(axis=(0, 1))
@@ -334,6 +330,6 @@ def _standard_errors_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return difference / np.sqrt(variance)
 
 
-def _least(measured: list[dict[str, float]], name: str) -> float | None:
-    values = [diagnostic[name] for diagnostic in measured if name in diagnostic]
+def _least(diagnostics: list[dict[str, float]], name: str) -> float | None:
+    values = [diagnostic[name] for diagnostic in diagnostics if name in diagnostic]
     return min(values) if values and all(map(math.isfinite, values)) else None

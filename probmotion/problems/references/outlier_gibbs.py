@@ -54,11 +54,8 @@ class OutlierGibbs:
     def draws_from(self, posterior: MotionPosterior) -> bool:
         """Whether the likelihood is 3D joints with Student-t noise and the prior exact."""
         likelihood = posterior.likelihood
-        return (
-            isinstance(posterior.prior, HasExactPosterior)
-            and isinstance(likelihood, Joints3D)
-            and likelihood.degrees_of_freedom is not None
-        )
+        noisy = isinstance(likelihood, Joints3D) and likelihood.degrees_of_freedom is not None
+        return noisy and isinstance(posterior.prior, HasExactPosterior)
 
     def sample(
         self,
@@ -81,16 +78,11 @@ class OutlierGibbs:
         check_count("draws", draws)
         check_count("chains", chains)
         start = time.perf_counter()
+        rngs = [seeds.generator(seed, "chain", chain) for chain in range(chains)]
         with progress_bar(chains * draws, self.name, progress) as bar:
-            positions = np.stack(
-                [
-                    self._chain(posterior, draws, seeds.generator(seed, "chain", chain), bar)
-                    for chain in range(chains)
-                ]
-            )
-        return MotionDraws.of(
-            posterior, self, positions, seed=seed, seconds=time.perf_counter() - start
-        )
+            positions = np.stack([self._chain(posterior, draws, rng, bar) for rng in rngs])
+        seconds = time.perf_counter() - start
+        return MotionDraws.of(posterior, self, positions, seed=seed, seconds=seconds)
 
     def _chain(
         self, posterior: MotionPosterior, draws: int, rng: np.random.Generator, bar: Any
@@ -108,8 +100,8 @@ class OutlierGibbs:
             motion = prior.exact_posterior(given).sample(rng, 1)[0]
             rate = 0.5 * (nu + precision * (likelihood.joints - motion) ** 2)
             factors = rng.gamma(0.5 * (nu + 1), 1 / rate)
-            draw, left = divmod(step - self.warmup + 1, self.thin)
-            if left == 0 and draw > 0:
+            draw, remainder = divmod(step - self.warmup + 1, self.thin)
+            if remainder == 0 and draw > 0:
                 states[draw - 1] = motion
                 bar.update(1)
         return states

@@ -35,7 +35,6 @@ __all__ = [
     "write_limit_terms",
 ]
 
-
 _Vector = tuple[float, float, float]
 
 
@@ -118,8 +117,7 @@ def log_annotations(
 ) -> None:
     """Write −d²/2σ_l² of all annotations near a view to ``logs`` (N,); the maximum is log L_v."""
     image = project_to_view(pose, view, body, views)
-    seen = prepare_projection(image, views.prepared)
-    distances_to(seen, views.near[view], views.prepared, logs)
+    distances_to(prepare_projection(image, views.prepared), views.near[view], views.prepared, logs)
     for position in range(len(logs)):
         logs[position] = -0.5 * (logs[position] / views.noise) ** 2
 
@@ -140,14 +138,12 @@ def log_surrogate(
     """
     image = project_to_view(pose, view, body, views)
     if views.prepared.measure == INTERACTION:
-        distance = annotation_graph_distance(
-            centred(image), annotation, views.prepared, apart, terms
-        )
+        image = centred(image)
+        distance = annotation_graph_distance(image, annotation, views.prepared, apart, terms)
     else:
         # Distances without a graph have no cheaper surrogate.
-        seen = prepare_projection(image, views.prepared)
-        one, distances = np.array([annotation]), np.empty(1)
-        distances_to(seen, one, views.prepared, distances)
+        prepared, distances = prepare_projection(image, views.prepared), np.empty(1)
+        distances_to(prepared, np.array([annotation]), views.prepared, distances)
         distance = distances[0]
     return -0.5 * (distance / views.noise) ** 2
 
@@ -197,20 +193,16 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
     """
     i, j, k = _local_frame(pose, body)
     a, b, c = views.vectors[view]
-    towards = _unit(
-        (
-            a * i[0] + b * j[0] + c * k[0],
-            a * i[1] + b * j[1] + c * k[1],
-            a * i[2] + b * j[2] + c * k[2],
-        )
+    x, y, z = (
+        a * i[0] + b * j[0] + c * k[0],
+        a * i[1] + b * j[1] + c * k[1],
+        a * i[2] + b * j[2] + c * k[2],
     )
+    towards = _unit((x, y, z))
     x, y, z = abs(towards[0]), abs(towards[1]), abs(towards[2])
+    across = (0.0, 1.0, 0.0) if y <= z else (0.0, 0.0, 1.0)
     if x <= y and x <= z:
         across = (1.0, 0.0, 0.0)
-    elif y <= z:
-        across = (0.0, 1.0, 0.0)
-    else:
-        across = (0.0, 0.0, 1.0)
     right = _unit(_cross(across, towards))
     up = _cross(towards, right)
     image = np.empty((len(pose), 2))
@@ -236,11 +228,8 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vecto
 # Tuples avoid the allocation of small arrays.
 @numba.njit(cache=True, nogil=True)
 def _between(pose: np.ndarray, start: int, end: int) -> _Vector:
-    return (
-        pose[end, 0] - pose[start, 0],
-        pose[end, 1] - pose[start, 1],
-        pose[end, 2] - pose[start, 2],
-    )
+    (a, b, c), (x, y, z) = pose[start], pose[end]
+    return (x - a, y - b, z - c)
 
 
 @numba.njit(cache=True, nogil=True)

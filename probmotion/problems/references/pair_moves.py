@@ -53,10 +53,9 @@ def moves_of(body: Body) -> np.ndarray:
 
     The second joint is a crank's only child or a hinge's sibling.
     """
+    joints = range(len(body.parents))
     bones = np.flatnonzero(body.parents >= 0).tolist()
-    children = [
-        np.flatnonzero(body.parents == joint).tolist() for joint in range(len(body.parents))
-    ]
+    children = [np.flatnonzero(body.parents == joint).tolist() for joint in joints]
     moves = [(kind, joint, -1) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
     moves += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
     moves += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
@@ -80,35 +79,29 @@ def propose(
     turn, vector, centre = np.empty((3, 3)), np.empty(3), np.zeros(3)
     for i in range(3):
         vector[i] = size * rng.standard_normal()
-    if kind == SHIFT:
-        for k in range(len(pose)):
-            if body.below[joint, k]:
-                proposed[k] += vector
-    elif kind == STRETCH:
-        factor = np.exp(vector[0]) - 1.0
-        for i in range(3):
-            vector[i] = factor * (pose[joint, i] - pose[parent, i])
-        for k in range(len(pose)):
-            if body.below[joint, k]:
-                proposed[k] += vector
-    elif kind == TURN:
-        people = 0
-        for k in range(len(pose)):
-            if body.below[joint, k]:
-                centre += pose[k]
-                people += 1
+    if kind in (TURN, SWING):
+        if kind == SWING:
+            centre[:] = pose[parent]
+        else:
+            n_joints = 0
+            for k in range(len(pose)):
+                if body.below[joint, k]:
+                    centre += pose[k]
+                    n_joints += 1
+            centre /= n_joints
         _rotation(vector, turn)
-        _turn_about(proposed, body.below[joint], centre / people, turn)
-    elif kind == SWING:
-        _rotation(vector, turn)
-        _turn_about(proposed, body.below[joint], pose[parent], turn)
-    elif kind == SLIDE:
-        _rotation(vector, turn)
-        for i in range(3):
-            moved = -(pose[joint, i] - pose[parent, i])
-            for m in range(3):
-                moved += turn[i, m] * (pose[joint, m] - pose[parent, m])
-            vector[i] = moved
+        _turn_about(proposed, body.below[joint], centre, turn)
+    elif kind in (SHIFT, STRETCH, SLIDE):
+        if kind == STRETCH:
+            factor = np.exp(vector[0]) - 1.0
+            for i in range(3):
+                vector[i] = factor * (pose[joint, i] - pose[parent, i])
+        elif kind == SLIDE:
+            _rotation(vector, turn)
+            for i in range(3):
+                vector[i] = -(pose[joint, i] - pose[parent, i])
+                for m in range(3):
+                    vector[i] += turn[i, m] * (pose[joint, m] - pose[parent, m])
         for k in range(len(pose)):
             if body.below[joint, k]:
                 proposed[k] += vector
@@ -153,9 +146,9 @@ def resample_placement(
             turned = 0.0
             for m in range(3):
                 turned += turn[i, m] * (pose[root, m] - middle[m])
-            wanted = body.seed[root, i] - start[i]
-            before += (pose[root, i] - middle[i] - wanted) ** 2
-            after += (turned - wanted) ** 2
+            relative = body.seed[root, i] - start[i]
+            before += (pose[root, i] - middle[i] - relative) ** 2
+            after += (turned - relative) ** 2
     log_ratio = 0.5 * (before - after) / body.root_noise**2
     if -rng.standard_exponential() < log_ratio:
         parts[0] -= log_places(pose, body)
@@ -184,33 +177,17 @@ def _rotation(vector: np.ndarray, turn: np.ndarray) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _any_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
-    w, x, y, z = (
-        rng.standard_normal(),
-        rng.standard_normal(),
-        rng.standard_normal(),
-        rng.standard_normal(),
-    )
+    w, x = rng.standard_normal(), rng.standard_normal()
+    y, z = rng.standard_normal(), rng.standard_normal()
     size = np.sqrt(w * w + x * x + y * y + z * z)
     _of_quaternion(w / size, x / size, y / size, z / size, turn)
 
 
 @numba.njit(cache=True, nogil=True)
 def _of_quaternion(w: float, x: float, y: float, z: float, turn: np.ndarray) -> None:
-    turn[0, 0], turn[0, 1], turn[0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    turn[1, 0], turn[1, 1], turn[1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    turn[2, 0], turn[2, 1], turn[2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
+    turn[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    turn[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    turn[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -107,9 +107,7 @@ def _surrogate_walk(
     """Take Metropolis steps on prior · surrogate^power; return the change of the log surrogate."""
     proposed, weighed = np.empty_like(pose), np.empty_like(parts)
     apart, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
-    start = 0.0
-    if power > 0:
-        start = log_surrogate(pose, view, annotation, body, views, apart, terms)
+    start = log_surrogate(pose, view, annotation, body, views, apart, terms) if power > 0 else 0.0
     here = start
     for _ in range(n_steps):
         number = int(rng.random() * len(moves))

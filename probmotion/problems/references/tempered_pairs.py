@@ -143,22 +143,17 @@ class TemperedPairs:
                 _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
                 for chain in range(chains)
             ]
-            files = [
-                StoredChain(unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz"))
-                for chain in range(chains)
-            ]
             try:
-                futures = [
-                    threads.submit(ladder.draw, draws, bar, stop, own)
-                    for ladder, own in zip(ladders, files, strict=True)
-                ]
+                futures = []
+                for chain, ladder in enumerate(ladders):
+                    path = unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz")
+                    futures.append(threads.submit(ladder.draw, draws, bar, stop, StoredChain(path)))
                 # The first failure stops all chains.
-                ended, _ = wait(futures, return_when=FIRST_EXCEPTION)
-                for each in ended:
-                    each.result()
+                for future in wait(futures, return_when=FIRST_EXCEPTION).done:
+                    future.result()
             finally:
                 stop.set()
-            states = [each.result() for each in futures]
+            states = [future.result() for future in futures]
         return MotionDraws.of(
             posterior,
             self,
@@ -184,7 +179,6 @@ class _Ladder:
         rng: np.random.Generator,
         chain: int,
     ) -> None:
-
         prior = posterior.prior
         assert isinstance(prior, PosePairPrior)
         self.sampler, self.arrays, self.rng = sampler, arrays, rng
@@ -202,7 +196,8 @@ class _Ladder:
         self.views = rng.integers(len(views.vectors), size=levels)
         # log L_v of each level.
         self.seen = np.array([log_view(pose, view, body, views) for view in self.views])
-        self.cut = _Cut(self, posterior) if _is_cut(posterior) else None
+        truncated = isinstance(posterior, TruncatedPosterior) and posterior.truncated
+        self.cut = _Cut(self, posterior) if truncated else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
         self.odd = False
         # Whether a state has been at power 0 since it was last at power 1.
@@ -216,13 +211,13 @@ class _Ladder:
 
     def draw(self, draws: int, bar: Any, stop: Event, file: StoredChain) -> np.ndarray:
         """Return states at power 1 after warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
-        states, done, held = np.empty((draws, *self.poses.shape[1:])), 0, file.load()
-        if held is None:
+        states, done, stored = np.empty((draws, *self.poses.shape[1:])), 0, file.load()
+        if stored is None:
             self._warm_up(stop)
         else:
-            done = len(held["draws"])
-            states[:done] = held["draws"]
-            self._resume(held)
+            done = len(stored["draws"])
+            states[:done] = stored["draws"]
+            self._resume(stored)
             bar.update(done)
         for draw in range(done, draws):
             for _ in range(self.sampler.thin):
@@ -234,21 +229,26 @@ class _Ladder:
 
     def _state(self, draws: np.ndarray) -> dict[str, np.ndarray]:
         """Return the draws so far and the complete state of the chain."""
-        held = {name: np.asarray(getattr(self, name)) for name in _STATE}
-        if self.cut is not None:
-            held |= {f"cut_{name}": np.asarray(getattr(self.cut, name)) for name in _CUT_STATE}
-        return held | {"draws": draws, "random": seeds.state_words(self.rng)}
+        state = {
+            prefix + name: np.asarray(getattr(owner, name))
+            for owner, prefix, name in self._states()
+        }
+        return state | {"draws": draws, "random": seeds.state_words(self.rng)}
 
-    def _resume(self, held: Mapping[str, np.ndarray]) -> None:
-        for owner, names, prefix in ((self, _STATE, ""), (self.cut, _CUT_STATE, "cut_")):
-            for name in names if owner is not None else ():
-                value = held[f"{prefix}{name}"]
-                setattr(owner, name, value if value.ndim else value.item())
-        self.rng = seeds.resumed_generator(held["random"])
+    def _resume(self, stored: Mapping[str, np.ndarray]) -> None:
+        for owner, prefix, name in self._states():
+            value = stored[prefix + name]
+            setattr(owner, name, value if value.ndim else value.item())
+        self.rng = seeds.resumed_generator(stored["random"])
+
+    def _states(self) -> list[tuple[object, str, str]]:
+        """Return owner, prefix in the file and name of each attribute of the state."""
+        cut = [] if self.cut is None else [(self.cut, "cut_", name) for name in _CUT_STATE]
+        return [*((self, "", name) for name in _STATE), *cut]
 
     def _warm_up(self, stop: Event) -> None:
         """Tune step sizes after every exchange and powers after rounds of growing length."""
-        end_of_round, length = _FIRST_ROUND, _FIRST_ROUND
+        end_of_round = length = _FIRST_ROUND
         for number in range(1, self.sampler.warmup + 1):
             self._exchange_after_walking(stop)
             tried = self.tried > 0
@@ -259,11 +259,8 @@ class _Ladder:
             if number == end_of_round:
                 self._set_powers()
                 # Extend the last round, as the final powers depend on it.
-                length = (
-                    2 * length
-                    if end_of_round + 6 * length <= self.sampler.warmup
-                    else (self.sampler.warmup - end_of_round)
-                )
+                last = end_of_round + 6 * length > self.sampler.warmup
+                length = self.sampler.warmup - end_of_round if last else 2 * length
                 end_of_round += length
         self.round_trips = 0
         if self.cut is not None:
@@ -307,8 +304,8 @@ class _Ladder:
         for level in range(int(self.odd), len(probability), 2):
             if self.rng.random() < probability[level]:
                 pair = [level, level + 1]
-                for held in (self.poses, self.parts, self.seen, self.views, self.been_down):
-                    held[pair] = held[pair[::-1]]
+                for values in (self.poses, self.parts, self.seen, self.views, self.been_down):
+                    values[pair] = values[pair[::-1]]
         self.odd = not self.odd
         self.been_down[0] = True
         self.round_trips += int(self.been_down[-1])
@@ -330,15 +327,15 @@ class _Cut:
 
     def exchange(self, ladder: _Ladder) -> None:
         """Metropolis exchange with the top level."""
-        theirs = self._log_ratio(ladder)
+        log_ratio = self._log_ratio(ladder)
         # The comparison with NaN rejects if both densities are 0.
-        if not -ladder.rng.standard_exponential() < theirs - self.log_share:
+        if not -ladder.rng.standard_exponential() < log_ratio - self.log_share:
             return
         for own, top in ((self.pose, ladder.poses[-1]), (self.parts, ladder.parts[-1])):
             own[:], top[:] = top.copy(), own.copy()
         self.seen, ladder.seen[-1] = ladder.seen[-1], self.seen
         self.view, ladder.views[-1] = ladder.views[-1], self.view
-        self.log_share = theirs
+        self.log_share = log_ratio
 
     def check(self) -> None:
         """Raise ``ValueError`` if no state within the truncation was found."""
@@ -358,46 +355,39 @@ class _Cut:
 
 def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, ViewAnnotations]:
     """Return the compiled-code arguments of a posterior over pose pairs."""
-
     prior, likelihood = posterior.prior, posterior.likelihood
     assert isinstance(prior, PosePairPrior)
     assert isinstance(likelihood, AnnotatedPairs)
-    skeleton, limits, comparer = prior.skeleton, prior.joint_limits, likelihood.comparer
+    skeleton, limits = prior.skeleton, prior.joint_limits
     parents = np.array(skeleton.parents, dtype=np.int64)
     below = np.eye(skeleton.n_joints, dtype=bool)
     for joint in range(skeleton.n_joints):
         below[list(skeleton.ancestors(joint)), joint] = True
     roots = np.array(skeleton.roots)
-    return (
-        Body(
-            parents=parents,
-            below=below,
-            roots=roots,
-            chests=np.array(chest_joints(skeleton)),
-            person=np.searchsorted(roots, joint_roots(skeleton)),
-            seed=prior.seed[0],
-            bone_noise=prior.bone_noise,
-            root_noise=prior.root_noise,
-        ),
-        Physics(
-            limits.trees,
-            limits.arrays,
-            *capsules_of(skeleton),
-            prior.penetration_weight,
-            prior.position_noise,
-            prior.max_invalid,
-        ),
-        ViewAnnotations(
-            view_vectors(likelihood.views), likelihood.near, comparer.prepared, likelihood.noise
-        ),
+    body = Body(
+        parents=parents,
+        below=below,
+        roots=roots,
+        chests=np.array(chest_joints(skeleton)),
+        person=np.searchsorted(roots, joint_roots(skeleton)),
+        seed=prior.seed[0],
+        bone_noise=prior.bone_noise,
+        root_noise=prior.root_noise,
     )
+    physics = Physics(
+        limits.trees,
+        limits.arrays,
+        *capsules_of(skeleton),
+        prior.penetration_weight,
+        prior.position_noise,
+        prior.max_invalid,
+    )
+    vectors, prepared = view_vectors(likelihood.views), likelihood.comparer.prepared
+    views = ViewAnnotations(vectors, likelihood.near, prepared, likelihood.noise)
+    return body, physics, views
 
 
 def _hidden(posterior: MotionPosterior) -> int:
     """Return the number of occluded annotated joints."""
     annotations = getattr(posterior.likelihood, "annotations", None)
     return 0 if annotations is None else int((~annotations.visible).sum())
-
-
-def _is_cut(posterior: MotionPosterior) -> bool:
-    return isinstance(posterior, TruncatedPosterior) and posterior.truncated

@@ -48,43 +48,38 @@ def person():
     return detected_walk(0)
 
 
-def flat(values):
-    """Return x, y, confidence of each keypoint, with zeros for NaN."""
-    return np.nan_to_num(values, nan=0.0).ravel().tolist()
+def write_archive(track, folder, name="archive", views=None):
+    """Write a track, or one copy per view, to ``<name>.npz`` and return its path."""
+    copies = track.keypoints, track.confidence
+    if views is not None:
+        copies = (np.stack([values] * views) for values in copies)
+    names, parents = np.array(track.skeleton.joint_names), np.array(track.skeleton.parents)
+    fields = ("keypoints", "confidence", "fps", "joint_names", "parents")
+    values = dict(zip(fields, (*copies, track.fps, names, parents), strict=True))
+    np.savez(folder / f"{name}.npz", **values)
+    return folder / f"{name}.npz"
 
 
-def values_of(track):
-    return np.concatenate([track.keypoints, track.confidence[..., None]], axis=-1)
-
-
-def as_coco(track, folder):
-    content = [
-        {"image_id": f"{frame}.jpg", "keypoints": flat(values), "score": 2.0}
-        for frame, values in enumerate(values_of(track))
+def detections(track, video="", **more):
+    """Return the frames of a track as entries of a COCO file."""
+    values = np.concatenate([track.keypoints, track.confidence[..., None]], axis=-1)
+    return [
+        {"image_id": f"{video}{frame}.jpg", "keypoints": pose.ravel().tolist()} | more
+        for frame, pose in enumerate(np.nan_to_num(values, nan=0.0))
     ]
-    (folder / "coco.json").write_text(json.dumps(content))
-    return folder / "coco.json"
 
 
-def as_table(track, folder):
-    """Write a DeepLabCut table."""
-    names = [name for name in COCO.joint_names for _ in range(3)]
-    rows = [
-        ["scorer", *["net"] * len(names)],
-        ["bodyparts", *names],
-        ["coords", *["x", "y", "likelihood"] * 17],
-        *([str(frame), *map(str, flat(values))] for frame, values in enumerate(values_of(track))),
-    ]
-    (folder / "table.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
-    return folder / "table.csv"
+def write_coco(track, folder, name="coco"):
+    (folder / f"{name}.json").write_text(json.dumps(detections(track)))
+    return folder / f"{name}.json"
 
 
 # Formats, names and crowds.
 
 
-@pytest.mark.parametrize("write", [as_coco, as_table, None])
-def test_formats_give_the_same_walk_in_metres(person, tmp_path, write, write_archive):
-    path = (write or write_archive)(person, tmp_path)
+@pytest.mark.parametrize("write", [write_coco, write_archive])
+def test_formats_give_the_same_walk_in_metres(person, tmp_path, write):
+    path = write(person, tmp_path)
     rate = None if path.suffix == ".npz" else 30.0
     (track,) = read_tracks([path], PERSON, 20.0, file_fps=rate).tracks
     assert track.name.startswith(f"{path.stem}/{path.stem}")
@@ -93,26 +88,23 @@ def test_formats_give_the_same_walk_in_metres(person, tmp_path, write, write_arc
     assert (track.confidence > 0).all()
     # Every second frame at 20 fps is every third frame of the file.
     truth = (person.keypoints / PIXELS)[::3]
+    hips = [COCO.canonical_names.index(f"{side}_hip") for side in ("left", "right")]
     for joint, name in enumerate(PERSON.canonical_names):
         if name in ("pelvis", "neck"):
             continue
-        own, left, right = (
-            truth[:, COCO.canonical_names.index(n)] for n in (name, "left_hip", "right_hip")
-        )
-        expected = own - (left + right) / 2
+        expected = truth[:, COCO.canonical_names.index(name)] - truth[:, hips].mean(axis=1)
         scale = (track.keypoints[::2, joint] * expected).sum() / (expected**2).sum()
         assert scale == pytest.approx(1, abs=0.12)  # reference sizes are those of other people
         np.testing.assert_allclose(track.keypoints[::2, joint], scale * expected, atol=0.03)
 
 
-def test_several_files_and_patterns(person, tmp_path, write_archive):
+def test_several_files_and_patterns(person, tmp_path):
     for name in ("c", "a", "b"):
         write_archive(person, tmp_path, name)
-    as_table(person, tmp_path)
     (alone,) = read_tracks([tmp_path / "a.npz"], PERSON, 20.0).tracks
-    paths = [str(tmp_path / "*.npz"), tmp_path / "table.csv"]
+    paths = [str(tmp_path / "*.npz"), write_coco(person, tmp_path, "d")]
     result = read_tracks(paths, PERSON, 20.0, file_fps=60.0).tracks
-    assert [track.name for track in result] == ["a/a", "b/b", "c/c", "table/table"]
+    assert [clip_of(track.name) for track in result] == ["a", "b", "c", "d"]
     # Archives contain their frame rate, 30 fps.
     for track in result[:3]:
         np.testing.assert_array_equal(track.keypoints, alone.keypoints)
@@ -127,43 +119,23 @@ def test_several_files_and_patterns(person, tmp_path, write_archive):
             read_tracks(paths, PERSON, 20.0)
 
 
-def test_views_in_one_archive_are_no_crowd(person, tmp_path):
-    np.savez(
-        tmp_path / "rig.npz",
-        keypoints=np.stack([person.keypoints] * 4),
-        confidence=np.stack([person.confidence] * 4),
-        fps=30.0,
-        joint_names=np.array(COCO.joint_names),
-        parents=np.array(COCO.parents, dtype=np.int32),
-    )
-    tracks = read_tracks([tmp_path / "rig.npz"], PERSON, 20.0).tracks
+def test_people_in_one_video_may_be_a_crowd_and_views_and_videos_may_not(person, tmp_path):
+    tracks = read_tracks([write_archive(person, tmp_path, "rig", views=4)], PERSON, 20.0).tracks
     assert len({track.name for track in tracks}) == 4
     assert {clip_of(track.name) for track in tracks} == {"rig"}
 
-
-def test_people_in_one_video_may_be_a_crowd_and_videos_are_separate(person, tmp_path):
-    values = values_of(person)
-
-    def read(content):
-        (tmp_path / "people.json").write_text(json.dumps(content))
+    def read(*people):
+        (tmp_path / "people.json").write_text(json.dumps(sum(people, [])))
         return read_tracks([tmp_path / "people.json"], PERSON, 20.0, file_fps=30.0).tracks
 
     def pair(shift):
-        return [
-            {"image_id": f"{frame}.jpg", "keypoints": flat(pose), "idx": who}
-            for who, everyone in enumerate((values, np.add(values, [shift, 0, 0])))
-            for frame, pose in enumerate(everyone)
-        ]
+        other = replace(person, keypoints=person.keypoints + [shift, 0])
+        return detections(person, idx=0), detections(other, idx=1)
 
-    assert [track.name[-9:] for track in read(pair(800))] == ["/people 0", "/people 1"]
+    assert [track.name[-9:] for track in read(*pair(800))] == ["/people 0", "/people 1"]
     with pytest.raises(ValueError, match="no track is left after step crowds"):
-        read(pair(5))
-    videos = [
-        {"image_id": f"{video}/{frame}.jpg", "keypoints": flat(values[frame])}
-        for video, frames in (("a", 60), ("b", 90))
-        for frame in range(frames)
-    ]
-    result = read(videos)
+        read(*pair(5))
+    result = read(detections(person, "a/")[:60], detections(person, "b/")[:90])
     assert [track.frames for track in result] == [40, 60]
     # Image names contain a slash; the clip is still the file.
     assert {clip_of(track.name) for track in result} == {"people"}
@@ -176,16 +148,8 @@ def shin(track):
     return bone_sizes([track])["left_ankle"]
 
 
-@pytest.mark.parametrize("scale", [1e-3, 40.0])
-def test_scale_does_not_depend_on_the_unit(person, tmp_path, scale, write_archive):
-    other = replace(person, keypoints=scale * person.keypoints)
-    (track,) = read_tracks([write_archive(other, tmp_path)], PERSON, 20.0).tracks
-    (expected,) = read_tracks([write_archive(person, tmp_path)], PERSON, 20.0).tracks
-    np.testing.assert_allclose(track.keypoints, expected.keypoints, atol=1e-9)
-
-
 @pytest.mark.parametrize("name", ["coco17", "body25b", "gymnast-ball"])
-def test_people_on_other_skeletons_are_scaled_to_metres(tmp_path, name, write_archive):
+def test_people_on_other_skeletons_are_scaled_to_metres(tmp_path, name):
     skeleton = Skeleton.preset(name)
     walks = [detected_walk(k, skeleton=skeleton, pixels=p) for k, p in enumerate((183.0, 60.0))]
     for walk in walks:
@@ -198,13 +162,14 @@ def test_people_on_other_skeletons_are_scaled_to_metres(tmp_path, name, write_ar
     assert [report.step for report in result.reports].count("scale") == 1
 
 
-def test_given_sizes_of_all_or_some_bones(person, tmp_path, write_archive):
+def test_scale_depends_on_the_given_sizes_and_not_on_the_unit(person, tmp_path):
     file = write_archive(person, tmp_path)
-    sizes = body_sizes(PERSON)
-    double = {name: 2 * size for name, size in sizes.items()}
-    (track,) = read_tracks([file], PERSON, 20.0, sizes=double).tracks
     (expected,) = read_tracks([file], PERSON, 20.0).tracks
-    np.testing.assert_allclose(track.keypoints, 2 * expected.keypoints, atol=1e-9)
+    other = write_archive(replace(person, keypoints=1e-3 * person.keypoints), tmp_path, "other")
+    double = {name: 2 * size for name, size in body_sizes(PERSON).items()}
+    for path, sizes, factor in ((other, None, 1), (file, double, 2)):
+        (track,) = read_tracks([path], PERSON, 20.0, sizes=sizes).tracks
+        np.testing.assert_allclose(track.keypoints, factor * expected.keypoints, atol=1e-9)
     (track,) = read_tracks([file], PERSON, 20.0, sizes={"left_ankle": 0.5}).tracks
     assert shin(track) == pytest.approx(0.5)
     with pytest.raises(ValueError, match="sizes must contain the size of at least one bone"):
@@ -219,8 +184,9 @@ def test_body_sizes_are_close_to_bone_lengths_on_any_skeleton():
         length = np.linalg.norm(body[joint] - body[parent])
         assert 0.8 * length < sizes[PERSON.joint_names[joint]] < 1.1 * length
     other = body_sizes(COCO)
-    for limb in (f"{side}_{end}" for side in ("left", "right") for end in ("elbow", "ankle")):
+    for limb in ("left_elbow", "right_elbow", "left_ankle", "right_ankle"):
         assert other[limb] == pytest.approx(sizes[limb], rel=0.03)
+    assert body_sizes(WORM) == {}
 
 
 def test_shared_skeleton_has_both_ends_of_its_bones():
@@ -236,10 +202,8 @@ def test_shared_skeleton_has_both_ends_of_its_bones():
     result = shared_skeleton(horse)
     assert result.joint_names == ("nose", "left_eye", "neck", "tail")
     assert result.parents == (-1, 0, 0, 2)
-    # A single joint is no bone.
-    assert shared_skeleton(Skeleton(["nose", "back"], [-1, 0])) is None
-    assert shared_skeleton(WORM) is None
-    assert body_sizes(WORM) == {}
+    for boneless in (Skeleton(["nose", "back"], [-1, 0]), WORM):
+        assert shared_skeleton(boneless) is None
 
 
 # Scale of unknown bodies.
@@ -254,10 +218,9 @@ def worm(number, pixels):
     return KeypointTrack(pixels * points + 300, np.full((60, 4), 0.9), WORM, 30.0, f"worm{number}")
 
 
-def test_unknown_bodies_are_scaled_to_body_lengths(tmp_path, write_archive):
+def test_unknown_bodies_are_scaled_to_body_lengths(tmp_path):
     def read(unit):
-        scales = enumerate((20.0, 3.0, 300.0))
-        worms = [worm(number, unit * scale) for number, scale in scales]
+        worms = [worm(number, unit * scale) for number, scale in enumerate((20.0, 3.0, 300.0))]
         return read_tracks([write_archive(w, tmp_path, w.name) for w in worms], WORM, 30.0)
 
     result = read(1.0)
@@ -274,9 +237,9 @@ def test_unknown_bodies_are_scaled_to_body_lengths(tmp_path, write_archive):
         np.testing.assert_allclose(again.keypoints, track.keypoints, atol=1e-9)
 
 
-def straight(scale, places=(0, 3, 8, 10)):
+def straight(scale, places=(0, 3, 8, 10), skeleton=WORM):
     points = np.stack([scale * np.array(places), np.zeros(len(places))], axis=-1)
-    return KeypointTrack(np.tile(points, (5, 1, 1)), np.ones((5, 4)), WORM, 30.0)
+    return KeypointTrack(np.tile(points, (5, 1, 1)), np.ones((5, len(places))), skeleton, 30.0)
 
 
 def test_per_track_scales_are_median_proportions():
@@ -291,8 +254,7 @@ def test_per_track_scales_are_median_proportions():
     assert np.median([body_extent(track) for track in both]) == pytest.approx(1)
     # A body without a visible tail is scaled by its other bones.
     docked = straight(4.0)
-    docked.confidence[:, 3] = 0
-    docked.keypoints[:, 3] = np.nan
+    docked.confidence[:, 3], docked.keypoints[:, 3] = 0, np.nan
     assert body_extent(docked) == pytest.approx(32)
     sizes = per_track_scales([*tracks, docked])
     (scaled,), _ = scale_to_bones([docked], sizes)
@@ -301,9 +263,6 @@ def test_per_track_scales_are_median_proportions():
 
 def test_body_extent_ignores_joints_without_bones():
     skeleton = Skeleton([*WORM.joint_names, "ball"], [*WORM.parents, -1])
-    points = np.tile([[0.0, 0], [3, 0], [8, 0], [10, 0], [1000, 0]], (5, 1, 1))
-    assert body_extent(KeypointTrack(points, np.ones((5, 5)), skeleton, 30.0)) == 10
-    dots = Skeleton(["snout", "back"], [-1, -1])
-    track = KeypointTrack(np.ones((5, 2, 2)), np.ones((5, 2)), dots, 30.0)
+    assert body_extent(straight(1.0, (0, 3, 8, 10, 1000), skeleton)) == 10
     with pytest.raises(ValueError, match="tracks must show at least one bone"):
-        per_track_scales([track])
+        per_track_scales([straight(0.0, (1, 1), Skeleton(["snout", "back"], [-1, -1]))])

@@ -149,7 +149,7 @@ def test_learning_rate_rises_and_is_halved(tmp_path):
     settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
     rates = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
     assert rates == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
-    # Also during warm-up, and for marks in any order.
+    # Also during warm-up, and for steps in any order.
     assert replace(settings, halve_at=(10, 2)).rate(3) == pytest.approx(0.3)
     # With a constant gradient the steps of Adam have the length of the learning rate.
     line = Line()
@@ -273,33 +273,33 @@ def test_other_settings_or_data_are_rejected(whole, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("what", "step", "message"),
+    ("fault", "step", "message"),
     [
         ("loss", 15, "the loss is nan"),
         ("gradient", 15, "the gradient is not finite"),
         ("validation", 20, "the validation loss is nan"),
     ],
 )
-def test_divergence_leaves_the_last_good_checkpoint(tmp_path, what, step, message):
+def test_divergence_leaves_the_last_good_checkpoint(tmp_path, fault, step, message):
     class Explodes(Curve):
         def training_loss(self, network, rng, batch, device):
             loss = super().training_loss(network, rng, batch, device)
-            if self.calls != 15 or what == "validation":
+            if self.calls != 15 or fault == "validation":
                 return loss
-            if what == "loss":
+            if fault == "loss":
                 return loss * float("nan")
             # The square root has an infinite slope at 0.
             return loss + torch.sqrt(0 * network[0].weight.sum())
 
         def validation_loss(self, network, device):
             loss = super().validation_loss(network, device)
-            return math.nan if what == "validation" and self.calls == 20 else loss
+            return math.nan if fault == "validation" and self.calls == 20 else loss
 
     with pytest.raises(Diverged, match=f"diverged at step {step}: {message}; the last.*another fo"):
         run(Explodes(), tmp_path / "run")
     run(Curve(), tmp_path / "good", steps=10)
     assert_same(tmp_path / "good", tmp_path / "run")
-    if what != "validation":
+    if fault != "validation":
         with pytest.raises(Diverged, match=r"no checkpoint yet; try a smaller learning_rate$"):
             run(Explodes(), tmp_path / "early", checkpoint_every=100)
 
