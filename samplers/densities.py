@@ -128,10 +128,10 @@ def starting_points(
         if posterior.likelihood is None or candidates <= n:
             starts.append(posterior.initial(rng, n))
             continue
-        drawn = posterior.initial(rng, candidates)
+        draws = posterior.initial(rng, candidates)
         # Gumbel top-n: n choices without replacement, with probability ∝ likelihood.
-        keys = log_likelihood(drawn) + rng.gumbel(size=candidates)
-        starts.append(drawn[np.argsort(-keys, kind="stable")[:n]])
+        keys = log_likelihood(draws) + rng.gumbel(size=candidates)
+        starts.append(draws[np.argsort(-keys, kind="stable")[:n]])
     return np.stack(starts).reshape(shape)
 
 
@@ -154,15 +154,15 @@ def continued(
         return None
     attributes = initial.dataset.attrs
     settings = settings_of(sampler)
-    for name, given, before in (
+    for name, value, earlier in (
         ("sampler", sampler.name, attributes["sampler"]),
         ("settings", settings, json.loads(attributes["settings"])),
         ("seed", seed, int(attributes["seed"])),
         ("chains", chains, initial.dataset.sizes["chain"]),
     ):
-        if given != before:
+        if value != earlier:
             raise ValueError(
-                f"{name} must be {before}, as in the run to be continued, got {given}; to start a "
+                f"{name} must be {earlier}, as in the run to be continued, got {value}; to start a "
                 "new run at its end, pass an array of points"
             )
     last = initial.dataset.isel(draw=-1)

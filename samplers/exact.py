@@ -58,5 +58,5 @@ def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable
             return None, f"needs a posterior in closed form, but {error}", "not-conjugate"
     if posterior.likelihood is None and isinstance(prior, Samplable):
         return prior, "", ""
-    needed = "needs a prior with HasExactPosterior to condition on observations, got"
-    return None, f"{needed} {type(prior).__name__}", "HasExactPosterior"
+    reason = "needs a prior with HasExactPosterior to condition on observations, got"
+    return None, f"{reason} {type(prior).__name__}", "HasExactPosterior"

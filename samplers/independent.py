@@ -104,8 +104,8 @@ class IndependentSampler:
         # amplify the difference.
         try:
             with threadpool_limits(1, user_api="blas"), bars as bar:
-                for some in batches(pairs, source.size):
-                    streams = NormalStreams.of_draws(seed, list(some))
+                for batch in batches(pairs, source.size):
+                    streams = NormalStreams.of_draws(seed, list(batch))
                     done.append(source.draw(streams, lambda: bar.update(1)) * source.scale)
                     spent = dict(source.counts)
         except KeyboardInterrupt as interrupt:

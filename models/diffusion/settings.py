@@ -20,7 +20,7 @@ _SIZES = ("layers", "width", "heads", "feedforward")
 
 @dataclass(frozen=True)
 class TransformerSettings:
-    """Size of a transformer over frames.
+    """Size of a transformer over frames; ``ValueError`` if a number is out of range.
 
     Parameters
     ----------
@@ -28,8 +28,6 @@ class TransformerSettings:
         Maximum number of frames L.
     layers, width, heads, feedforward : int
         Size of the encoder; ``width`` is an even multiple of ``heads``.
-
-    Raises ``ValueError`` if a number is out of range.
     """
 
     frames: int = 60
@@ -50,7 +48,7 @@ class TransformerSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings(TransformerSettings):
-    """Size of the network and its noise levels.
+    """Size of the network and its noise levels; ``ValueError`` if a number is out of range.
 
     Parameters
     ----------
@@ -62,8 +60,6 @@ class DiffusionSettings(TransformerSettings):
         Number of noise levels T.
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the MAS authors' code.
-
-    Raises ``ValueError`` if a number is out of range.
     """
 
     dropout: float = 0.1

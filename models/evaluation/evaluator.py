@@ -23,7 +23,6 @@ KIND = "track-evaluator"
 _TOKENS = 1024
 _GPU_TOKENS = 200_000
 _ENCODER = "encoder."
-_OFF_ORIGIN = 1e-6
 
 
 class TrackEvaluator(TrackNetwork):
@@ -129,11 +128,11 @@ class TrackEvaluator(TrackNetwork):
         root = self.skeleton.roots[0]
         if views.size == 0 or (self.standards.deviation[root] > 0).any():
             return
-        off = np.abs(views[:, :, root] - self.standards.mean[root]).max()
-        if off > _OFF_ORIGIN:
+        distance = np.abs(views[:, :, root] - self.standards.mean[root]).max()
+        if distance > 1e-6:
             raise ValueError(
                 f"views must have the {self.skeleton.joint_names[root]} at the origin, as in the "
-                f"training data, got {off:.3g} m from it"
+                f"training data, got {distance:.3g} m from it"
             )
 
 

@@ -208,9 +208,9 @@ class PoseLifter:
             If the shape is wrong or a number is not finite.
         """
         poses, depth, elevation = self._estimates(views)
-        elevation = np.repeat(elevation, views.shape[1])
-        parts = (poses, depth, np.zeros_like(elevation), elevation)
-        points = raise_points(*map(torch.from_numpy, parts), distance=self.settings.distance)
+        tilt = torch.from_numpy(np.repeat(elevation, views.shape[1]))
+        inputs = torch.from_numpy(poses), torch.from_numpy(depth)
+        points = raise_points(*inputs, 0 * tilt, tilt, self.settings.distance)
         return points.numpy().reshape(*views.shape[:3], 3)
 
     def elevations(self, views: np.ndarray) -> np.ndarray:
@@ -227,9 +227,8 @@ class PoseLifter:
         check_finite("views", views)
         if 0 in views.shape:
             raise ValueError(f"views must contain a motion and a frame, got shape {views.shape}")
-        root = self.skeleton.roots[0]
         poses = np.asarray(views, np.float64).reshape(-1, J, 2)
-        poses = poses - poses[:, root : root + 1]
+        poses = poses - poses[:, [self.skeleton.roots[0]]]
         depth, elevation = np.empty(poses.shape[:2]), np.empty(len(poses))
         for start in range(0, len(poses), _CHUNK):
             n = min(_CHUNK, len(poses) - start)

@@ -133,12 +133,12 @@ class LifterTrainee(PoseTrainee):
         **options: Any,
     ) -> None:
         super().__init__(tracks, validation, size, **options)
-        skeleton = self.skeleton
-        if flow.skeleton != skeleton:
+        if flow.skeleton != self.skeleton:
             raise ValueError("flow must have the same skeleton as tracks")
         self.weights = LossWeights() if weights is None else weights
-        self.sizes = bone_sizes(skeleton, self.poses.astype(np.float64))
-        self.network = LifterNetwork(size, skeleton.n_joints, skeleton.roots[0], self._seed)
+        self.sizes = bone_sizes(self.skeleton, self.poses.astype(np.float64))
+        root = self.skeleton.roots[0]
+        self.network = LifterNetwork(size, self.skeleton.n_joints, root, self._seed)
         flat = self.poses[:, self.network.joints].reshape(len(self.poses), -1).astype(np.float64)
         self.network.mean.copy_(torch.from_numpy(flat.mean(axis=0)))
         self.network.deviation.copy_(torch.from_numpy(np.maximum(flat.std(axis=0), 1e-3)))

@@ -134,8 +134,7 @@ class PoseFlow(nn.Module):
         self.skeleton = skeleton
         self.settings = settings
         self.components = components
-        root = skeleton.roots[0]
-        self.joints = [joint for joint in range(skeleton.n_joints) if joint != root]
+        self.joints = [joint for joint in range(skeleton.n_joints) if joint != skeleton.roots[0]]
         D = 2 * len(self.joints)
         self.register_buffer("mean", torch.zeros(D))
         self.register_buffer("basis", torch.eye(D))

@@ -39,8 +39,7 @@ def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray
             f"tracks must contain a frame with every joint at confidence {threshold:g} or more, "
             "got none"
         )
-    root = skeleton.roots[0]
-    poses = poses - poses[:, root : root + 1]
+    poses = poses - poses[:, [skeleton.roots[0]]]
     mirrored = poses[:, list(skeleton.mirrored_order)] * np.array([-1.0, 1.0])
     return np.concatenate([poses, mirrored])
 

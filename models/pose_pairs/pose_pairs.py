@@ -124,8 +124,8 @@ class PosePairPrior:
         inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
         log_f = np.full(len(flat), -np.inf)
         log_f[inside] = self.log_plausibility(positions[inside])
-        log_f = log_f.reshape(log_measure.shape)
-        return np.where(log_f > -np.inf, log_measure, 0.0) + log_f
+        shaped = log_f.reshape(log_measure.shape)
+        return np.where(shaped > -np.inf, log_measure, 0.0) + shaped
 
     def log_measure(self, theta: Array) -> np.ndarray:
         """Return the log base measure: ``(…, dim) → (…)``."""

@@ -3,7 +3,8 @@
 Source: Ponymation, section 3.3 and table 5.
 
 Decoders attend to a memory of one token. The softmax over one token is 1, so cross-attention is a
-linear map of the memory, the same for every query, and is computed once.
+linear map of the memory, the same for every query, and is computed once. The names of weights are
+those of the shipped checkpoints.
 """
 
 from __future__ import annotations

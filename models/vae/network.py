@@ -34,7 +34,7 @@ _LOG_VARIANCE_BOUND = 10.0
 class FrameMap(nn.Module):
     """Linear replacement of E_s for the ablation: frame descriptor → frame vector.
 
-    As published, it uses only the frames' image features (table 7); occluded joints are 0.
+    As published (table 7), it uses image features of frames, not of joints; occluded joints are 0.
     """
 
     def __init__(self, size: MotionVAESettings, n_joints: int) -> None:

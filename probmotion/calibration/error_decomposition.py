@@ -100,7 +100,9 @@ def decompose_error(
         for seed, link in itertools.product(range(seeds), links):
             if stored.get(link.name, seed) is None:
                 measures = ErrorMeasures(problem) if measures is None else measures
-                number = seeding.integer(seed, "bias budget", link.stream)
+                # Samplers share a random stream, separate from that of exact draws.
+                stream = "exact" if link.name == "exact" else "samplers"
+                number = seeding.integer(seed, "bias budget", stream)
                 drawn = link.sampler.sample(
                     link.posterior, draws=draws, seed=number, progress=False
                 )
@@ -122,11 +124,6 @@ class _Link:
     name: str
     sampler: Sampler
     posterior: MotionPosterior
-
-    @property
-    def stream(self) -> str:
-        """Random stream: separate for exact draws, shared by the samplers."""
-        return "exact" if self.name == "exact" else "samplers"
 
 
 def _chain(
@@ -170,22 +167,16 @@ def _chain(
     if learnt is None:
         notes.append("no network part: no learnt denoiser was given")
     else:
-        _check_learnt(learnt, problem)
+        frames, joints = inside.frames, inside.skeleton.joint_names
+        if (learnt.frames, learnt.skeleton.joint_names) != (frames, joints):
+            raise ValueError(
+                f"learnt must have the problem's {frames} frames and {len(joints)} named joints, "
+                f"got {learnt.frames} frames and {learnt.skeleton.n_joints} joints"
+            )
         links.append(_Link("network", last, MotionPosterior(learnt, likelihood)))
     for link in links:  # fail before the first long run
         require(link.sampler, link.posterior)
     return links, notes
-
-
-def _check_learnt(learnt: MotionPrior, problem: Problem) -> None:
-    """Raise ``ValueError`` if frames or joints of a learnt denoiser differ from the problem's."""
-    posterior = problem.posterior
-    wanted = (posterior.frames, posterior.skeleton.joint_names)
-    if (learnt.frames, learnt.skeleton.joint_names) != wanted:
-        raise ValueError(
-            f"learnt must have the problem's {posterior.frames} frames and {len(wanted[1])} named "
-            f"joints, got {learnt.frames} frames and {learnt.skeleton.n_joints} joints"
-        )
 
 
 def _title(problem: Problem, links: list[_Link], steps: int) -> str:

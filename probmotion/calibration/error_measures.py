@@ -31,7 +31,7 @@ class ErrorMeasures:
 
     - ``spread``: log of the trace of the covariance over the exact one; negative: overconfident
     - ``small``: mean log(variance / exact variance) over the small principal directions, beyond
-      those that hold 95 % of the exact variance
+      those that account for 95 % of the exact variance
     - ``off``: log of the mean variance off the manifold over that of exact draws, if defined
     - ``mean``: squared error of the mean over the trace, minus its expectation for exact draws
     - ``distance``: squared sliced 2-Wasserstein distance to exact draws over the mean variance of
@@ -49,7 +49,7 @@ class ErrorMeasures:
         variances, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
         self.total = float(variances.sum())
         held = np.cumsum(variances[::-1])[::-1]
-        # A direction is small if the larger ones hold 95 % of the variance.
+        # A direction is small if the larger ones account for 95 % of the variance.
         self.small = axes[:, held - variances >= _LARGE * self.total]
         self.small_variances = np.var(flat @ self.small, axis=0, ddof=1)
         prior = problem.posterior.prior
@@ -57,14 +57,9 @@ class ErrorMeasures:
         self.off = None if self.manifold is None else float(self.manifold.off_manifold(pool).mean())
 
     def of(self, positions: np.ndarray, seed: int) -> dict[str, float]:
-        """Return every measure of draws.
+        """Return every measure of draws, (n, L, J, 3), metres.
 
-        Parameters
-        ----------
-        positions : ndarray, (n, L, J, 3)
-            Metres.
-        seed : int
-            Seed of the exact draws and directions, shared by all samplers.
+        ``seed`` determines the exact draws and directions, shared by all samplers.
         """
         n = len(positions)
         flat = positions.reshape(n, -1)
@@ -73,23 +68,20 @@ class ErrorMeasures:
         spread = float(flat.var(axis=0, ddof=1).sum())
         chance = spread / n + float(exact.var(axis=0, ddof=1).sum()) / len(exact)
         apart = float(((flat.mean(axis=0) - exact.mean(axis=0)) ** 2).sum())
-        found = {"spread": float(np.log(spread / self.total))}
+        values = {"spread": float(np.log(spread / self.total))}
         if self.small.shape[1]:
             ratios = np.var(flat @ self.small, axis=0, ddof=1) / self.small_variances
-            found["small"] = float(np.log(ratios).mean())
+            values["small"] = float(np.log(ratios).mean())
         if self.manifold is not None and self.off is not None:
             off = float(self.manifold.off_manifold(positions).mean())
-            found["off"] = float(np.log(off / self.off))
-        found["mean"] = (apart - chance) / self.total
-        directions = random_directions(
-            seeds.generator(seed, "directions"), _DIRECTIONS, flat.shape[1]
-        )
-        squares = [
-            float(sliced_wasserstein(flat, some, directions)) ** 2
-            for some in np.split(exact, _SETS)
-        ]
-        found["distance"] = float(np.mean(squares)) * flat.shape[1] / self.total
-        return found
+            values["off"] = float(np.log(off / self.off))
+        values["mean"] = (apart - chance) / self.total
+        rng = seeds.generator(seed, "directions")
+        directions = random_directions(rng, _DIRECTIONS, flat.shape[1])
+        distances = [float(sliced_wasserstein(flat, x, directions)) for x in np.split(exact, _SETS)]
+        squares = [distance**2 for distance in distances]
+        values["distance"] = float(np.mean(squares)) * flat.shape[1] / self.total
+        return values
 
 
 def require_exact(problem: Problem) -> None:

@@ -49,7 +49,7 @@ class ErrorDecomposition:
         first = values[self.chain][0]
         self.values = {
             measure: {
-                link: np.array([found[measure] for found in by_seed])
+                link: np.array([row[measure] for row in by_seed])
                 for link, by_seed in values.items()
             }
             for measure in MEASURES
@@ -76,9 +76,8 @@ class ErrorDecomposition:
             parts = self.differences(measure)
             whole = np.sum(list(parts.values()), axis=0)
             for part, values in {_FLOOR: by_link[self.chain], **parts, _WHOLE: whole}.items():
-                rows.append(
-                    (self.setting, measure, part, float(values.mean()), *t_interval(values))
-                )
+                mean = float(values.mean())
+                rows.append((self.setting, measure, part, mean, *t_interval(values)))
         return pd.DataFrame(rows, columns=["setting", "measure", "part", "mean", "low", "high"])
 
     @property
@@ -91,9 +90,8 @@ class ErrorDecomposition:
             clear = {part: row for part, row in rows.items() if row["low"] > 0 or row["high"] < 0}
             whole = clear.pop(_WHOLE, None)
             rows.pop(_WHOLE)
-            words = [
-                f"{measure}: {'not significant' if whole is None else _in_words(whole)} in all"
-            ]
+            total = "not significant" if whole is None else _in_words(whole)
+            words = [f"{measure}: {total} in all"]
             if clear:
                 ordered = sorted(clear, key=lambda part: -abs(clear[part]["mean"]))
                 words.append(", ".join(f"{part} {_in_words(clear[part])}" for part in ordered))

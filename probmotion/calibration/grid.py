@@ -77,7 +77,7 @@ def calibrate(
     chains : int
         Number of chains.
     out : str or Path, optional
-        Folder in which ``calibration`` will hold the ranks, ``table.csv`` and ``failures.json``;
+        Folder whose subfolder ``calibration`` receives ranks, ``table.csv`` and ``failures.json``;
         may be a comparison's; temporary by default.
     workers, executor, time_limit, progress
         As for :func:`~probmotion.comparison.compare`.
@@ -87,8 +87,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        If an argument is invalid, a problem cannot be simulated, or ``out`` holds ranks of the same
-        names made with other settings.
+        If an argument is invalid, a problem cannot be simulated, or ``out`` contains ranks of
+        the same names with other settings.
     OSError
         If ``out`` cannot be written to.
     KeyboardInterrupt
@@ -106,8 +106,8 @@ def calibrate(
                 "posteriors.problem.simulated() if the prior can be sampled"
             )
     # Workers may have another working directory.
-    given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out).absolute()
-    folder = writable_folder(given / Calibration.FOLDER)
+    parent = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out).absolute()
+    folder = writable_folder(parent / Calibration.FOLDER)
     Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, simulations, budget, per="simulation")
     with locked(folder, chosen):

@@ -36,25 +36,20 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
     - ``hidden <joint>``: a random occluded joint, if any, along a random direction
     - ``speed``: mean step length over joints and frames, metres, for several frames
 
-    Parameters
-    ----------
-    posterior : MotionPosterior
-        Posterior of the problem, not of a simulation.
-    seed : int
-        Seed of the choice.
+    ``posterior`` is that of the problem, not of a simulation; ``seed`` determines the choice.
     """
     rng = seeds.generator(seed, "quantities")
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)
     root = posterior.skeleton.roots[0]
-    found = []
+    chosen = []
     for k in range(_DIRECTIONS):
         direction = rng.standard_normal(shape)
         direction /= np.sqrt((direction**2).sum())
-        found.append(Quantity(f"direction {k + 1}", partial(_along, direction, root)))
+        chosen.append(Quantity(f"direction {k + 1}", partial(_along, direction, root)))
     others = [joint for joint in range(shape[1]) if joint != root] or [root]
     frame, joint = int(rng.integers(shape[0])), int(rng.choice(others))
     name = posterior.skeleton.joint_names[joint]
-    found.append(Quantity(f"height of {name}", partial(_height, frame, joint)))
+    chosen.append(Quantity(f"height of {name}", partial(_height, frame, joint)))
     visible = visible_joints(posterior)
     direction = rng.standard_normal(3)
     if visible is not None and not visible.all():
@@ -63,10 +58,10 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
         at = np.zeros(shape)
         at[frame, joint] = direction / np.sqrt((direction**2).sum())
         name = posterior.skeleton.joint_names[joint]
-        found.append(Quantity(f"hidden {name}", partial(_along, at, root)))
+        chosen.append(Quantity(f"hidden {name}", partial(_along, at, root)))
     if posterior.frames > 1:
-        found.append(Quantity("speed", _speed))
-    return found
+        chosen.append(Quantity("speed", _speed))
+    return chosen
 
 
 def log_densities(simulation: Problem, positions: np.ndarray) -> dict[str, np.ndarray]:

@@ -31,35 +31,20 @@ class Rank(NamedTuple):
 def rank(truth: float, draws: np.ndarray, rng: np.random.Generator) -> float:
     """Return (r + U) / (L + 1), r the rank of the truth among L draws, ties broken at random.
 
-    It is uniform on [0, 1] for every L if truth and draws are exchangeable, so that runs of
-    different lengths can be pooled.
-
-    Parameters
-    ----------
-    truth : float
-        The quantity of the truth.
-    draws : ndarray, (L,)
-        The quantity of independent draws.
-    rng : numpy.random.Generator
-        For ties and U.
+    ``truth`` and ``draws`` (L,) are values of one quantity, the draws independent. The rank is
+    uniform on [0, 1] for every L if truth and draws are exchangeable, so that runs of different
+    lengths can be pooled.
     """
     below, equal = int((draws < truth).sum()), int((draws == truth).sum())
     return float((below + (equal + 1) * rng.random()) / (len(draws) + 1))
 
 
 def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
-    """Return values of a chain thinned evenly to about independent ones.
+    """Return values (chain, draw) of a run, thinned evenly to about independent ones, (n,).
 
     Their number is the effective sample size of the quantity (bulk, Vehtari et al. 2021; of an
     ensemble, draws / autocorrelation time), or all for independent draws; it is 1 if values are
     constant or not finite, chains have fewer than 4 draws, or the autocorrelation time is NaN.
-
-    Parameters
-    ----------
-    values : ndarray, (chain, draw)
-        The quantity of every draw.
-    draws : MotionDraws
-        The run.
     """
     flat = values.reshape(-1)
     if draws.independent:
@@ -84,31 +69,21 @@ def ranks_of_truth(
     elsewhere: Problem,
     seed: int,
 ) -> dict[str, Rank]:
-    """Return the truth's rank in each quantity.
+    """Return the rank of a simulation's truth in each quantity of ``problem``.
 
-    Parameters
-    ----------
-    problem : Problem
-        The simulated problem, which determines the quantities.
-    simulation : Problem
-        One simulation of it, with a truth.
-    draws : MotionDraws
-        A run on the simulation.
-    elsewhere : Problem
-        Another simulation; the quantity ``distance`` is the root mean square distance of joints
-        from its truth, metres.
-    seed : int
-        Seed of ties.
+    The quantity ``distance`` is the root mean square distance of joints from the truth of another
+    simulation, ``elsewhere``, in metres. ``seed`` breaks ties.
     """
     if simulation.truth is None or elsewhere.truth is None:
         raise ValueError(f"simulations of {problem.name} must have a truth")
     positions = np.concatenate([simulation.truth[None], draws.flat()])
-    found = {one.name: one.evaluate(positions) for one in quantities(problem.posterior)}
-    found |= log_densities(simulation, positions)
-    found[DISTANCE] = np.sqrt(((positions - elsewhere.truth) ** 2).sum(axis=-1).mean(axis=(1, 2)))
+    values_of = {one.name: one.evaluate(positions) for one in quantities(problem.posterior)}
+    values_of |= log_densities(simulation, positions)
+    square = ((positions - elsewhere.truth) ** 2).sum(axis=-1)
+    values_of[DISTANCE] = np.sqrt(square.mean(axis=(1, 2)))
     shape = (draws.dataset.sizes["chain"], draws.dataset.sizes["draw"])
     ranks = {}
-    for name, values in found.items():
+    for name, values in values_of.items():
         if unknown := int(np.isnan(values).sum()):
             raise ValueError(
                 f"{name} must not be NaN, got NaN for {unknown} of the truth and the draws"

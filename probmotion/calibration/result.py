@@ -48,8 +48,8 @@ class Calibration:
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
         self.folder = folder
         self.plan = plan
-        found = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
-        self.results: list[RunResult] = [result for result in found if result is not None]
+        results = [read_result(plan.run_folder(folder, *address)) for address in plan.runs()]
+        self.results: list[RunResult] = [result for result in results if result is not None]
         if temporary:
             weakref.finalize(self, shutil.rmtree, folder.parent, True)
 
@@ -72,11 +72,8 @@ class Calibration:
         ):
             if name not in known:
                 raise ValueError(f"{what} must be one of {', '.join(known)}, got {name!r}")
-        return [
-            result
-            for result in self.results
-            if (result.problem, result.sampler) == (problem, sampler)
-        ]
+        place = (problem, sampler)
+        return [result for result in self.results if (result.problem, result.sampler) == place]
 
     def ranks(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
         """Return the truth's ranks in [0, 1] by quantity, (n,), one per successful simulation."""
@@ -89,12 +86,9 @@ class Calibration:
     def _values(self, problem: str, sampler: str, kind: str) -> dict[str, np.ndarray]:
         """Return the values of a kind by quantity, if all successful simulations have it."""
         rows = self._successful(problem, sampler)
-        names = [name for name in (rows[0] if rows else ()) if name.startswith(kind)]
-        return {
-            name.removeprefix(kind): np.array([row[name] for row in rows])
-            for name in names
-            if all(name in row for row in rows)
-        }
+        shared = [name for name in (rows[0] if rows else ()) if all(name in row for row in rows)]
+        names = [name.removeprefix(kind) for name in shared if name.startswith(kind)]
+        return {name: np.array([row[kind + name] for row in rows]) for name in names}
 
     def _successful(self, problem: str, sampler: str) -> list[dict[str, float]]:
         """Return the metrics of successful simulations."""
@@ -104,8 +98,8 @@ class Calibration:
         """Return the quantities that only some simulations have."""
         rows = self._successful(problem, sampler)
         names = {name for row in rows for name in row if name.startswith("rank ")}
-        partial = [name for name in names if not all(name in row for row in rows)]
-        return sorted(name.removeprefix("rank ") for name in partial)
+        names = {name.removeprefix("rank ") for name in names}
+        return sorted(names - set(self.ranks(problem, sampler)))
 
     @property
     def ranked(self) -> bool:
@@ -114,12 +108,12 @@ class Calibration:
 
     def _blocks(self, problems: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
         """Return the ranks of every sampler with more than one, by its verdict."""
-        found = {}
+        blocks = {}
         for problem, sampler in product(problems, self.plan.samplers):
             ranks = self.ranks(problem, sampler)
             if any(len(values) > 1 for values in ranks.values()):
-                found[self.verdict(problem, sampler)] = ranks
-        return found
+                blocks[self.verdict(problem, sampler)] = ranks
+        return blocks
 
     @property
     def notes(self) -> list[str]:
@@ -153,11 +147,10 @@ class Calibration:
     def table(self) -> CalibrationTable:
         """Return a data frame with a row per problem, sampler and quantity; prints a summary.
 
-        Quantity "all" is the sampler as a whole. Columns: ``p_value`` of uniform ranks (all:
+        Quantity "all" is all quantities together. Columns: ``p_value`` of uniform ranks (all:
         smallest after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over
         central intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over
-        quantities),
-        ``simulations`` that succeeded and ``failed`` ones.
+        quantities), ``simulations`` that succeeded and ``failed`` ones.
         """
         from probmotion.calibration.table import CalibrationTable
 

@@ -35,18 +35,10 @@ level|, mean over quantities, about 0.3/√simulations for exact draws"""
 
 @dataclass(frozen=True, eq=False)
 class Ranked:
-    """The ranks of one sampler on one problem.
+    """The truth's ranks in [0, 1] by quantity, (n,), of one sampler on one problem.
 
-    Parameters
-    ----------
-    problem, sampler : str
-        Their names.
-    ranks : mapping of str to ndarray, (n,)
-        The truth's ranks in [0, 1] by quantity, one per successful simulation.
-    failures : sequence of Failure
-        Failures of the other simulations.
-    simulations, planned : int
-        Numbers of finished and planned simulations.
+    There is a rank per successful and a failure per other simulation; ``simulations`` and
+    ``planned`` are the numbers of finished and planned ones.
     """
 
     problem: str
@@ -75,11 +67,10 @@ class CalibrationTable(pd.DataFrame):
     def _constructor(self) -> type[pd.DataFrame]:
         return pd.DataFrame
 
-    def __str__(self) -> str:
-        return self.summary()
-
     def __repr__(self) -> str:
         return self.summary()
+
+    __str__ = __repr__
 
     def _repr_html_(self) -> None:
         return None
@@ -89,7 +80,7 @@ class CalibrationTable(pd.DataFrame):
         blocks = []
         for problem in dict.fromkeys(self["problem"]):
             rows = pd.DataFrame(self[self["problem"] == problem])
-            lines = [_line(str(name), some) for name, some in rows.groupby("sampler", sort=False)]
+            lines = [_line(str(name), group) for name, group in rows.groupby("sampler", sort=False)]
             blocks.append(f"{problem}\n{pd.DataFrame(lines).to_string(index=False)}")
         blocks.append("\n".join(self.attrs["verdicts"]))
         blocks.append(_LEGEND)
@@ -154,12 +145,9 @@ def _deviation(ranks: Mapping[str, np.ndarray], p_values: Mapping[str, float]) -
 
 def _central(ranks: Mapping[str, np.ndarray]) -> float:
     """Return the mean coverage of central 90 % intervals over quantities."""
-    levels = [
-        credible_level(name, values)
-        for name, values in ranks.items()
-        if name not in (DENSITY, DISTANCE)
-    ]
-    return float((np.array(levels) <= _SHOWN).mean())
+    central = [name for name in ranks if name not in (DENSITY, DISTANCE)]
+    levels = np.array([credible_level(name, ranks[name]) for name in central])
+    return float((levels <= _SHOWN).mean())
 
 
 def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, float]]:
@@ -178,19 +166,19 @@ def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, fl
 
 def _line(sampler: str, table: pd.DataFrame) -> dict[str, str]:
     rows = table.set_index("quantity")
-    whole = rows.loc["all"]
+    all_together = rows.loc["all"]
     others = rows.drop(index="all")["p_value"]
     covered = rows["coverage_90"]
     return {
         "sampler": sampler,
-        "p": _number(float(whole["p_value"])),
+        "p": _number(float(all_together["p_value"])),
         "worst": "-" if others.empty else str(others.idxmin()),
-        "90 % covers": _percent(float(whole["coverage_90"])),
+        "90 % covers": _percent(float(all_together["coverage_90"])),
         "density": _percent(float(covered.get(DENSITY, math.nan))),
         "distance": _percent(float(covered.get(DISTANCE, math.nan))),
-        "error": _number(float(whole["coverage_error"])),
-        "simulations": f"{whole['simulations']:.0f}",
-        "failed": f"{whole['failed']:.0f}",
+        "error": _number(float(all_together["coverage_error"])),
+        "simulations": f"{all_together['simulations']:.0f}",
+        "failed": f"{all_together['failed']:.0f}",
     }
 
 

@@ -18,32 +18,17 @@ __all__ = ["DENOISING_CLIPS", "denoising_clips", "synthetic_denoising_clips"]
 
 _FPS = 30.0
 _FRAMES = 30
+_HUMANOID_TRAINING = (
+    "backflip", "cartwheel", "crawl", "dance_a", "dance_spin", "getup_facedown", "long_walk1",
+    "long_walk2", "long_zombie", "punch", "roll", "sideflip", "spin", "spinkick", "stealthy_walk0",
+)  # fmt: skip
 
 DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
     "train": (
         *(f"cmu_single/cmu_01_{trial:02}" for trial in (*range(1, 9), 10, 11, 12, 14)),
         *(f"cmu_single/cmu_02_{trial:02}" for trial in (1, 3, 4, 5, 6, 8, 10)),
         "cmu_single/cmu_131_01",
-        *(
-            f"deepmimic_human/humanoid3d_{name}"
-            for name in (
-                "backflip",
-                "cartwheel",
-                "crawl",
-                "dance_a",
-                "dance_spin",
-                "getup_facedown",
-                "long_walk1",
-                "long_walk2",
-                "long_zombie",
-                "punch",
-                "roll",
-                "sideflip",
-                "spin",
-                "spinkick",
-                "stealthy_walk0",
-            )  # fmt: skip
-        ),
+        *(f"deepmimic_human/humanoid3d_{name}" for name in _HUMANOID_TRAINING),
     ),
     "validation": (
         "cmu_single/cmu_01_09",
@@ -74,20 +59,10 @@ _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
     """Return the recorded clips of each part on ``person14`` at 30 frames per second.
 
-    A clip is split at frames marked as ``suspect`` in its file (marker jumps) into segments named
-    ``cmu_01_07-0``, ….
-
-    Parameters
-    ----------
-    folder : str or Path
-        Folder with the clips of :data:`DENOISING_CLIPS` as ``.npz``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If a clip is missing.
-    ValueError
-        If ``suspect`` is not one bool per frame.
+    ``folder`` must contain the clips of :data:`DENOISING_CLIPS` as ``.npz``, else a
+    ``FileNotFoundError``. A clip is split at frames marked as ``suspect`` in its file (marker
+    jumps) into segments named ``cmu_01_07-0``, …; other marks than one bool per frame raise
+    ``ValueError``.
     """
     return {
         part: [segment for name in names for segment in _segments(Path(folder) / f"{name}.npz")]

@@ -113,11 +113,6 @@ def download(
     progress : bool
         Whether to show a progress bar for each file.
 
-    Returns
-    -------
-    list of Path
-        In the order of ``names``, or of the registry.
-
     Raises
     ------
     ValueError
@@ -134,14 +129,9 @@ def download(
 def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     """Return CMU's ten salsa clips of two people.
 
-    Searches the folders of :func:`data_places` for all ten as archives (``cmu_60_61_TT.npz``, or
-    below ``cmu_salsa_pairs``) or pairs of BVH files (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``,
-    or below ``cmu-salsa``). Nothing is downloaded.
-
-    Parameters
-    ----------
-    folder : str or Path, optional
-        Folder to search instead.
+    Searches ``folder``, or else the folders of :func:`data_places`, for all ten as archives
+    (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or pairs of BVH files
+    (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``). Nothing is downloaded.
 
     Returns
     -------

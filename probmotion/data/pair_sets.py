@@ -58,11 +58,6 @@ def dance_frames(
     Returns
     -------
     ndarray of bool, (L,)
-
-    Raises
-    ------
-    ValueError
-        If the motion has one person, or a limit is not positive.
     """
     return ~np.any(_excluded_frames(motion, farthest, fastest), axis=0)
 
@@ -183,11 +178,6 @@ def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     -------
     ndarray, (…, K)
         Metres.
-
-    Raises
-    ------
-    ValueError
-        If a person lacks one of the joints.
     """
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("…", skeleton.n_joints, 3))
@@ -235,12 +225,7 @@ def choose_seed(positions: np.ndarray) -> int:
     Parameters
     ----------
     positions : ndarray, (n, J, 3)
-        Pose pairs of the training clips, metres.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or a position is not finite.
+        At least one pose pair, metres and finite.
     """
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("n", "J", 3))

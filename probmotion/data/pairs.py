@@ -25,7 +25,6 @@ _SALSA_SCALES = (0.0254 / 0.45 / 0.04389, 0.0254 / 0.45 / 0.04700)
 # The first frames leave the rest pose of the figure, and the last ones jump.
 _SALSA_START, _SALSA_END = 24, 6
 _SALSA_FPS = 60.0  # the files say 120, which is wrong
-_SALSA_NAME = re.compile(r"(?P<subject>60|61)_(?P<trial>\d\d)(_scaled)?")
 
 
 def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
@@ -59,15 +58,8 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
 def pair_of(motion: Motion) -> Motion:
     """Return a motion of two people on ``pair17``, with joints matched by canonical name.
 
-    Parameters
-    ----------
-    motion : Motion
-        Two people; the one whose root comes first becomes ``person0``.
-
-    Raises
-    ------
-    ValueError
-        If there are not two roots, or a joint is missing.
+    The person with the first root becomes ``person0``. Raises ``ValueError`` if there are not two
+    roots, or a joint is missing.
     """
     skeleton = Skeleton.preset("pair17")
     if motion.skeleton == skeleton:
@@ -126,8 +118,7 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     The files are the DAZ-friendly conversion of the CMU database, subjects 60 and 61, in the scaled
     version of :mod:`probmotion.data.downloads`. Each person is scaled about the origin (1.286 and
     1.201 m per unit); the first 24 and last 6 frames are cut; every second frame of 60 per second
-    is kept; both people are lowered together until 98 % of the lowest joints are above the floor, y
-    = 0.
+    is used; both people are lowered until 98 % of the lowest joints are above the floor, y = 0.
 
     Parameters
     ----------
@@ -143,15 +134,13 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     ------
     ValueError
         If the names are not those of one trial, lengths differ or a file is damaged.
-    FileNotFoundError
-        If a file is missing.
     """
     trial = _salsa_trial(Path(lead), Path(follow))
-    people = [
+    leader, follower = (
         read_bvh(path, scale=scale, end_sites=True)
         for path, scale in zip((lead, follow), _SALSA_SCALES, strict=True)
-    ]
-    both = pair_motion(*people, name=f"cmu_60_61_{trial}")
+    )
+    both = pair_motion(leader, follower, name=f"cmu_60_61_{trial}")
     least = _SALSA_START + _SALSA_END + 1
     if both.frames < least:
         raise ValueError(f"lead must have at least {least} frames, got {both.frames}")
@@ -166,13 +155,13 @@ def _salsa_trial(lead: Path, follow: Path) -> str:
     """Return the two digits of the trial."""
     trials = []
     for argument, path, subject in (("lead", lead, "60"), ("follow", follow, "61")):
-        match = _SALSA_NAME.fullmatch(path.stem)
-        if match is None or match["subject"] != subject:
+        match = re.fullmatch(rf"{subject}_(\d\d)(_scaled)?", path.stem)
+        if match is None:
             raise ValueError(
                 f"{argument} must be named {subject}_TT_scaled.bvh, TT being the trial, got "
                 f"{path.name!r}"
             )
-        trials.append(match["trial"])
+        trials.append(match[1])
     if trials[0] != trials[1]:
         raise ValueError(f"lead and follow must be one trial, got {' and '.join(trials)}")
     return trials[0]

@@ -52,16 +52,15 @@ class DetectorNoise:
     silent: float = 0.3
 
     def __post_init__(self) -> None:
-        for name in ("found", "lost"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
-        if not 0 <= self.share < 1:
-            raise ValueError(f"share must be at least 0 and below 1, got {self.share}")
-        if not 0 <= self.silent <= 1:
-            raise ValueError(f"silent must be 0 to 1, got {self.silent}")
-        if not 1 <= self.frames < math.inf:
-            raise ValueError(f"frames must be a finite number of at least 1, got {self.frames}")
+        for name, valid, expected in (
+            ("found", 0 <= self.found < math.inf, "a finite number of at least 0"),
+            ("lost", 0 <= self.lost < math.inf, "a finite number of at least 0"),
+            ("silent", 0 <= self.silent <= 1, "0 to 1"),
+            ("frames", 1 <= self.frames < math.inf, "a finite number of at least 1"),
+            ("share", 0 <= self.share < 1, "at least 0 and below 1"),
+        ):
+            if not valid:
+                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)}")
         if self._begin > 1:
             raise ValueError(
                 f"share must be at most frames / (1 + frames), got {self.share} with frames "
@@ -80,12 +79,11 @@ class DetectorNoise:
 
     def lost_spans(self, rng: np.random.Generator, frames: int, joints: int) -> np.ndarray:
         """Return which joints are lost, (frames, joints) bool: a Markov chain per joint."""
-        stay = 1 - 1 / self.frames
         lost = np.empty((frames, joints), bool)
         lost[0] = rng.random(joints) < self.share
         for frame in range(1, frames):
-            chance = np.where(lost[frame - 1], stay, self._begin)
-            lost[frame] = rng.random(joints) < chance
+            probability = np.where(lost[frame - 1], 1 - 1 / self.frames, self._begin)
+            lost[frame] = rng.random(joints) < probability
         return lost
 
     def detect(
@@ -96,11 +94,11 @@ class DetectorNoise:
         lost = self.lost_spans(rng, L, J)
         silent = lost & (rng.random((L, J)) < self.silent)
         size = np.where(lost, self.lost, self.found)
-        reported = keypoints + size[..., None] * rng.standard_normal((L, J, 2))
+        detected = keypoints + size[..., None] * rng.standard_normal((L, J, 2))
         # The usual thresholds, 0.3 and 0.5, separate detected from lost joints.
         confidence = np.where(lost, 0.3 * rng.random((L, J)), 0.5 + 0.5 * rng.random((L, J)))
         confidence = np.where(silent, 0.0, confidence)
-        return np.where(confidence[..., None] > 0, reported, np.nan), confidence
+        return np.where(confidence[..., None] > 0, detected, np.nan), confidence
 
 
 @dataclass(frozen=True)
@@ -198,11 +196,10 @@ def project_clips(
     for motion in motions:
         rng = seeds.generator(seed, "filming", motion.name)
         cameras = filming.cameras(rng, views)
-        projected = cameras.project(centre_motion(motion, filming.centre).positions)
-        for view, image in enumerate(projected):
-            keypoints, confidence = detector.detect(rng, image)
-            name = f"{motion.name}/{view}"
-            tracks.append(KeypointTrack(keypoints, confidence, motion.skeleton, motion.fps, name))
+        images = cameras.project(centre_motion(motion, filming.centre).positions)
+        for view, image in enumerate(images):
+            detected, name = detector.detect(rng, image), f"{motion.name}/{view}"
+            tracks.append(KeypointTrack(*detected, motion.skeleton, motion.fps, name))
     return tracks
 
 

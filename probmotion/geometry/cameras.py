@@ -167,8 +167,9 @@ class Cameras:
     def view(self, index: int) -> Cameras:
         """Return one camera as a batch of one."""
         assert self.centre is not None
-        parts = (self.rotation, self.translation, self.focal, self.centre)
-        return Cameras(*(part[[index]] for part in parts), self.orthographic)
+        one = [index]
+        rotation, translation = self.rotation[one], self.translation[one]
+        return Cameras(rotation, translation, self.focal[one], self.centre[one], self.orthographic)
 
     def as_orthographic(self) -> Cameras:
         """Return orthographic cameras with the same scale at the depth of the world origin."""

@@ -1,4 +1,4 @@
-"""Measures of draws, one file per question."""
+"""Metrics of draws."""
 
 import lazy_loader
 

@@ -56,11 +56,9 @@ def nearest_draw_distances(
     check_shape("ground_truth", ground_truth, ("G", "J", 3))
     check_finite("ground_truth", ground_truth)
     check_shape("draws", draws, ("S", ground_truth.shape[1], 3))
-    for name, poses in (("ground_truth", ground_truth), ("draws", draws)):
-        if len(poses) == 0:
-            raise ValueError(f"{name} must contain at least one pose, got 0")
-    if len(counts) == 0:
-        raise ValueError("counts must contain at least one number, got 0")
+    for name, values in (("ground_truth", ground_truth), ("draws", draws), ("counts", counts)):
+        if len(values) == 0:
+            raise ValueError(f"{name} must not be empty, got 0 entries")
     for count in counts:
         check_count("counts", count)
         if count > len(draws):
@@ -69,7 +67,7 @@ def nearest_draw_distances(
     truths = prepare(ground_truth)
     least = np.full(len(ground_truth), np.inf)
     seen: set[bytes] = set()
-    found: dict[int, np.ndarray] = {}
+    by_count: dict[int, np.ndarray] = {}
     done = 0
     for count in sorted(set(counts)):
         for start in range(done, count, _BLOCK):
@@ -78,8 +76,8 @@ def nearest_draw_distances(
             new = block[_first_seen(block, seen)]
             lower_minima(*truths, *prepare(new), least)
         done = count
-        found[count] = least.copy()
-    return np.stack([found[count] for count in counts])
+        by_count[count] = least.copy()
+    return np.stack([by_count[count] for count in counts])
 
 
 def _first_seen(poses: np.ndarray, seen: set[bytes]) -> list[int]:

@@ -61,8 +61,8 @@ def sliced_wasserstein_ratio(
         raise ValueError(f"references must have at least 2 sets, got {len(references)}")
     pairs = zip(references, [*references[1:], references[0]], strict=True)
     floor = np.mean([float(sliced_wasserstein(a, b, directions)) for a, b in pairs])
-    found = np.mean([float(sliced_wasserstein(draws, r, directions)) for r in references])
-    return float(found / floor)
+    distance = np.mean([float(sliced_wasserstein(draws, r, directions)) for r in references])
+    return float(distance / floor)
 
 
 def trace_ratio(draws: Array, reference: Array) -> Array:

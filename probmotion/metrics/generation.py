@@ -181,10 +181,11 @@ class GenerationReference:
             raise ValueError("held_out_views must be given, got None")
         views = self._film(positions, seeds.generator(seed, "chamfer"))
         frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
-        shown, real = (
-            some[:, : some.shape[1] // frames * frames] for some in (views, self.held_out_views)
+        generated, real = (
+            motions[:, : motions.shape[1] // frames * frames]
+            for motions in (views, self.held_out_views)
         )
-        return motion_chamfer_distance(shown, real, frames=frames)
+        return motion_chamfer_distance(generated, real, frames=frames)
 
     def _film(
         self, positions: np.ndarray, rng: np.random.Generator, angles: Angles = "all"

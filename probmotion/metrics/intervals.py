@@ -15,6 +15,9 @@ from probmotion.validation import check_shape
 
 __all__ = ["best_and_tied", "t_interval"]
 
+# Standard deviation of the difference of two values rounded to integers.
+_TWO_ROUNDINGS = 1 / math.sqrt(6)
+
 
 def t_interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tuple[float, float]:
     """Return Student's confidence interval of the mean of independent normal values.
@@ -80,8 +83,8 @@ def best_and_tied(
         Rounding step of the values; 0 if they are not rounded.
     """
     errors = _errors(values, target, ratio, lower_is_better)
-    found = {name: np.isfinite(row).sum() for name, row in errors.items()}
-    complete = [name for name in errors if found[name] == max(found.values())]
+    n_seeds = {name: np.isfinite(row).sum() for name, row in errors.items()}
+    complete = [name for name in errors if n_seeds[name] == max(n_seeds.values())]
     best = min(complete, key=lambda name: float(np.nanmean(errors[name])))
     apart = {}
     for name, row in errors.items():
@@ -126,10 +129,6 @@ def _errors(
     if not errors:
         raise ValueError("values must contain a sampler with a finite value")
     return errors
-
-
-# Standard deviation of the difference of two values rounded to integers.
-_TWO_ROUNDINGS = 1 / math.sqrt(6)
 
 
 def _tail(differences: np.ndarray, least_spread: float) -> float:

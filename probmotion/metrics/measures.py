@@ -148,29 +148,29 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
     # Thin draws so that two reference sets are as large.
     most = problem.max_references
     n = len(flat) if most is None else min(len(flat), most // 2)
-    some = flat[np.arange(n) * len(flat) // n]
+    thinned = flat[np.arange(n) * len(flat) // n]
     exact = _exact_draws(problem, seed, n)
     prior = problem.posterior.prior
-    found = {
-        "swd_ratio": distribution.sliced_wasserstein_ratio(some, exact.sets, exact.directions),
+    values = {
+        "swd_ratio": distribution.sliced_wasserstein_ratio(thinned, exact.sets, exact.directions),
         "variance_ratio": float(distribution.trace_ratio(flat, exact.flat)),
         "mean_error_sd": float(distribution.mean_error(flat, exact.flat)),
     }
     off = _off_manifold(prior, positions)
     if off is not None and exact.off is not None:
-        found["off_manifold_ratio"] = off / exact.off
+        values["off_manifold_ratio"] = off / exact.off
     log_density = _log_density(problem, positions)
     if log_density is not None and exact.log_density is not None:
-        found["log_density_gap"] = log_density - exact.log_density
+        values["log_density_gap"] = log_density - exact.log_density
     proportions = _mode_proportions(prior, positions)
     if proportions:
-        found |= {f"mode_proportion_{style}": p for style, p in proportions.items()}
+        values |= {f"mode_proportion_{style}": p for style, p in proportions.items()}
         apart = [abs(p - exact.mode_proportions[style]) for style, p in proportions.items()]
-        found["mode_proportions_tv"] = 0.5 * sum(apart)
-    found["precision"], found["recall"] = distribution.precision_recall(some, exact.sets[0])
-    found["mmd"] = maximum_mean_discrepancy(some, exact.sets[0])
-    found["c2st"] = classifier_two_sample(some, exact.sets[0], seed)
-    return found
+        values["mode_proportions_tv"] = 0.5 * sum(apart)
+    values["precision"], values["recall"] = distribution.precision_recall(thinned, exact.sets[0])
+    values["mmd"] = maximum_mean_discrepancy(thinned, exact.sets[0])
+    values["c2st"] = classifier_two_sample(thinned, exact.sets[0], seed)
+    return values
 
 
 def _compared(problem: Problem, motions: np.ndarray) -> np.ndarray:
@@ -206,7 +206,7 @@ def _against_real_views(
     side = reference.score_motions(positions, seed=seed, samples=samples, angles="side")
     pairs = seeds.generator(seed, "real pairs")
     real = diversity(reference.held_out_features, pairs, _REAL_PAIRS)
-    found = {
+    values = {
         "fid": around["fid"][0],
         "diversity_ratio": around["diversity"][0] / real,
         "view_precision": around["precision"][0],
@@ -216,11 +216,11 @@ def _against_real_views(
     }
     if reference.learnt_features is not None:
         again = reference.of_learnt().score_motions(positions, seed=seed, samples=samples)
-        found["fid_learnt"] = again["fid"][0]
-        found["view_recall_learnt"] = again["recall"][0]
+        values["fid_learnt"] = again["fid"][0]
+        values["view_recall_learnt"] = again["recall"][0]
     if reference.held_out_views is not None:
-        found["mcd_cm2"] = _SQUARE_CENTIMETRES * reference.chamfer(positions, seed=seed).mean
-    return found
+        values["mcd_cm2"] = _SQUARE_CENTIMETRES * reference.chamfer(positions, seed=seed).mean
+    return values
 
 
 def _off_manifold(prior: object, positions: np.ndarray) -> float | None:

@@ -116,7 +116,7 @@ def _torch_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray
     import torch
 
     point = torch.tensor(theta, requires_grad=True)
-    # Rows are independent: the gradient of their sum holds each row's gradient.
+    # Rows are independent: the gradient of their sum contains each row's gradient.
     (gradient,) = torch.autograd.grad(posterior.log_density(point).sum(), point)
     return to_numpy(gradient)
 

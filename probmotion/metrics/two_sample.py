@@ -99,9 +99,9 @@ def discrepancy_p_value(
     labels[:n] = 1
     rng = seeds.generator(seed, "relabelling")
     labels[:, 1:] = rng.permuted(labels[:, 1:], axis=0)
-    found, *relabelled = _squared_discrepancies(kernel, labels)
+    observed, *relabelled = _squared_discrepancies(kernel, labels)
     # Swapping equal points changes the statistic by rounding only.
-    as_large = np.asarray(relabelled) >= found - _ROUNDING
+    as_large = np.asarray(relabelled) >= observed - _ROUNDING
     return float((1 + as_large.sum()) / (1 + permutations))
 
 

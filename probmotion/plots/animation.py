@@ -23,18 +23,11 @@ from probmotion.plots.style import LEFT, RIGHT
 from probmotion.validation import check_positive
 
 __all__ = [
-    "Animation",
-    "animate_skeletons",
-    "animation_html",
-    "animation_script",
-    "animation_style",
-]
+    "Animation", "animate_skeletons", "animation_html", "animation_script", "animation_style",
+]  # fmt: skip
 
-_PLACE = 180
-"""Width of a motion's place in pixels."""
-_CONTROLS = 420
-"""Least width of the page in pixels."""
-
+# Width of a motion's place and least width of the page, pixels.
+_PLACE, _CONTROLS = 180, 420
 _LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
 
 
@@ -208,9 +201,8 @@ def _hidden(hidden: bool) -> str:
 
 
 def _key(problem: StoredProblem) -> str:
-    entries = []
-    if problem.skeleton.mirrored_pairs:
-        entries += [("left", "left side"), ("right", "right side")]
+    entries = [("left", "left side"), ("right", "right side")]
+    entries = entries if problem.skeleton.mirrored_pairs else []
     if problem.truth is not None:
         entries.append(("ghost", "truth"))
     items = [

@@ -40,24 +40,24 @@ def draw_calibration(
     if not levels:
         raise ValueError("levels must contain at least one kind of pose, got none")
     terms = list(next(iter(levels.values())))
-    for kind, found in levels.items():
-        if list(found) != terms:
-            raise ValueError(f"levels[{kind!r}] must have the terms {terms}, got {list(found)}")
+    for kind, by_term in levels.items():
+        if list(by_term) != terms:
+            raise ValueError(f"levels[{kind!r}] must have the terms {terms}, got {list(by_term)}")
     figure = Figure(figsize=(0.4 + 3.4 * len(terms), 3.2), layout="constrained")
     for axes, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
-        values = {kind: np.asarray(found[term]) for kind, found in levels.items()}
-        finite = np.concatenate([some[np.isfinite(some)] for some in values.values()])
+        values = {kind: np.asarray(by_term[term]) for kind, by_term in levels.items()}
+        finite = np.concatenate([level[np.isfinite(level)] for level in values.values()])
         # Outliers would compress the rest.
         low, high = np.quantile(finite, 0.01), finite.max()
         edges = np.linspace(low - 0.02 * (high - low) - 1e-9, high + 0.02 * (high - low) + 1e-9, 41)
-        for place, (kind, some) in enumerate(values.items()):
+        for place, (kind, level) in enumerate(values.items()):
             colour = CYCLE[place % len(CYCLE)]
-            if some.size == 1:
-                axes.axvline(float(some[0]), color=colour, linewidth=2, linestyle="--", label=kind)
+            if level.size == 1:
+                axes.axvline(float(level[0]), color=colour, linewidth=2, linestyle="--", label=kind)
                 continue
-            weights = np.full(some.size, 1 / some.size)
-            axes.hist(np.maximum(some, edges[0]), edges, weights=weights, color=colour, alpha=0.55,
-                      label=kind)  # fmt: skip
+            weights = np.full(level.size, 1 / level.size)
+            clipped = np.maximum(level, edges[0])
+            axes.hist(clipped, edges, weights=weights, color=colour, alpha=0.55, label=kind)
         axes.set_title(term, loc="left", size=10.5, color=INK)
         axes.set_xlabel("nats", color=INK)
         plain_axes(axes)

@@ -12,11 +12,12 @@ from probmotion.plots.style import (
     GREY,
     INK,
     LEFT,
+    check_columns,
     finish_figure,
     legend_below,
     plain_axes,
     style_of,
-)
+)  # fmt: skip
 from probmotion.validation import check_count, check_finite, check_shape
 
 if TYPE_CHECKING:
@@ -26,16 +27,13 @@ if TYPE_CHECKING:
 
 __all__ = ["classical_scaling", "draw_coverage", "draw_embedding"]
 
+# Colour, marker and size of each kind of pose, in drawing order.
 _KINDS = {
     "real": (LEFT, "o", 9.0),
     "prior": ("#009E73", "o", 9.0),
     "posterior": ("#B8578F", "o", 9.0),
     "seed": ("#000000", "x", 70.0),
 }
-"""Colour, marker and size of each kind of pose, in drawing order."""
-
-_COLUMNS = ("measure", "density", "draws", "coverage")
-
 _TITLES = {
     "interaction": "interaction coordinates (m)",
     "cartesian": "Cartesian coordinates (m)",
@@ -123,11 +121,8 @@ def draw_embedding(
     middle, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.ptp(points, axis=0).max()
     limits = np.stack([middle - 0.54 * reach, middle + 0.54 * reach], axis=1)
     shown[0].set(xlim=limits[0], ylim=limits[1])
-    handles, labels = shown[-1].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", frameon=False, labelcolor=INK,
-        ncols=len(handles) if len(panels) > 1 else 2, markerscale=1.5,
-    )  # fmt: skip
+    ncols = len(shown[-1].collections) if len(panels) > 1 else 2
+    legend_below(figure, ncols, axes=shown[-1], markerscale=1.5)
     return finish_figure(figure, path)
 
 
@@ -151,10 +146,7 @@ def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure
     """
     from matplotlib.figure import Figure
 
-    missing = [name for name in _COLUMNS if name not in table]
-    if missing or len(table) == 0:
-        got = f"no columns {', '.join(missing)}" if missing else "no row"
-        raise ValueError(f"table must have rows with {', '.join(_COLUMNS)}, got {got}")
+    check_columns(table, ("measure", "density", "draws", "coverage"))
     if not (table["draws"] >= 1).all():
         raise ValueError(f"draws in table must be at least 1, got {table['draws'].min()}")
     measures = list(dict.fromkeys(table["measure"]))
@@ -173,9 +165,9 @@ def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure
 
 
 def _draw_line(axes: Axes, rows: pd.DataFrame, density: str, place: int) -> None:
-    found = rows.groupby("draws")["coverage"].agg(["mean", "min", "max"])
-    counts, mean = found.index.to_numpy(dtype=float), found["mean"].to_numpy()
-    bars = np.stack([mean - found["min"], found["max"] - mean])
+    by_count = rows.groupby("draws")["coverage"].agg(["mean", "min", "max"])
+    counts, mean = by_count.index.to_numpy(dtype=float), by_count["mean"].to_numpy()
+    bars = np.stack([mean - by_count["min"], by_count["max"] - mean])
     colour, marker = style_of(place)
     axes.errorbar(
         counts, mean, bars, label=density, color=colour, marker=marker,
@@ -191,9 +183,7 @@ def _style_coverage_axes(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlabel("draws", color=INK)
-    axes.grid(color=GREY, linewidth=0.5, alpha=0.6)
-    axes.set_axisbelow(True)
-    plain_axes(axes)
+    plain_axes(axes, grid="both")
 
 
 def _draw_points(axes: Axes, points: np.ndarray, kinds: np.ndarray, count: int | None) -> None:

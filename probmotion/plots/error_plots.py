@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probmotion.plots.style import CYCLE, GREY, INK, finish_figure, plain_axes
+from probmotion.plots.style import CYCLE, INK, check_columns, finish_figure, plain_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_error_decomposition"]
 
-_COLUMNS = ("setting", "measure", "part", "mean", "low", "high")
 _FLOOR, _WHOLE = "floor", "whole"
 _COLOURS = {
     part: CYCLE[place]
@@ -61,10 +60,7 @@ def draw_error_decomposition(
     """
     from matplotlib.figure import Figure
 
-    if missing := [name for name in _COLUMNS if name not in table]:
-        raise ValueError(
-            f"table must have the columns {', '.join(_COLUMNS)}, got none of {', '.join(missing)}"
-        )
+    check_columns(table, ("setting", "measure", "part", "mean", "low", "high"))
     settings = list(dict.fromkeys(table["setting"]))
     if len(settings) != 1:
         raise ValueError(f"table must have one setting, got {len(settings)}")
@@ -72,18 +68,15 @@ def draw_error_decomposition(
     parts = [part for part in dict.fromkeys(table["part"]) if part not in (_FLOOR, _WHOLE)]
     colours = {part: _COLOURS.get(part, CYCLE[6 + place % 2]) for place, part in enumerate(parts)}
     figure = Figure(figsize=(0.8 + 2.75 * len(measures), 4.6), layout="constrained")
-    for axes, measure in zip(
-        figure.subplots(1, len(measures), squeeze=False)[0], measures, strict=True
-    ):
+    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
         rows = table[table["measure"] == measure].set_index("part")
         _draw_stack(axes, rows, colours)
         _draw_intervals(axes, rows, colours)
         axes.axhline(0.0, color=INK, linewidth=0.8)
         axes.set_xlim(-0.6, 0.25 + 0.55 * (len(parts) + 1) + 0.4)
         axes.set_xticks([])
-        axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="y")
-        axes.set_axisbelow(True)
-        plain_axes(axes, ("top", "right", "bottom"))
+        plain_axes(axes, ("top", "right", "bottom"), grid="y")
         title = textwrap.fill((words or {}).get(measure, measure), _LETTERS)
         axes.set_title(title, loc="left", size=10, color=INK)
     figure.axes[0].set_ylabel("above exact draws", color=INK, size=9.5)
@@ -102,12 +95,12 @@ def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> N
             edgecolor="white", linewidth=0.8,
         )  # fmt: skip
         up, down = (up + height, down) if height >= 0 else (up, down + height)
-    whole = float(rows.loc[_WHOLE, "mean"])
-    axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [whole, whole], color="black", linewidth=2.2)
+    total = float(rows.loc[_WHOLE, "mean"])
+    axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [total, total], color="black", linewidth=2.2)
 
 
 def _draw_intervals(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
-    """Draw every part and the whole with their intervals, side by side."""
+    """Draw every part and the total with their intervals, side by side."""
     for place, (part, colour) in enumerate([*colours.items(), (_WHOLE, "black")], start=1):
         row = rows.loc[part]
         where = 0.25 + 0.55 * place

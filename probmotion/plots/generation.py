@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.plots.style import GREY, INK, LEFT, RIGHT, finish_figure, legend_below, plain_axes
+from probmotion.plots.style import (
+    INK,
+    LEFT,
+    RIGHT,
+    check_columns,
+    finish_figure,
+    legend_below,
+    plain_axes,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,8 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_generation"]
 
+# Marker, colour and fill.
 _VIEWS = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
-"""Marker, colour and fill."""
 
 
 def draw_generation(
@@ -51,13 +59,9 @@ def draw_generation(
     """
     from matplotlib.figure import Figure
 
-    missing = [name for name in ("name", *measures) if name not in table]
-    if missing or len(table) == 0:
-        got = f"no columns {', '.join(missing)}" if missing else "no row"
-        raise ValueError(f"table must have rows with name and the metrics, got {got}")
-    figure = Figure(
-        figsize=(1.6 + 2.4 * len(measures), 1.2 + 0.28 * len(table)), layout="constrained"
-    )
+    check_columns(table, ("name", *measures))
+    size = (1.6 + 2.4 * len(measures), 1.2 + 0.28 * len(table))
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
     places = np.arange(len(table))[::-1]
     for axes, (measure, title) in zip(panels, measures.items(), strict=True):
@@ -68,9 +72,7 @@ def draw_generation(
             axes.set_xscale("log")
         else:
             axes.set_xlim(left=0)
-        axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis="both")
-        axes.set_axisbelow(True)
-        plain_axes(axes)
+        plain_axes(axes, grid="both")
     panels[0].set_yticks(places, list(table["name"]))
     legend_below(figure, 2)
     return finish_figure(figure, path)
@@ -82,15 +84,8 @@ def _draw_markers(
     if measure not in table:
         return
     shape, colour, face = _VIEWS[label]
-    deviations = f"{measure}_sd"
+    deviations = table.get(f"{measure}_sd")
     axes.errorbar(
-        table[measure].to_numpy(dtype=float),
-        places,
-        xerr=table[deviations].to_numpy(dtype=float) if deviations in table else None,
-        fmt=shape,
-        color=colour,
-        markersize=5,
-        markerfacecolor=face,
-        elinewidth=1.0,
-        label=label,
-    )
+        table[measure], places, xerr=deviations, fmt=shape, color=colour, markersize=5,
+        markerfacecolor=face, elinewidth=1.0, label=label,
+    )  # fmt: skip

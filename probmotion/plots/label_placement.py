@@ -24,7 +24,7 @@ def place_labels(
     ``sizes`` are (width, height) of the labels, and the room is the area available to them.
     """
     taken = list(markers.values())
-    found = {}
+    boxes = {}
     for name, marker in markers.items():
         width, height = sizes[name]
         places = [
@@ -35,8 +35,8 @@ def place_labels(
         covered = [_covered(place, taken, room) for place in places]
         best = covered.index(min(covered))
         taken.append(places[best])
-        found[name] = places[best], best >= len(_AROUND)
-    return found
+        boxes[name] = places[best], best >= len(_AROUND)
+    return boxes
 
 
 def _beside(box: Box, across: int, down: int, distance: float, width: float, height: float) -> Box:

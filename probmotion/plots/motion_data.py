@@ -10,18 +10,19 @@ from typing import Any
 import numpy as np
 
 from probmotion.comparison.results.stored_problems import StoredProblem
+from probmotion.geometry.cameras import Cameras
 from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.plots.skeletons import face_heading, joint_sides
 
 __all__ = ["Shown", "choose_draws", "motion_numbers"]
 
+# Heading of bodies without observations, radians.
 _HEADING = np.pi / 2 - 0.35
-"""Heading of bodies without observations, radians."""
 _LARGEST = np.iinfo(np.int16).max
+# Largest elevation of the view, in radians, at which a body stays in its place.
 _TILT = 0.3
-"""Largest elevation of the view, in radians, at which a body stays in its place."""
+# Name of each side's colour in the style sheet.
 _SIDES = {"middle": "ink", "left": "left", "right": "right"}
-"""Name of each side's colour in the style sheet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +83,10 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
         "camera": None,
         **_extent(first if truth is None else np.concatenate([first, truth[None]])),
     }
-    if problem.joints is not None:
-        assert path is not None
+    if path is not None and problem.joints is not None:
         data["dots"] = _base64((problem.joints[::step] - path[:, None]).astype("<f4"))
-    if problem.camera is not None:
-        assert path is not None
-        data |= _camera(problem, step)
+    if path is not None and problem.camera is not None:
+        data |= _camera(problem.camera, problem.keypoints, step)
         data["anchor"] = np.round(path[:, [0, 2]], 4).tolist()
     return data
 
@@ -120,11 +119,8 @@ def _extent(motions: np.ndarray) -> dict[str, float]:
     }
 
 
-def _camera(problem: StoredProblem, step: int) -> dict[str, Any]:
-    camera = problem.camera
-    assert camera is not None
+def _camera(camera: Cameras, keypoints: np.ndarray | None, step: int) -> dict[str, Any]:
     assert camera.centre is not None
-    keypoints = problem.keypoints
     return {
         # Beside the camera, where depth is visible.
         "azimuth": round(float(camera.azimuth[0]) + 1.0, 4),

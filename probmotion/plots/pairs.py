@@ -19,11 +19,10 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_pairs"]
 
+# Colours of characters in the order of their roots, repeated after the fourth.
 _CHARACTERS = (LEFT, RIGHT, "#009E73", "#B8578F")
-"""Colours of characters in the order of their roots, repeated after the fourth."""
-
+# Space for row labels, for the title and between figures, inches.
 _LABEL, _TITLE, _GAP = 1.15, 0.42, 0.1
-"""Space for row labels, for the title and between figures, inches."""
 
 
 def draw_pairs(

@@ -22,11 +22,10 @@ __all__ = ["plot_quality_against_cost", "quality_points"]
 
 _LETTERS = 46
 
+# Seconds and quality, (seeds,) each.
 Point = tuple[np.ndarray, np.ndarray]
-"""Seconds and quality, (seeds,) each."""
-
+# Colour and marker.
 Style = tuple[str, str]
-"""Colour and marker."""
 
 
 def plot_quality_against_cost(table: pd.DataFrame, path: str | Path | None = None) -> Figure:
@@ -101,8 +100,8 @@ def _missing(table: pd.DataFrame, problem: str, points: Mapping[str, Point]) -> 
     lines = []
     for sampler, group in rows.groupby("sampler", sort=False):
         if sampler not in points:
-            failed = group["metric"].iloc[0] if len(group) == 1 else "not measured"
-            lines.append(f"no point: {sampler} ({words.get(f'{problem}/{sampler}', failed)})")
+            reason = group["metric"].iloc[0] if len(group) == 1 else "not measured"
+            lines.append(f"no point: {sampler} ({words.get(f'{problem}/{sampler}', reason)})")
     return lines
 
 
@@ -110,9 +109,7 @@ def _draw_panel(
     axes: Axes, problem: str, points: Mapping[str, Point], styles: Mapping[str, Style]
 ) -> None:
     axes.set_title(problem, loc="left", size=11, color=INK, weight="bold")
-    axes.grid(which="major", color=GREY, linewidth=0.5, alpha=0.6)
-    axes.set_axisbelow(True)
-    plain_axes(axes)
+    plain_axes(axes, grid="both")
     if not points:
         axes.set(xticks=[], yticks=[])
         return

@@ -98,20 +98,14 @@ def _draw_histograms(
 ) -> None:
     """Draw a histogram per quantity with a simultaneous band (Bonferroni)."""
     columns = min(_ACROSS, len(ranks))
-    panels = part.subplots(
-        -(-len(ranks) // columns),
-        columns,
-        squeeze=False,
-        sharex=True,
-        gridspec_kw={"hspace": 0.4, "wspace": 0.3, **place},
-    ).ravel()
+    spacing = {"hspace": 0.4, "wspace": 0.3, **place}
+    lines = -(-len(ranks) // columns)
+    panels = part.subplots(lines, columns, squeeze=False, sharex=True, gridspec_kw=spacing).ravel()
     for axes, (name, values) in zip(panels, ranks.items(), strict=False):
         n = len(values)
         bins = max(2, min(_MOST_BINS, n // _PER_BIN))
-        low, high = (
-            float(binom.ppf(tail, n, 1 / bins))
-            for tail in (0.5 * (1 - _LEVEL) / bins, 1 - 0.5 * (1 - _LEVEL) / bins)
-        )
+        tail = 0.5 * (1 - _LEVEL) / bins
+        low, high = binom.ppf([tail, 1 - tail], n, 1 / bins)
         axes.axhspan(low, high, color=GREY, alpha=0.6, linewidth=0)
         axes.axhline(n / bins, color=INK, linewidth=0.7)
         axes.hist(values, np.linspace(0, 1, bins + 1), color=colours[name], alpha=0.75, rwidth=0.92)
@@ -127,8 +121,7 @@ def _draw_histograms(
 def _draw_difference(
     axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]
 ) -> None:
-    sizes = {len(values) for values in ranks.values()}
-    for n in sizes:
+    for n in {len(values) for values in ranks.values()}:
         _draw_band(axes, n, less=1)
     for name, values in ranks.items():
         points = evaluation_points(len(values))

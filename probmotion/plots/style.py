@@ -8,39 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 from probmotion.files import written_whole
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = [
-    "CYCLE",
-    "GREY",
-    "INK",
-    "LEFT",
-    "RIGHT",
-    "finish_figure",
-    "legend_below",
-    "plain_axes",
-    "style_of",
-]
+    "CYCLE", "GREY", "INK", "LEFT", "RIGHT", "check_columns", "finish_figure", "legend_below",
+    "plain_axes", "style_of",
+]  # fmt: skip
 
 LEFT = "#0072B2"
 RIGHT = "#D55E00"
 INK = "#333333"
 GREY = "#C4C4C4"
 
+# Colours and markers of samplers in order; markers distinguish them without colour.
 CYCLE = (
     "#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A",
     "#7A7A7A",
 )  # fmt: skip
-"""Colours of samplers in order."""
-
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p", "<", ">")
-"""Markers of samplers in order, which distinguish them without colour."""
 _DOTS_PER_INCH = 150
 
 
@@ -49,23 +41,38 @@ def style_of(place: int) -> tuple[str, str]:
     return CYCLE[place % len(CYCLE)], _MARKERS[place % len(_MARKERS)]
 
 
-def plain_axes(axes: Axes, hidden: Sequence[str] = ("top", "right"), size: float = 8.5) -> None:
-    """Hide some spines and style the ticks."""
+def plain_axes(
+    axes: Axes,
+    hidden: Sequence[str] = ("top", "right"),
+    size: float = 8.5,
+    grid: Literal["both", "x", "y"] | None = None,
+) -> None:
+    """Hide some spines, style the ticks and draw a grid along the given axes."""
     for name in hidden:
         axes.spines[name].set_visible(False)
     axes.tick_params(which="both", color=GREY, labelcolor=INK, labelsize=size)
+    if grid is not None:
+        axes.grid(color=GREY, linewidth=0.5, alpha=0.6, axis=grid)
+        axes.set_axisbelow(True)
 
 
-def legend_below(figure: Figure, ncols: int) -> None:
-    """Add the legend of the first axes below the figure."""
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=ncols,
-        frameon=False, labelcolor=INK,
-    )  # fmt: skip
+def check_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
+    """Raise ``ValueError`` unless a table has a row and all columns."""
+    missing = [name for name in columns if name not in table]
+    if missing or len(table) == 0:
+        problem = f"no columns {', '.join(missing)}" if missing else "no row"
+        raise ValueError(f"table must have rows with {', '.join(columns)}, got {problem}")
+
+
+def legend_below(figure: Figure, ncols: int, axes: Axes | None = None, **options: Any) -> None:
+    """Add the legend of some axes, by default the first, below the figure."""
+    handles, labels = (axes or figure.axes[0]).get_legend_handles_labels()
+    options |= {"loc": "outside lower center", "frameon": False, "labelcolor": INK}
+    figure.legend(handles, labels, ncols=ncols, **options)
 
 
 def finish_figure(figure: Figure, path: str | Path | None) -> Figure:
-    """Write a figure as PNG if a path is given, and return it; failed writing leaves no file.
+    """Write a figure as PNG if a path is given, and return it; if writing fails, no file remains.
 
     Raises
     ------

@@ -35,11 +35,6 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
 
     The class is given by name, so that importing this module loads no networks. The evaluator is
     ``<name>-evaluator``; ``<name>-features.npz`` contains features of held-out and training motion.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such prior.
     """
     from probmotion.models.evaluation.evaluator import TrackEvaluator
 

@@ -109,8 +109,8 @@ class Ancestral2D(NoiseLevels):
         done: list[np.ndarray] = []
         # Multithreaded products round differently for different batch sizes.
         with threadpool_limits(1, user_api="blas"), bars as bar:
-            for some in batches([(0, draw) for draw in range(draws)], self.batch):
-                streams = NormalStreams.of_draws(seed, list(some))
+            for batch in batches([(0, draw) for draw in range(draws)], self.batch):
+                streams = NormalStreams.of_draws(seed, list(batch))
                 done.append(ancestral(state, streams, lambda: bar.update(1)) * prior.scale)
         return np.concatenate(done)
 

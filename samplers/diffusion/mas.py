@@ -122,13 +122,10 @@ class MultiViewAncestral(AncestralSampler):
         if not self.shared_noise:
             raise ValueError("shared_noise must be True to project the noise to a new view")
         state = self._state(posterior)
-        watched: list[tuple[Any, Any]] = []
-
-        def watch(clean: np.ndarray | None, noise: np.ndarray | None) -> None:
-            watched.append((clean, noise))
-
+        watched: list[Any] = []
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
-        ancestral(state, streams, lambda: None, watch=watch, **self._options())
+        options = {"watch": lambda *pair: watched.append(pair), **self._options()}
+        ancestral(state, streams, lambda: None, **options)
         estimates = np.stack([clean for clean, _ in watched[1:]])
         noises = np.stack([noise for _, noise in watched[:-1]])
         if noises.shape[-1] == 2:

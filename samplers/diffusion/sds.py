@@ -98,12 +98,9 @@ class ScoreDistillation(IndependentSampler):
         check_positive("arc", self.arc)
         if self.arc > 2 * math.pi:
             raise ValueError(f"arc must be at most 2 pi, got {self.arc}")
-        for name, known in (("levels", Levels), ("weighting", Weighting)):
-            if getattr(self, name) not in get_args(known):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(get_args(known))}, got "
-                    f"{getattr(self, name)!r}"
-                )
+        for name, options in (("levels", get_args(Levels)), ("weighting", get_args(Weighting))):
+            if (value := getattr(self, name)) not in options:
+                raise ValueError(f"{name} must be one of {', '.join(options)}, got {value!r}")
 
     @classmethod
     def reference_code(cls) -> ScoreDistillation:
@@ -141,8 +138,8 @@ class ScoreDistillation(IndependentSampler):
             motions = streams.normal(*shape)
             counts["denoiser"] += len(motions) * self.iterations * self.n_views
 
-            def gradient(alpha_bar: float, numbers: np.ndarray) -> np.ndarray:
-                views = Views(Cameras.around(self.arc * numbers / self.azimuths, elevation))
+            def gradient(alpha_bar: float, indices: np.ndarray) -> np.ndarray:
+                views = Views(Cameras.around(self.arc * indices / self.azimuths, elevation))
                 if self.shared_noise:
                     noise = views.project(streams.normal(*shape))
                 else:
@@ -164,7 +161,7 @@ class ScoreDistillation(IndependentSampler):
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             theta = streams.normal(posterior.dim)
 
-            def gradient(alpha_bar: float, numbers: np.ndarray) -> np.ndarray:
+            def gradient(alpha_bar: float, indices: np.ndarray) -> np.ndarray:
                 noise = streams.normal(posterior.dim)
                 return posterior_gradient(posterior, theta, noise, alpha_bar)
 
@@ -193,8 +190,8 @@ class ScoreDistillation(IndependentSampler):
         )
         if self.levels == "uniform":
             return rng.integers(1, self.steps, self.iterations), views
-        fall = np.linspace(self.steps - 1, 1, self.iterations)
-        return np.round(fall).astype(int), views
+        levels = np.linspace(self.steps - 1, 1, self.iterations)
+        return np.round(levels).astype(int), views
 
     def _descend(
         self,
@@ -206,9 +203,9 @@ class ScoreDistillation(IndependentSampler):
         """Optimise values in place by their gradient at (ᾱ, azimuth indices)."""
         alpha_bars = self.schedule.alpha_bar
         adam = Adam(values, self.learning_rate)
-        for t, numbers in zip(*self.plan(seed), strict=True):
+        for t, indices in zip(*self.plan(seed), strict=True):
             alpha_bar = float(alpha_bars[t])
-            adam.descend(self.weight(alpha_bar) * gradient(alpha_bar, numbers))
+            adam.descend(self.weight(alpha_bar) * gradient(alpha_bar, indices))
             tick()
 
 

@@ -223,8 +223,8 @@ class _Run:
         self.recorded.append((coordinates, log_density))
         self.last = _State(coordinates, log_density, random, 0, len(self.recorded))
 
-    def draws(self, wanted: int) -> tuple[np.ndarray, np.ndarray, _State]:
-        """Return θ and log densities of at most ``wanted`` draws, and the state after them."""
+    def draws(self, n: int) -> tuple[np.ndarray, np.ndarray, _State]:
+        """Return θ and log densities of at most ``n`` draws, and the state after them."""
         walkers = self.start.coordinates.shape[1]
         finished = self.last.draws if self.last is not self.start else 0
         begin = walkers - self.start.unused
@@ -233,7 +233,7 @@ class _Run:
             np.concatenate(parts, axis=1)
             for parts in zip(first, *self.recorded[:finished], strict=True)
         )
-        n = min(wanted, theta.shape[1])
+        n = min(n, theta.shape[1])
         state = self.last._replace(unused=theta.shape[1] - n, draws=self.start.draws + n)
         return theta[:, :n], log_density[:, :n], state
 
@@ -265,7 +265,7 @@ class _Run:
 def _words(state: Any) -> np.ndarray:
     """Return a RandomState's state as signed 32-bit words, for netCDF.
 
-    The cached normal number is left out: emcee's stretch move draws none.
+    The cached normal number is omitted, since the stretch move of emcee draws none.
     """
     _, key, position, *_ = state
     return np.append(key.view(np.int32), np.int32(position))

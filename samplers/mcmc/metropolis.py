@@ -134,11 +134,11 @@ class MetropolisHastings:
         *values, states = zip(*finished, strict=True)
         theta, log_density, acceptance = (np.stack(rows, axis=1) for rows in values)
         state = states[-1]
-        positions = motions(posterior, theta, seed, first=int(state["draws"]) - len(finished))
+        first = int(state["draws"]) - len(finished)
         return MotionDraws.of(
             posterior,
             self,
-            positions,
+            motions(posterior, theta, seed, first),
             seed=seed,
             seconds=time.perf_counter() - start,
             theta=theta,

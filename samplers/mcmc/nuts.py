@@ -175,20 +175,20 @@ class _Run:
         with progress_bar(chains * (warmup + draws * thin), self.sampler.name, progress) as bar:
             states = [self._begin(chain) for chain in range(chains)]
             for chain in range(chains):
-                for some in _chunks(warmup, 1):
-                    states[chain], _ = self._advance(states[chain], some, 1)
-                    bar.update(some)
-            for some in _chunks(draws, thin):
+                for n in _chunks(warmup, 1):
+                    states[chain], _ = self._advance(states[chain], n, 1)
+                    bar.update(n)
+            for n in _chunks(draws, thin):
                 rows = []
                 for chain in range(chains):
-                    states[chain], row = self._advance(states[chain], some, thin)
+                    states[chain], row = self._advance(states[chain], n, thin)
                     rows.append(row)
-                    bar.update(some * thin)
+                    bar.update(n * thin)
                 chunk = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
                 if self.recorded:
                     chunk = {k: np.concatenate([self.recorded[k], chunk[k]], 1) for k in chunk}
                 self.recorded, self.chains = chunk, list(states)
-                self.finished += some
+                self.finished += n
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state after the last finished draw, to continue from."""

@@ -19,7 +19,7 @@ __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 
 CHUNK = 50
-"""Maximum iterations per compiled call, unless a single draw takes more; limits the rows too."""
+"""Maximum draws, and maximum iterations unless a single draw takes more, per compiled call."""
 
 
 @lru_cache(maxsize=8)

@@ -202,13 +202,13 @@ class DVAEInference(IndependentSampler):
             return AmortisedPosterior.fit(posterior, settings, seed, progress).draw
         inference = self._fitted(network, posterior, seed, counts, progress)
 
-        def drawn(streams: NormalStreams) -> np.ndarray:
+        def draw(streams: NormalStreams) -> np.ndarray:
             positions, theta = inference.draw(streams, len(streams.generators))
             if theta is not None and isinstance(prior, HasLogDensity):
                 thetas.append(theta)
             return positions
 
-        return drawn
+        return draw
 
     def _network_of(self, posterior: MotionPosterior) -> InferenceNetwork | None:
         """Return the network for the observations, or None if one must be trained."""

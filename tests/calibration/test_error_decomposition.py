@@ -141,8 +141,8 @@ def test_isotropic_prior_shrinks_by_discretisation_alone():
     S, T = np.eye(3), 30
     assert log_trace(covariance_after(S, 100), S) == pytest.approx(math.log(0.955), abs=1e-3)
     assert log_trace(covariance_after(S, 1000), S) == pytest.approx(math.log(0.995), abs=1e-3)
-    found = decompose(problem_of(centred(1, 1, 1)), steps=T, seeds=2, draws=100)
-    spread = means(found, "spread")
+    result = decompose(problem_of(centred(1, 1, 1)), steps=T, seeds=2, draws=100)
+    spread = means(result, "spread")
     error = 4 * math.sqrt(2) * math.sqrt(2 / (100 * 2 * JOINTS * 3))
     many, few = (log_trace(covariance_after(S, steps), S) for steps in (10 * T, T))
     assert spread["remainder"] == pytest.approx(many, abs=error)
@@ -156,7 +156,7 @@ def test_isotropic_prior_shrinks_by_discretisation_alone():
     sharing = log_trace(here, covariance_after(S, T))
     assert spread["noise sharing"] == pytest.approx(sharing, abs=error)
     assert spread["whole"] == pytest.approx(log_trace(here, S), abs=error)
-    assert means(found, "mean").abs().max() < 0.01
+    assert means(result, "mean").abs().max() < 0.01
 
 
 @pytest.mark.parametrize(
@@ -175,12 +175,12 @@ def test_single_view_conditioning_shrinks_large_and_inflates_small_directions(
     S, T = prior.covariance, 15
     exact = log_trace(covariance_after(S, 60, ring(5, elevation)), covariance_after(S, 60))
     assert exact == pytest.approx(log_trace(np.diag(drawn), S), abs=0.02)
-    found = decompose(
+    result = decompose(
         problem_of(prior), steps=T, seeds=2, draws=100, settings={"elevation": elevation}
     )
     after = covariance_after(S, T, ring(5, elevation))
     before = covariance_after(S, T)
-    spread = means(found, "spread")
+    spread = means(result, "spread")
     assert spread["single view"] == pytest.approx(log_trace(after, before), abs=0.01)
     # Small directions mix joints, and axes of equal variance.
     small = ErrorMeasures(problem_of(prior)).small.reshape(JOINTS, 3, -1)
@@ -188,24 +188,24 @@ def test_single_view_conditioning_shrinks_large_and_inflates_small_directions(
         np.einsum("jxd,xy,jyd->d", small, covariance, small) for covariance in (after, before)
     )
     expected = np.log(inflated / right).mean()
-    assert means(found, "small")["single view"] == pytest.approx(expected, abs=0.03)
+    assert means(result, "small")["single view"] == pytest.approx(expected, abs=0.03)
     assert expected > 0.3
 
 
 def test_parts_add_up_exactly_seed_by_seed():
-    found = decompose(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
-    assert found.parts == ["remainder", "discretisation", "single view", "noise sharing"]
-    table = found.table()
+    result = decompose(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
+    assert result.parts == ["remainder", "discretisation", "single view", "noise sharing"]
+    table = result.table()
     assert list(table.columns) == ["setting", "measure", "part", "mean", "low", "high"]
     assert set(table["setting"]) == {"points, V = 5, T = 5"}
-    for measure, links in found.values.items():
+    for measure, links in result.values.items():
         whole = links["noise sharing"] - links["exact"]
-        parts = np.sum(list(found.differences(measure).values()), axis=0)
+        parts = np.sum(list(result.differences(measure).values()), axis=0)
         np.testing.assert_allclose(parts, whole, atol=1e-12)
         rows = table[table["measure"] == measure].set_index("part")
-        np.testing.assert_allclose(rows.loc[found.parts, "mean"].sum(), rows.loc["whole", "mean"])
+        np.testing.assert_allclose(rows.loc[result.parts, "mean"].sum(), rows.loc["whole", "mean"])
         assert (rows["low"] < rows["high"]).all()
-    sentences = {words.partition(":")[0]: words for words in found.findings}
+    sentences = {words.partition(":")[0]: words for words in result.findings}
     assert "discretisation -" in sentences["spread"]
     assert sentences["mean"].startswith("mean: not significant in all; not significant: ")
 
@@ -264,16 +264,16 @@ def test_guidance():
         np.testing.assert_allclose(idle.differences(measure)["guidance"], 0, atol=1e-6)
         np.testing.assert_array_equal(idle.differences(measure)["network"], 0)
     sharp = problem_of(prior, observed(prior, 0.05))
-    found = run(sharp)
-    assert abs(means(found, "mean")["floor"]) < 0.02
-    assert any("no learnt denoiser" in note for note in found.notes)
+    result = run(sharp)
+    assert abs(means(result, "mean")["floor"]) < 0.02
+    assert any("no learnt denoiser" in note for note in result.notes)
     # Treating the observation as one more view is biased.
     naive = run(sharp, settings={"guidance": WeightedTriangulation()})
     row = naive.table().set_index(["measure", "part"]).loc[("mean", "guidance")]
-    assert row["low"] > 10 * means(found, "mean")["guidance"] > 0
+    assert row["low"] > 10 * means(result, "mean")["guidance"] > 0
     for part in ("remainder", "discretisation", "single view"):
         np.testing.assert_array_equal(
-            naive.differences("mean")[part], found.differences("mean")[part]
+            naive.differences("mean")[part], result.differences("mean")[part]
         )
 
 
@@ -305,13 +305,13 @@ def test_interrupted_runs_resume(tmp_path):
 
 def test_gaits_have_a_manifold_measure_and_a_plot(tmp_path):
     problem = load_problem("gait", frames=4, components=3)
-    found = decompose(problem, steps=8, seeds=2, draws=40)
-    assert list(found.values) == ["spread", "small", "off", "mean", "distance"]
-    off = found.table().set_index(["measure", "part"]).loc["off"]
+    result = decompose(problem, steps=8, seeds=2, draws=40)
+    assert list(result.values) == ["spread", "small", "off", "mean", "distance"]
+    off = result.table().set_index(["measure", "part"]).loc["off"]
     assert abs(off.loc["floor", "mean"]) < 0.1
     assert off.loc["discretisation", "high"] < 0
     assert off.loc["single view", "low"] > 0
-    path = found.plot(tmp_path / "budget.png")
+    path = result.plot(tmp_path / "budget.png")
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, seeds
-from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
+from probmotion.data.projections import DetectorNoise, Filming, project_clips
 from probmotion.data.synthetic.gaits import make_gaits
-from probmotion.motion.splits import clip_of
 
 NO_NOISE = DetectorNoise.none()
 
@@ -29,20 +28,16 @@ def test_noiseless_tracks_are_projections_of_the_centred_clip(clips, perspective
     filming = Filming(elevation=0.3, tilt=0.0, distance=5.0, perspective=perspective, centre=centre)
     tracks = project_clips(clips, views=4, seed=2, filming=filming, noise=NO_NOISE)
     assert [track.name for track in tracks] == [f"{c.name}/{v}" for c in clips for v in range(4)]
-    for clip, views in zip(
-        clips, np.array_split(np.array(tracks, object), len(clips)), strict=True
-    ):
+    for number, clip in enumerate(clips):
         root = clip.positions[:, clip.skeleton.roots[0]]
         origin = root[:, None] if centre == "frame" else root.mean(axis=0)
         azimuths = seeds.generator(2, "filming", clip.name).uniform(0, 2 * np.pi, 4)
         cameras = Cameras.around(azimuths, np.full(4, 0.3), distance=5.0, perspective=perspective)
         expected = cameras.project(clip.positions - origin)
-        for track, image in zip(views, expected, strict=True):
+        for track, image in zip(tracks[4 * number :][:4], expected, strict=True):
             np.testing.assert_allclose(track.keypoints, image, atol=1e-12)
             assert track.confidence.min() >= 0.5
-            assert track.skeleton == clip.skeleton
-            assert track.fps == clip.fps
-            assert clip_of(track.name) == clip.name
+            assert (track.skeleton, track.fps) == (clip.skeleton, clip.fps)
 
 
 def test_camera_elevations_and_azimuths():
@@ -50,8 +45,7 @@ def test_camera_elevations_and_azimuths():
     cameras = filming.cameras(np.random.default_rng(0), 4000)
     forward = cameras.rotation[:, 2]
     elevation = np.arcsin(-forward[:, 1])
-    assert elevation.min() >= 0.3
-    assert elevation.max() <= 0.5
+    assert 0.3 <= elevation.min() < elevation.max() <= 0.5
     assert elevation.mean() == pytest.approx(0.4, abs=5 * 0.1 / math.sqrt(3 * 4000))
     azimuth = np.arctan2(-forward[:, 0], -forward[:, 2])
     # The first two moments of a uniform angle have sd 1/√(2n).
@@ -81,11 +75,9 @@ def test_frequency_and_duration_of_losses():
     for frame in (0, L - 1):
         assert lost[frame].mean() == pytest.approx(0.1, abs=5 * math.sqrt(0.09 / n))
     # The mean duration follows from the number of ends.
-    begun = lost[1:] & ~lost[:-1]
     ended = lost[:-1] & ~lost[1:]
     mean = lost[:-1].sum() / ended.sum()
     assert mean == pytest.approx(5.0, rel=5 / math.sqrt(ended.sum()))
-    assert abs(begun.sum() - ended.sum()) < 5 * math.sqrt(begun.sum())
 
 
 def test_errors_and_confidences():
@@ -107,19 +99,6 @@ def test_errors_and_confidences():
     assert errors[reported].std() == pytest.approx(0.3, rel=5 / math.sqrt(2 * 2 * reported.sum()))
 
 
-def test_centring_is_a_translation(clips):
-    clip = clips[1]
-    root = clip.skeleton.roots[0]
-    for centre in ("frame", "sequence"):
-        moved = centre_motion(clip, centre)
-        step = clip.positions - moved.positions
-        np.testing.assert_allclose(step, np.broadcast_to(step[:, :1], step.shape), atol=1e-12)
-        np.testing.assert_allclose(moved.positions[:, root].mean(axis=0), 0, atol=1e-12)
-        assert (moved.name, moved.fps, moved.skeleton) == (clip.name, clip.fps, clip.skeleton)
-    np.testing.assert_allclose(centre_motion(clip).positions[:, root], 0, atol=1e-12)
-    assert abs(centre_motion(clip, "sequence").positions[:, root]).max() > 0.01
-
-
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -128,7 +107,6 @@ def test_centring_is_a_translation(clips):
         (DetectorNoise, {"share": 1.0}),
         (DetectorNoise, {"silent": 1.5}),
         (DetectorNoise, {"frames": 0.5}),
-        (DetectorNoise, {"frames": math.nan}),
         (DetectorNoise, {"frames": math.inf}),
         (DetectorNoise, {"share": 0.9, "frames": 2.0}),
         (Filming, {"distance": 0.0}),

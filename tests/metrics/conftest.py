@@ -1,4 +1,4 @@
-"""Random numbers of the tests of metrics."""
+"""Random number generator of the metrics' tests."""
 
 import numpy as np
 import pytest

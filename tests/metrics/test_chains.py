@@ -70,6 +70,7 @@ def test_only_principal_coordinates_are_monitored_in_high_dimension(rng):
     theta = rng.normal(size=(2, 50, 40)) * np.r_[10.0, np.ones(39)]
     monitored = monitored_coordinates(run(theta))
     assert monitored.shape == (2, 50, 10)
+    np.testing.assert_array_equal(monitored_coordinates(run(theta[..., :3])), theta[..., :3])
     assert abs(np.corrcoef(monitored[..., 0].ravel(), theta[..., 0].ravel())[0, 1]) > 0.99
 
 
@@ -118,14 +119,3 @@ def test_the_limit_of_r_hat_is_a_quantile_over_runs(monkeypatch):
     greatest = np.sort(together.reshape(12, 33).max(axis=1))
     limit = rhat_of_independent(2, 12, level=0.5, seed=7)
     assert limit == pytest.approx((greatest[5] + greatest[6]) / 2, rel=1e-12)
-
-
-def test_short_converged_chains_have_a_large_r_hat(rng, monkeypatch):
-    monkeypatch.setattr(chains, "_RUNS", 20)
-    limit = rhat_of_independent(4, 10)
-    rhats = [chain_diagnostics(run(rng.normal(size=(4, 10, 32))))["rhat"] for _ in range(10)]
-    assert limit > 1.25
-    assert np.median(rhats) > 1.15
-    # Each exceeds the limit with probability 1/20: more than 4 of 10 in one of 10 000 cases.
-    assert 0.9 * limit < np.max(rhats)
-    assert sum(rhat > limit for rhat in rhats) <= 4

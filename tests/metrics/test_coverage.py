@@ -1,5 +1,7 @@
 """Coverage and pose distances against plain formulas, SciPy and known cases."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
@@ -33,11 +35,11 @@ def plain_interaction(first, second):
     second = Rotation.align_vectors(first, second)[0].apply(second)
     total = 0.0
     for pose in (first, second):
-        simplices = Delaunay(pose).simplices
-        edges = {(min(i, j), max(i, j)) for s in simplices for i in s for j in s if i != j}
-        weights = [1 / max(0.05, np.linalg.norm(pose[i] - pose[j])) for i, j in edges]
-        apart = [np.linalg.norm(first[i] - first[j] - second[i] + second[j]) for i, j in edges]
-        total += np.average(apart, weights=weights)
+        pairs = (itertools.permutations(simplex, 2) for simplex in Delaunay(pose).simplices)
+        i, j = np.unique(np.sort([edge for edges in pairs for edge in edges]), axis=0).T
+        apart = np.linalg.norm(first[i] - first[j] - second[i] + second[j], axis=1)
+        lengths = np.linalg.norm(pose[i] - pose[j], axis=1)
+        total += np.average(apart, weights=1 / np.maximum(0.05, lengths))
     return total
 
 
@@ -85,11 +87,11 @@ def test_distances_of_a_scaled_pose_by_hand():
     pose[:3] = np.eye(3)
     centred = pose - pose.mean(axis=0)
     wanted = 0.1 * np.sqrt((centred**2).sum() / 4)
-    found = {m: pose_distances(pose[None], 1.1 * pose[None], m)[0, 0] for m in MEASURES}
-    assert found["cartesian"] == pytest.approx(wanted)
+    result = {m: pose_distances(pose[None], 1.1 * pose[None], m)[0, 0] for m in MEASURES}
+    assert result["cartesian"] == pytest.approx(wanted)
     lengths = np.array([1.0, 1.0, 1.0, np.sqrt(2), np.sqrt(2), np.sqrt(2)])
     mean = np.average(0.1 * lengths, weights=1 / lengths)
-    assert found["interaction"] == pytest.approx(2 * mean)
+    assert result["interaction"] == pytest.approx(2 * mean)
 
 
 def test_the_rotation_is_the_best_proper_one_of_any_poses():
@@ -158,11 +160,11 @@ def test_degenerate_poses_have_finite_distances():
     ("changes", "message"),
     [
         ({"measure": "euclid"}, "measure must be one of interaction, cartesian, .*got 'euclid'"),
-        ({"draws": DRAWS[:0]}, "draws must contain at least one pose, got 0"),
-        ({"ground_truth": TRUTHS[:0]}, "ground_truth must contain at least one pose, got 0"),
+        ({"draws": DRAWS[:0]}, "draws must not be empty, got 0 entries"),
+        ({"ground_truth": TRUTHS[:0]}, "ground_truth must not be empty, got 0 ent"),
         ({"counts": [5, 31]}, "counts must be at most the 20 draws, got 31"),
         ({"counts": [0]}, "counts must be an integer of at least 1, got 0"),
-        ({"counts": []}, "counts must contain at least one number, got 0"),
+        ({"counts": []}, "counts must not be empty, got 0 entries"),
         ({"draws": DRAWS[:, :33]}, r"draws must have shape \(S, 34, 3\), got \(20, 33, 3\)"),
         ({"draws": BROKEN}, "draws must be finite, got 1 values"),
     ],

@@ -76,8 +76,8 @@ def test_p_values_are_uniform_for_exact_sets(rng):
 def test_p_value_by_enumeration():
     # Two of the six labellings of {0, 0.1, 5, 5.1} separate near from far.
     x, y = np.array([[0.0], [0.1]]), np.array([[5.0], [5.1]])
-    found = discrepancy_p_value(x, y, 0, permutations=3000)
-    assert found == pytest.approx(1 / 3, abs=4 * math.sqrt(2 / 9 / 3000))
+    result = discrepancy_p_value(x, y, 0, permutations=3000)
+    assert result == pytest.approx(1 / 3, abs=4 * math.sqrt(2 / 9 / 3000))
 
 
 def test_classifier_accuracy_is_a_half_for_exact_sets(rng):
@@ -112,13 +112,6 @@ def test_classifier_detects_errors_off_the_manifold(rng):
         return rng.normal(size=(60, 12)) @ frame.T + noise * rng.normal(size=(60, 600))
 
     assert classifier_two_sample(motions(0.002), motions(0.001), 0) > 0.95
-
-
-def test_classifier_accuracy_is_reproducible_and_scale_invariant(rng):
-    x, y = rng.normal(size=(2, 40, 6))
-    expected = classifier_two_sample(x, y + 0.3, 5)
-    assert classifier_two_sample(x, y + 0.3, 5) == expected
-    assert classifier_two_sample(1000 * x + 7, 1000 * (y + 0.3) + 7, 5) == expected
 
 
 def test_principal_coordinates_are_standardised_and_uncorrelated(rng):

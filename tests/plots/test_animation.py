@@ -33,8 +33,8 @@ POSES = np.array(
 def data_of(rows, skeleton=WALK.skeleton, **options):
     """Return the data in a page."""
     page = animate_skeletons(rows, skeleton, **{"fps": 30, **options}).html
-    (found,) = re.findall(r'json">(.*?)</script>', page)
-    return json.loads(found)
+    (data,) = re.findall(r'json">(.*?)</script>', page)
+    return json.loads(data)
 
 
 def test_motions_are_millimetres_with_the_root_in_the_middle():
@@ -43,9 +43,9 @@ def test_motions_are_millimetres_with_the_root_in_the_middle():
     assert (data["frames"], data["joints"], data["fps"]) == (20, WALK.skeleton.n_joints, 30)
     motion = data["rows"][0][0]
     numbers = np.frombuffer(base64.b64decode(motion["numbers"]), "<i2")
-    found = motion["unit"] / 1000 * numbers.reshape(turned.shape)
+    positions = motion["unit"] / 1000 * numbers.reshape(turned.shape)
     root = turned[:, [WALK.skeleton.roots[0]]] * np.array([1, 0, 1])
-    np.testing.assert_allclose(found, turned - root, atol=0.0005 + 1e-9)
+    np.testing.assert_allclose(positions, turned - root, atol=0.0005 + 1e-9)
 
 
 def test_bones_have_sides_and_the_first_row_sets_the_scale():

@@ -81,7 +81,7 @@ TWO_SETTINGS = pd.concat([ERRORS, ERRORS.assign(setting="V = 12")])
         (draw_coverage, (COVERAGE.drop(columns="coverage"),), "got no columns coverage"),
         (draw_coverage, (COVERAGE[:0],), "table must have rows with measure, .* got no row"),
         (draw_coverage, (COVERAGE.assign(draws=0),), "draws in table must be at least 1, got 0"),
-        (draw_error_decomposition, (ERRORS.drop(columns=["low"]),), "got none of low"),
+        (draw_error_decomposition, (ERRORS.drop(columns=["low"]),), "got no columns low"),
         (draw_error_decomposition, (TWO_SETTINGS,), "table must have one setting, got 2"),
         (draw_generation, (GENERATION, {"speed": "speed"}), "got no columns speed"),
         (draw_generation, (GENERATION[:0], {"fid": "FID"}), "table must have rows .*, got no row"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from probmotion.io.files import load_all
 from probmotion.problems import clips_problem, load_problem
 from probmotion.problems.clips import CLIP_PROBLEMS
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 SMALL = {"frames": 10, "rank": 3, "styles": 2}
 
 
@@ -65,19 +63,14 @@ def test_clips_are_resampled_on_request_only():
     assert problem.truth.shape == (10, 17, 3)
 
 
-def test_clips_are_reduced_to_common_joints():
+def test_joints_are_the_common_ones_and_short_clips_are_reported():
     clips = gaits()
-    kept = [joint for joint in range(17) if clips[0].skeleton.joint_names[joint] != "head"]
-    bald = replace(
-        clips[0], skeleton=clips[0].skeleton.subset(kept), positions=clips[0].positions[:, kept]
-    )
-    problem = clips_problem([bald, *clips[1:]], **SMALL)
-    assert problem.posterior.skeleton.n_joints == 16
-    assert "head" not in problem.posterior.skeleton.joint_names
-
-
-def test_short_clips_are_skipped_and_reported():
-    problem = clips_problem([gaits()[0].window(0, 5), *gaits()], **SMALL)
+    skeleton = clips[0].skeleton
+    others = [joint for joint in range(17) if skeleton.joint_names[joint] != "head"]
+    positions = clips[0].positions[:5, others]
+    headless = replace(clips[0], skeleton=skeleton.subset(others), positions=positions)
+    problem = clips_problem([headless, *clips[1:]], **SMALL)
+    assert problem.posterior.skeleton.joint_names == headless.skeleton.joint_names
     assert "(1 shorter than 10 frames left out)" in problem.description
 
 
@@ -108,36 +101,25 @@ def test_invalid_arguments_are_rejected(clips, settings, message):
         clips_problem(clips, **(SMALL | settings))
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="the real clips are not beside this checkout")
-def test_problem_from_real_bvh_files():
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the reader guesses one file's unit and says so
-        clips = load_all(DATA / "originals" / "*.bvh", fps=30.0)
-    problem = clips_problem(clips)
-    draws = problem.reference(0, 50)
-    image = problem.posterior.likelihood.cameras.project(draws)
-    assert np.abs(image - problem.posterior.likelihood.keypoints).mean() < 0.1
+@pytest.mark.filterwarnings("ignore")  # the unit of one file is guessed
+def test_problem_from_real_bvh_files(real_data):
+    problem = clips_problem(load_all(real_data / "originals" / "*.bvh", fps=30.0))
+    likelihood = problem.posterior.likelihood
+    image = likelihood.cameras.project(problem.reference(0, 50))
+    assert np.abs(image - likelihood.keypoints).mean() < 0.1
 
 
-@pytest.mark.parametrize(("name", "observed"), [("cmu", False), ("cmu-monocular", True)])
-def test_cmu_problems_are_exact(real_data, name, observed):
-    problem = load_problem(name)
-    assert problem.exact is not None
-    assert (problem.truth is not None) == observed
-    assert problem.simulate is not None
-    walks = problem.posterior.prior
-    assert walks.frames == 30
-    if observed:
-        # The observations reduce the error for a clip that was held out.
-        known = problem.reference(0, 50)
-        from_prior = problem.posterior.prior.sample(np.random.default_rng(0), 50)
-        far, near = (
-            np.linalg.norm(drawn - drawn[:, :, :1] - problem.truth + problem.truth[:, :1], axis=-1)
-            for drawn in (from_prior, known)
-        )
-        assert near.mean() < 0.6 * far.mean()
+def test_cmu_problems_are_exact(real_data):
+    problem = load_problem("cmu-monocular")
+    prior = problem.posterior.prior
+    assert prior.frames == 30
+    # The observations reduce the error for a clip that was held out.
+    centred = problem.truth - problem.truth[:, :1]
+    prior_error, error = (
+        np.linalg.norm(drawn - drawn[:, :, :1] - centred, axis=-1).mean()
+        for drawn in (prior.sample(np.random.default_rng(0), 50), problem.reference(0, 50))
+    )
+    assert error < 0.6 * prior_error
 
 
 def test_missing_cmu_clips_error_explains_the_download(monkeypatch, tmp_path):

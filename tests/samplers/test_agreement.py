@@ -76,8 +76,10 @@ class Dense:
     def directions(self):
         """Return the leading principal axes and as many random directions, (n, D)."""
         weights = np.exp(self.log_weights)
-        apart = self.means - weights @ self.means
-        total = np.tensordot(weights, self.covariances, 1) + (weights[:, None] * apart).T @ apart
+        centred = self.means - weights @ self.means
+        total = (
+            np.tensordot(weights, self.covariances, 1) + (weights[:, None] * centred).T @ centred
+        )
         leading = np.linalg.eigh(total)[1].T[::-1][: DIRECTIONS // 2]
         others = np.random.default_rng(7).normal(size=(DIRECTIONS - len(leading), len(total)))
         return np.concatenate([leading, others / np.linalg.norm(others, axis=1, keepdims=True)])

@@ -75,9 +75,9 @@ def test_starts_without_a_choice_are_prior_draws(posterior):
 
 def test_starts_cover_modes_in_proportion_to_their_mass(two_modes):
     """Starts at the highest density would all be in the narrow mode, of mass 0.1."""
-    apart = np.array([[-12.0, 0.0, 0.0], [12.0, 0.0, 0.0]])
+    means = np.array([[-12.0, 0.0, 0.0], [12.0, 0.0, 0.0]])
     spread = np.stack([2.0 * np.eye(3), 0.05 * np.eye(3)])
-    prior = replace(two_modes, weights=np.array([0.9, 0.1]), means=apart, covariances=spread)
+    prior = replace(two_modes, weights=np.array([0.9, 0.1]), means=means, covariances=spread)
     points, _ = starts(MotionPosterior(prior), (400, 3), 1000)
     assert (points[:, 0] < 0).mean() == pytest.approx(0.9, abs=0.06)
 

@@ -14,6 +14,7 @@ from probmotion.cli.settings_options import object_from_text, text_of_object
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, load_sampler, suited
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
+from probmotion.samplers.independent import IndependentSampler
 
 QUICK = {
     "exact": {},
@@ -26,7 +27,6 @@ QUICK = {
     "ensemble": {"warmup": 20, "thin": 2},
     "dvae": {"training_steps": 5, "training_pairs": 200},
 }
-CHAIN_SAMPLERS = ("mh", "nuts", "ensemble")
 
 
 @pytest.fixture(params=QUICK)
@@ -92,7 +92,7 @@ def test_saving_and_continuing(sampler, run, tmp_path):
     np.testing.assert_array_equal(loaded.positions.values, draws.positions.values)
     assert loaded.counts == draws.counts
     assert set(loaded.state) == set(draws.state)
-    assert bool(draws.state) == (sampler.name in CHAIN_SAMPLERS)
+    assert bool(draws.state) != isinstance(sampler, IndependentSampler)
     if not draws.state:
         message = f"initial must be None, got MotionDraws: {sampler.name} has no starting points"
         with pytest.raises(ValueError, match=message):

@@ -45,18 +45,9 @@ def animal_clips(
 ) -> dict[str, list[Motion]]:
     """Return animal clips in the parts "train", "validation" and "test", at 30 fps.
 
-    Parameters
-    ----------
-    folder : str or Path, optional
-        Folder with the dog's cycles (:func:`dog_clips`); synthetic animals alone by default.
-    n, seconds, seed
-        Number of synthetic training clips, their length and seed; validation and test have n / 5
-        each, at least 2.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As :func:`dog_clips` and :func:`synthetic_animals`.
+    ``n``, ``seconds`` and ``seed`` are the number of synthetic training clips, their length and
+    seed; validation and test have n / 5 each, at least 2. With ``folder`` the dog's cycles
+    (:func:`dog_clips`) are added.
     """
     check_count("n", n)
     frames = _frames(seconds)
@@ -76,19 +67,9 @@ def animal_clips(
 def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Motion]]:
     """Return the dog's cycles of each part, repeated for ``seconds``, at 30 fps.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Folder with the cycles of :data:`DOG_CLIPS` as ``.npz``; a cycle takes 0.4 to 0.7 s.
-    seconds : float
-        Length of a clip.
-
-    Raises
-    ------
-    FileNotFoundError
-        If a cycle is missing.
-    ValueError
-        If a file is not a cycle (``loop`` other than "wrap") or has another frame rate.
+    ``folder`` must contain the cycles of :data:`DOG_CLIPS` (0.4 to 0.7 s) as ``.npz``, else a
+    ``FileNotFoundError``. Raises ``ValueError`` if a file is not a cycle (``loop`` other than
+    "wrap") or has another frame rate.
     """
     frames = _frames(seconds)
     return {
@@ -117,9 +98,8 @@ def _frames(seconds: float) -> int:
 
 def _dog_clip(path: Path, frames: int) -> Motion:
     if not path.is_file():
-        raise FileNotFoundError(
-            f"folder must contain {path.parent.name}/{path.name}, got no such file"
-        )
+        name = f"{path.parent.name}/{path.name}"
+        raise FileNotFoundError(f"folder must contain {name}, got no such file")
     with np.load(path) as archive:
         loop = str(archive["loop"]) if "loop" in archive else "none"
     cycle = load(path)
@@ -164,12 +144,12 @@ def _quadruped(number: int, frames: int, fps: float, seed: int) -> Motion:
     for side, sign in (("left", 1.0), ("right", -1.0)):
         # Shoulders tilt with the trunk.
         shoulder = neck + sign * 0.09 * left - 0.1 * np.cross(back, left) + 0.04 * back
-        for names, top, bones, bend, behind in (
-            (("shoulder", "elbow", "wrist", "front_paw"), shoulder, *_FORE, True),
-            (("hip", "knee", "ankle", "back_paw"), joint[f"{side}_hip"], *_HIND, False),
+        for names, top, bones, bend, first_side in (
+            (("shoulder", "elbow", "wrist", "front_paw"), shoulder, *_FORE, 1.0),
+            (("hip", "knee", "ankle", "back_paw"), joint[f"{side}_hip"], *_HIND, -1.0),
         ):
             paw = joint[f"{side}_{names[3]}"]
-            chain = _leg(top, paw, left, bones, bend, behind)
+            chain = _leg(top, paw, left, bones, bend, first_side)
             joints.update(zip([f"{side}_{name}" for name in names], chain, strict=True))
     stacked = np.stack([joints[name] for name in ANIMAL_SKELETON.joint_names], axis=1)
     return Motion(stacked, ANIMAL_SKELETON, fps, name=gait.name)
@@ -181,9 +161,9 @@ def _leg(
     left: np.ndarray,
     bones: np.ndarray,
     bend: tuple[float, float],
-    behind: bool,
+    side: float,
 ) -> tuple[np.ndarray, ...]:
-    """Return the four joints of a leg, (L, 3) each; ``behind`` is the side of the first bend.
+    """Return the four joints of a leg, (L, 3) each; the first bend is behind for ``side`` 1.
 
     The extension of the leg sets the lower angle; the two bones around it then act as one bone.
     """
@@ -191,26 +171,18 @@ def _leg(
     stretch = np.linalg.norm(paw - top, axis=-1) / bones.sum()
     angle = np.radians(bend[0] + (bend[1] - bend[0]) * stretch)
     reach = np.sqrt(middle**2 + lower**2 - 2 * middle * lower * np.cos(angle))
-    first = _between(top, paw, left, upper, reach, behind)
-    second = _between(first, paw, left, np.full_like(reach, middle), lower, not behind)
-    return top, first, second, paw
 
+    def between(start: np.ndarray, first: float, second: float, side: float) -> np.ndarray:
+        """Return the point at two distances from start and paw, in the plane normal to left."""
+        line = paw - start
+        distance = np.linalg.norm(line, axis=-1)
+        along = (first**2 - second**2 + distance**2) / (2 * distance)
+        aside = np.sqrt(first**2 - along**2) * side
+        axis = line / distance[:, None]
+        return start + along[:, None] * axis + aside[:, None] * np.cross(left, axis)
 
-def _between(
-    top: np.ndarray,
-    end: np.ndarray,
-    left: np.ndarray,
-    first: float | np.ndarray,
-    second: float | np.ndarray,
-    behind: bool,
-) -> np.ndarray:
-    """Return the point at two distances from two points, in the plane normal to ``left``."""
-    line = end - top
-    distance = np.linalg.norm(line, axis=-1)
-    along = (first**2 - second**2 + distance**2) / (2 * distance)
-    aside = np.sqrt(first**2 - along**2) * (1.0 if behind else -1.0)
-    axis = line / distance[:, None]
-    return top + along[:, None] * axis + aside[:, None] * np.cross(left, axis)
+    knee = between(top, upper, reach, side)
+    return top, knee, between(knee, middle, lower, -side), paw
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

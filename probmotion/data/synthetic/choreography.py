@@ -65,18 +65,15 @@ class Dance:
 
     def raised(self, time: np.ndarray, person: int) -> np.ndarray:
         """Return how far the hands are raised, 0 to 1, for a turn of ``person``."""
-        return sum(
-            (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in self._turns(time, person)),
-            np.zeros_like(time),
-        )
+        turns = self._turns(time, person)
+        lifts = (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in turns)
+        return sum(lifts, np.zeros_like(time))
 
     def turned(self, time: np.ndarray, person: int) -> np.ndarray:
         """Return the angle by which ``person`` has turned under the raised hands."""
-        ways = [figure.way for figure in self.figures if figure.turns == person]
+        ways = [2 * np.pi * figure.way for figure in self.figures if figure.turns == person]
         turns = zip(ways, self._turns(time, person), strict=True)
-        return sum(
-            (2 * np.pi * way * rise((x - 1.9) / 4.2) for way, x in turns), np.zeros_like(time)
-        )
+        return sum((way * rise((x - 1.9) / 4.2) for way, x in turns), np.zeros_like(time))
 
     def _turns(self, time: np.ndarray, person: int) -> list[np.ndarray]:
         beats = self.beats(time)
@@ -85,30 +82,25 @@ class Dance:
     def place(self, time: np.ndarray, person: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the ground position (n, 3) of a person's root, y = 0, and the yaw (n,)."""
         weights = self.weights(time)
-        inside = np.clip(
-            self.beats(time) - _FIGURE * np.arange(len(self.figures))[:, None], 0, _FIGURE
-        )
-        there_and_back = (
-            np.sin(np.pi * inside / _FIGURE * 2) * np.sin(np.pi * inside / _FIGURE) ** 2
-        )
-        forward = np.array([figure.forward for figure in self.figures]) @ there_and_back
-        aside = np.array([figure.aside for figure in self.figures]) @ there_and_back
+        begin = _FIGURE * np.arange(len(self.figures))[:, None]
+        inside = np.clip(self.beats(time) - begin, 0, _FIGURE)
+        excursion = np.sin(np.pi * inside / _FIGURE * 2) * np.sin(np.pi * inside / _FIGURE) ** 2
+        forward = np.array([figure.forward for figure in self.figures]) @ excursion
+        aside = np.array([figure.aside for figure in self.figures]) @ excursion
         distance = np.array([figure.distance for figure in self.figures]) @ weights
         raised = self.raised(time, 0) + self.raised(time, 1)
         distance = distance + raised * (_TURN_DISTANCE - distance)
         heading = self.heading + self.turning * time + 0.25 * self.wander(0, time)
         facing = level(heading)
-        centre = 0.15 * np.stack(
-            [self.wander(1, time), np.zeros_like(time), self.wander(2, time)], axis=-1
-        )
+        x, z = self.wander(1, time), self.wander(2, time)
+        centre = 0.15 * np.stack([x, np.zeros_like(time), z], axis=-1)
         centre += forward[:, None] * facing + aside[:, None] * level(heading + np.pi / 2)
         # Partners are offset to their left and sway over the standing foot.
         closed = np.array([figure.hold == "closed" for figure in self.figures]) @ weights
         left = 0.05 * closed + self.sway * np.sin(np.pi * self.beats(time))
         yaw = heading + np.pi * person
-        root = (
-            centre - 0.5 * distance[:, None] * level(yaw) + left[:, None] * level(yaw + np.pi / 2)
-        )
+        root = centre - 0.5 * distance[:, None] * level(yaw)
+        root = root + left[:, None] * level(yaw + np.pi / 2)
         return root, yaw + 0.12 * self.wander(3 + person, time) + self.turned(time, person)
 
 

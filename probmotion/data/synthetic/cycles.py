@@ -19,19 +19,8 @@ def repeated_cycle(cycle: Motion, frames: int) -> Motion:
 
     The last frame of a cycle is the first of the next one, translated and rotated about the
     vertical as the root moved over the cycle. The remaining mismatch of the pose is distributed
-    evenly over the cycle by rotating rigid groups of bones, so that bones keep their lengths.
-
-    Parameters
-    ----------
-    cycle : Motion
-        At least 3 frames of one body.
-    frames : int
-        Frames of the result.
-
-    Raises
-    ------
-    ValueError
-        If the cycle has fewer than 3 frames or several roots.
+    evenly over the cycle by rotating rigid groups of bones, which preserves bone lengths. Raises
+    ``ValueError`` if the cycle has fewer than 3 frames or several roots.
     """
     check_count("frames", frames)
     if len(cycle.skeleton.roots) != 1:

@@ -87,14 +87,12 @@ def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
     ):
         joints[name] = joints[parent] + height * _rotated(frame, offset)
     for side, sign in _SIDES.items():
-        own = (sign, 1.0, 1.0)
-        joints[f"{side}_shoulder"] = joints["chest"] + height * _rotated(
-            chest, np.multiply(own, _SHOULDER)
-        )
-        hip = joints["pelvis"] + height * _rotated(pelvis, np.multiply(own, _HIP))
+        shoulder = _rotated(chest, np.multiply((sign, 1.0, 1.0), _SHOULDER))
+        joints[f"{side}_shoulder"] = joints["chest"] + height * shoulder
+        hip = joints["pelvis"] + height * _rotated(pelvis, np.multiply((sign, 1.0, 1.0), _HIP))
+        lengths, forward = (height * _LEG[0], height * _LEG[1]), (0.15 * sign, 0.0, 1.0)
         ankle = _foot(dance, person, sign, time)
-        lengths = (height * _LEG[0], height * _LEG[1])
-        knee, ankle = bent_limb(hip, ankle, lengths, _rotated(pelvis, (0.15 * sign, 0.0, 1.0)))
+        knee, ankle = bent_limb(hip, ankle, lengths, _rotated(pelvis, forward))
         joints |= {f"{side}_hip": hip, f"{side}_knee": knee, f"{side}_ankle": ankle}
     return joints
 
@@ -127,22 +125,18 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
     }
     raised = [dance.raised(time, person) for person in range(2)]
     lead, follow = bodies
-    sides = {(0, "left"), (1, "right")}  # hands that stay joined
     for person, body in enumerate(bodies):
         for side, sign in _SIDES.items():
-            shoulder = body[f"{side}_shoulder"]
-            swing = 0.05 * np.sin(np.pi * dance.beats(time))
-            free = _rotated(body["frame"], (0.08 * sign, -0.34, 0.18)) + swing[:, None] * _rotated(
-                body["frame"], (0.0, 0.3, 1.0)
-            )
-            free += shoulder
-            joined = (person, side) in sides
+            shoulder, frame = body[f"{side}_shoulder"], body["frame"]
+            swing = 0.05 * np.sin(np.pi * dance.beats(time))[:, None]
+            free = _rotated(frame, (0.08 * sign, -0.34, 0.18))
+            free = free + swing * _rotated(frame, (0.0, 0.3, 1.0)) + shoulder
+            joined = (person, side) in ((0, "left"), (1, "right"))
             grip = _grip(lead, follow, person, side, dance.hands)
-            closed = (
-                grip + 0.22 * _rotated(lead["frame"], (1.0, 0.6, 0.0))
-                if joined
-                else _on_partner(bodies[1 - person], person)
-            )
+            if joined:
+                closed = grip + 0.22 * _rotated(lead["frame"], (1.0, 0.6, 0.0))
+            else:
+                closed = _on_partner(bodies[1 - person], person)
             target = weight["open"][:, None] * grip + weight["closed"][:, None] * closed
             target = target + weight["one hand"][:, None] * (grip if joined else free)
             for turner in range(2):
@@ -151,19 +145,17 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
                 target = target + raised[turner][:, None] * (goal - target)
             back = shoulder - target
             target = target + _WRIST_TO_GRIP * back / np.linalg.norm(back, axis=-1, keepdims=True)
-            height = dance.heights[person]
-            body[f"{side}_elbow"], body[f"{side}_wrist"] = bent_limb(
-                shoulder,
-                target,
-                (height * _ARM[0], height * _ARM[1]),
-                _elbow_points(body["frame"], sign, target - shoulder),
-            )
+            lengths = (dance.heights[person] * _ARM[0], dance.heights[person] * _ARM[1])
+            pole = _elbow_direction(frame, sign, target - shoulder)
+            elbow, wrist = bent_limb(shoulder, target, lengths, pole)
+            body |= {f"{side}_elbow": elbow, f"{side}_wrist": wrist}
 
 
 def _grip(lead: Joints, follow: Joints, person: int, side: str, higher: float) -> np.ndarray:
     """Return where hands meet in an open hold: below the middle of the shoulders."""
-    own, other = (side, "right" if side == "left" else "left")[:: 1 - 2 * person]
-    between = (lead[f"{own}_shoulder"] + follow[f"{other}_shoulder"]) / 2
+    opposite = "right" if side == "left" else "left"
+    of_lead, of_follow = (side, opposite) if person == 0 else (opposite, side)
+    between = (lead[f"{of_lead}_shoulder"] + follow[f"{of_follow}_shoulder"]) / 2
     return between - _UP * (0.28 - higher)
 
 
@@ -181,7 +173,7 @@ def _above(turner: Joints, partner: Joints, height: float) -> np.ndarray:
     return above + _UP * 1.01 * height
 
 
-def _elbow_points(frame: np.ndarray, sign: float, way: np.ndarray) -> np.ndarray:
+def _elbow_direction(frame: np.ndarray, sign: float, way: np.ndarray) -> np.ndarray:
     """Return the direction of an elbow: back when the arm hangs, forward when raised."""
     along = way / np.linalg.norm(way, axis=-1, keepdims=True)
     raised = rise((along * frame[..., 1]).sum(axis=-1) / 0.8)[:, None]
@@ -204,20 +196,9 @@ def bent_limb(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle joint and the end of a limb that reaches from ``start`` for ``target``.
 
-    Parameters
-    ----------
-    start, target : ndarray, (…, 3)
-        Shoulder or hip, and the desired wrist or ankle, metres.
-    lengths : tuple of float
-        Lengths of the upper and the lower bone, metres.
-    pole : ndarray, (…, 3)
-        Direction of the elbow or knee; its component along the limb is ignored.
-
-    Returns
-    -------
-    middle, end : ndarray, (…, 3)
-        Bones have exactly their lengths. The end lies on the line to the target; targets out of
-        reach are approached smoothly.
+    Points are (…, 3), metres; ``lengths`` are those of the upper and the lower bone, which are met
+    exactly; ``pole`` is the direction of the elbow or knee, whose component along the limb is
+    ignored. The end lies on the line to the target; targets out of reach are approached smoothly.
     """
     upper, lower = lengths
     farthest = _STRAIGHTEST * (upper + lower)

@@ -112,13 +112,13 @@ def make_gait(
         for name in ("cadence", "stride", "lift", "lean", "swing", "bend", "bounce", "turning")
     }
     phase = 2 * np.pi * (rng.random() + draw["cadence"] * time)
-    body, leg = _BODIES[gait.body]
+    body, leg, layout = _BODIES[gait.body]
     joints = body(phase, draw, gait, lambda: gait.wander * _wander(rng, time))
     heading = draw["turning"] * time
     speed = 4 * leg * np.sin(draw["stride"]) * draw["cadence"]
     c, s = np.cos(heading), np.sin(heading)
     path = np.stack([np.cumsum(s), np.zeros(frames), np.cumsum(c)], axis=-1) * speed / fps
-    skeleton = Skeleton.preset(_SKELETONS[gait.body])
+    skeleton = Skeleton.preset(layout)
     flat = np.stack([joints[name] for name in skeleton.canonical_names], axis=1)
     x, y, z = flat[..., 0], flat[..., 1], flat[..., 2]
     turned = np.stack([c[:, None] * x + s[:, None] * z, y, c[:, None] * z - s[:, None] * x], -1)
@@ -127,7 +127,12 @@ def make_gait(
 
 def _direction(angle: np.ndarray) -> np.ndarray:
     """Return the unit vector at ``angle`` forwards from straight down, (…) → (…, 3)."""
-    return np.stack([np.zeros_like(angle), -np.cos(angle), np.sin(angle)], axis=-1)
+    return _in_plane(-np.cos(angle), np.sin(angle))
+
+
+def _in_plane(y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return vectors (…, 3) in the plane x = 0."""
+    return np.stack([np.zeros_like(y), y, z], axis=-1)
 
 
 def _across(yaw: np.ndarray, lean: np.ndarray) -> np.ndarray:
@@ -155,7 +160,7 @@ def _person(
     joints: dict[str, np.ndarray] = {}
     frames = len(phase)
     lean = draw["lean"] + 0.5 * stray()
-    up = np.stack([np.zeros(frames), np.cos(lean), np.sin(lean)], axis=-1)
+    up = _in_plane(np.cos(lean), np.sin(lean))
     pelvis = np.zeros((frames, 3))
     pelvis[:, 1] = 0.9 + draw["bounce"] * np.cos(2 * phase)
     sway = 0.12 * draw["stride"] / 0.42
@@ -163,8 +168,8 @@ def _person(
     joints["spine"] = pelvis + 0.24 * up
     joints["neck"] = joints["spine"] + 0.26 * up
     tilt = 0.4 * lean + stray()
-    nod = np.stack([np.zeros(frames), np.cos(tilt), np.sin(tilt)], axis=-1)
-    face = np.stack([np.zeros(frames), -np.sin(tilt), np.cos(tilt)], axis=-1)
+    nod = _in_plane(np.cos(tilt), np.sin(tilt))
+    face = _in_plane(-np.sin(tilt), np.cos(tilt))
     joints["nose"] = joints["neck"] + 0.12 * nod + 0.06 * face
     joints["head"] = joints["nose"] + 0.13 * nod - 0.06 * face
     for side, sign, own in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
@@ -195,10 +200,9 @@ def _quadruped(
     tail[:, 1] = 0.62 + draw["bounce"] * np.cos(2 * phase)
     tail[:, 2] = -0.35
     slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase) + 0.5 * stray()
-    back = np.stack([np.zeros(frames), np.sin(slope), np.cos(slope)], axis=-1)
-    neck = tail + 0.72 * back
-    face = np.stack([np.zeros(frames), np.cos(nod + 0.8), np.sin(nod + 0.8)], axis=-1)
-    brow = np.stack([np.zeros(frames), np.sin(nod + 0.8), -np.cos(nod + 0.8)], axis=-1)
+    neck = tail + 0.72 * _in_plane(np.sin(slope), np.cos(slope))
+    face = _in_plane(np.cos(nod + 0.8), np.sin(nod + 0.8))
+    brow = _in_plane(np.sin(nod + 0.8), -np.cos(nod + 0.8))
     joints["tail"], joints["neck"] = tail, neck
     joints["nose"] = neck + 0.36 * face
     for side, sign, hind, fore in (
@@ -228,8 +232,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 Body = Callable[
     [np.ndarray, Mapping[str, float], Gait, Callable[[], np.ndarray]], dict[str, np.ndarray]
 ]
-_BODIES: Mapping[str, tuple[Body, float]] = {
-    "person": (_person, 0.85),
-    "quadruped": (_quadruped, 0.52),
+_BODIES: Mapping[str, tuple[Body, float, str]] = {
+    "person": (_person, 0.85, "h36m17"),
+    "quadruped": (_quadruped, 0.52, "apt36k17"),
 }
-_SKELETONS = {"person": "h36m17", "quadruped": "apt36k17"}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from probmotion.data.synthetic.animals import ANIMAL_SKELETON, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gait, make_gaits
 from probmotion.io.files import load
@@ -75,20 +77,13 @@ def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
     Joints are matched by canonical names with the body, person or quadruped, that shares more
     bones. A joint whose parent is dropped becomes a root. None if no bone is shared.
     """
-    best: Skeleton | None = None
-    for style in _STYLES:
-        part = _common_joints(make_gait(style).skeleton, skeleton)
-        if part is not None and len(part.bones) > (0 if best is None else len(best.bones)):
-            best = part
-    return best
-
-
-def _common_joints(body: Skeleton, skeleton: Skeleton) -> Skeleton | None:
-    """Return the skeleton without the joints that the body lacks."""
-    known = [name in body.canonical_names for name in skeleton.canonical_names]
-    if all(known):
-        return skeleton
-    kept = [joint for joint, there in enumerate(known) if there]
-    above = [skeleton.parents[joint] for joint in kept]
-    names = [skeleton.joint_names[joint] for joint in kept]
-    return Skeleton(names, [kept.index(p) if p in kept else -1 for p in above]) if kept else None
+    bodies = [make_gait(style).skeleton.canonical_names for style in _STYLES]
+    known = [[name in body for name in skeleton.canonical_names] for body in bodies]
+    n_bones = [sum(flags[j] and flags[p] for j, p in skeleton.bones) for flags in known]
+    best = known[int(np.argmax(n_bones))]
+    if all(best) or not any(n_bones):
+        return skeleton if any(n_bones) else None
+    joints = [joint for joint, is_known in enumerate(best) if is_known]
+    parents = [skeleton.parents[joint] for joint in joints]
+    names = [skeleton.joint_names[joint] for joint in joints]
+    return Skeleton(names, [joints.index(p) if p in joints else -1 for p in parents])

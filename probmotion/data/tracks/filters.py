@@ -8,18 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from probmotion.data.tracks.segments import track_size
-from probmotion.data.tracks.step_reports import StepReport, entries_of, seen
+from probmotion.data.tracks.step_reports import (
+    Step,
+    StepReport,
+    boxes_of,
+    entries_of,
+    masked,
+    seen,
+)
 from probmotion.motion.motion import KeypointTrack
 from probmotion.validation import check_positive
 
 __all__ = ["drop_crowds", "drop_low_quality", "drop_short", "mask_outliers", "mask_uncertain"]
 
-Step = tuple[list[KeypointTrack], StepReport]
 _FEWEST = 3  # entries needed for a meaningful median
 
 
@@ -29,11 +34,9 @@ def mask_uncertain(tracks: Sequence[KeypointTrack], *, threshold: float = 0.3) -
     *MAS* uses 0.3 for people, 0.5 for horses and 0.01 with a ball.
     """
     check_positive("threshold", threshold)
-    kept = [_masked(track, track.confidence < threshold) for track in tracks]
+    hidden = [track.confidence < threshold for track in tracks]
     why = f"dropped detections with a confidence below {threshold:g}"
-    return kept, StepReport.of(
-        "uncertain", tracks, kept, why, entries_changed=entries_of(tracks) - entries_of(kept)
-    )
+    return _masked("uncertain", tracks, hidden, why)
 
 
 def mask_outliers(
@@ -41,43 +44,34 @@ def mask_outliers(
 ) -> Step:
     """Mark detections far from the median of their joint in a time window as unseen.
 
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks without jumps (:func:`~probmotion.data.tracks.segments.split_discontinuities`).
-    distance : float
-        Greatest distance from the median, in track sizes
-        (:func:`~probmotion.data.tracks.segments.track_size`).
-    window : float
-        Window length, seconds. Windows with fewer than 3 detections are skipped.
+    The greatest ``distance`` is in units of :func:`~probmotion.data.tracks.segments.track_size`,
+    the ``window`` in seconds; windows with fewer than 3 detections are skipped. The tracks must
+    have no jumps (:func:`~probmotion.data.tracks.segments.split_discontinuities`).
     """
     check_positive("distance", distance)
     check_positive("window", window)
-    kept = [
-        _masked(track, _off_median(track, round(window * track.fps / 2)) > distance * size)
-        if (size := track_size(track)) > 0
-        else track
+    hidden = [
+        # A single joint has size 0.
+        _off_median(track, round(window * track.fps / 2)) > (distance * track_size(track) or np.inf)
         for track in tracks
     ]
     why = f"dropped detections over {distance:g} track sizes from their median in {window:g} s"
-    return kept, StepReport.of(
-        "outliers", tracks, kept, why, entries_changed=entries_of(tracks) - entries_of(kept)
-    )
+    return _masked("outliers", tracks, hidden, why)
 
 
 def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step:
     """Drop tracks shorter than ``seconds`` (frames over frames per second)."""
     check_positive("seconds", seconds)
     # Tolerance for rounded frame rates: 60 frames of .016666 s are a second.
-    lasts = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
+    long = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
     why = f"dropped tracks shorter than {seconds:g} s"
-    if tracks and not any(lasts):
+    if tracks and not any(long):
         longest = max(tracks, key=lambda track: track.frames / track.fps)
         why += (
             f", {math.ceil(seconds * longest.fps - 0.01)} frames at {longest.fps:g} fps; the "
             f"longest track has {longest.frames}"
         )
-    return _kept("short", tracks, lasts, why)
+    return _selected("short", tracks, long, why)
 
 
 def drop_low_quality(
@@ -91,7 +85,7 @@ def drop_low_quality(
     _check_fraction("share", share)
     good = [(track.confidence >= threshold).mean() >= share for track in tracks]
     why = f"dropped tracks with under {share:.0%} of joints at confidence {threshold:g} or more"
-    return _kept("quality", tracks, good, why)
+    return _selected("quality", tracks, good, why)
 
 
 def drop_crowds(
@@ -102,24 +96,19 @@ def drop_crowds(
 ) -> Step:
     """Drop tracks that lie largely inside the bounding boxes of others in the same video.
 
-    The overlap with another track is the fraction of the own box's area inside the other's,
+    The overlap with another track is the fraction of the track's box inside the other's,
     averaged over the frames in which the track is seen. A small person behind a large one is
     dropped, the large one kept.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Uncut tracks: those of a video have the same frames.
+        Uncut tracks, with equal numbers of frames per video, else a ``ValueError``.
     overlap : float
         Greatest overlap with any other track, in (0, 1].
     videos : sequence of str, optional
         Video of each track; by default the name before its last space (``"video person"``) together
         with the number of frames.
-
-    Raises
-    ------
-    ValueError
-        If ``videos`` are not one per track, or a video's tracks differ in frames.
     """
     _check_fraction("overlap", overlap)
     if videos is not None and len(videos) != len(tracks):
@@ -127,54 +116,45 @@ def drop_crowds(
     groups: dict[tuple[str, int], list[int]] = {}
     for number, track in enumerate(tracks):
         video, space, _ = track.name.rpartition(" ")
-        guess = (video, track.frames) if space else (f"{track.name} {number}", track.frames)
+        guess = (video if space else f"{track.name} {number}", track.frames)
         groups.setdefault(guess if videos is None else (videos[number], 0), []).append(number)
     alone = [True] * len(tracks)
     for (video, _), members in groups.items():
         lengths = sorted({tracks[number].frames for number in members})
         if len(lengths) > 1:
             raise ValueError(f"tracks of video {video!r} must have as many frames, got {lengths}")
-        boxes = np.stack([_boxes(tracks[number]) for number in members])
-        for own, number in enumerate(members):
-            others = [_overlap(boxes[own], other) for other in np.delete(boxes, own, axis=0)]
+        boxes = np.stack([boxes_of(tracks[number]) for number in members])
+        for index, number in enumerate(members):
+            others = [_overlap(boxes[index], other) for other in np.delete(boxes, index, axis=0)]
             alone[number] = max(others, default=0.0) <= overlap
     why = f"dropped tracks with over {overlap:.0%} of their box inside another's"
-    return _kept("crowds", tracks, alone, why)
+    return _selected("crowds", tracks, alone, why)
 
 
-def _masked(track: KeypointTrack, hide: np.ndarray) -> KeypointTrack:
-    """Return a track with the entries ``hide`` (L, J) marked as unseen."""
-    return replace(
-        track,
-        keypoints=np.where(hide[..., np.newaxis], np.nan, track.keypoints),
-        confidence=np.where(hide, 0.0, track.confidence),
-    )
+def _masked(
+    step: str, tracks: Sequence[KeypointTrack], hidden: Sequence[np.ndarray], why: str
+) -> Step:
+    after = [masked(track, entries) for track, entries in zip(tracks, hidden, strict=True)]
+    changed = entries_of(tracks) - entries_of(after)
+    return after, StepReport.of(step, tracks, after, why, entries_changed=changed)
 
 
 def _off_median(track: KeypointTrack, side: int) -> np.ndarray:
     """Return the distance of entries from the median of ``side`` frames on either side, (L, J)."""
-    there = seen(track)
-    points = np.where(there[..., np.newaxis], track.keypoints, np.nan)
+    visible = seen(track)
+    points = np.where(visible[..., np.newaxis], track.keypoints, np.nan)
     padded = np.pad(points, ((side, side), (0, 0), (0, 0)), constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
-    judged = there & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _FEWEST)
-    off = np.zeros(there.shape)
-    off[judged] = np.linalg.norm(points[judged] - np.nanmedian(windows[judged], axis=-1), axis=-1)
-    return off
+    judged = visible & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _FEWEST)
+    medians = np.nanmedian(windows[judged], axis=-1)
+    distances = np.zeros(visible.shape)
+    distances[judged] = np.linalg.norm(points[judged] - medians, axis=-1)
+    return distances
 
 
-def _kept(step: str, tracks: Sequence[KeypointTrack], keep: Sequence[bool], why: str) -> Step:
-    kept = [track for track, stays in zip(tracks, keep, strict=True) if stays]
-    return kept, StepReport.of(step, tracks, kept, why)
-
-
-def _boxes(track: KeypointTrack) -> np.ndarray:
-    """Return the least and greatest x and y of each frame, (L, 2, 2); NaN if unseen."""
-    there = seen(track)[..., np.newaxis]
-    least = np.where(there, track.keypoints, np.inf).min(axis=1)
-    greatest = np.where(there, track.keypoints, -np.inf).max(axis=1)
-    boxes = np.stack([least, greatest], axis=1)
-    return np.where(there.any(axis=1, keepdims=True), boxes, np.nan)
+def _selected(step: str, tracks: Sequence[KeypointTrack], keep: Sequence[bool], why: str) -> Step:
+    after = [track for track, selected in zip(tracks, keep, strict=True) if selected]
+    return after, StepReport.of(step, tracks, after, why)
 
 
 def _overlap(boxes: np.ndarray, others: np.ndarray) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from probmotion.data.tracks.step_reports import seen
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_shape
+from probmotion.validation import check_finite, check_shape
 
 __all__ = ["nearest_object", "retarget_track", "with_joint", "with_midpoint"]
 
@@ -30,14 +30,10 @@ def with_joint(
     confidence: np.ndarray,
     parent: str | None = None,
 ) -> KeypointTrack:
-    """Return the track with an additional last joint.
+    """Return the track with an additional last joint ``name``, such as ``"ball"``.
 
     Parameters
     ----------
-    track : KeypointTrack
-        The track.
-    name : str
-        Name of the joint, such as ``"ball"``.
     keypoints : ndarray, (L, 2)
         Positions, in the track's unit; ignored where the confidence is 0.
     confidence : ndarray, (L,)
@@ -55,13 +51,13 @@ def with_joint(
     check_shape("keypoints", points, (track.frames, 2))
     check_shape("confidence", weights, (track.frames,))
     source = track.skeleton
-    above = -1 if parent is None else source.index(parent)
+    parent_index = -1 if parent is None else source.index(parent)
     points = np.where((weights > 0)[:, np.newaxis], points, np.nan)
     return replace(
         track,
         keypoints=np.concatenate([track.keypoints, points[:, np.newaxis]], axis=1),
         confidence=np.concatenate([track.confidence, weights[:, np.newaxis]], axis=1),
-        skeleton=Skeleton([*source.joint_names, name], [*source.parents, above]),
+        skeleton=Skeleton([*source.joint_names, name], [*source.parents, parent_index]),
     )
 
 
@@ -74,28 +70,16 @@ def with_midpoint(
     """
     if isinstance(joints, str) or len(joints) < 2:
         raise ValueError(f"joints must name at least two joints, got {joints!r}")
-    places = [track.skeleton.index(joint) for joint in joints]
-    middle = track.keypoints[:, places].mean(axis=1)
-    return with_joint(track, name, middle, track.confidence[:, places].min(axis=1), parent)
+    indices = [track.skeleton.index(joint) for joint in joints]
+    middle = track.keypoints[:, indices].mean(axis=1)
+    return with_joint(track, name, middle, track.confidence[:, indices].min(axis=1), parent)
 
 
 def retarget_track(track: KeypointTrack, skeleton: Skeleton, derive: bool = False) -> KeypointTrack:
     """Return the track on another skeleton, with joints matched by name or canonical name.
 
-    Parameters
-    ----------
-    track : KeypointTrack
-        The track.
-    skeleton : Skeleton
-        The target skeleton.
-    derive : bool
-        Whether to derive a missing ``pelvis`` from the hips and a missing ``neck`` from the
-        shoulders.
-
-    Raises
-    ------
-    ValueError
-        If a joint of ``skeleton`` has no counterpart.
+    ``derive`` replaces a missing ``pelvis`` by the midpoint of the hips and a missing ``neck`` by
+    that of the shoulders. Raises ``ValueError`` if a joint of ``skeleton`` has no counterpart.
     """
     if track.skeleton == skeleton:
         return track
@@ -132,7 +116,8 @@ def nearest_object(
     track : KeypointTrack
         The athlete.
     boxes : sequence of ndarray, (n, 5)
-        Boxes detected in each frame: left, top, right, bottom, in the track's unit, and confidence.
+        Finite boxes detected in each frame: left, top, right, bottom, in the track's unit, and
+        confidence.
 
     Returns
     -------
@@ -140,11 +125,6 @@ def nearest_object(
         Centres; NaN in frames without a box or a seen joint.
     confidence : ndarray, (L,)
         Confidences of the boxes, 0 where there is none; see :func:`with_joint`.
-
-    Raises
-    ------
-    ValueError
-        If there is not one array per frame, or one has another shape or is not finite.
     """
     if len(boxes) != track.frames:
         raise ValueError(f"boxes must have one entry per frame, {track.frames}, got {len(boxes)}")
@@ -152,16 +132,14 @@ def nearest_object(
     confidence = np.zeros(track.frames)
     for frame, values in enumerate(boxes):
         detected = np.asarray(values, dtype=np.float64)
-        there = seen(track)[frame]
         if not detected.size:
             continue
         check_shape(f"boxes[{frame}]", detected, ("n", 5))
-        if not np.isfinite(detected).all():
-            raise ValueError(f"boxes[{frame}] must be finite")
-        if not there.any():
+        check_finite(f"boxes[{frame}]", detected)
+        joints = track.keypoints[frame, seen(track)[frame]]
+        if not len(joints):
             continue
         centres = (detected[:, :2] + detected[:, 2:4]) / 2
-        joints = track.keypoints[frame, there]
         distances = np.linalg.norm(centres[:, np.newaxis] - joints, axis=-1).min(axis=1)
         nearest = int(np.argmin(distances))
         confidence[frame] = detected[nearest, 4]

@@ -79,13 +79,10 @@ def film_clips(
 def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
     """Return tracks with confidence 1 from the threshold on and 0 below.
 
-    The confidences of synthetic detections tell which joints are lost but are otherwise random, so
-    that they should not weight errors.
+    Confidences of synthetic detections only indicate which joints are lost and should not weight
+    errors.
     """
-    return [
-        replace(track, confidence=np.where(track.confidence >= threshold, 1.0, 0.0))
-        for track in tracks
-    ]
+    return [replace(track, confidence=1.0 * (track.confidence >= threshold)) for track in tracks]
 
 
 def film_windows(
@@ -103,19 +100,19 @@ def film_windows(
     """
     noise = DetectorNoise(share=0.0)
     filmed = film_clips(motions, skeleton, fps, views=64, seed=seed, noise=noise).tracks
-    every = [
+    windows_of_tracks = [
         sliding_window_view(track.keypoints, frames, axis=0).transpose(0, 3, 1, 2)
         for track in filmed
         if track.frames >= frames
     ]
     # The outlier filter may have removed single detections.
-    whole = [windows[np.isfinite(windows).all(axis=(1, 2, 3))] for windows in every]
-    if not sum(map(len, whole)):
+    complete = [part[np.isfinite(part).all(axis=(1, 2, 3))] for part in windows_of_tracks]
+    if not sum(map(len, complete)):
         raise ValueError(
             f"motions must contain a complete window of {frames} frames at {fps:g} fps, got tracks "
             f"of at most {max(track.frames for track in filmed)} frames"
         )
-    windows = np.concatenate(whole)
+    windows = np.concatenate(complete)
     rng = seeds.generator(seed, "windows")
     chosen = windows[rng.choice(len(windows), n, replace=n > len(windows))]
     mirrored = rng.random(n) < 0.5
@@ -182,9 +179,11 @@ def read_tracks(
             # The clip's name ends at the last slash; image names may contain one.
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
-            videos.append(name if archive else _video(path, track))
-    own = raw[0].skeleton if skeleton is None and raw else skeleton
-    known = sizes if sizes is not None or own is None else body_sizes(own) or None
+            # Tracks are named "file video person".
+            video = f"{path} {track.name.rpartition(' ')[0]} {track.frames}"
+            videos.append(name if archive else video)
+    target = raw[0].skeleton if skeleton is None and raw else skeleton
+    known = sizes if sizes is not None or target is None else body_sizes(target) or None
     prepared = prepare_tracks(
         raw, fps=fps, skeleton=skeleton, sizes=known, videos=videos, threshold=threshold,
         centre=centre, shortest=shortest,
@@ -205,11 +204,6 @@ def unique_files(paths: Iterable[str | Path]) -> dict[str, Path]:
     return files
 
 
-def _video(path: Path, track: KeypointTrack) -> str:
-    """Return a name of the video of a track named ``"file video person"``."""
-    return f"{path} {track.name.rpartition(' ')[0]} {track.frames}"
-
-
 def body_sizes(skeleton: Skeleton) -> dict[str, float]:
     """Return the apparent bone sizes of an adult body, metres, by joint.
 
@@ -225,10 +219,8 @@ def _body_sizes(skeleton: Skeleton) -> dict[str, float]:
     shared = shared_skeleton(skeleton)
     if shared is None:
         return {}
-    filmed = film_clips(
-        synthetic_walks(8, shared), shared, 20.0, views=16, noise=DetectorNoise.none()
-    )
-    return bone_sizes(filmed.tracks)
+    walks, noise = synthetic_walks(8, shared), DetectorNoise.none()
+    return bone_sizes(film_clips(walks, shared, 20.0, views=16, noise=noise).tracks)
 
 
 def split_tracks(
@@ -257,31 +249,29 @@ def split_tracks(
     """
     clips = {clip_of(track.name) for track in tracks}
     split = split_names(clips, validation=validation, test=test, seed=seed)
-    return LearningTracks(
-        tracks_of_clips(tracks, split.train),
-        tracks_of_clips(tracks, split.validation),
-        tracks_of_clips(tracks, split.test),
-        split,
+    train, held, tested = (
+        tracks_of_clips(tracks, part) for part in (split.train, split.validation, split.test)
     )
+    return LearningTracks(train, held, tested, split)
 
 
 def split_names(
     clips: Iterable[str], *, validation: Sequence[str], test: Sequence[str], seed: int
 ) -> Split:
     """Split the names of clips as :func:`split_tracks`."""
-    every = set(clips)
+    names = set(clips)
     if bool(validation) != bool(test):
         given, missing = ("validation", "test") if validation else ("test", "validation")
         raise ValueError(f"{given} requires {missing}; name clips for both or neither")
     if not validation:
-        return split_clips(every, seed=seed)
-    for part, names in (("validation", validation), ("test", test)):
-        if unknown := sorted(set(names) - every):
-            known = ", ".join(sorted(every))
+        return split_clips(names, seed=seed)
+    for part, chosen in (("validation", validation), ("test", test)):
+        if unknown := sorted(set(chosen) - names):
+            known = ", ".join(sorted(names))
             raise ValueError(f"{part} must name clips among {known}, got {unknown[0]!r}")
     if twice := sorted(set(validation) & set(test)):
         raise ValueError(f"validation and test must be disjoint, both have {twice[0]!r}")
-    rest = sorted(every - set(validation) - set(test))
-    if not rest:
+    train = sorted(names - set(validation) - set(test))
+    if not train:
         raise ValueError("validation and test must leave training clips, got every clip")
-    return Split(tuple(rest), tuple(sorted(validation)), tuple(sorted(test)))
+    return Split(tuple(train), tuple(sorted(validation)), tuple(sorted(test)))

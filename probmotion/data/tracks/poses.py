@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from probmotion.data.tracks.step_reports import StepReport, entries_of, seen
+from probmotion.data.tracks.step_reports import Step, StepReport, entries_of, seen
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.splits import name_within_clip
 
 __all__ = ["centre_tracks", "mirrored_track"]
 
-Step = tuple[list[KeypointTrack], StepReport]
 _MIRRORED = "mirrored"
 
 
@@ -51,12 +50,8 @@ def mirrored_track(track: KeypointTrack) -> KeypointTrack:
     " mirrored" is appended to the name; mirroring twice returns the original.
     """
     order = list(track.skeleton.mirrored_order)
-    twice = track.name.endswith(_MIRRORED)
-    return replace(
-        track,
-        keypoints=track.keypoints[:, order] * np.array([-1.0, 1.0]),
-        confidence=track.confidence[:, order],
-        name=track.name[: -len(_MIRRORED) - 1]
-        if twice
-        else name_within_clip(track.name, _MIRRORED),
-    )
+    name = track.name[: -len(_MIRRORED) - 1]
+    if not track.name.endswith(_MIRRORED):
+        name = name_within_clip(track.name, _MIRRORED)
+    keypoints = track.keypoints[:, order] * np.array([-1.0, 1.0])
+    return replace(track, keypoints=keypoints, confidence=track.confidence[:, order], name=name)

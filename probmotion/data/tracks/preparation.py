@@ -23,8 +23,9 @@ quality       again: centring drops frames without a root
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from probmotion.data.tracks.filters import (
     drop_crowds,
@@ -38,7 +39,7 @@ from probmotion.data.tracks.poses import centre_tracks
 from probmotion.data.tracks.scales import scale_to_bones
 from probmotion.data.tracks.segments import split_discontinuities
 from probmotion.data.tracks.smoothing import fill_gaps, resample_tracks, smooth_tracks
-from probmotion.data.tracks.step_reports import StepReport
+from probmotion.data.tracks.step_reports import Step, StepReport
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive
@@ -67,7 +68,7 @@ class PreparedTracks:
             )
             for report in self.reports
         ]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return "\n".join(
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
@@ -82,17 +83,10 @@ def prepare_tracks(
     sizes: Mapping[str, float] | None = None,
     videos: Sequence[str] | None = None,
     threshold: float = 0.3,
-    overlap: float = 0.3,
-    share: float = 0.6,
-    jump: float = 0.5,
-    unseen: float = 0.5,
-    outlier: float = 0.15,
-    longest_gap: float = 0.25,
-    window: float = 0.25,
     shortest: float = 1.0,
     centre: str = "frame",
 ) -> PreparedTracks:
-    """Run the steps of this module's table over raw tracks.
+    """Run the steps of this module's table over raw tracks, with their default limits.
 
     Parameters
     ----------
@@ -106,18 +100,12 @@ def prepare_tracks(
     sizes : mapping of str to float, optional
         Bone sizes to scale tracks to (:func:`~probmotion.data.tracks.scales.scale_to_bones`); no
         scaling by default.
-    videos, overlap
+    videos : sequence of str, optional
         See :func:`~probmotion.data.tracks.filters.drop_crowds`.
     threshold : float
         Least confidence of a detection: 0.3 for people, 0.5 for horses, 0.01 with a ball.
-    share : float
-        See :func:`~probmotion.data.tracks.filters.drop_low_quality`.
-    jump, unseen : float
-        See :func:`~probmotion.data.tracks.segments.split_discontinuities`.
-    outlier : float
-        See :func:`~probmotion.data.tracks.filters.mask_outliers`.
-    longest_gap, window, shortest : float
-        Seconds: longest gap to fill, window of smoothing and outlier detection, shortest track.
+    shortest : float
+        Shortest track to keep, seconds.
     centre : {"frame", "sequence"}
         See :func:`~probmotion.data.tracks.poses.centre_tracks`.
 
@@ -128,42 +116,38 @@ def prepare_tracks(
         leaves no track.
     """
     check_positive("fps", fps)
-    left = list(tracks)
-    if not left:
+    result = list(tracks)
+    if not result:
         raise ValueError("tracks must contain at least one, got none")
-    if skeleton is None and any(track.skeleton != left[0].skeleton for track in left):
+    if skeleton is None and any(track.skeleton != result[0].skeleton for track in result):
         raise ValueError("tracks must have one skeleton, got several; pass skeleton")
-    reports: list[StepReport] = []
-
-    def take(step: tuple[list[KeypointTrack], StepReport]) -> list[KeypointTrack]:
-        reports.append(step[1])
-        if not step[0]:
-            raise ValueError(f"no track is left after step {step[1]}")
-        return step[0]
-
-    left = take(mask_uncertain(left, threshold=threshold))
-    left = take(drop_crowds(left, overlap=overlap, videos=videos))
-    if skeleton is not None:
-        left = take(_retargeted(left, skeleton))
-    left = take(split_discontinuities(left, jump=jump, unseen=unseen))
-    left = take(mask_outliers(left, distance=outlier, window=window))
-    left = take(drop_low_quality(left, threshold=threshold, share=share))
-    left = take(fill_gaps(left, longest=longest_gap))
-    left = take(smooth_tracks(left, window=window))
-    left = take(resample_tracks(left, fps=fps))
-    left = take(drop_short(left, seconds=shortest))
-    if sizes is not None:
-        left = take(scale_to_bones(left, sizes))
-    left = take(centre_tracks(left, per=centre))
-    left = take(drop_low_quality(left, threshold=threshold, share=share))
-    return PreparedTracks(tuple(left), tuple(reports))
+    steps: list[Callable[[Sequence[KeypointTrack]], Step]] = [
+        partial(mask_uncertain, threshold=threshold),
+        partial(drop_crowds, videos=videos),
+        *([] if skeleton is None else [partial(_retargeted, skeleton=skeleton)]),
+        split_discontinuities,
+        mask_outliers,
+        partial(drop_low_quality, threshold=threshold),
+        fill_gaps,
+        smooth_tracks,
+        partial(resample_tracks, fps=fps),
+        partial(drop_short, seconds=shortest),
+        *([] if sizes is None else [partial(scale_to_bones, sizes=sizes)]),
+        partial(centre_tracks, per=centre),
+        partial(drop_low_quality, threshold=threshold),
+    ]
+    reports = []
+    for step in steps:
+        result, report = step(result)
+        reports.append(report)
+        if not result:
+            raise ValueError(f"no track is left after step {report}")
+    return PreparedTracks(tuple(result), tuple(reports))
 
 
-def _retargeted(
-    tracks: list[KeypointTrack], skeleton: Skeleton
-) -> tuple[list[KeypointTrack], StepReport]:
+def _retargeted(tracks: Sequence[KeypointTrack], skeleton: Skeleton) -> Step:
     try:
-        moved = [retarget_track(track, skeleton, derive=True) for track in tracks]
+        retargeted = [retarget_track(track, skeleton, derive=True) for track in tracks]
     except ValueError as error:
         own = ", ".join(tracks[0].skeleton.joint_names)
         raise ValueError(
@@ -171,4 +155,4 @@ def _retargeted(
             "None (own on the command line)"
         ) from error
     why = f"retargeted to the {skeleton.n_joints} joints {skeleton.joint_names[0]}, …"
-    return moved, StepReport.of("joints", tracks, moved, why)
+    return retargeted, StepReport.of("joints", tracks, retargeted, why)

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from probmotion.data.tracks.step_reports import StepReport, seen
+from probmotion.data.tracks.segments import track_size
+from probmotion.data.tracks.step_reports import Step, StepReport, masked, seen
 from probmotion.motion.motion import KeypointTrack
 from probmotion.validation import check_positive
 
@@ -23,21 +24,9 @@ _QUANTILE = 0.9
 def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     """Return the apparent size of each bone: the 90 % quantile of its projected length.
 
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        At least one track, all of one skeleton.
-
-    Returns
-    -------
-    sizes : dict of str to float
-        By the name of the bone's lower joint, in the tracks' unit, over the frames in which both
-        ends are seen; without bones that are never seen.
-
-    Raises
-    ------
-    ValueError
-        If there is no track, or the tracks have several skeletons.
+    Sizes are by the name of the bone's lower joint, in the tracks' unit, over the frames in which
+    both ends are seen; bones that are never seen are missing. Raises ``ValueError`` if there is no
+    track, or the tracks have several skeletons.
     """
     if not tracks:
         raise ValueError("tracks must contain at least one, got none")
@@ -47,35 +36,19 @@ def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
             raise ValueError(f"tracks must have one skeleton, but tracks[{number}] has another")
     sizes = {}
     for joint, parent in skeleton.bones:
-        lengths = np.concatenate([_lengths(track, joint, parent) for track in tracks])
+        bones = [np.diff(track.keypoints[:, [parent, joint]], axis=1)[:, 0] for track in tracks]
+        both = [seen(track)[:, [parent, joint]].all(axis=1) for track in tracks]
+        lengths = np.linalg.norm(np.concatenate(bones)[np.concatenate(both)], axis=-1)
         if len(lengths):
             sizes[skeleton.joint_names[joint]] = float(np.quantile(lengths, _QUANTILE))
     return sizes
 
 
-def scale_to_bones(
-    tracks: Sequence[KeypointTrack], sizes: Mapping[str, float]
-) -> tuple[list[KeypointTrack], StepReport]:
-    """Scale each track by the median ratio of reference and own bone sizes.
+def scale_to_bones(tracks: Sequence[KeypointTrack], sizes: Mapping[str, float]) -> Step:
+    """Scale each track by the median ratio of reference ``sizes`` to its :func:`bone_sizes`.
 
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks in any unit.
-    sizes : mapping of str to float
-        Reference sizes (:func:`bone_sizes`), metres.
-
-    Returns
-    -------
-    tracks : list of KeypointTrack
-        Tracks in the unit of ``sizes``, without those that show no bone of ``sizes``.
-    report : StepReport
-        With the range of the factors.
-
-    Raises
-    ------
-    ValueError
-        If ``sizes`` is empty, a size is not positive, or a skeleton has none of its bones.
+    Tracks that show no bone of ``sizes`` are dropped. Raises ``ValueError`` if ``sizes`` is empty,
+    a size is not positive, or a skeleton has none of its bones.
     """
     if not sizes:
         raise ValueError("sizes must contain the size of at least one bone, got none")
@@ -89,8 +62,8 @@ def scale_to_bones(
                 f"sizes must contain bones of track {track.name!r} "
                 f"({', '.join(sorted(names)) or 'which has none'}), got {', '.join(sizes)}"
             )
-        own = bone_sizes([track])
-        ratios = [sizes[name] / size for name, size in own.items() if name in sizes and size > 0]
+        known = bone_sizes([track]).items()
+        ratios = [sizes[name] / size for name, size in known if name in sizes and size > 0]
         if ratios:
             factors.append(float(np.median(ratios)))
             scaled.append(replace(track, keypoints=track.keypoints * factors[-1]))
@@ -100,26 +73,14 @@ def scale_to_bones(
     return scaled, StepReport.of("scale", tracks, scaled, why)
 
 
-def _lengths(track: KeypointTrack, joint: int, parent: int) -> np.ndarray:
-    """Return a bone's projected lengths over the frames in which both ends are seen."""
-    both = seen(track)[:, joint] & seen(track)[:, parent]
-    return np.linalg.norm(track.keypoints[both, joint] - track.keypoints[both, parent], axis=-1)
-
-
 def body_extent(track: KeypointTrack) -> float:
     """Return the median diagonal of the body's bounding box, 0 if no frame shows two joints.
 
     Only joints at the end of a bone belong to the body; a ball does not.
     """
-    body = sorted({joint for bone in track.skeleton.bones for joint in bone})
-    there = seen(track)[:, body]
-    shown = there.sum(axis=1) > 1
-    if not shown.any():
-        return 0.0
-    points, there = track.keypoints[shown][:, body], there[shown][..., np.newaxis]
-    most = np.where(there, points, -np.inf).max(axis=1)
-    least = np.where(there, points, np.inf).min(axis=1)
-    return float(np.median(np.linalg.norm(most - least, axis=-1)))
+    body = np.isin(np.arange(track.skeleton.n_joints), track.skeleton.bones)
+    single = (seen(track) & body).sum(axis=1, keepdims=True) < 2
+    return 0.0 if single.all() else track_size(masked(track, ~body | single))
 
 
 def per_track_scales(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
@@ -127,21 +88,7 @@ def per_track_scales(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
 
     Proportions are the median over tracks of each bone's size relative to the track's
     :func:`body_extent`. Scaled by :func:`scale_to_bones`, the tracks have a median extent of 1.
-
-    Parameters
-    ----------
-    tracks : sequence of KeypointTrack
-        Tracks of one skeleton.
-
-    Returns
-    -------
-    sizes : dict of str to float
-        As :func:`bone_sizes`.
-
-    Raises
-    ------
-    ValueError
-        If no track shows a bone.
+    Raises ``ValueError`` if no track shows a bone.
     """
     ratios: dict[str, list[float]] = {}
     for track in tracks:

@@ -9,13 +9,12 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import savgol_filter
 
-from probmotion.data.tracks.step_reports import StepReport, entries_of, seen
+from probmotion.data.tracks.step_reports import Step, StepReport, entries_of, seen
 from probmotion.motion.motion import KeypointTrack
 from probmotion.validation import check_positive
 
 __all__ = ["fill_gaps", "resample_tracks", "smooth_tracks"]
 
-Step = tuple[list[KeypointTrack], StepReport]
 _HIGHEST_FPS = 10_000
 _ROUNDING = 1e-3  # as in probmotion.motion.resampling
 _SAME_TIME = 1e-6  # frames
@@ -91,25 +90,24 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
     last = track.frames - 1
     frames = int(np.floor(last / track.fps * fps + _ROUNDING)) + 1
     time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
-    near = np.round(time)
+    nearest = np.round(time)
     # Frames that coincide with old ones do not depend on a neighbour, which may be unseen.
-    time = np.where(np.abs(time - near) < _SAME_TIME, near, time)
-    before = time.astype(int)
-    after = np.ceil(time).astype(int)
+    time = np.where(np.abs(time - nearest) < _SAME_TIME, nearest, time)
+    before, after = time.astype(int), np.ceil(time).astype(int)
     weight = (time - before)[:, np.newaxis]
-    there = seen(track)[before] & seen(track)[after]
+    visible = seen(track)[before] & seen(track)[after]
     confidence = (1 - weight) * track.confidence[before] + weight * track.confidence[after]
     weight = weight[..., np.newaxis]
     keypoints = (1 - weight) * track.keypoints[before] + weight * track.keypoints[after]
     return replace(
         track,
-        keypoints=np.where(there[..., np.newaxis], keypoints, np.nan),
-        confidence=np.where(there, confidence, 0.0),
+        keypoints=np.where(visible[..., np.newaxis], keypoints, np.nan),
+        confidence=np.where(visible, confidence, 0.0),
         fps=fps,
     )
 
 
-def _runs(there: np.ndarray) -> list[tuple[int, int]]:
+def _runs(visible: np.ndarray) -> list[list[int]]:
     """Return the first frame and the end of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
-    return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    edges = np.flatnonzero(np.diff(visible, prepend=False, append=False))
+    return edges.reshape(-1, 2).tolist()

@@ -1,15 +1,15 @@
-"""Reports of the preparation steps of 2D tracks."""
+"""Reports of the preparation steps of 2D tracks, and what the steps share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probmotion.motion.motion import KeypointTrack
 
-__all__ = ["StepReport", "entries_of", "seen"]
+__all__ = ["Step", "StepReport", "boxes_of", "entries_of", "masked", "seen"]
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,18 @@ class StepReport:
         entries_changed: int = 0,
     ) -> StepReport:
         """Return the report of a step; what is missing from its output counts as dropped."""
-        tracks, frames = (len(before), len(after)), (frames_of(before), frames_of(after))
-        if tracks_dropped is None:
-            tracks_dropped = tracks[0] - tracks[1]
-        if frames_dropped is None:
-            frames_dropped = frames[0] - frames[1]
+        frames = [sum(track.frames for track in tracks) for tracks in (before, after)]
         return cls(
-            step, tracks[0], frames[0], tracks[1], frames[1], tracks_dropped, frames_dropped,
-            entries_changed, why,
-        )  # fmt: skip
+            step,
+            len(before),
+            frames[0],
+            len(after),
+            frames[1],
+            len(before) - len(after) if tracks_dropped is None else tracks_dropped,
+            frames[0] - frames[1] if frames_dropped is None else frames_dropped,
+            entries_changed,
+            why,
+        )
 
     def __str__(self) -> str:
         return (
@@ -61,9 +64,8 @@ class StepReport:
         )
 
 
-def frames_of(tracks: Sequence[KeypointTrack]) -> int:
-    """Return the total number of frames."""
-    return sum(track.frames for track in tracks)
+Step = tuple[list[KeypointTrack], StepReport]
+"""Result of a step."""
 
 
 def seen(track: KeypointTrack) -> np.ndarray:
@@ -74,3 +76,21 @@ def seen(track: KeypointTrack) -> np.ndarray:
 def entries_of(tracks: Sequence[KeypointTrack]) -> int:
     """Return the total number of seen entries."""
     return sum(int(seen(track).sum()) for track in tracks)
+
+
+def masked(track: KeypointTrack, hidden: np.ndarray) -> KeypointTrack:
+    """Return a track with the entries ``hidden`` (L, J) marked as unseen."""
+    return replace(
+        track,
+        keypoints=np.where(hidden[..., np.newaxis], np.nan, track.keypoints),
+        confidence=np.where(hidden, 0.0, track.confidence),
+    )
+
+
+def boxes_of(track: KeypointTrack) -> np.ndarray:
+    """Return the least and greatest x and y of each frame, (L, 2, 2); NaN if no joint is seen."""
+    visible = seen(track)[..., np.newaxis]
+    least = np.where(visible, track.keypoints, np.inf).min(axis=1)
+    greatest = np.where(visible, track.keypoints, -np.inf).max(axis=1)
+    boxes = np.stack([least, greatest], axis=1)
+    return np.where(visible.any(axis=1, keepdims=True), boxes, np.nan)

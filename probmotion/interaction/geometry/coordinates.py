@@ -151,8 +151,8 @@ def interaction_distance(
     aligned = align_rigidly(first, second)
     distances = [xp.zeros(0, dtype=first.dtype)]
     for k in range(first.shape[0]):
-        edges = [graph_edges(to_numpy(pairs[k, ...]), graph) for pairs in (first, second)]
-        distance = dissimilarity(aligned[k, ...], second[k, ...], *edges, epsilon)
+        one, other = (graph_edges(to_numpy(pairs[k, ...]), graph) for pairs in (first, second))
+        distance = dissimilarity(aligned[k, ...], second[k, ...], one, other, epsilon)
         distances.append(distance[None])
     return xp.reshape(xp.concat(distances), tuple(batch))
 

@@ -90,7 +90,7 @@ def make_reference(
     ReferenceRefused
         If R-hat exceeds 1.01 or the runs disagree.
     OSError
-        If ``unfinished`` is not writable; errors after the start only warn.
+        If ``unfinished`` is not writable; later write errors only warn.
     """
     check_count("draws", draws, least=8 * _CHAINS)
     if draws % (2 * _CHAINS):
@@ -173,14 +173,10 @@ def _cached_run(
 def certify(
     problem: Problem, runs: list[MotionDraws], seed: int, draws: int | None = None
 ) -> StoredReference:
-    """Return the draws of two runs as a reference if both have mixed and they agree.
+    """Return the draws of two runs as a reference, or raise :class:`ReferenceRefused`.
 
-    Keeps ``draws`` evenly spaced draws of the chains; all by default.
-
-    Raises
-    ------
-    ReferenceRefused
-        Otherwise, with the violated limit.
+    Both runs must have mixed and agree. The reference contains ``draws`` evenly spaced draws of the
+    chains, all by default.
     """
     world = [run.dataset["positions"].values for run in runs]
     aligned = [align_motions(positions, world[0][0, 0]) for positions in world]

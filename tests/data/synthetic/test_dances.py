@@ -8,6 +8,7 @@ from probmotion.data.synthetic.dances import bent_limb, synthetic_dances
 from probmotion.motion.skeleton import Skeleton
 
 PAIR = Skeleton.preset("pair17")
+SIDES = {"left": 1.0, "right": -1.0}
 
 
 @pytest.fixture(scope="module")
@@ -26,19 +27,20 @@ def length(vectors):
 
 def body_axes(positions, person, low, high):
     """Return left, up and forward of a person's pelvis or chest."""
-    sides = [joint(positions, f"person{person}:{side}_{low}") for side in ("left", "right")]
+    sides = [joint(positions, f"person{person}:{side}_{low}") for side in SIDES]
     left = sides[0] - sides[1]
     up = joint(positions, f"person{person}:{high}") - joint(positions, f"person{person}:pelvis")
     left, up = left / length(left)[..., None], up / length(up)[..., None]
     return left, up, np.cross(left, up)
 
 
-def off_the_line(positions, start, middle, end):
-    """Return the offset of elbow or knee from the straight line of the limb."""
-    start, middle, end = (joint(positions, name) for name in (start, middle, end))
+def limb(positions, person, side, names):
+    """Return the vector from start to end, and the direction of the bend at elbow or knee."""
+    start, middle, end = (joint(positions, f"person{person}:{side}_{name}") for name in names)
     along = (end - start) / length(end - start)[..., None]
-    way = middle - start
-    return way - (way * along).sum(axis=-1, keepdims=True) * along
+    off = middle - start - ((middle - start) * along).sum(axis=-1, keepdims=True) * along
+    assert length(off).min() > 0.01
+    return end - start, off / length(off)[..., None]
 
 
 def test_bones_have_constant_symmetric_lengths(positions):
@@ -46,48 +48,32 @@ def test_bones_have_constant_symmetric_lengths(positions):
     lengths = length(positions[:, :, child] - positions[:, :, parent])
     assert lengths.min() > 0.05
     np.testing.assert_allclose(lengths, lengths[:, :1].repeat(120, axis=1), rtol=0, atol=1e-9)
-    # Left and right are alike.
     for left, right in PAIR.mirrored_pairs:
         bones = [list(child).index(j) for j in (left, right)]
         np.testing.assert_allclose(lengths[..., bones[0]], lengths[..., bones[1]], atol=1e-9)
 
 
-def test_heights(positions):
+def test_heights_speeds_and_feet_are_plausible(positions):
     heights = person_height(positions[:, 0], PAIR)
     assert heights.mean(axis=0) == pytest.approx([1.7, 1.6], abs=0.02)
     assert heights.std(axis=0).min() > 0.005
-
-
-def test_speeds_and_feet_are_plausible(positions):
     speed = 30 * length(np.diff(positions, axis=1))
     assert speed.max() < 7
     assert 0.1 < np.median(speed) < 1
     assert all(dance_frames(dance).all() for dance in synthetic_dances(5))
-    # Feet reach the floor, and one is always near it.
     for person in range(2):
-        ankles = np.stack(
-            [joint(positions, f"person{person}:{s}_ankle")[..., 1] for s in ("left", "right")]
-        )
-        assert ankles.min() > 0.05
-        assert ankles.max() < 0.35
-        assert ankles.min(axis=0).max() < 0.12
-
-
-def test_standing_feet_do_not_slide(positions):
-    """At most one foot is in the air, and the other does not slide."""
-    for person in range(2):
-        moves = np.stack(
-            [
-                30 * length(np.diff(joint(positions, f"person{person}:{s}_ankle"), axis=1))
-                for s in ("left", "right")
-            ]
-        )
-        assert (moves.min(axis=0) < 0.1).mean() > 0.9
+        # Feet reach the floor, one is always close to it, and the standing one does not slide.
+        ankles = np.stack([joint(positions, f"person{person}:{s}_ankle") for s in SIDES])
+        heights = ankles[..., 1]
+        assert 0.05 < heights.min() < heights.max() < 0.35
+        assert heights.min(axis=0).max() < 0.12
+        slowest = 30 * length(np.diff(ankles, axis=2)).min(axis=0)
+        assert (slowest < 0.1).mean() > 0.9
 
 
 def test_partners_hold_hands_and_face_each_other(positions):
-    apart = length(positions[:, :, 0] - positions[:, :, 17])
-    assert 0.45 < apart.min() < apart.max() < 0.95
+    distance = length(positions[:, :, 0] - positions[:, :, 17])
+    assert 0.45 < distance.min() < distance.max() < 0.95
     held = length(joint(positions, "person0:left_wrist") - joint(positions, "person1:right_wrist"))
     assert held.max() < 0.2
     # Chests face each other except in turns.
@@ -100,46 +86,33 @@ def test_partners_hold_hands_and_face_each_other(positions):
     assert 0.2 < over.any(axis=1).mean() < 1
 
 
-def test_knees_bend_forwards(positions):
+def test_knees_and_elbows_bend_anatomically(positions):
     for person in range(2):
-        forward = body_axes(positions, person, "hip", "spine")[2]
-        for side in ("left", "right"):
-            names = [f"person{person}:{side}_{part}" for part in ("hip", "knee", "ankle")]
-            off = off_the_line(positions, *names)
-            assert length(off).min() > 0.01
-            assert ((off * forward).sum(axis=-1) / length(off)).min() > 0.5
-
-
-def test_elbows_bend_anatomically(positions):
-    """Down, out or back with the hand low; never inwards with the hand raised."""
-    for person in range(2):
+        knees = body_axes(positions, person, "hip", "spine")[2]
         left, up, forward = body_axes(positions, person, "shoulder", "neck")
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            names = [f"person{person}:{side}_{part}" for part in ("shoulder", "elbow", "wrist")]
-            off = off_the_line(positions, *names)
-            assert length(off).min() > 0.01
-            off = off / length(off)[..., None]
-            shoulder, wrist = joint(positions, names[0]), joint(positions, names[2])
-            low = ((wrist - shoulder) * up).sum(axis=-1) < 0
+        for side, sign in SIDES.items():
+            _, bend = limb(positions, person, side, ("hip", "knee", "ankle"))
+            assert (bend * knees).sum(axis=-1).min() > 0.5
+            # Elbows: down, out or back with the hand low; never inwards with the hand raised.
+            reach, bend = limb(positions, person, side, ("shoulder", "elbow", "wrist"))
+            height = (reach * up).sum(axis=-1)
             natural = 0.3 * sign * left - up - 0.5 * forward
-            assert (off * natural).sum(axis=-1)[low].min() > 0
-            high = ((wrist - shoulder) * up).sum(axis=-1) > 0.1
-            outwards = (off * (sign * left + 0.5 * forward)).sum(axis=-1)
-            assert outwards[high].min(initial=1.0) > 0
+            assert (bend * natural).sum(axis=-1)[height < 0].min() > 0
+            outwards = (bend * (sign * left + 0.5 * forward)).sum(axis=-1)
+            assert outwards[height > 0.1].min(initial=1.0) > 0
 
 
 def test_dance_does_not_depend_on_other_dances():
     few, many = synthetic_dances(2, seed=3), synthetic_dances(5, seed=3)
     np.testing.assert_array_equal(few[1].positions, many[1].positions)
     assert [dance.name for dance in many] == [f"dance-{k}" for k in range(5)]
-    assert not np.array_equal(few[1].positions, many[2].positions)
-    assert not np.array_equal(few[1].positions, synthetic_dances(2, seed=4)[1].positions)
+    for other in (many[2], synthetic_dances(2, seed=4)[1]):
+        assert not np.array_equal(few[1].positions, other.positions)
     # Clips of another length or frame rate are samples of the same dance.
     longer = synthetic_dances(2, frames=700, seed=3)[1]
     np.testing.assert_allclose(longer.positions[:90], few[1].positions, atol=1e-12)
     finer = synthetic_dances(2, frames=179, fps=60.0, seed=3)[1]
     np.testing.assert_allclose(finer.positions[::2], few[1].positions, atol=1e-12)
-    assert np.isfinite(longer.positions).all()
 
 
 def test_limb_reaches_its_target():
@@ -152,7 +125,6 @@ def test_limb_reaches_its_target():
     np.testing.assert_allclose(end, start + distance * way, atol=1e-4)
     np.testing.assert_allclose(length(middle - start), 0.3, atol=1e-12)
     np.testing.assert_allclose(length(end - middle), 0.25, atol=1e-12)
-    assert (((middle - start) * pole).sum(-1) > ((end - start) * pole).sum(-1) * 0.3).any()
     square = pole - (pole * way).sum(-1, keepdims=True) * way
     assert ((middle - start) * square).sum(axis=-1).min() > 0
     # Targets out of reach are approached without full extension or flexion.

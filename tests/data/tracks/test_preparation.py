@@ -48,11 +48,14 @@ def raw(clean):
     """Six people, one with a jump, and a poor, a short and an unseen track."""
     tracks = [detected(track, seed) for seed, track in enumerate(clean)]
     tracks[2].keypoints[JUMP:] += 900
-    doubt = np.where(np.arange(14) < 6, 1.0, 0.45)
-    poor = KeypointTrack(tracks[0].keypoints, doubt * tracks[0].confidence, PERSON, 60, "poor")
-    short = KeypointTrack(tracks[1].keypoints[:40], tracks[1].confidence[:40], PERSON, 60, "short")
-    never = KeypointTrack(np.full((50, 14, 2), np.nan), np.zeros((50, 14)), PERSON, 60, "never")
-    return [*tracks, poor, short, never]
+    factors = np.where(np.arange(14) < 6, 1.0, 0.45)
+    some, other = ((track.keypoints, track.confidence) for track in tracks[:2])
+    return [
+        *tracks,
+        KeypointTrack(some[0], factors * some[1], PERSON, 60, "poor"),
+        KeypointTrack(other[0][:40], other[1][:40], PERSON, 60, "short"),
+        KeypointTrack(some[0], 0 * some[1], PERSON, 60, "never"),
+    ]
 
 
 def prepared(tracks, clean, **more):
@@ -60,10 +63,15 @@ def prepared(tracks, clean, **more):
     return prepare_tracks(tracks, **settings)
 
 
-def assert_reports_chain(result, tracks):
+@pytest.fixture(scope="module")
+def result(raw, clean):
+    return prepared(raw, clean)
+
+
+def test_known_motions_are_recovered_in_metres(raw, clean, result):
     first, last = result.reports[0], result.reports[-1]
-    assert (first.tracks_before, last.tracks_after) == (len(tracks), len(result.tracks))
-    assert first.frames_before == sum(track.frames for track in tracks)
+    assert (first.tracks_before, last.tracks_after) == (len(raw), len(result.tracks))
+    assert first.frames_before == sum(track.frames for track in raw)
     assert last.frames_after == sum(track.frames for track in result.tracks)
     for before, after in pairwise(result.reports):
         assert before.tracks_after == after.tracks_before
@@ -73,11 +81,6 @@ def assert_reports_chain(result, tracks):
             assert report.frames_before == report.frames_after + report.frames_dropped
         if report.step != "segments":
             assert report.tracks_before == report.tracks_after + report.tracks_dropped
-
-
-def test_known_motions_are_recovered_in_metres(raw, clean):
-    result = prepared(raw, clean)
-    assert_reports_chain(result, raw)
     assert [track.name for track in result.tracks] == [
         "video0", "video1", "video2/0", "video3", "video4", "video5",
     ]  # fmt: skip
@@ -86,8 +89,8 @@ def test_known_motions_are_recovered_in_metres(raw, clean):
         "segments": 1, "quality": 1, "short": 2,
     }  # fmt: skip
     for track in result.tracks:
-        truth = next(c for c in clean if c.name == clip_of(track.name))
-        centred = (truth.keypoints - truth.keypoints[:, :1])[::3][: track.frames]
+        truth = next(c.keypoints for c in clean if c.name == clip_of(track.name))
+        centred = (truth - truth[:, :1])[::3][: track.frames]
         assert (track.fps, track.frames) == (20, 24 if "/" in track.name else 40)
         assert (track.confidence > 0).mean() > 0.98
         off = np.linalg.norm(track.keypoints - centred, axis=-1)
@@ -95,76 +98,55 @@ def test_known_motions_are_recovered_in_metres(raw, clean):
         assert np.nanmax(off) < 0.1
 
 
-def test_tracks_are_prepared_independently(raw, clean):
-    together = prepared(raw, clean).tracks
-    backwards = {track.name: track for track in prepared(raw[::-1], clean).tracks}
-    for track in together:
-        np.testing.assert_array_equal(backwards[track.name].keypoints, track.keypoints)
-    (alone,) = prepared(raw[3:4], clean).tracks
-    np.testing.assert_array_equal(alone.keypoints, together[3].keypoints)
-
-
-def test_options_select_steps(raw, clean):
+def test_options_select_steps(raw, clean, result):
     steps = [
         "uncertain", "crowds", "segments", "outliers", "quality", "gaps", "smooth", "resample",
         "short", "scale", "centre", "quality",
     ]  # fmt: skip
-    result = prepared(raw, clean)
     assert [report.step for report in result.reports] == steps
     head, *lines = str(result).splitlines()
     assert head.split() == ["step", "tracks", "frames", "dropped", "changed"]
     assert [line.split()[0] for line in lines] == steps
     assert "9 → 9" in lines[0]
-    pixels = prepared(raw, clean, sizes=None)
+    pixels = prepared(raw[3:5], clean, sizes=None, centre="sequence", videos=["one", "other"])
     assert "scale" not in [report.step for report in pixels.reports]
-    assert np.ptp(pixels.tracks[0].keypoints) > 100
-    path = prepared(raw, clean, centre="sequence")
-    assert np.ptp(path.tracks[0].keypoints[:, 0, 0]) > 0.5
-    crowd = prepared(raw[:2], clean, videos=["one", "other"])
-    assert len(crowd.tracks) == 2
+    assert len(pixels.tracks) == 2
+    assert np.ptp(pixels.tracks[0].keypoints[:, 0, 0]) > 100
+    # A track is prepared independently of others.
+    (alone,) = prepared(raw[3:4], clean).tracks
+    np.testing.assert_array_equal(alone.keypoints, result.tracks[3].keypoints)
     with pytest.raises(ValueError, match="no track is left after step crowds: tracks 2 → 0"):
         prepared([raw[0], raw[0]], clean, videos=["one", "one"])
 
 
 def test_invalid_input(raw, clean):
-    snake = Skeleton(["tail", "mid", "head"], [-1, 0, 1])
-    own = KeypointTrack(np.ones((50, 3, 2)), np.ones((50, 3)), snake, 30.0)
+    skeleton = Skeleton(["tail", "mid", "head"], [-1, 0, 1])
+    snake = KeypointTrack(np.ones((50, 3, 2)), np.ones((50, 3)), skeleton, 30.0)
     for tracks, options, message in (
         ([], {}, "tracks must contain at least one, got none"),
         (raw, {"fps": None}, "fps must be a finite number above 0, got None"),
         (raw[-1:], {}, "no track is left after step segments: tracks 1"),
         (raw[:6], {"threshold": 2}, "no track is left after step segments: tracks 6"),
-        ([own], {"skeleton": PERSON}, "tracks of tail, mid, head cannot be retargeted: .*own"),
-        ([raw[0], own], {}, "tracks must have one skeleton, got several; pass skeleton"),
+        ([snake], {"skeleton": PERSON}, "tracks of tail, mid, head cannot be retargeted: .*own"),
+        ([raw[0], snake], {}, "tracks must have one skeleton, got several; pass skeleton"),
     ):
         with pytest.raises(ValueError, match=message):
             prepared(tracks, clean, **options)
 
 
-# --- real detections --------------------------------------------------------------------------
-
-
 def test_real_detections(real_data, clean):
     files = sorted((real_data / "pose2sim_multiview").glob("*_cam_0*.npz"))
     raw = [track for file in files for track in read_keypoints(file)]
-    result = prepare_tracks(
-        raw,
-        fps=20,
-        skeleton=PERSON,
-        sizes=bone_sizes(clean),
-        videos=[track.name.removesuffix("_bystander") for track in raw],
-    )
-    assert_reports_chain(result, raw)
+    videos = [track.name.removesuffix("_bystander") for track in raw]
+    result = prepared(raw, clean, skeleton=PERSON, videos=videos, threshold=0.3)
     # The bystander of the first camera has an occluded hip, hence no root.
     assert [track.name[-12:] for track in result.tracks] == [
         "Trial_cam_01", "Trial_cam_02", "02_bystander", "Trial_cam_03", "Trial_cam_04",
     ]  # fmt: skip
     for track in result.tracks:
-        assert (track.frames, track.fps, track.skeleton) == (34, 20, PERSON)
+        assert (track.frames, track.skeleton) == (34, PERSON)
         assert (track.confidence > 0).mean() > 0.9
         sizes = bone_sizes([track])
         assert 0.3 < sizes["left_knee"] < 0.55
         assert 0.25 < sizes["right_ankle"] < 0.55
         assert 1.0 < np.nanmax(track.keypoints[..., 1]) - np.nanmin(track.keypoints[..., 1]) < 2.0
-    smooth = next(report for report in result.reports if report.step == "smooth")
-    assert smooth.entries_changed > 7000

@@ -11,8 +11,6 @@ import pytest
 from probmotion import Skeleton, seeds
 from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.data.tracks.learning import read_tracks
-from probmotion.data.tracks.preparation import prepare_tracks
 from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
 from probmotion.models.diffusion.track_denoising import denoise_track
 from probmotion.motion.motion import KeypointTrack
@@ -67,6 +65,16 @@ def visible(track):
     return there
 
 
+def interpolated(track):
+    """Return keypoints of which occluded ones are interpolated linearly in time."""
+    time = np.arange(track.frames)
+    filled = track.keypoints.copy()
+    for joint, axis in np.ndindex(filled.shape[1:]):
+        known = track.confidence[:, joint] >= 0.3
+        filled[:, joint, axis] = np.interp(time, time[known], filled[known, joint, axis])
+    return filled
+
+
 def test_denoising_reduces_the_error(prior, true, noisy, clean):
     there = [visible(track) for track in noisy]
     lost = [track.confidence < 0.3 for track in noisy]
@@ -74,39 +82,16 @@ def test_denoising_reduces_the_error(prior, true, noisy, clean):
     assert error(clean, true, there) < 0.76 * NOISE
     for track, truth, some in zip(clean, true, there, strict=True):
         assert error([track], [truth], [some]) < 0.8 * NOISE
-    constant = [
-        replace(track, keypoints=np.broadcast_to(prior.standards.mean, track.keypoints.shape))
-        for track in true
-    ]
+    mean = np.broadcast_to(prior.standards.mean, true[0].keypoints.shape)
+    constant = [replace(track, keypoints=mean) for track in true]
     assert error(clean, true, lost) < 0.45 * error(constant, true, lost)
+    linear = [replace(track, keypoints=interpolated(track)) for track in noisy]
+    assert error(clean, true, lost) < 0.81 * error(linear, true, lost)
     for track, raw in zip(clean, noisy, strict=True):
         assert (track.name, track.fps, track.frames) == (raw.name, raw.fps, raw.frames)
         np.testing.assert_array_equal(track.keypoints[:, 0], 0.0)
         confidence = np.where(raw.confidence >= 0.3, 1.0, raw.confidence)
         np.testing.assert_array_equal(track.confidence, confidence)
-
-
-def interpolated(keypoints):
-    """Return keypoints with gaps filled linearly in time."""
-    time = np.arange(len(keypoints))
-    filled = keypoints.copy()
-    for joint, axis in np.ndindex(filled.shape[1:]):
-        known = np.isfinite(keypoints[:, joint, axis])
-        filled[:, joint, axis] = np.interp(time, time[known], keypoints[known, joint, axis])
-    return filled
-
-
-def test_occluded_joints_are_more_accurate_than_interpolation(true, noisy, clean):
-    prepared = prepare_tracks(noisy, fps=20.0, videos=[track.name for track in noisy]).tracks
-    assert [track.frames for track in prepared] == [60] * len(true)
-    known = [np.isfinite(track.keypoints[..., 0]) for track in prepared]
-    # Preparation leaves long gaps open.
-    filled = [replace(track, keypoints=interpolated(track.keypoints)) for track in prepared]
-    lost = [raw.confidence < 0.3 for raw in noisy]
-    long = [gone & ~there for gone, there in zip(lost, known, strict=True)]
-    assert sum(gone.sum() for gone in long) > 200
-    assert error(clean, true, long) < 0.76 * error(filled, true, long)
-    assert error(clean, true, lost) < 0.81 * error(filled, true, lost)
 
 
 @pytest.mark.parametrize("noise", [1e-6, 0.02, 20.0])
@@ -246,13 +231,3 @@ def test_invalid_input_is_rejected(prior, noisy, changes, options, message):
         changes = {"keypoints": track.keypoints[:1], "confidence": track.confidence[:1]}
     with pytest.raises(ValueError, match=message):
         denoise_track(replace(track, **changes), prior, **({"noise": NOISE} | options))
-
-
-def test_real_detections_are_denoised(prior, real_data):
-    files = str(real_data / "pose2sim_multiview" / "*_T01_*cam_01.npz")
-    (track,) = read_tracks([files], prior.skeleton, prior.fps).tracks
-    track = replace(track, keypoints=track.keypoints[:80], confidence=track.confidence[:80])
-    clean = denoise_track(track, prior, noise=0.03)
-    moved = np.linalg.norm(clean.keypoints - track.keypoints, axis=-1)[visible(track)]
-    assert np.median(moved) < 0.1
-    assert np.abs(clean.keypoints).max() < 2.0

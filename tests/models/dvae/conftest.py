@@ -24,7 +24,7 @@ RANK = 4
 
 
 def random_prior(frames=5, seed=0, spread_latents=False, changes=None, **options):
-    """Return a prior with random weights whose bodies stand and move a little."""
+    """Return a prior with random weights; its bodies stand upright and move little."""
     size = replace(DVAESettings.tiny(), frames=frames, latent=3, **(changes or {}))
     states = BodyStates(BODY, REST)
     model = DVAEModel(size, states.dim, BODY.n_joints, RANK, seed)

@@ -20,9 +20,9 @@ C[2, 0] = -(C[:2, 0] @ C[:2, 1]) / C[2, 1]
 START = np.array([0.7, -1.2])
 Y = np.random.default_rng(0).normal(size=(T, 3)) + 0.5
 # Moments of all z, from z_t − a z_{t−1} = q ε_t.
-BACK = np.linalg.inv(np.eye(2 * T) - np.diag(np.tile(A, T - 1), -2))
-MEAN = BACK[:, :2] @ (A * START)
-COVARIANCE = BACK * np.tile(Q**2, T) @ BACK.T
+INVERSE = np.linalg.inv(np.eye(2 * T) - np.diag(np.tile(A, T - 1), -2))
+MEAN = INVERSE[:, :2] @ (A * START)
+COVARIANCE = INVERSE * np.tile(Q**2, T) @ INVERSE.T
 
 
 class Walk:

@@ -101,8 +101,8 @@ def test_features_are_the_mean_of_the_encoder(evaluator, run, views):
     standardised = (views[0] - mean) / np.where(deviation > 0, deviation, np.inf)
     motion = torch.tensor(standardised, dtype=torch.float32).flatten(1)[None]
     with torch.no_grad():
-        wanted, _ = network.encoder(motion, torch.ones(1, FRAMES, dtype=torch.bool))
-    np.testing.assert_allclose(evaluator.features(views[:1]), wanted, atol=1e-5)
+        expected, _ = network.encoder(motion, torch.ones(1, FRAMES, dtype=torch.bool))
+    np.testing.assert_allclose(evaluator.features(views[:1]), expected, atol=1e-5)
     # Joints without variation are ignored.
     moved = views.copy()
     moved[:, :, 0] += 1e-7
@@ -139,12 +139,12 @@ def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
     # The fixed root, the occluded neck and padding do not count.
     assert (motions[:, :, [0, neck]] == 0).all()
     assert (motions[~valid] == 0).all()
-    wanted = (motions**2).sum() / (valid.sum() * 15 * 2) + 0.5 * 3
-    assert float(loss) == pytest.approx(float(wanted), rel=1e-5)
+    expected = (motions**2).sum() / (valid.sum() * 15 * 2) + 0.5 * 3
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
     mean, log_variance = torch.randn(2, 6, 5, generator=torch.Generator().manual_seed(0))
     normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
-    wanted = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
-    torch.testing.assert_close(divergence_from_normal(mean, log_variance), wanted.sum(dim=1))
+    expected = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
+    torch.testing.assert_close(divergence_from_normal(mean, log_variance), expected.sum(dim=1))
 
 
 def test_saved_encoder_gives_the_same_features(evaluator, views, tmp_path, run, monkeypatch):

@@ -124,37 +124,37 @@ def losses(bodies, flow):
 def test_projection_matches_the_cameras_and_raising_inverts_it(bodies):
     points, azimuth, elevation = bodies
     poses = project_points(points, azimuth, elevation, DISTANCE)
-    wanted = perspective(points, azimuth, elevation)
-    torch.testing.assert_close(poses, wanted, rtol=0, atol=1e-12)
+    expected = perspective(points, azimuth, elevation)
+    torch.testing.assert_close(poses, expected, rtol=0, atol=1e-12)
     depth = depths(points, azimuth, elevation)
     again = raise_points(poses, depth, azimuth, elevation, DISTANCE)
     torch.testing.assert_close(again, points, rtol=0, atol=1e-12)
 
 
 def test_lifted_motions_project_onto_their_input(lifter):
-    given = views()
-    lifted, elevations = lifter.lift(given), lifter.elevations(given)
+    poses_2d = views()
+    lifted, elevations = lifter.lift(poses_2d), lifter.elevations(poses_2d)
     assert lifted.shape == (3, 5, 14, 3)
     assert (lifted[:, :, 0] == 0).all()
     assert np.ptp(elevations) > 1e-4
-    centred = given - given[:, :, :1]
-    for motion, elevation, wanted in zip(lifted, elevations, centred, strict=True):
+    centred = poses_2d - poses_2d[:, :, :1]
+    for motion, elevation, expected in zip(lifted, elevations, centred, strict=True):
         camera = Cameras.around(
             np.zeros(1), elevation, distance=lifter.settings.distance, perspective=True
         )
-        np.testing.assert_allclose(camera.project(motion)[0], wanted, atol=1e-12)
+        np.testing.assert_allclose(camera.project(motion)[0], expected, atol=1e-12)
         assert np.abs(motion @ camera.rotation[0, 2]).max() > 0.05
     # The elevation is the mean over frames.
-    alone = lifter.elevations(given.reshape(15, 1, 14, 2)).reshape(3, 5)
+    alone = lifter.elevations(poses_2d.reshape(15, 1, 14, 2)).reshape(3, 5)
     np.testing.assert_allclose(elevations, alone.mean(axis=1), rtol=1e-12)
     assert 0 < alone.min() < alone.max() < lifter.settings.steepest
 
 
 def test_lifting_does_not_depend_on_the_batch(lifter):
-    given = views(80)
-    together = lifter.lift(given)
+    poses_2d = views(80)
+    lifted = lifter.lift(poses_2d)
     for row in (0, 41, 79):
-        np.testing.assert_array_equal(lifter.lift(given[row : row + 1])[0], together[row])
+        np.testing.assert_array_equal(lifter.lift(poses_2d[row : row + 1])[0], lifted[row])
 
 
 def test_true_outputs_have_no_loss_except_the_likelihood(bodies, losses, flow):
@@ -301,5 +301,5 @@ def test_checkpoints_are_restored(trainee, tmp_path):
     path = tmp_path / "lifter.safetensors"
     weights = trainee.network.state_dict()
     save_checkpoint(path, Checkpoint("pose-lifter", {"network": trainee.settings}, weights))
-    wanted = PoseLifter(trainee.network, PERSON).lift(views())
-    np.testing.assert_array_equal(PoseLifter.load(path).lift(views()), wanted)
+    expected = PoseLifter(trainee.network, PERSON).lift(views())
+    np.testing.assert_array_equal(PoseLifter.load(path).lift(views()), expected)

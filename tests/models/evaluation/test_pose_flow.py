@@ -18,7 +18,7 @@ from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
 PERSON = Skeleton.preset("person14")
-# One joint besides the root gives a density on the plane.
+# With one joint besides the root, the density is that of a point in the plane.
 POINT = Skeleton(["root", "tip"], [-1, 0])
 SPOTS = np.array([[1.0, 0.5], [-1.0, 0.5], [0.4, -0.8], [-0.4, -0.8]])
 SPREAD = 0.25
@@ -47,13 +47,6 @@ def test_log_determinant_is_that_of_the_jacobian(dimensions):
     assert log_determinant.abs().min() > 1e-3
 
 
-def grid(most):
-    """Return points of a square and the area of each."""
-    axis = torch.linspace(-most, most, 300, dtype=torch.float64)
-    points = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
-    return points, float(axis[1] - axis[0]) ** 2
-
-
 def poses_of(points):
     return torch.stack([torch.zeros_like(points), points], dim=1)
 
@@ -62,10 +55,10 @@ def test_density_integrates_to_one():
     data = seeds.generator(0, "data").normal([0.2, -0.1], [0.6, 0.3], (500, 2))
     flow = PoseFlow.of_poses(POINT, TINY, poses_of(torch.from_numpy(data)).numpy())
     flow = perturbed(flow, 0.15)
-    points, area = grid(6.0)
+    axis = torch.linspace(-6, 6, 300, dtype=torch.float64)
     with torch.no_grad():
-        density = flow.log_density(poses_of(points)).exp()
-    assert abs(float(density.sum()) * area - 1) < 1e-3
+        density = flow.log_density(poses_of(torch.cartesian_prod(axis, axis))).exp()
+    assert abs(float(density.sum()) * float(axis[1] - axis[0]) ** 2 - 1) < 1e-3
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -78,10 +71,10 @@ def test_untrained_density_is_the_gaussian_of_the_data(share):
     settings = replace(TINY, share=share)
     flow = PoseFlow.of_poses(PERSON, settings, poses).double()
     covariance = np.cov(flat, rowvar=False, bias=True) + settings.blur**2 * np.eye(26)
-    wanted = stats.multivariate_normal(flat.mean(0), covariance).logpdf(flat[:20])
+    expected = stats.multivariate_normal(flat.mean(0), covariance).logpdf(flat[:20])
     density = flow.log_density(torch.from_numpy(poses[:20])).detach()
     # Buffers have single precision.
-    np.testing.assert_allclose(density, wanted, atol=1e-3)
+    np.testing.assert_allclose(density, expected, atol=1e-3)
     assert (flow.components == 26) == (share == 1.0)
 
 

@@ -214,13 +214,13 @@ def test_observations_require_a_rigid_path(prior):
 
 
 def test_invalid_arguments_are_rejected(prior, tmp_path):
-    nameless = MotionVAE(prior.model.vae, prior.model.pose, TINY, BODY, 20.0)
+    unrecorded = MotionVAE(prior.model.vae, prior.model.pose, TINY, BODY, 20.0)
     for call, message in (
         (lambda: prior.placed_by(Joints3D(np.zeros((6, 9, 3)), 0.1)), "must be Keypoints2D, got J"),
         (lambda: prior.placed(some_path(frames=5)), "rigid must have the prior's 6 frames, got 5"),
         (lambda: prior.placed(some_path(), np.zeros(1)), "log_lengths must have shape"),
         (lambda: RigidPath(2 * np.eye(3)[None], np.zeros((1, 3))), "rotations must be orthonormal"),
-        (lambda: nameless.save(tmp_path), "prior must have a training record"),
+        (lambda: unrecorded.save(tmp_path), "prior must have a training record"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

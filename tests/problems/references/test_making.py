@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from probmotion.posteriors.reference import StoredReference
 from probmotion.posteriors.sampling import load_sampler
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem
-from probmotion.problems.references import making as references
+from probmotion.problems.references import making
 from probmotion.problems.references.making import (
     ReferenceRefused,
     agreement,
@@ -61,16 +62,9 @@ def of_chains(*values):
 
 def runs_of(positions, problem):
     """Return two runs of four chains."""
-    return [
-        MotionDraws.of(
-            problem.posterior,
-            OutlierGibbs(),
-            half.reshape(4, -1, *half.shape[1:]),
-            seed=0,
-            seconds=0.0,
-        )
-        for half in np.split(positions, 2)
-    ]
+    chains = positions.reshape(2, 4, -1, *positions.shape[1:])
+    make = partial(MotionDraws.of, problem.posterior, OutlierGibbs(), seed=0, seconds=0.0)
+    return [make(half) for half in chains]
 
 
 def disk_full(*_, **__):
@@ -90,12 +84,6 @@ def heavy():
 @pytest.fixture(scope="module")
 def certified(exact):
     return make_reference(exact, draws=800, seed=2, progress=False)
-
-
-@pytest.fixture(scope="module")
-def made(heavy):
-    sampler = OutlierGibbs(thin=1)
-    return make_reference(heavy, draws=480, seed=1, progress=False, sampler=sampler)
 
 
 def test_exact_problem_gets_an_exact_certificate(certified):
@@ -178,12 +166,12 @@ def test_gibbs_matches_importance_sampling(heavy):
         assert (np.abs((drawn**power).mean(axis=0) - expected) < 5 * error).all()
 
 
-def test_saved_reference_is_loaded_and_sampled(tmp_path, heavy, made):
-    assert (made.n, made.certificate["draws_made"]) == (480, 4000)
-    folder = made.save(tmp_path / "toy")
-    assert sorted(path.name for path in tmp_path.rglob("*")) == [
-        "certificate.json", "draws.npz", "toy",
-    ]  # fmt: skip
+def test_saved_reference_is_loaded_and_sampled(tmp_path, heavy):
+    sampler = OutlierGibbs(thin=1)
+    reference = make_reference(heavy, draws=480, seed=1, progress=False, sampler=sampler)
+    assert (reference.n, reference.certificate["draws_made"]) == (480, 4000)
+    folder = reference.save(tmp_path / "toy")
+    assert {path.name for path in folder.iterdir()} == {"certificate.json", "draws.npz"}
     problem = replace(heavy, stored=StoredReference.load(folder))
     assert problem.has_reference
     assert not heavy.has_reference
@@ -194,10 +182,10 @@ def test_saved_reference_is_loaded_and_sampled(tmp_path, heavy, made):
     assert (problem.reference(4, 5) != drawn[:5]).any()
     with pytest.raises(ValueError, match="at most the 480 stored reference draws of toy, got 481"):
         problem.reference(0, 481)
-    made.save(folder)  # replaces the folder
+    reference.save(folder)  # replaces the folder
     assert len(list(tmp_path.iterdir())) == 1
     with pytest.raises(ValueError, match="certificate must have toy's fingerprint"):
-        replace(toy(freedom=4.0), stored=made)
+        replace(toy(freedom=4.0), stored=reference)
 
 
 def test_failed_write_keeps_the_old_reference(tmp_path, certified, monkeypatch):
@@ -232,32 +220,20 @@ def cached(problem, folder, draws=480, seed=1):
 @pytest.fixture
 def halves(monkeypatch):
     """Record the indices of the runs made during a test."""
-    run, indices = references._run, []
-    monkeypatch.setattr(references, "_LEAST", 480)
-    monkeypatch.setattr(references, "_run", lambda *args: indices.append(args[4]) or run(*args))
+    run, indices = making._run, []
+    monkeypatch.setattr(making, "_LEAST", 480)
+    monkeypatch.setattr(making, "_run", lambda *args: indices.append(args[4]) or run(*args))
     return indices
 
 
-def test_finished_run_is_reused(tmp_path, exact, halves, monkeypatch):
-    save = MotionDraws.save
-
-    def interrupted(run, path):
-        save(run, path)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(MotionDraws, "save", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            cached(exact, tmp_path)
-    reference = cached(exact, tmp_path)
-    assert halves == [0, 1]
-    uncached = cached(exact, None)
-    assert np.array_equal(reference.positions, uncached.positions)
-    assert reference.certificate["fingerprint"] == uncached.certificate["fingerprint"]
-
-
-def test_cache_key_distinguishes_runs(tmp_path, exact, halves, monkeypatch):
-    cached(exact, tmp_path)
+def test_finished_runs_are_reused_for_equal_arguments_only(tmp_path, exact, halves, monkeypatch):
+    expected = cached(exact, None)
+    for indices in ([0, 1], []):
+        halves.clear()
+        reference = cached(exact, tmp_path)
+        assert halves == indices
+        assert np.array_equal(reference.positions, expected.positions)
+        assert reference.certificate["fingerprint"] == expected.certificate["fingerprint"]
     likelihood = exact.posterior.likelihood
     # Mirrored observations have the same density at the origin.
     mirrored = replace(likelihood, joints=-likelihood.joints)
@@ -272,32 +248,28 @@ def test_cache_key_distinguishes_runs(tmp_path, exact, halves, monkeypatch):
         cached(problem, tmp_path, **options)
         assert halves == [0, 1]
     halves.clear()
-    monkeypatch.setattr(references, "library_versions", lambda: {"numpy": "1"})
+    monkeypatch.setattr(making, "library_versions", lambda: {"numpy": "1"})
     cached(exact, tmp_path)
     assert halves == [0, 1]
 
 
-def test_file_errors_only_warn(tmp_path, exact, halves, monkeypatch):
-    expected = cached(exact, tmp_path)
-    for path in tmp_path.iterdir():
-        path.write_bytes(path.read_bytes()[:100])
-    halves.clear()
-    with pytest.warns(UserWarning, match="the run is repeated"):
-        reference = cached(exact, tmp_path)
-    assert halves == [0, 1]
-    assert np.array_equal(reference.positions, expected.positions)
-
-    monkeypatch.setattr(MotionDraws, "save", disk_full)
-    with pytest.warns(UserWarning, match="cannot store the run in .*: No space left on device"):
-        reference = cached(exact, tmp_path / "other")
-    assert np.array_equal(reference.positions, expected.positions)
-
-
-def test_unwritable_folder_fails_before_the_first_run(tmp_path, exact, halves):
+def test_file_errors_after_the_start_only_warn(tmp_path, exact, halves, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="writable"):
         cached(exact, tmp_path / "file" / "runs")
     assert not halves
+    folder = tmp_path / "runs"
+    expected = cached(exact, folder)
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    with pytest.warns(UserWarning, match="the run is repeated"):
+        references = [cached(exact, folder)]
+    assert halves == [0, 1, 0, 1]
+    monkeypatch.setattr(MotionDraws, "save", disk_full)
+    with pytest.warns(UserWarning, match="cannot store the run in .*: No space left on device"):
+        references.append(cached(exact, tmp_path / "other"))
+    for reference in references:
+        assert np.array_equal(reference.positions, expected.positions)
 
 
 class Moved(StandardNormalPrior):
@@ -329,12 +301,6 @@ def test_random_walk_reference_of_a_latent_prior_is_correct():
     certificate = reference.certificate
     assert (certificate["exact"], certificate["seeds"]) == (False, None)
     assert certificate["rhat"] <= 1.01
-
-    class Seeded(Moved):
-        def seed_coordinates(self):
-            return np.zeros((1, 3))
-
-    assert references._n_seeds(replace(problem, posterior=MotionPosterior(Seeded()))) == 1
     assert replace(problem, stored=reference).has_reference
     for other in (observed(size=1.1), observed(at=0.6)):
         with pytest.raises(ValueError, match="certificate must have moved's fingerprint"):
@@ -382,7 +348,7 @@ def test_shipped_reference_agrees_with_another_run(monkeypatch, tmp_path):
     monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
     problem = load_problem("gait-noisy3d")
     run = OutlierGibbs(thin=1).sample(problem.posterior, draws=60, chains=2, seed=9, progress=False)
-    drawn, stored = run.flat(), problem.reference(0, problem.max_references)
+    drawn, stored = run.flat(), problem.stored.positions
     difference = (drawn.mean(axis=0) - stored.mean(axis=0)) / stored.std(axis=0)
     assert np.sqrt((difference**2).mean()) < 2 / np.sqrt(60)
     assert np.abs(drawn.std(axis=0) / stored.std(axis=0) - 1).mean() < 2 / np.sqrt(2 * 60)

@@ -35,7 +35,7 @@ from probmotion.problems.references.pair_walk_kernels import walk
 from probmotion.problems.references.tempered_pairs import TemperedPairs, pair_arrays
 
 # Exceeded by one in 100 000 normal variables.
-_APART = 4.4
+_LARGEST_Z = 4.4
 
 
 @pytest.fixture(scope="module")
@@ -83,17 +83,17 @@ def test_compiled_density_matches_the_posterior(prior, likelihood):
     rng = np.random.default_rng(0)
     theta = rng.uniform(0.05, 0.6, (40, 1)) * rng.standard_normal((40, prior.dim))
     poses = np.ascontiguousarray(prior.motion(theta)[:, 0])
-    parts, found = np.zeros(6), []
+    parts, logs = np.zeros(6), []
     for pose in poses:
         log_prior_terms(pose, body, physics, parts)
-        found.append(log_prior(parts, physics) + logsumexp(log_views(pose, body, views)))
+        logs.append(log_prior(parts, physics) + logsumexp(log_views(pose, body, views)))
     stretches, places = theta[:, 12:].reshape(40, -1, 3)[..., 2], theta[:, 6:12]
     normal = -0.5 * ((stretches / 0.05) ** 2).sum(axis=-1) - 0.5 * (places**2).sum(axis=-1)
     expected = normal + prior.log_plausibility(poses[:, None])
     allowed = np.isfinite(expected)
     assert 5 < allowed.sum() < 40
     expected[allowed] += posterior.likelihood.log_density(poses[allowed][:, None])
-    np.testing.assert_allclose(np.array(found) - math.log(5), expected, rtol=1e-9)
+    np.testing.assert_allclose(np.array(logs) - math.log(5), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("measure", ["interaction", "cartesian"])
@@ -101,25 +101,25 @@ def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
     """Uses joints as complex numbers; without a graph, the surrogate is the exact distance."""
     likelihood = replace(likelihood, measure=measure)
     body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
-    held, view, rng = views.prepared, 3, np.random.default_rng(0)
+    prepared, view, rng = views.prepared, 3, np.random.default_rng(0)
     pose = prior.seed[0] + 0.1 * rng.standard_normal(prior.seed[0].shape)
     apart, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(views.near.shape[1])
     log_annotations(pose, view, body, views, logs)
     points = project_to_view(pose, view, body, views) @ [1, 1j]
     points -= points.mean()
     for annotation, exact in zip(views.near[view], logs, strict=True):
-        target = held.joints[annotation].T @ [1, 1j]
+        target = prepared.joints[annotation].T @ [1, 1j]
         turn = np.vdot(points, target)
         error = points * turn / abs(turn) - target
+        surrogate = log_surrogate(pose, view, annotation, body, views, apart, terms)
         if measure == "cartesian":
-            known = math.sqrt(np.mean(np.abs(error) ** 2))
-            assert exact == pytest.approx(-0.5 * (known / likelihood.noise) ** 2, rel=1e-9)
+            distance = math.sqrt(np.mean(np.abs(error) ** 2))
+            assert exact == pytest.approx(surrogate, rel=1e-9)
         else:
-            edges = slice(*held.edge_start[annotation : annotation + 2])
-            i, j = held.edges[:, edges]
-            known = 2 * np.sum(held.weights[edges] * np.abs(error[i] - error[j]))
-        found = log_surrogate(pose, view, annotation, body, views, apart, terms)
-        assert found == pytest.approx(-0.5 * (known / likelihood.noise) ** 2, rel=1e-9)
+            edges = slice(*prepared.edge_start[annotation : annotation + 2])
+            i, j = prepared.edges[:, edges]
+            distance = 2 * np.sum(prepared.weights[edges] * np.abs(error[i] - error[j]))
+        assert surrogate == pytest.approx(-0.5 * (distance / likelihood.noise) ** 2, rel=1e-9)
 
 
 def test_moves_preserve_bone_lengths(prior, likelihood):
@@ -134,9 +134,9 @@ def test_moves_preserve_bone_lengths(prior, likelihood):
         propose(pose, move, 0.5, body, rng, proposed)
         assert np.abs(proposed - pose).max() > 1e-6
         after = np.linalg.norm(proposed[ends] - proposed[starts], axis=1)
-        kept = (ends != joint) | (kind != STRETCH)
-        np.testing.assert_allclose(after[kept], before[kept], rtol=1e-12)
-        assert kept.all() or after[~kept] != pytest.approx(before[~kept], rel=1e-9)
+        rigid = (ends != joint) | (kind != STRETCH)
+        np.testing.assert_allclose(after[rigid], before[rigid], rtol=1e-12)
+        assert rigid.all() or after[~rigid] != pytest.approx(before[~rigid], rel=1e-9)
         if kind == HINGE:
             shift = proposed[[joint, other]] - pose[[joint, other]]
             np.testing.assert_allclose(shift[0], shift[1], atol=1e-12)
@@ -162,7 +162,7 @@ def test_walk_updates_its_terms_correctly(prior, likelihood):
 
 @pytest.mark.slow
 def test_walk_samples_the_tempered_density(prior, likelihood, exact):
-    """Importance-weighted exact draws in every view give the moments of prior · L_v^power.
+    """Compare with importance-weighted draws of the base measure in every view.
 
     Many annotations per view test that only the nearest one counts.
     """
@@ -171,90 +171,82 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
     body, physics, views = pair_arrays(posterior)
 
     def summary(poses: np.ndarray):
-        """Log L_v, how many annotations are as near, log L_v less the mean view's: (n, V, 3)."""
+        """Return log L_v, the number of equally near annotations and log L_v − mean, (n, V, 3)."""
         logs = np.empty((len(poses), *views.near.shape))
         for pose, of_pose in zip(poses, logs, strict=True):
             for view, of_view in enumerate(of_pose):
                 log_annotations(pose, view, body, views, of_view)
         best = logs.max(axis=-1)
-        as_near = logsumexp(power * logs, axis=-1) - power * best
-        return np.stack([best, as_near, best - best.mean(axis=1, keepdims=True)], axis=-1)
+        n_near = logsumexp(power * logs, axis=-1) - power * best
+        return np.stack([best, n_near, best - best.mean(axis=1, keepdims=True)], axis=-1)
 
-    known = summary(exact)
-    log_weight = gentle.log_plausibility(exact[:, None])[:, None] + power * known[..., 0]
+    expected = summary(exact)
+    log_weight = gentle.log_plausibility(exact[:, None])[:, None] + power * expected[..., 0]
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    mean = np.einsum("nv,nvk->k", weight, known)
-    error = np.sqrt((np.einsum("nv,nvk->nk", weight, known - mean) ** 2).sum(axis=0))
+    mean = np.einsum("nv,nvk->k", weight, expected)
+    error = np.sqrt((np.einsum("nv,nvk->nk", weight, expected - mean) ** 2).sum(axis=0))
 
-    moves, found = moves_of(body), []
+    moves, summaries = moves_of(body), []
     sizes, tried, taken = np.full(len(moves), 0.7), np.zeros(len(moves)), np.zeros(len(moves))
     for chain in range(2):
         rng, pose, parts, view = np.random.default_rng(chain), prior.seed[0].copy(), np.zeros(6), 0
         log_prior_terms(pose, body, physics, parts)
-        walked = []
+        states = []
         for _ in range(1100):
             view, _ = walk(
                 pose, parts, view, power, 400, moves, sizes, tried, taken, body, physics, views, rng
             )
-            walked.append((pose.copy(), view))
-        poses, views = zip(*walked[100:], strict=True)
-        found.append(summary(np.array(poses))[np.arange(len(views)), list(views)])
-    assert np.abs(_errors_apart(np.array(found), mean, error)).max() < _APART
+            states.append((pose.copy(), view))
+        poses, chosen = zip(*states[100:], strict=True)
+        summaries.append(summary(np.array(poses))[np.arange(len(chosen)), list(chosen)])
+    assert np.abs(_z_scores(np.array(summaries), mean, error)).max() < _LARGEST_Z
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", [2.0, math.inf])
 def test_draws_match_importance_sampling(prior, likelihood, exact, limit):
-    """Weak limits and penetration let base-measure draws cover the posterior."""
+    """Limits and penetration are weak, so that draws of the base measure cover the posterior."""
     gentle = replace(prior, position_noise=0.7, max_invalid=24)
     log_f = gentle.log_plausibility(exact[:, None]) + likelihood.log_density(exact[:, None])
     # A seed of intermediate density, so that both bounds truncate.
-    middling = exact[np.argsort(log_f)[int(0.97 * len(exact))]]
-    posterior = TruncatedPosterior(
-        gentle, likelihood, seed=gentle.coordinates(middling), limit=limit
-    )
-    log_share = np.where(log_f < posterior.log_floor, -np.inf, np.minimum(log_f, posterior.log_cap))
-    weights = np.exp(log_share - log_share.max())
+    seed = gentle.coordinates(exact[np.argsort(log_f)[int(0.97 * len(exact))]])
+    posterior = TruncatedPosterior(gentle, likelihood, seed=seed, limit=limit)
+    log_cut = np.where(log_f < posterior.log_floor, -np.inf, np.minimum(log_f, posterior.log_cap))
+    weights = np.exp(log_cut - log_cut.max())
     allowed, weights = exact[weights > 0], weights[weights > 0]
     assert weights.sum() ** 2 / (weights**2).sum() > 400
     sampler = TemperedPairs(levels=5, steps=100, warmup=100, thin=1)
     run = sampler.sample(posterior, draws=600, chains=2, progress=False)
     poses = run.dataset["positions"].values[:, :, 0]
-    found = _summaries(poses.reshape(-1, *poses.shape[2:]), posterior)
-    found = found.reshape(*poses.shape[:2], -1)
-    known = _summaries(allowed, posterior)
-    mean = np.average(known, axis=0, weights=weights)
-    spread = weights[:, None] * (known - mean)
-    error = np.sqrt((spread**2).sum(axis=0)) / weights.sum()
-    assert np.abs(_errors_apart(found, mean, error)).max() < _APART
+    drawn = _summaries(poses.reshape(-1, *poses.shape[2:]), posterior)
+    drawn = drawn.reshape(*poses.shape[:2], -1)
+    expected = _summaries(allowed, posterior)
+    mean = np.average(expected, axis=0, weights=weights)
+    weighted = weights[:, None] * (expected - mean)
+    error = np.sqrt((weighted**2).sum(axis=0)) / weights.sum()
+    assert np.abs(_z_scores(drawn, mean, error)).max() < _LARGEST_Z
     if math.isfinite(limit):
         assert log_f.max() > posterior.log_cap
-        assert (found[..., :2].sum(axis=-1) >= posterior.log_floor - 1e-6).all()
+        assert (drawn[..., :2].sum(axis=-1) >= posterior.log_floor - 1e-6).all()
 
 
-def test_failed_chain_stops_all_chains(prior, likelihood, monkeypatch):
-    """The error of the failed chain is raised."""
-    posterior = MotionPosterior(prior, likelihood)
-    warm_up = tempered_pairs._Ladder._warm_up
+def test_error_of_one_chain_stops_all_chains(prior, likelihood, monkeypatch):
+    exchange, ladders = tempered_pairs._Ladder._exchange_after_walking, {}
 
     def failing(ladder, stop):
-        warm_up(ladder, stop)
-        if ladder is not first[0]:
+        if ladders.setdefault(id(ladder), len(ladders)):
             raise MemoryError("no room")
+        exchange(ladder, stop)
 
-    first: list = []
-    make = tempered_pairs._Ladder.__init__
-
-    def noted(ladder, *given):
-        make(ladder, *given)
-        first.append(ladder)
-
-    monkeypatch.setattr(tempered_pairs._Ladder, "__init__", noted)
-    monkeypatch.setattr(tempered_pairs._Ladder, "_warm_up", failing)
-    sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
+    monkeypatch.setattr(tempered_pairs._Ladder, "_exchange_after_walking", failing)
     with pytest.raises(MemoryError, match="no room"):
-        sampler.sample(posterior, draws=10**6, chains=2, progress=False)
+        endless(MotionPosterior(prior, likelihood))
+
+
+def endless(posterior):
+    sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
+    sampler.sample(posterior, draws=10**6, chains=2, progress=False)
 
 
 @pytest.mark.parametrize("cut", [False, True])
@@ -264,50 +256,42 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
         posterior = TruncatedPosterior(prior, likelihood, limit=1e3)
     sampler = TemperedPairs(levels=3, steps=30, warmup=20, thin=3)
     options = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
-    whole = sampler.sample(posterior, **options)
+    uninterrupted = sampler.sample(posterior, **options)
     monkeypatch.setattr(chains, "_SECONDS", 0.0)
     save = StoredChain.save
 
-    def stopping(kept, held):
-        save(kept, held)
-        if len(held()["draws"]) == 7:
+    def stopping(file, state):
+        save(file, state)
+        if len(state()["draws"]) == 7:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(StoredChain, "save", stopping)
         with pytest.raises(KeyboardInterrupt):
             sampler.sample(posterior, **options, unfinished=tmp_path / "run")
-    kept = sorted(tmp_path.iterdir())
-    assert "run-0.npz" in [path.name for path in kept]
-    walked = []
-    exchange = tempered_pairs._Ladder._exchange_after_walking
-
-    def counted(ladder, stop):
-        walked.append(ladder)
-        exchange(ladder, stop)
-
-    monkeypatch.setattr(tempered_pairs._Ladder, "_exchange_after_walking", counted)
-    again = sampler.sample(posterior, **options, unfinished=tmp_path / "run")
-    assert len(walked) < 2 * (20 + 3 * 12) - 20
-    assert np.array_equal(again.dataset["positions"], whole.dataset["positions"])
-    for name in ("round_trips", "rejected_exchanges"):
-        assert np.array_equal(again.dataset[name], whole.dataset[name])
-    kept[0].write_bytes(b"PK")
+    exchange, calls = tempered_pairs._Ladder._exchange_after_walking, []
+    monkeypatch.setattr(
+        tempered_pairs._Ladder,
+        "_exchange_after_walking",
+        lambda *args: calls.append(1) or exchange(*args),
+    )
+    resumed = sampler.sample(posterior, **options, unfinished=tmp_path / "run")
+    assert len(calls) < 2 * (20 + 3 * 12) - 20
+    for name in ("positions", "round_trips", "rejected_exchanges"):
+        assert np.array_equal(resumed.dataset[name], uninterrupted.dataset[name])
+    (tmp_path / "run-0.npz").write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"run-0.npz must contain a stored chain"):
         sampler.sample(posterior, **options, unfinished=tmp_path / "run")
 
 
 def test_ctrl_c_stops_all_chains(prior, likelihood):
-    sampler = TemperedPairs(levels=3, steps=5, warmup=16, thin=1)
     main, before = threading.main_thread().ident, signal.getsignal(signal.SIGINT)
     pressed = threading.Timer(0.5, signal.pthread_kill, (main, signal.SIGINT))
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         pressed.start()
         with pytest.raises(KeyboardInterrupt):
-            sampler.sample(
-                MotionPosterior(prior, likelihood), draws=10**6, chains=3, progress=False
-            )
+            endless(MotionPosterior(prior, likelihood))
     finally:
         pressed.join()
         signal.signal(signal.SIGINT, before)
@@ -331,29 +315,28 @@ def test_chains_start_at_successive_seeds(prior, likelihood, dances):
 @pytest.mark.slow
 def test_tuned_powers_have_equal_rejection_rates(prior, likelihood):
     posterior = MotionPosterior(prior, replace(likelihood, noise=0.05))
-    sampler = TemperedPairs(levels=10, steps=40, warmup=500, thin=1)
-    arrays = pair_arrays(posterior)
-    ladder = tempered_pairs._Ladder(sampler, posterior, arrays, np.random.default_rng(0), 0)
+    sampler, rng = TemperedPairs(levels=10, steps=40, warmup=500, thin=1), np.random.default_rng(0)
+    ladder = tempered_pairs._Ladder(sampler, posterior, pair_arrays(posterior), rng, 0)
     ladder._warm_up(Event())
     assert (ladder.powers[0], ladder.powers[-1]) == (0.0, 1.0)
     for _ in range(600):
         ladder._exchange_after_walking(Event())
-    rejected = ladder.rejected / ladder.asked
-    assert rejected.max() - rejected.min() < 0.25
-    assert ladder.barrier == pytest.approx(rejected.sum())
+    rates = ladder.rejected / ladder.asked
+    assert rates.max() - rates.min() < 0.25
+    assert ladder.barrier == pytest.approx(rates.sum())
     # Ideal rate of 1 in 2 + 2 Σ r/(1 − r) exchanges (Syed et al. 2022).
-    most = 600 / (2 + 2 * (rejected / (1 - rejected)).sum())
-    assert 0.1 * most < ladder.round_trips < 1.5 * most
+    ideal = 600 / (2 + 2 * (rates / (1 - rates)).sum())
+    assert 0.1 * ideal < ladder.round_trips < 1.5 * ideal
 
 
 def test_unsuitable_posteriors_are_rejected(prior, likelihood):
-    hidden = likelihood.annotations.visible.copy()
-    hidden[0, 3] = False
-    partly = AnnotatedPairs(replace(likelihood.annotations, visible=hidden), n_views=2)
+    visible = likelihood.annotations.visible.copy()
+    visible[0, 3] = False
+    occluded = AnnotatedPairs(replace(likelihood.annotations, visible=visible), n_views=2)
     for posterior, message in (
         (load_problem("gait-monocular").posterior, "got GaussianMixtureMotion and Keypoints2D"),
         (MotionPosterior(prior), "got PosePairPrior and NoneType with 0"),
-        (MotionPosterior(prior, partly), "and AnnotatedPairs with 1"),
+        (MotionPosterior(prior, occluded), "and AnnotatedPairs with 1"),
     ):
         with pytest.raises(ValueError, match=message):
             TemperedPairs().sample(posterior, progress=False)
@@ -369,20 +352,14 @@ def _summaries(poses: np.ndarray, posterior: MotionPosterior):
     roots = list(skeleton.roots)
     chests = [k for k, name in enumerate(skeleton.joint_names) if "chest" in name]
     trunks = poses[:, chests] - poses[:, roots]
-    return np.stack(
-        [
-            posterior.prior.log_plausibility(poses[:, None]),
-            posterior.likelihood.log_density(poses[:, None]),
-            np.linalg.norm(poses[:, roots[0]] - poses[:, roots[1]], axis=-1),
-            (trunks[:, 0] * trunks[:, 1]).sum(axis=-1),
-        ],
-        axis=-1,
-    )
+    log_f = posterior.prior.log_plausibility(poses[:, None])
+    log_l = posterior.likelihood.log_density(poses[:, None])
+    distance = np.linalg.norm(poses[:, roots[0]] - poses[:, roots[1]], axis=-1)
+    return np.stack([log_f, log_l, distance, np.prod(trunks, axis=1).sum(axis=-1)], axis=-1)
 
 
-def _errors_apart(values: np.ndarray, mean: float | np.ndarray, error: float = 0.0):
-    """Return deviations of chain means in standard errors."""
-    flat = values.reshape(*values.shape[:2], -1)
-    effective = np.asarray(array_stats.ess(flat, method="mean", chain_axis=0, draw_axis=1))
-    own = flat.var(axis=(0, 1), ddof=1) / effective
-    return (flat.mean(axis=(0, 1)) - np.ravel(mean)) / np.sqrt(own + np.ravel(error) ** 2)
+def _z_scores(values, mean, error):
+    """Return deviations of the chains' means (chain, draw, k) in standard errors."""
+    ess = np.asarray(array_stats.ess(values, method="mean", chain_axis=0, draw_axis=1))
+    variance = values.var(axis=(0, 1), ddof=1) / ess
+    return (values.mean(axis=(0, 1)) - mean) / np.sqrt(variance + error**2)

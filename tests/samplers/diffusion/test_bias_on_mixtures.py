@@ -16,7 +16,6 @@ from probmotion.motion.retargeting import common_skeleton
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 
 REAL_CLIPS = Path(__file__).parents[3].parent / "shared" / "data" / "cmu_single"
-ELEVATION = np.pi / 12
 DRAWS = 300
 SEEDS = 10
 
@@ -46,13 +45,11 @@ def metrics(prior, sampler, run_seeds, n=DRAWS):
     for seed in run_seeds:
         draws = sampler.sample(MotionPosterior(prior), draws=n, seed=seed, progress=False)
         X, flat = draws.flat(), draws.flat().reshape(n, -1)
-        proportions = prior.style_responsibilities(X).mean(axis=0)
         rows.append(
             {
                 "swd_ratio": sliced_wasserstein_ratio(flat, list(exact), directions),
                 "off_manifold_ratio": prior.off_manifold(X).mean(),
                 "variance_ratio": trace_ratio(flat, exact.reshape(8 * n, -1)),
-                "mode_proportions_tv": 0.5 * np.abs(proportions - prior.weights).sum(),
                 "calls": draws.counts["denoiser"] / n,
             }
         )

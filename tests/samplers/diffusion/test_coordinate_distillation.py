@@ -148,8 +148,8 @@ def test_a_draw_depends_only_on_its_seed_chain_and_number(prior):
     for sampler, draws, chains in ((replace(QUICK, batch=2), 5, 3), (QUICK, 4, 2)):
         few = distilled(sampler, posterior, seed=2, draws=draws, chains=chains)
         for name in ("theta", "positions", "log_density"):
-            wanted = many.dataset[name].values[:chains, :draws]
-            np.testing.assert_allclose(few.dataset[name].values, wanted, rtol=0, atol=1e-9)
+            expected = many.dataset[name].values[:chains, :draws]
+            np.testing.assert_allclose(few.dataset[name].values, expected, rtol=0, atol=1e-9)
 
 
 def test_one_of_two_protocols_is_required(prior, gaussian, two_modes):

@@ -209,12 +209,12 @@ def test_conjugate_gradients_stop_if_the_system_is_not_positive_or_symmetric():
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
     systems = np.einsum("ij,bj,kj->bik", turn, values, turn)
     right = np.random.default_rng(1).normal(size=(2, 4))
-    wanted = np.linalg.solve(np.eye(4) + systems, right[..., None])[..., 0]
-    wanted = np.einsum("bij,bj->bi", systems, wanted)
-    np.testing.assert_allclose(solved(systems, right, 4)[0], wanted[0], atol=1e-12)
+    expected = np.linalg.solve(np.eye(4) + systems, right[..., None])[..., 0]
+    expected = np.einsum("bij,bj->bi", systems, expected)
+    np.testing.assert_allclose(solved(systems, right, 4)[0], expected[0], atol=1e-12)
     # The solution is hundreds of times the right-hand side.
     sizes = [np.linalg.norm(solved(systems, right, steps)[1]) for steps in range(1, 30)]
-    assert 0 < sizes[0] <= max(sizes) < 0.01 * np.linalg.norm(wanted[1])
+    assert 0 < sizes[0] <= max(sizes) < 0.01 * np.linalg.norm(expected[1])
     assert sizes[-1] == sizes[10]
     # All curvatures are 1.5 in this asymmetric system, so only the conjugacy of directions fails.
     system = np.array([[[0.5, 30.0], [-30.0, 0.5]]])

@@ -143,8 +143,8 @@ def test_limit_5_independent_noise_shrinks_the_motion(gaussian_motion, n_views, 
     expected = np.kron(S, np.linalg.inv(views.gram))
     np.testing.assert_allclose(covariance, expected, atol=3e-3)
     if elevation == 0:
-        wanted = np.diag([2, 1, 2]) / n_views
-        np.testing.assert_allclose(np.linalg.inv(views.gram), wanted, atol=1e-12)
+        inverse = np.diag([2, 1, 2]) / n_views
+        np.testing.assert_allclose(np.linalg.inv(views.gram), inverse, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_replay_in_any_view(gaussian, perspective):
     trace = sampler.trace(posterior, draws=2, seed=1)
     draws = sampler.sample(posterior, draws=2, seed=1, progress=False).flat()
     np.testing.assert_array_equal(trace.estimates[-1] * gaussian.scale, draws)
-    # Denoising the replay in the views of the run gives its estimates.
+    # Denoising the replay in the views of the run reproduces its estimates.
     for level in (40, 20, 5, 1):
         noisy = trace.replay(sampler.cameras, level)
         clean = gaussian.denoise(noisy, sampler.schedule.alpha_bar[level], sampler.cameras)

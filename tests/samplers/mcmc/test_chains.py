@@ -24,40 +24,40 @@ def sampler(request):
 
 
 @pytest.fixture(scope="module")
-def whole(sampler, run):
+def complete(sampler, run):
     return run(sampler, 100)
 
 
-def assert_joined(parts, whole):
+def assert_joined(parts, complete):
     for name in ("theta", "positions", "log_density"):
         joined = np.concatenate([part.dataset[name].values for part in parts], axis=1)
-        np.testing.assert_array_equal(joined, whole.dataset[name].values)
+        np.testing.assert_array_equal(joined, complete.dataset[name].values)
 
 
-def test_positions_and_densities_are_those_of_theta(whole, two_modes):
-    theta = whole.dataset["theta"].values
-    np.testing.assert_allclose(whole.dataset["log_density"], two_modes.log_density(theta))
-    np.testing.assert_array_equal(whole.positions.values, two_modes.motion(theta))
-    assert not whole.independent
+def test_positions_and_densities_are_those_of_theta(complete, two_modes):
+    theta = complete.dataset["theta"].values
+    np.testing.assert_allclose(complete.dataset["log_density"], two_modes.log_density(theta))
+    np.testing.assert_array_equal(complete.positions.values, two_modes.motion(theta))
+    assert not complete.independent
 
 
-def test_continuing_equals_one_run(sampler, run, whole, tmp_path):
+def test_continuing_equals_one_run(sampler, run, complete, tmp_path):
     """Also from within an iteration of an ensemble, and without a new one."""
     parts, last = [], None
     for draws in (11, 3, 1, 85):
         parts.append(run(sampler, draws, initial=last))
         parts[-1].save(tmp_path / "part.nc")
         last = MotionDraws.load(tmp_path / "part.nc")
-    assert_joined(parts, whole)
-    for count in whole.counts:
-        assert sum(part.counts[count] for part in parts) == whole.counts[count]
+    assert_joined(parts, complete)
+    for count in complete.counts:
+        assert sum(part.counts[count] for part in parts) == complete.counts[count]
 
 
-def test_chains_are_independent(sampler, run, whole):
+def test_chains_are_independent(sampler, run, complete):
     many = run(sampler, 20, chains=4, progress=True)
     # In mh the rounding of log densities depends on the batch, and adapts the proposal.
     np.testing.assert_allclose(
-        many.dataset["theta"][:2], whole.dataset["theta"][:, :20], rtol=1e-9, atol=1e-12
+        many.dataset["theta"][:2], complete.dataset["theta"][:, :20], rtol=1e-9, atol=1e-12
     )
 
 
@@ -86,12 +86,12 @@ def interrupt(monkeypatch, owner, name, n):
 )
 def test_an_interrupted_run_can_be_continued(run, monkeypatch, name, method, n, finished):
     sampler = SAMPLERS[name]
-    whole = run(sampler, 100)
+    complete = run(sampler, 100)
     interrupt(monkeypatch, *method, n)
     with pytest.raises(Interrupted, match=f"after {finished} draws per chain") as stopped:
         run(sampler, 100)
     first = stopped.value.draws
-    assert_joined([first, run(sampler, 100 - finished, initial=first)], whole)
+    assert_joined([first, run(sampler, 100 - finished, initial=first)], complete)
 
 
 @pytest.mark.parametrize(

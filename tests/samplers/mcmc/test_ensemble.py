@@ -78,8 +78,8 @@ def test_autocorrelation_time_of_an_autoregressive_process(correlation, iteratio
     trace = noise.copy()
     for t in range(1, iterations):
         trace[t] = correlation * trace[t - 1] + np.sqrt(1 - correlation**2) * noise[t]
-    wanted = (1 + correlation) / (1 - correlation)
-    np.testing.assert_allclose(autocorrelation_time(trace), wanted, rtol=0.2, atol=0.1)
+    expected = (1 + correlation) / (1 - correlation)
+    np.testing.assert_allclose(autocorrelation_time(trace), expected, rtol=0.2, atol=0.1)
     trace[..., 0] = 3.0
     constant, varying = autocorrelation_time(trace)
     assert np.isnan(constant)

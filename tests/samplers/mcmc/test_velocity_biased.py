@@ -13,7 +13,6 @@ from scipy.stats import norm
 
 from probmotion import MotionDraws, MotionPosterior, UnsupportedPosterior
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import ComparesViews, HasCoordinateSpeeds
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.samplers import NUTS, MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic, VelocityBiased
@@ -102,8 +101,6 @@ LIMIT = 4.0
 
 
 def test_velocity_biased_chains_have_the_right_moments():
-    assert isinstance(Annotations(), ComparesViews)
-    assert isinstance(Point(), HasCoordinateSpeeds)
     assert moments(mh(VelocityBiased(**STEPS)), Annotations()).max() < LIMIT
 
 

@@ -145,8 +145,8 @@ def test_pairs_are_simulated_from_the_likelihood(gaussian_motion):
     noise = np.moveaxis(keypoints, 2, 1) - cameras.project(positions)
     noise[:, 0, 2, 1] = np.nan
     assert np.nanstd(noise) == pytest.approx(0.03, rel=0.02)
-    apart = np.moveaxis(observed_entries(likelihood, 6).reshape(6, 2, 2, 2), 1, 0)
-    np.testing.assert_array_equal(apart, likelihood.keypoints)
+    entries = observed_entries(likelihood, 6).reshape(6, 2, 2, 2)
+    np.testing.assert_array_equal(np.moveaxis(entries, 1, 0), likelihood.keypoints)
 
 
 def test_principal_coordinates_and_their_complement_sum_to_the_values():
@@ -156,9 +156,9 @@ def test_principal_coordinates_and_their_complement_sum_to_the_values():
     x = basis.coordinates(values)
     np.testing.assert_allclose(x.T @ x / 50, np.eye(5), atol=1e-9)
     flat = values.reshape(50, -1)
-    rest = basis.without(flat - basis.mean)
-    np.testing.assert_allclose(basis.values(x) + rest, flat, atol=1e-12)
-    np.testing.assert_allclose(basis.coordinates(basis.values(x) + rest), x, atol=1e-9)
+    complement = basis.without(flat - basis.mean)
+    np.testing.assert_allclose(basis.values(x) + complement, flat, atol=1e-12)
+    np.testing.assert_allclose(basis.coordinates(basis.values(x) + complement), x, atol=1e-9)
     constant = np.concatenate([values[..., :2], np.zeros((50, 4, 2, 1))], axis=-1)
     assert len(PrincipalCoordinates.of(constant, 100).deviation) == 16
 
@@ -174,8 +174,8 @@ def test_the_remainder_is_the_gaussian_conditional():
     observed = (positions + sigma * rng.standard_normal(positions.shape)).reshape(n, 5, 6)
     y = np.zeros((n, 0))
     motions = MotionCoordinates.learn(SimulatedPairs(positions, observed), y, 1)
-    wanted = delta**2 / (delta**2 + sigma**2)
-    np.testing.assert_allclose(motions.gain, wanted * np.eye(6)[None].repeat(5, 0), atol=0.05)
+    expected = delta**2 / (delta**2 + sigma**2)
+    np.testing.assert_allclose(motions.gain, expected * np.eye(6)[None].repeat(5, 0), atol=0.05)
     x = motions.coordinates(positions[:1], y[:1]).repeat(4000, 0)
     flat = motions.motions(x, y[:4000], observed[0], rng.standard_normal((4000, 5, 6)))
     np.testing.assert_allclose(motions.coordinates(flat, y[:4000]), x, atol=1e-9)
@@ -203,8 +203,8 @@ def test_loss_is_the_evidence_lower_bound():
     d = normal(network.decode(z, y), network.log_scale.exp()).log_prob(x).sum(1) + 4 * halves
     kl = r.log_prob(z).sum(1) - p.log_prob(z)
     for weight in (0.1, 1.0):
-        wanted = (-d + weight * kl).mean()
-        torch.testing.assert_close(network.loss(x, y, noise, weight), wanted)
+        expected = (-d + weight * kl).mean()
+        torch.testing.assert_close(network.loss(x, y, noise, weight), expected)
 
 
 def test_divergence_and_infinite_variance_are_errors(gaussian_motion):

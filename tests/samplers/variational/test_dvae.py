@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import json
 import math
+import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from probmotion import Cameras, Joints3D, Keypoints2D, MotionDraws, MotionPosterior, seeds
-from probmotion.comparison import compare
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.models.bodies.body_states import BodyStates, rest_pose
 from probmotion.models.dvae.denoiser_training import DenoiserTrainee
@@ -22,7 +21,6 @@ from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.network import DVAESettings
 from probmotion.models.dvae.training import DVAETrainee
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Interrupted
 from probmotion.samplers import DVAEInference
 from probmotion.seeds import NormalStreams
@@ -167,8 +165,8 @@ def test_a_draw_depends_only_on_its_seed_chain_and_number(prior, walks, sampler,
             few = run(other, posterior, draws=draws, chains=chains)
             assert few.counts == many.counts
             for name in ("positions", *names):
-                wanted = many.dataset[name].values[:chains, :draws]
-                np.testing.assert_array_equal(few.dataset[name].values, wanted)
+                expected = many.dataset[name].values[:chains, :draws]
+                np.testing.assert_array_equal(few.dataset[name].values, expected)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
@@ -182,8 +180,8 @@ def test_optimisation_increases_the_bound_of_a_copy(posterior, denoiser):
     fresh = denoiser.on(posterior.prior, posterior.likelihood)
 
     @torch.no_grad()
-    def losses(some):
-        loss = partial(some.loss, initial_entropy=True, latent_weight=1.0)
+    def losses(inference):
+        loss = partial(inference.loss, initial_entropy=True, latent_weight=1.0)
         return np.array([float(loss(np.random.default_rng(seed))) for seed in range(15)])
 
     gain = losses(fresh) - losses(inference)
@@ -197,12 +195,16 @@ def test_optimisation_increases_the_bound_of_a_copy(posterior, denoiser):
     assert not any(value.requires_grad for value in posterior.prior.model.parameters())
 
 
-@pytest.mark.parametrize(("own", "given"), [(None, 4.0), (4.0, math.inf), (4.0, None)])
-def test_degrees_of_freedom_override_those_of_the_likelihood(prior, walks, denoiser, own, given):
-    posterior = observed(prior, walks, freedom=own)
-    sampler = replace(FIT, iterations=2, degrees_of_freedom=given)
+@pytest.mark.parametrize(
+    ("observed_freedom", "freedom", "heavy"),
+    [(None, 4.0, True), (4.0, math.inf, False), (4.0, None, True)],
+)
+def test_degrees_of_freedom_override_those_of_the_likelihood(
+    prior, walks, denoiser, observed_freedom, freedom, heavy
+):
+    posterior = observed(prior, walks, freedom=observed_freedom)
+    sampler = replace(FIT, iterations=2, degrees_of_freedom=freedom)
     inference, _ = fitted(posterior, denoiser, sampler)
-    heavy = (own if given is None else given) == 4.0
     assert (term(inference, "noise", 2) > 0) == heavy
     assert float(inference.windows.tails[0]) == (0.25 if heavy else 0.0)
 
@@ -228,8 +230,8 @@ def test_predict(posterior, denoiser, sampler):
     assert abs(decoded.positions - motion.positions).max() > 1e-3
     if sampler.mode == "regression":
         inference = denoiser.on(posterior.prior, posterior.likelihood)
-        wanted = inference.predict(seeds.generator(3, "predict"), average=True)
-        np.testing.assert_allclose(motion.positions, wanted, atol=1e-6)
+        expected = inference.predict(seeds.generator(3, "predict"), average=True)
+        np.testing.assert_allclose(motion.positions, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("frames", [2, 13, 75])
@@ -267,12 +269,11 @@ def test_windows_join_without_jumps(prior, walks, overlap):
 
 @pytest.mark.parametrize("networked", [True, False])
 def test_without_observations_draws_are_those_of_the_prior(prior, bare, trainings, networked):
-    some = prior if networked else bare
-    draws = run(replace(FIT, batch=4), MotionPosterior(some))
+    draws = run(replace(FIT, batch=4), MotionPosterior(prior if networked else bare))
     for chain, draw in np.ndindex(2, 3):
         rng = NormalStreams.of_draws(9, [(chain, draw)]).generators[0]
-        wanted = prior.sample(rng, 1)[0]
-        np.testing.assert_allclose(draws.positions.values[chain, draw], wanted, atol=1e-9)
+        expected = prior.sample(rng, 1)[0]
+        np.testing.assert_allclose(draws.positions.values[chain, draw], expected, atol=1e-9)
     assert draws.counts == {"gradient": 0}
     assert trainings == []
 
@@ -314,11 +315,11 @@ def test_an_interrupted_run_has_the_finished_draws(posterior, denoiser):
 
 
 def test_provenance_of_draws(posterior, denoiser, tmp_path):
-    for network, wanted in ((None, None), (denoiser, repr(denoiser))):
+    for network, expected in ((None, None), (denoiser, repr(denoiser))):
         sampler = replace(FIT, iterations=2, network=network)
         draws = run(sampler, posterior)
         settings = json.loads(draws.dataset.attrs["settings"])
-        assert settings["network"] == wanted
+        assert settings["network"] == expected
         assert settings["mode"] == "optimization"
         draws.save(tmp_path / "draws.nc")
         loaded = MotionDraws.load(tmp_path / "draws.nc")

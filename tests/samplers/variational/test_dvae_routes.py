@@ -261,15 +261,15 @@ def test_a_network_is_trained_for_other_priors(
 
 
 def test_a_given_network_takes_precedence(trainings):
-    own, given = GaussianNetwork(), GaussianNetwork()
-    sampler = DVAEInference(network=given, overlap=2, degrees_of_freedom=5.0)
-    for posterior in (one_direction(own), one_direction()):
+    of_prior, network = GaussianNetwork(), GaussianNetwork()
+    sampler = DVAEInference(network=network, overlap=2, degrees_of_freedom=5.0)
+    for posterior in (one_direction(of_prior), one_direction()):
         run(sampler, posterior)
         sampler.predict(posterior, progress=False)
-    assert given.options == [{"degrees_of_freedom": 5.0, "overlap": 2}] * 4
-    assert own.options == []
+    assert network.options == [{"degrees_of_freedom": 5.0, "overlap": 2}] * 4
+    assert of_prior.options == []
     assert trainings == []
-    assert isinstance(own, InferenceNetwork)
+    assert isinstance(of_prior, InferenceNetwork)
     assert isinstance(posterior.prior, HasInferenceNetwork)
 
 
