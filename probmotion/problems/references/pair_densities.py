@@ -87,7 +87,7 @@ def log_prior(parts: np.ndarray, physics: Physics) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def log_view(
-    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, least: float = -np.inf
+    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, least: float
 ) -> float:
     """Return log L(Θ_v; v) of one view: −d²/2σ_l² of the nearest annotation (eq. 9).
 
@@ -107,7 +107,7 @@ def log_views(pose: np.ndarray, body: Body, views: ViewAnnotations) -> np.ndarra
     """Return log L(Θ_v; v) of every view, (V,)."""
     logs = np.empty(len(views.vectors))
     for view in range(len(logs)):
-        logs[view] = log_view(pose, view, body, views)
+        logs[view] = log_view(pose, view, body, views, -np.inf)
     return logs
 
 

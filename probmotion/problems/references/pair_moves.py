@@ -184,10 +184,11 @@ def _any_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _of_quaternion(w: float, x: float, y: float, z: float, turn: np.ndarray) -> None:
-    turn[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    turn[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    turn[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+def _of_quaternion(w: float, x: float, y: float, z: float, R: np.ndarray) -> None:
+    # Assignments of rows would take three seconds longer to compile.
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
 @numba.njit(cache=True, nogil=True)

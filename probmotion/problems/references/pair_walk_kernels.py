@@ -75,7 +75,7 @@ def walk(
     resample_placement(pose, parts, body, rng)
     if power == 0:
         view = int(rng.random() * len(views.vectors))
-        return view, log_view(pose, view, body, views)
+        return view, log_view(pose, view, body, views, -np.inf)
     log_l = logs.max()
     for _ in range(_VIEW_PROPOSALS):
         # Draw the acceptance threshold first, to terminate the evaluation early.

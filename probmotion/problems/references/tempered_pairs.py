@@ -195,7 +195,7 @@ class _Ladder:
         self.parts[:] = self.parts[0]
         self.views = rng.integers(len(views.vectors), size=levels)
         # log L_v of each level.
-        self.seen = np.array([log_view(pose, view, body, views) for view in self.views])
+        self.seen = np.array([log_view(pose, view, body, views, -np.inf) for view in self.views])
         truncated = isinstance(posterior, TruncatedPosterior) and posterior.truncated
         self.cut = _Cut(self, posterior) if truncated else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
