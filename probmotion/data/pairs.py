@@ -145,7 +145,7 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     if both.frames < least:
         raise ValueError(f"lead must have at least {least} frames, got {both.frames}")
     # The floor is estimated with the toes, which are End Sites and dropped later.
-    lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in people])
+    lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in (leader, follower)])
     floor = np.percentile(lowest, 2)
     positions = both.positions[_SALSA_START : both.frames - _SALSA_END : 2]
     return Motion(positions - [0.0, floor, 0.0], both.skeleton, _SALSA_FPS / 2, name=both.name)
