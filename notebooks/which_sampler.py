@@ -22,17 +22,17 @@ ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "which-sampler.md")
 SHOWN = ("gait", "gait-monocular", "gait-sparse", "cmu-monocular")
 WHEN = {
-    "exact": "prior and likelihood have a closed-form posterior, or there are no observations",
+    "exact": "posteriors in closed form, or no observations",
     "ensemble": "log density of at most about 20 dimensions, modes not far apart",
     "nuts": "log density with a gradient; start many chains and check R-hat",
     "mh": "log density without a gradient; start many chains and check R-hat",
     "ancestral3d": "3D denoiser",
     "mvpc": "2D denoiser only",
     "mas": "comparison with the published method; `mvpc` costs the same",
-    "dvae": "prior with an inference network; otherwise it trains one first",
-    "sds": "one plausible motion is enough; it does not sample",
+    "dvae": "priors with an inference network; otherwise it trains one first",
+    "sds": "one plausible motion; it does not sample",
 }
-"""When to take which sampler, from exact to not sampling at all."""
+"""Use of each sampler, from exact to no sampling at all."""
 
 
 def main() -> None:
@@ -69,10 +69,10 @@ def replace_block(text: str, name: str, block: str) -> str:
 
 def problem_table(advices: Iterable[Advice]) -> Iterator[str]:
     """Yield the table of all problems."""
-    yield "| Problem | Metric | Take | On par | On par, with warnings | Worse |"
+    yield "| Problem | Metric | Recommended | On par | On par, with warnings | Worse |"
     yield "|---|---|---|---|---|---|"
     for each in advices:
-        warned = " (not right yet)" if each.recommended.warnings else ""
+        warned = " (with warnings)" if each.recommended.warnings else ""
         cells = [
             f"`{each.problem}`",
             each.metric.partition(",")[0],
@@ -86,7 +86,7 @@ def problem_table(advices: Iterable[Advice]) -> Iterator[str]:
 
 def without_table(advices: Iterable[Advice]) -> Iterator[str]:
     """Yield the table of samplers without draws."""
-    yield "| Problem | Samplers without draws and why |"
+    yield "| Problem | Samplers without draws (reason) |"
     yield "|---|---|"
     for each in advices:
         if each.without_draws:
@@ -104,8 +104,8 @@ def in_brief(standings: Sequence[Standing]) -> str:
 
 
 def advice_table(advices: Mapping[str, Advice]) -> Iterator[str]:
-    """Yield the table that says when to take which sampler."""
-    yield f"| Sampler | Take it for | {' | '.join(f'`{name}`' for name in SHOWN)} |"
+    """Yield the table of samplers and their uses."""
+    yield f"| Sampler | Use for | {' | '.join(f'`{name}`' for name in SHOWN)} |"
     yield "|---" * (2 + len(SHOWN)) + "|"
     results = {name: {s: result(advices[name], s) for s in WHEN} for name in SHOWN}
     best = {name: advices[name].recommended.sampler for name in SHOWN}

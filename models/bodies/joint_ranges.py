@@ -41,7 +41,7 @@ _SAME = {
     "lower_spine": "spine", "chest": "spine", "upper_neck": "neck", "lower_neck": "neck",
     "head": "neck", "nose": "neck", "palm": "wrist", "foot": "ankle",
 }  # fmt: skip
-# Hinges: direction of the human lower limb along Z, and the maximum angle from straight.
+# Hinges: sign of the Z direction in which human limbs bend, and maximum flexion in radians.
 _HINGES: Mapping[str, tuple[float, float]] = {"knee": (-1.0, 2.7), "elbow": (1.0, 2.7)}
 _SIDEWAYS = 0.5
 """Tolerance of a hinge about directions perpendicular to its axis, radians."""
@@ -78,7 +78,7 @@ def range_of(
 def _hinge(
     part: str, animal: bool, above: np.ndarray, below: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    way, far = _HINGES[part]
+    direction, max_flexion = _HINGES[part]
     across = np.cross(above, below)
     # Positive rotations about the axis bend the hinge further; it is straight at −bent.
     bent = float(np.arctan2(np.linalg.norm(across), above @ below))
@@ -86,13 +86,13 @@ def _hinge(
     if bent > _IN_LINE:
         axis = across / np.linalg.norm(across)
     else:
-        axis = np.cross(above, [0.0, 0.0, way])
+        axis = np.cross(above, [0.0, 0.0, direction])
         size = float(np.linalg.norm(axis))
         # For bones along Z the direction is ambiguous: elbows bend upwards.
-        alone = size < _IN_LINE * np.linalg.norm(above)
-        axis = np.array([-way, 0.0, 0.0]) if alone else axis / size
+        ambiguous = size < _IN_LINE * np.linalg.norm(above)
+        axis = np.array([-direction, 0.0, 0.0]) if ambiguous else axis / size
         bent = float(np.arctan2(across @ axis, above @ below))
-        least = -bent - far if animal else -bent
-    ends = np.stack([least * axis, (far - bent) * axis])
-    spare = _SIDEWAYS * np.sqrt(np.maximum(0.0, 1 - axis**2))
-    return ends.min(axis=0) - spare, ends.max(axis=0) + spare
+        least = -bent - max_flexion if animal else -bent
+    ends = np.stack([least * axis, (max_flexion - bent) * axis])
+    tolerance = _SIDEWAYS * np.sqrt(np.maximum(0.0, 1 - axis**2))
+    return ends.min(axis=0) - tolerance, ends.max(axis=0) + tolerance

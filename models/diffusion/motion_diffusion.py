@@ -111,7 +111,7 @@ class MotionDiffusion(TrackNetwork):
             If the file cannot be written.
         """
         if "network" not in self.card:
-            raise ValueError("card must describe a trained network, got a prior without training")
+            raise ValueError("card must describe a trained network, got an untrained prior")
         save_checkpoint(path, Checkpoint(KIND, self.card, self._network.state_dict()), half=half)
 
     def of_length(self, frames: int) -> MotionDiffusion:

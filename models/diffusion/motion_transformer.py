@@ -1,7 +1,7 @@
 """Transformer of the motion diffusion model (MDM, Tevet et al. 2023; used in 2D by MAS).
 
 An encoder over frames with linear maps from and to the 2J coordinates of a frame, one additional
-token for the noise level, and sinusoidal positions.
+token for the noise level, and sinusoidal position embeddings.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["MotionTransformer", "sinusoids"]
 
 
 class MotionTransformer(nn.Module):
-    """(noisy motion, level) → clean motion, in standardised units.
+    """Denoising network: (noisy motion, level) → clean motion, in standardised units.
 
     ``features`` is 2J, the length of a frame, and ``frames`` the maximum L.
     """

@@ -27,7 +27,7 @@ class TransformerSettings:
     frames : int
         Maximum number of frames L.
     layers, width, heads, feedforward : int
-        Size of the encoder; ``width`` is an even multiple of ``heads``.
+        Size of the encoder; ``width`` is even and a multiple of ``heads``.
     """
 
     frames: int = 60
@@ -42,7 +42,7 @@ class TransformerSettings:
             check_count(name, getattr(self, name))
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width must be an even multiple of heads, {self.heads}, got {self.width}"
+                f"width must be even and a multiple of heads={self.heads}, got {self.width}"
             )
 
 

@@ -59,8 +59,9 @@ def denoise_track(
     Raises
     ------
     ValueError
-        If joints or frame rate are not the prior's, no joint is confident, detections are not in
-        metres about the root, a number is out of range, or the noise is above the prior's levels.
+        If joints or frame rate differ from the prior's, no joint is confident, detections are not
+        in metres relative to the root, a number is out of range, or the noise exceeds the prior's
+        highest level.
     """
     check_positive("noise", noise)
     check_count("rounds", rounds)
@@ -88,17 +89,17 @@ def denoise_track(
 def _shrunk_towards(
     clean: np.ndarray, seen: np.ndarray, visible: np.ndarray, sigma: float
 ) -> np.ndarray:
-    """Return the estimate, moved towards detections where it deviates more than they can.
+    """Return the estimate, moved towards detections where it deviates by more than σ.
 
-    The posterior mean deviates from a detection by less than σ in mean square: by σ² − v, with v
-    the posterior variance. A larger mean square deviation r² shows an error of the network. If this
-    error were independent, it would be r² − σ², and σ²/r² the best weight of the estimate.
+    The mean square deviation of the posterior mean from a detection is σ² − v, with v the posterior
+    variance. A value r² above σ² indicates an error of the network. If this error were independent,
+    its variance would be r² − σ², and the optimal weight of the estimate σ²/r².
     """
-    off = np.where(visible[..., None], seen - clean, 0.0)
+    deviation = np.where(visible[..., None], seen - clean, 0.0)
     count = 2 * np.maximum(visible.sum(axis=0), 1)
-    squares = (off**2).sum(axis=(0, 2)) / count
+    squares = (deviation**2).sum(axis=(0, 2)) / count
     weight = sigma**2 / np.maximum(squares, sigma**2)
-    return np.where(visible[..., None], seen - weight[:, None] * off, clean)
+    return np.where(visible[..., None], seen - weight[:, None] * deviation, clean)
 
 
 def _denoise(prior: MotionDiffusion, keypoints: np.ndarray, sigma: float) -> np.ndarray:
@@ -145,6 +146,6 @@ def _check_track(
     distance = math.sqrt(((track.keypoints - prior.standards.mean)[visible] ** 2).mean())
     if distance > _FARTHEST * prior.scale:
         raise ValueError(
-            f"{name} must be in metres about the root, at most {_FARTHEST * prior.scale:.3g} m in "
-            f"root mean square, got {distance:.3g}"
+            f"{name} must be in metres relative to the root, at most "
+            f"{_FARTHEST * prior.scale:.3g} m in root mean square, got {distance:.3g}"
         )

@@ -1,4 +1,4 @@
-"""Training of the denoiser from noisy joints only (B, C, E.2)."""
+"""Training of the denoiser from noisy joints only (Motion-DVAE, appendices B, C and E.2)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class DenoiserTrainee(WindowTrainee):
     validation : sequence of Motion
         Held-out clips.
     prior : MotionDVAE
-        The prior.
+        Trained motion prior.
     noise : JointNoise
         Corruption model.
     latent_weight : float

@@ -61,7 +61,7 @@ def rollout(
 ) -> Rollout:
     """Draw z_{1:T} from q given x₀ (``initial``, (B, D)), or from p without an inference model.
 
-    ``noise`` (B, T, Z) are the standard normal numbers of the draws; 0 for the means.
+    ``noise`` (B, T, Z) contains standard normal draws; zeros yield the means.
     """
     states = [generative.start(initial)]
     latents = []

@@ -20,7 +20,7 @@ __all__ = ["EvaluatorTrainee"]
 
 
 class EvaluatorTrainee(TrackTrainee):
-    """Trainee of an evaluator.
+    """Loss and data for :func:`~probmotion.models.training.trainer.train` of an evaluator.
 
     The loss is the mean squared error in standardised units over visible joints, plus ``kl_weight``
     times the mean divergence of the latents from N(0, I). Parameters are those of

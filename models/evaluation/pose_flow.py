@@ -2,8 +2,8 @@
 
 Pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR 2022). Joints are so
 strongly correlated that a flow over their coordinates is almost singular. As in the paper, the flow
-acts on the leading principal components; unlike there, the remaining ones are Gaussian, so that the
-density covers all coordinates.
+acts on the leading principal components; unlike in the paper, the remaining ones are Gaussian, so
+that the density covers all coordinates.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class FlowSettings:
         if not 0 < self.share <= 1:
             raise ValueError(f"share must be above 0 and at most 1, got {self.share}")
         if not 0 <= self.blur < math.inf:
-            raise ValueError(f"blur must be a number of at least 0, got {self.blur}")
+            raise ValueError(f"blur must be finite and at least 0, got {self.blur}")
 
     @classmethod
     def tiny(cls) -> FlowSettings:

@@ -65,9 +65,9 @@ class EvaluatorSettings(TransformerSettings):
 
 
 class TrackEncoder(nn.Module):
-    """Standardised motion → mean and log variance of its latent.
+    """Encoder: standardised motion → mean and log variance of its latent.
 
-    Two learnt tokens precede the frames; their outputs give mean and log variance (ACTOR).
+    Two learnt tokens precede the frames; mean and log variance are linear in their outputs (ACTOR).
     """
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
@@ -93,7 +93,10 @@ class TrackEncoder(nn.Module):
 
 
 class TrackDecoder(nn.Module):
-    """Latent → standardised motion; every frame is the latent plus a positional embedding."""
+    """Decoder: latent → standardised motion.
+
+    The input token of every frame is the embedded latent plus a positional embedding.
+    """
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
         super().__init__()
@@ -110,7 +113,7 @@ class TrackDecoder(nn.Module):
 
 
 class TrackAutoencoder(nn.Module):
-    """Encoder and decoder."""
+    """Variational autoencoder: encoder and decoder of standardised motions."""
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
         super().__init__()

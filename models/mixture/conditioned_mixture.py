@@ -65,8 +65,8 @@ class ConditionedMixture:
         """Return p(X | y); raise ``NotConjugate`` if a second likelihood is given."""
         if likelihood is not None:
             raise NotConjugate(
-                "likelihood must be None, the prior already includes one; condition the prior on "
-                "all observations at once"
+                "likelihood must be None for a prior that is already conditioned, got "
+                f"{type(likelihood).__name__}; condition the prior on all observations at once"
             )
         return self._posterior
 

@@ -148,7 +148,7 @@ class Study:
         """The problem that samplers draw from."""
         return Problem(
             "walks",
-            "people who walk, a prior learnt from 2D tracks alone: generation",
+            "walking people, diffusion prior learnt from 2D tracks alone: generation",
             MotionPosterior(self.prior),
             generation=replace(self.reference, held_out_views=self.views("test", 400)),
         )

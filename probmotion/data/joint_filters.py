@@ -167,8 +167,8 @@ def fit_acceleration(
     _Problem.of(joints, confidence, noise, fps, 1.0)  # validates the input
 
     def cost(exponent: float, one: slice) -> float:
-        given = {"noise": noise, "fps": fps, "acceleration": 10.0**exponent}
-        return -float(log_marginal_likelihood(joints[:, one], confidence[:, one], **given)[0])
+        problem = _Problem.of(joints[:, one], confidence[:, one], noise, fps, 10.0**exponent)
+        return -float(_forward(problem).log_marginal_likelihood[0])
 
     bounds = (math.log10(_LEAST), math.log10(_MOST))
     slices = [slice(joint, joint + 1) for joint in range(joints.shape[1])]
@@ -270,19 +270,10 @@ def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
 
 
 def filled_between(joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the joints with missing entries interpolated over time and held at the ends.
+    """Return joints (L, J, 3) with linear interpolation over time and constant extrapolation.
 
-    Parameters
-    ----------
-    joints : ndarray, (L, J, 3)
-        Metres; unobserved entries are ignored and may be NaN.
-    seen : ndarray of bool, (L, J)
-        Whether an entry is observed.
-
-    Raises
-    ------
-    ValueError
-        If a joint is never observed, or an observed entry is not finite.
+    Entries that are not ``seen`` (L, J) are replaced. Raises ``ValueError`` if a joint is never
+    observed, or an observed entry is not finite.
     """
     seen = np.asarray(seen, dtype=bool)
     joints = _seen_joints(joints, seen, "seen")

@@ -67,8 +67,8 @@ def describe_dance_frames(motion: Motion) -> str:
 
     An excluded frame is counted once, under the first reason that applies.
     """
-    opening, apart, glitch = _excluded_frames(motion, _MOST_APART, _FASTEST)
-    counts = opening.sum(), (apart & ~opening).sum(), (glitch & ~apart & ~opening).sum()
+    opening, distant, glitch = _excluded_frames(motion, _MOST_APART, _FASTEST)
+    counts = opening.sum(), (distant & ~opening).sum(), (glitch & ~distant & ~opening).sum()
     return (
         f"{motion.name or 'the motion'}: {motion.frames - sum(counts)} of {motion.frames} frames "
         f"are dance; excluded are {counts[0]} of the opening, {counts[1]} with partners over "
@@ -199,9 +199,11 @@ def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
             f"{odd[0]:.3g}; positions are in metres"
         )
     roots = pose[list(skeleton.roots)]
-    apart = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
-    if apart > _FARTHEST:
-        raise ValueError(f"people in {name} must be at most {_FARTHEST:g} m apart, got {apart:.3g}")
+    distance = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
+    if distance > _FARTHEST:
+        raise ValueError(
+            f"people in {name} must be at most {_FARTHEST:g} m apart, got {distance:.3g}"
+        )
 
 
 def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
@@ -258,13 +260,13 @@ def _excluded_frames(motion: Motion, farthest: float, fastest: float) -> np.ndar
         raise ValueError(f"motion must have at least 2 people, got {motion}")
     distances = np.linalg.norm(roots[:, :, None] - roots[:, None], axis=-1)
     distances += np.where(np.eye(roots.shape[1]), np.inf, 0.0)
-    apart = distances.min(axis=-1).max(axis=-1) > farthest
-    near = np.flatnonzero(~apart)
-    opening = np.arange(motion.frames) < (near[0] if len(near) else motion.frames)
+    distant = distances.min(axis=-1).max(axis=-1) > farthest
+    close = np.flatnonzero(~distant)
+    opening = np.arange(motion.frames) < (close[0] if len(close) else motion.frames)
     step = np.linalg.norm(np.diff(motion.positions, axis=0), axis=-1).max(axis=-1)
     fast = step * motion.fps > fastest
     glitch = np.append(fast, False) | np.append(False, fast)
-    return np.stack([opening, apart, glitch])
+    return np.stack([opening, distant, glitch])
 
 
 def _height(positions: np.ndarray, skeleton: Skeleton, root: int) -> np.ndarray:

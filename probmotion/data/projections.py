@@ -38,11 +38,6 @@ class DetectorNoise:
         Mean duration of a loss, frames, at least 1.
     silent : float
         Fraction of lost joints that are not reported (NaN with confidence 0), in [0, 1].
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
     """
 
     found: float = 0.01
@@ -118,11 +113,6 @@ class Filming:
         distance.
     centre : {"frame", "sequence"}
         Whether the root is at the origin in every frame or on average.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range or ``centre`` unknown.
     """
 
     elevation: float = math.pi / 16
@@ -169,10 +159,8 @@ def project_clips(
         Cameras per clip, each at a random azimuth and elevation.
     seed : int
         Seed of cameras and errors; the tracks of a clip do not depend on other clips.
-    filming : Filming, optional
-        Camera placement.
-    noise : DetectorNoise, optional
-        Detector.
+    filming, noise : optional
+        Camera placement, and error model of the detector.
 
     Returns
     -------

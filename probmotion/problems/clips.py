@@ -18,7 +18,6 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["CLIP_PROBLEMS", "clips_problem"]
 
 _WINDOWS = 1000
-_TRIALS = 10
 _HELD_OUT = "cmu_02_02"
 
 
@@ -124,12 +123,11 @@ def _check_distinct(motions: Sequence[Motion]) -> None:
 
 
 def _index(motions: Sequence[Motion], held_out: int | str) -> int:
-    names = [motion.name for motion in motions]
     if isinstance(held_out, str):
+        names = [motion.name for motion in motions]
         if names.count(held_out) != 1:
-            raise ValueError(
-                f"held_out must name exactly one of {', '.join(names)}, got {held_out!r}"
-            )
+            known = ", ".join(names)
+            raise ValueError(f"held_out must name exactly one of {known}, got {held_out!r}")
         return names.index(held_out)
     if not -len(motions) <= held_out < len(motions):
         raise ValueError(f"held_out must be an index into the {len(motions)} clips, got {held_out}")
@@ -165,7 +163,7 @@ def _description(
 
 def _cmu_problem(name: str, description: str, observe: str) -> Problem:
     """Return a problem on ten clips of CMU subject 02."""
-    clips = [cmu_clip(f"cmu_02_{trial:02}") for trial in range(1, _TRIALS + 1)]
+    clips = [cmu_clip(f"cmu_02_{trial:02}") for trial in range(1, 11)]
     problem = clips_problem(clips, observe=observe, held_out=_HELD_OUT, name=name)
     return replace(problem, description=description)
 

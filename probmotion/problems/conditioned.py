@@ -23,12 +23,9 @@ class Conditions(Protocol):
 def conditioned(posterior: MotionPosterior) -> MotionPosterior:
     """Return the same distribution with the observations absorbed into the prior.
 
-    Raises
-    ------
-    ValueError
-        If there are observations and the prior is neither a Gaussian mixture nor has ``given``.
-    NotConjugate
-        If a mixture's likelihood is not linear in the positions with Gaussian noise.
+    Raises ``ValueError`` if there are observations and the prior is neither a Gaussian mixture nor
+    has ``given``; ``NotConjugate`` if a mixture's likelihood is not linear in the positions with
+    Gaussian noise.
     """
     prior, likelihood = posterior.prior, posterior.likelihood
     if likelihood is None:

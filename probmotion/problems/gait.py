@@ -51,11 +51,10 @@ Observed = Literal["nothing", "keypoints", "one frame", "joints"]
 
 @dataclass(frozen=True)
 class GaitProblem:
-    """Factory of a gait problem.
+    """Factory of a gait problem with the default parameters ``defaults``.
 
     ``observes``: 2D keypoints of one camera in all frames or the middle one, or 3D joints with
-    Student-t noise of 3 degrees of freedom; ``defaults``: parameters of the problem with their
-    defaults.
+    Student-t noise of 3 degrees of freedom.
     """
 
     name: str
@@ -97,15 +96,14 @@ class GaitProblem:
 def _prior(
     quadruped: bool, frames: int, components: int, coordinates: Coordinates
 ) -> GaussianMixtureMotion:
-    weights_by_style = _QUADRUPEDS if quadruped else _PEOPLE
     check_count("components", components)
-    K = len(weights_by_style)
+    fitted = _fitted(quadruped, frames)
+    K = len(fitted.styles)
     if components > K and components % K:
         raise ValueError(
             f"components must be at most {K}, the number of styles, or a multiple of it, got "
             f"{components}"
         )
-    fitted = _fitted(quadruped, frames)
     n_styles, azimuths = min(components, K), max(1, components // K)
     if (n_styles, azimuths, coordinates) == (K, fitted.azimuths, fitted.coordinates):
         return fitted

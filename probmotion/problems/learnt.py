@@ -72,19 +72,19 @@ LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
         (
             learnt_problem,
             "walk2d",
-            "people who walk, a prior learnt from 2D tracks alone: generation",
+            "walking people, diffusion prior learnt from 2D tracks alone: generation",
             "MotionDiffusion",
         ),
         (
             learnt_problem,
             "walk-vae",
-            "people who walk, a motion VAE learnt from 2D tracks alone: generation",
+            "walking people, motion VAE learnt from 2D tracks alone: generation",
             "MotionVAE",
         ),
         (
             learnt_problem,
             "animal-vae",
-            "four-legged animals, a motion VAE learnt from 2D tracks alone: generation",
+            "four-legged animals, motion VAE learnt from 2D tracks alone: generation",
             "MotionVAE",
         ),
         (

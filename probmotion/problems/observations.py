@@ -29,13 +29,8 @@ _SPARSE_JOINTS = 6
 def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | None:
     """Return noisy keypoints of ``motion`` in one orthographic camera 15° above the horizon.
 
-    ``how`` is a name of :data:`OBSERVATIONS`; ``noise`` is a standard deviation in metres, with one
-    image unit per metre.
-
-    Raises
-    ------
-    ValueError
-        If ``how`` is unknown.
+    ``how`` is a name of :data:`OBSERVATIONS`, else a ``ValueError``; ``noise`` is a standard
+    deviation in metres, with one image unit per metre.
     """
     if how not in OBSERVATIONS:
         raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {how!r}")

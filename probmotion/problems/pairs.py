@@ -1,7 +1,7 @@
 """Problems on close interaction: annotated 2D pairs and one 3D seed.
 
 There is no exact posterior. Runs are scored by how well their draws cover the 3D pose pairs of
-held-out clips, from which neither annotations nor seed are taken.
+held-out clips. Annotations and the seed are from the other clips.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def pairs_problem(
     held_out : sequence of str
         Names of the held-out clips.
     n_annotations : int
-        Number of annotated frames, limited by the available ones.
+        Maximum number of annotated frames.
     n_held_out : int
         Number of evenly spaced pose pairs of the held-out clips to cover.
     settings : PairSettings, optional
@@ -49,12 +49,7 @@ def pairs_problem(
     seed : int
         Seed of frames, views and the likelihood's views.
     name, description : str
-        Name in tables, and a sentence.
-
-    Raises
-    ------
-    ValueError
-        If no clip is left or held out, or a clip has another skeleton.
+        Name and description of the problem in tables.
     """
     # Import compiled code lazily.
     from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth, hold_out
@@ -66,10 +61,10 @@ def pairs_problem(
     poses, test_poses = ground_truth(training)[0], ground_truth(test)[0]
     n = min(n_annotations, len(poses))
     annotations = draw_annotations(training, n, seed, frames=frames).annotations
-    first = poses[choose_seed(poses)]
-    posterior = pair_posterior(first, annotations, settings, fps=training[0].fps, view_seed=seed)
+    pose = poses[choose_seed(poses)]
+    posterior = pair_posterior(pose, annotations, settings, fps=training[0].fps, view_seed=seed)
     covered, _, _ = ground_truth(test, min(n_held_out, len(test_poses)))
-    return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=first[None])
+    return Problem(name, description, posterior, held_out=covered[:, None], aligned_to=pose[None])
 
 
 _DANCE = "two synthetic dancers, 300 annotated 2D pairs and one 3D seed: coverage"
@@ -105,7 +100,7 @@ def _salsa(name: str, description: str, paper: bool = False) -> Problem:
     )
 
 
-_PAPER = "the same with a density that is cut at 100 times the seed's, as published"
+_PAPER = "salsa-pairs with the density truncated at 100 times the seed's, as published"
 
 PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
     "dance-pairs": (_DANCE, _dance),

@@ -42,10 +42,10 @@ _MARKERS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """Missing draws of a sampler on a problem.
+    """Outcome of a sampler on a problem: seeds without draws, and the reason.
 
-    ``word`` and ``sentences`` are the reason, ``note`` the id of its note, and ``failed`` the
-    number of seeds without draws.
+    ``word`` and ``sentences`` are the short and the long reason, ``note`` the id of its note, and
+    ``failed`` the number of ``seeds`` without draws.
     """
 
     word: str = ""
@@ -101,7 +101,7 @@ def overview(plan: Plan, table: pd.DataFrame, outcomes: Mapping[str, Mapping[str
 def problem_tables(
     table: pd.DataFrame, problem: str, samplers: Sequence[str], outcomes: Mapping[str, Outcome]
 ) -> str:
-    """Return the tables of one problem as HTML, with further metrics in a folded one."""
+    """Return the tables of one problem as HTML, with further metrics in a collapsed table."""
     rows = table[(table["problem"] == problem) & ~table["metric"].isin(_FAILURES)]
     values = seed_values(rows)
     measured = list(dict.fromkeys(str(name) for name in rows["metric"]))
@@ -137,10 +137,10 @@ def _table(
     body = []
     for place, sampler in enumerate(samplers):
         outcome = outcomes[sampler]
-        some = f" ({outcome.seeds - outcome.failed} of {outcome.seeds} seeds; {outcome.link()})"
+        partial = f" ({outcome.seeds - outcome.failed} of {outcome.seeds} seeds; {outcome.link()})"
         name = (
             f'<th scope="row" data-value="{escape(sampler)}">{_name(place, sampler)}'
-            f"{some if 0 < outcome.failed < outcome.seeds else ''}</th>"
+            f"{partial if 0 < outcome.failed < outcome.seeds else ''}</th>"
         )
         if outcome.failed == outcome.seeds:
             entries = f'<td class="failed" colspan="{len(headings)}">{outcome.link()}</td>'

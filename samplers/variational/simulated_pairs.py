@@ -50,8 +50,8 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
     if freedom is not None and freedom <= 2:
         raise UnsupportedPosterior(
             "dvae",
-            "trains on simulated observations and needs more than 2 degrees of freedom of the "
-            f"noise, got {freedom:g}",
+            "requires noise with more than 2 degrees of freedom to train on simulated "
+            f"observations, got {freedom:g}",
             word="outliers",
         )
     if hasattr(likelihood, "keypoints"):
@@ -66,7 +66,7 @@ def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
 
 
 def simulate_pairs(posterior: MotionPosterior, seed: int, n: int) -> Iterator[SimulatedPairs]:
-    """Yield n pairs in chunks, to limit the memory."""
+    """Yield n pairs in chunks, to limit memory use."""
     prior, likelihood = posterior.prior, posterior.likelihood
     assert isinstance(prior, Samplable)
     observed_entries(likelihood, posterior.frames)
@@ -142,7 +142,7 @@ class MotionCoordinates:
     gain : ndarray, (L, M, 3J)
         Regression of the remainder on the unexplained observations.
     root : ndarray, (L, 3J, 3J)
-        Root of the covariance of the remainder.
+        Square root of the covariance of the remainder.
     """
 
     linear: np.ndarray
@@ -153,7 +153,7 @@ class MotionCoordinates:
 
     @classmethod
     def learn(cls, pairs: SimulatedPairs, y: np.ndarray, most: int) -> MotionCoordinates:
-        """Fit to n pairs with observation coordinates y, (n, E), and at most ``most`` x."""
+        """Fit at most ``most`` coordinates x to n pairs with observation coordinates y, (n, E)."""
         n, L = pairs.observed.shape[:2]
         flat = pairs.positions.reshape(n, -1)
         linear = np.linalg.lstsq(_with_one(y), flat, rcond=None)[0]
@@ -185,7 +185,7 @@ class MotionCoordinates:
         """Return flattened motions with a random remainder, (B, D), metres.
 
         Motions have coordinates ``x``, (B, C), and observations ``observed``, (L, M), with
-        coordinates ``y``, (B, E); ``normal``, (B, L, 3J), are standard normal numbers.
+        coordinates ``y``, (B, E); ``normal``, (B, L, 3J), are standard normal draws.
         """
         explained = _with_one(y, x) @ self.explained
         unexplained = observed - explained.reshape(len(x), *observed.shape)

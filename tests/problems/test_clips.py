@@ -11,7 +11,6 @@ from probmotion import Motion
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import load_all
 from probmotion.problems import clips_problem, load_problem
-from probmotion.problems.clips import CLIP_PROBLEMS
 
 SMALL = {"frames": 10, "rank": 3, "styles": 2}
 
@@ -120,10 +119,3 @@ def test_cmu_problems_are_exact(real_data):
         for drawn in (prior.sample(np.random.default_rng(0), 50), problem.reference(0, 50))
     )
     assert error < 0.6 * prior_error
-
-
-def test_missing_cmu_clips_error_explains_the_download(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match="clip cmu_02_01 is not in"):
-        CLIP_PROBLEMS["cmu"][1]()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, MotionPosterior, compare, models
-from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.data.projections import centre_motion
 from probmotion.data.synthetic.animals import animal_clips, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gaits
@@ -113,18 +112,6 @@ def test_compare_works_without_downloads(tmp_path):
     assert "2D views against real" in text
     assert "FID: Fréchet distance" in text
     assert "nuts on walk2d: nuts needs a prior with HasLogDensity" in text
-
-
-def test_fingerprint_depends_on_weights(problem):
-    prior = problem.posterior.prior
-    before = fingerprint(prior)
-    prior.denoise(np.zeros((1, 2, 40, 14, 2)), 0.5, None)
-    assert fingerprint(prior) == before
-    other = models.MotionDiffusion.load("walk2d")
-    assert fingerprint(other) == before
-    assert fingerprint(other.of_length(20)) != before
-    next(other._network.parameters()).data[0, 0] += 1
-    assert fingerprint(other) != before
 
 
 def test_observations_of_travelling_motion_are_rejected(problem):

@@ -196,9 +196,9 @@ def bent_limb(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle joint and the end of a limb that reaches from ``start`` for ``target``.
 
-    Points are (…, 3), metres; ``lengths`` are those of the upper and the lower bone, which are met
-    exactly; ``pole`` is the direction of the elbow or knee, whose component along the limb is
-    ignored. The end lies on the line to the target; targets out of reach are approached smoothly.
+    Points are (…, 3), metres. The upper and the lower bone have exactly the given ``lengths``;
+    ``pole`` is the direction of the elbow or knee, whose component along the limb is ignored. The
+    end lies on the line to the target; targets out of reach are approached smoothly.
     """
     upper, lower = lengths
     farthest = _STRAIGHTEST * (upper + lower)

@@ -81,13 +81,13 @@ def make_gaits(
     """
     check_count("n", n)
     weights = {"walk": 0.5, "run": 0.3, "march": 0.2} if styles is None else dict(styles)
-    total = sum(weights.values())
-    clips = []
     for style, weight in weights.items():
         check_positive(f"styles[{style!r}]", weight)
-        for number in range(round(n * weight / total)):
-            clips.append(make_gait(style, number, frames=frames, fps=fps, seed=seed))
-    return clips
+    return [
+        make_gait(style, number, frames=frames, fps=fps, seed=seed)
+        for style, weight in weights.items()
+        for number in range(round(n * weight / sum(weights.values())))
+    ]
 
 
 def make_gait(
@@ -172,17 +172,17 @@ def _person(
     face = _in_plane(-np.sin(tilt), np.cos(tilt))
     joints["nose"] = joints["neck"] + 0.12 * nod + 0.06 * face
     joints["head"] = joints["nose"] + 0.13 * nod - 0.06 * face
-    for side, sign, own in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
-        hip = draw["stride"] * np.sin(own) + 0.15 * draw["lift"] * _flexion(own, 0.6) + stray()
-        knee = 0.12 + 0.75 * draw["lift"] * _flexion(own, -0.35) + stray()
+    for side, sign, angle in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
+        hip = draw["stride"] * np.sin(angle) + 0.15 * draw["lift"] * _flexion(angle, 0.6) + stray()
+        knee = 0.12 + 0.75 * draw["lift"] * _flexion(angle, -0.35) + stray()
         joints[f"{side}_hip"] = pelvis + sign * 0.11 * _across(sway * np.sin(phase), lean)
         joints[f"{side}_knee"] = joints[f"{side}_hip"] + 0.43 * _direction(hip)
         joints[f"{side}_ankle"] = joints[f"{side}_knee"] + 0.42 * _direction(hip - knee)
-        arm = -draw["swing"] * np.sin(own) + 0.5 * lean + stray()
+        arm = -draw["swing"] * np.sin(angle) + 0.5 * lean + stray()
         shoulder = joints["neck"] - 0.04 * up + sign * 0.17 * _across(-sway * np.sin(phase), lean)
         out = np.array([0.15 * sign, 0.0, 0.0])
         upper = _unit(_direction(arm) + out)
-        elbow = draw["bend"] + 0.3 * draw["swing"] * np.cos(own) + stray()
+        elbow = draw["bend"] + 0.3 * draw["swing"] * np.cos(angle) + stray()
         fore = _unit(_direction(arm + elbow) + 0.3 * out)
         joints[f"{side}_shoulder"] = shoulder
         joints[f"{side}_elbow"] = shoulder + 0.29 * upper
@@ -215,9 +215,9 @@ def _quadruped(
             (tail, "hip", "knee", "back_paw", hind, 0.1),
             (neck, "shoulder", "elbow", "front_paw", fore, -0.1),
         ):
-            own = phase + 2 * np.pi * offset
-            upper = draw["stride"] * np.sin(own) + 3.0 * start * draw["bend"] + stray()
-            knee = 0.55 * draw["lift"] * _flexion(own, -0.35) + 4.0 * start * draw["bend"]
+            angle = phase + 2 * np.pi * offset
+            upper = draw["stride"] * np.sin(angle) + 3.0 * start * draw["bend"] + stray()
+            knee = 0.55 * draw["lift"] * _flexion(angle, -0.35) + 4.0 * start * draw["bend"]
             lower = upper - knee + stray()
             joints[f"{side}_{first}"] = root + out - np.array([0.0, 0.1, 0.4 * start])
             joints[f"{side}_{second}"] = joints[f"{side}_{first}"] + 0.25 * _direction(upper)

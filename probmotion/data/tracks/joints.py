@@ -17,10 +17,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["nearest_object", "retarget_track", "with_joint", "with_midpoint"]
 
-_MIDPOINTS = {
-    "pelvis": ("left_hip", "right_hip"),
-    "neck": ("left_shoulder", "right_shoulder"),
-}
+_MIDPOINTS = {"pelvis": ("left_hip", "right_hip"), "neck": ("left_shoulder", "right_shoulder")}
 
 
 def with_joint(

@@ -149,10 +149,10 @@ def _retargeted(tracks: Sequence[KeypointTrack], skeleton: Skeleton) -> Step:
     try:
         retargeted = [retarget_track(track, skeleton, derive=True) for track in tracks]
     except ValueError as error:
-        own = ", ".join(tracks[0].skeleton.joint_names)
+        names = ", ".join(tracks[0].skeleton.joint_names)
         raise ValueError(
-            f"tracks of {own} cannot be retargeted: {error}; pass a skeleton with these joints, or "
-            "None (own on the command line)"
+            f"tracks of {names} cannot be retargeted: {error}; pass a skeleton with these joints, "
+            "or None (own on the command line)"
         ) from error
     why = f"retargeted to the {skeleton.n_joints} joints {skeleton.joint_names[0]}, …"
     return retargeted, StepReport.of("joints", tracks, retargeted, why)

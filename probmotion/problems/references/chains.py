@@ -18,23 +18,16 @@ _SECONDS = 30.0
 
 
 class StoredChain:
-    """Periodic, atomic checkpoint of a chain's state.
+    """Periodic, atomic checkpoint of a chain's state in ``path``, an ``.npz`` file without pickle.
 
-    Resuming reproduces the draws bit by bit, whenever the state was written. ``path`` is an
-    ``.npz`` file without pickle; by default nothing is written.
+    Resuming reproduces the draws bit by bit. Without a path nothing is written.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path, self._written = path, time.monotonic()
 
     def load(self) -> Mapping[str, np.ndarray] | None:
-        """Return the last state written, or None.
-
-        Raises
-        ------
-        ValueError
-            If the file is not readable.
-        """
+        """Return the last state written, or None; ``ValueError`` if the file is damaged."""
         if self.path is None or not self.path.is_file():
             return None
         try:

@@ -1,10 +1,9 @@
 """`make_reference`: certified reference draws from two independent runs.
 
 Each run has four chains. The draws are accepted only if both runs have mixed and agree, in world
-coordinates and after rigid alignment, because large translations can hide poses that do not mix.
-If the prior starts chains at few seeds, modes that no chain reached remain undetected; the
-certificate records the number of seeds. Exact posteriors give two sets of exact draws, tested in
-the same way.
+coordinates and after rigid alignment, because large translations can mask poor mixing of poses.
+If chains start at few seeds, modes that no chain reached remain undetected; the certificate records
+the number of seeds. For exact posteriors, two sets of exact draws are tested in the same way.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _PROBES = 4
 _DIRECTIONS = 128
 _SPREADS, _RATIO = 5.0, 1.5
 _LEVEL = 1e-3
-_STILL = 1e-9
+_CONSTANT = 1e-9
 
 
 class ReferenceRefused(ValueError):  # noqa: N818
@@ -75,10 +74,8 @@ def make_reference(
     progress : bool
         Show progress bars.
     sampler : Sampler, optional
-        Sampler for posteriors that are not exact. By default
-        :class:`~probmotion.problems.references.outlier_gibbs.OutlierGibbs` or
-        :class:`~probmotion.problems.references.tempered_pairs.TemperedPairs` where suitable, else
-        NUTS with a long warm-up, or a random walk without gradients.
+        Sampler for posteriors that are not exact; by default ``OutlierGibbs`` or ``TemperedPairs``
+        where suitable, else NUTS with a long warm-up, or a random walk without gradients.
     unfinished : str or Path, optional
         Folder for finished runs and the state of tempered chains, from which the same call
         resumes; the caller deletes it. By default nothing is written.
@@ -90,7 +87,7 @@ def make_reference(
     ReferenceRefused
         If R-hat exceeds 1.01 or the runs disagree.
     OSError
-        If ``unfinished`` is not writable; later write errors only warn.
+        If ``unfinished`` is not writable; later write errors are issued as warnings.
     """
     check_count("draws", draws, least=8 * _CHAINS)
     if draws % (2 * _CHAINS):
@@ -132,9 +129,8 @@ def _run(
     progress: bool,
     unfinished: Path | None,
 ) -> MotionDraws:
-    options: dict[str, Any] = (
-        {"unfinished": unfinished} if isinstance(sampler, TemperedPairs) else {}
-    )
+    resumable = isinstance(sampler, TemperedPairs)
+    options: dict[str, Any] = {"unfinished": unfinished} if resumable else {}
     return sampler.sample(
         problem.posterior,
         draws=n // _CHAINS,
@@ -148,12 +144,12 @@ def _run(
 def _cached_run(
     folder: Path, half: int, key: list[Any], make: Callable[[Path], MotionDraws]
 ) -> MotionDraws:
-    """Load a finished run, or make and store it; file errors only warn.
+    """Load a finished run, or make and store it; file errors are issued as warnings.
 
     The file name contains a hash of everything that determines the run.
     """
-    text = json.dumps([*key, library_versions()])
-    path = folder / f"run-{half}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.nc"
+    digest = hashlib.sha256(json.dumps([*key, library_versions()]).encode()).hexdigest()
+    path = folder / f"run-{half}-{digest[:16]}.nc"
     if path.is_file():
         try:
             return MotionDraws.load(path)
@@ -189,11 +185,12 @@ def certify(
             diagnostics.append(chain_diagnostics(run, principal_coordinates(flat)))
     elif not _is_rigid(problem):
         raise ReferenceRefused(
-            f"runs on {problem.name} must contain more than one motion up to rigid motion"
+            f"runs on {problem.name} must contain motions that differ by more than a rigid "
+            "motion, got none"
         )
     names = (problem.name, f"{problem.name} after alignment")
     rhats = [each["rhat"] for each in diagnostics if "rhat" in each]
-    # The negation also refuses NaN.
+    # The negation also rejects NaN.
     for number, rhat in enumerate(rhats):
         if not rhat <= _RHAT:
             raise ReferenceRefused(
@@ -202,17 +199,18 @@ def certify(
             )
     agreed = _agreed(names[0], world, seed)
     agreed_after_alignment = _agreed(names[1], aligned, seed) if deforms else None
-    positions = np.concatenate([_evenly(run, draws) for run in runs]).astype(np.float32)
-    first = runs[0].dataset.attrs
+    positions = np.concatenate([_thinned(run, draws) for run in runs]).astype(np.float32)
+    attributes, prior = runs[0].dataset.attrs, problem.posterior.prior
     certificate: dict[str, Any] = {
         "problem": problem.name,
         "draws": len(positions),
         "exact": problem.exact_source is not None,
-        "sampler": first["sampler"],
-        "settings": json.loads(first["settings"]),
+        "sampler": attributes["sampler"],
+        "settings": json.loads(attributes["settings"]),
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
-        "seeds": _n_seeds(problem),
+        # None if chains start at draws from the prior.
+        "seeds": len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None,
         "rhat": max(rhats, default=None),
         "ess_bulk": _least(diagnostics, "ess_bulk"),
         "ess_tail": _least(diagnostics, "ess_tail"),
@@ -239,7 +237,7 @@ def _agreed(name: str, runs: list[np.ndarray], seed: int) -> dict[str, float]:
 
 def _alike(aligned: list[np.ndarray]) -> bool:
     flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in aligned])
-    return bool(np.ptp(flat, axis=0).max() < _STILL)
+    return bool(np.ptp(flat, axis=0).max() < _CONSTANT)
 
 
 def _is_rigid(problem: Problem) -> bool:
@@ -254,13 +252,7 @@ def _is_rigid(problem: Problem) -> bool:
     return _alike([align_motions(positions, positions[0])])
 
 
-def _n_seeds(problem: Problem) -> int | None:
-    """Return the number of starting points; None if chains start at draws from the prior."""
-    prior = problem.posterior.prior
-    return len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None
-
-
-def _evenly(run: MotionDraws, draws: int | None) -> np.ndarray:
+def _thinned(run: MotionDraws, draws: int | None) -> np.ndarray:
     positions = run.dataset["positions"].values
     available = positions.shape[1]
     n = available if draws is None else draws // (2 * len(positions))
@@ -276,7 +268,8 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     - ``mean_z``: largest difference of means in standard errors from the effective sample sizes;
       ``mean_z_at_most`` is exceeded with probability .001 by equal distributions
 
-    Takes positions (chain, draw, L, J, 3) of equal shape, metres, and the seed of the projections.
+    Both runs are positions (chain, draw, L, J, 3) of equal shape, metres; ``seed`` is that of the
+    projections.
     """
     from scipy.stats import norm
 
@@ -288,7 +281,7 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     halves = [_sliced_distance(projected, chosen) for chosen in _mixed_halves(chains)]
     floor = float(np.mean(halves))
     # Skip constant coordinates, such as those of a centred root.
-    varies = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _STILL
+    varies = np.concatenate([run.reshape(-1, dim) for run in runs]).std(axis=0) > _CONSTANT
     z = _z_scores(*(run[..., varies] for run in runs))
     return {
         "swd_ratio": _sliced_distance(projected, tuple(range(chains))) / floor,
@@ -299,7 +292,7 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
 
 
 def _mixed_halves(chains: int) -> list[tuple[int, ...]]:
-    """Return halves that contain equally many chains of both runs, one of each pair."""
+    """Return halves with equal numbers of chains of both runs, one of each complementary pair."""
     halves = list(combinations(range(chains), chains // 2))
     return [(*a, *(chains + i for i in b)) for a in halves for b in halves if 0 in a]
 

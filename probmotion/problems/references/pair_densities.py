@@ -54,7 +54,7 @@ class Physics(NamedTuple):
 class ViewAnnotations(NamedTuple):
     """Parameters of eqs. 6 to 9: views, nearby annotations, and their comparison.
 
-    ``vectors`` (V, 3); ``near`` (V, N) int64, the annotations near each view.
+    ``vectors`` (V, 3); ``near`` (V, N) int64, the annotations close to each view.
     """
 
     vectors: np.ndarray
@@ -115,7 +115,7 @@ def log_views(pose: np.ndarray, body: Body, views: ViewAnnotations) -> np.ndarra
 def log_annotations(
     pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, logs: np.ndarray
 ) -> None:
-    """Write −d²/2σ_l² of all annotations near a view to ``logs`` (N,); the maximum is log L_v."""
+    """Write −d²/2σ_l² of the annotations of a view to ``logs`` (N,); the maximum is log L_v."""
     image = project_to_view(pose, view, body, views)
     distances_to(prepare_projection(image, views.prepared), views.near[view], views.prepared, logs)
     for position in range(len(logs)):
@@ -129,17 +129,17 @@ def log_surrogate(
     annotation: int,
     body: Body,
     views: ViewAnnotations,
-    apart: np.ndarray,
+    errors: np.ndarray,
     terms: np.ndarray,
 ) -> float:
-    """Return −d²/2σ_l² of one annotation with its own graph only, which takes a tenth of the time.
+    """Return −d²/2σ_l² of one annotation, computed on its graph only (ten times faster).
 
-    ``apart`` (2, J) and ``terms`` (edges,) are work space.
+    ``errors`` (2, J) and ``terms`` (edges,) are workspace arrays.
     """
     image = project_to_view(pose, view, body, views)
     if views.prepared.measure == INTERACTION:
         image = centred(image)
-        distance = annotation_graph_distance(image, annotation, views.prepared, apart, terms)
+        distance = annotation_graph_distance(image, annotation, views.prepared, errors, terms)
     else:
         # Distances without a graph have no cheaper surrogate.
         prepared, distances = prepare_projection(image, views.prepared), np.empty(1)
@@ -155,11 +155,11 @@ def log_measure(pose: np.ndarray, body: Body) -> float:
     for joint in range(len(pose)):
         parent = body.parents[joint]
         if parent >= 0:
-            here, there = 0.0, 0.0
+            square, seed_square = 0.0, 0.0
             for i in range(3):
-                here += (pose[joint, i] - pose[parent, i]) ** 2
-                there += (body.seed[joint, i] - body.seed[parent, i]) ** 2
-            lengths += (0.5 * np.log(here / there)) ** 2
+                square += (pose[joint, i] - pose[parent, i]) ** 2
+                seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
+            lengths += (0.5 * np.log(square / seed_square)) ** 2
     return log_places(pose, body) - 0.5 * lengths / body.bone_noise**2
 
 
@@ -176,11 +176,11 @@ def write_limit_terms(pose: np.ndarray, person: int, physics: Physics, parts: np
     """Write a person's term of ‖X − X̂‖² and number of invalid angles."""
     poses = pose.reshape(1, len(pose), 3)
     valid, nearest = project_poses(poses, physics.trees[person : person + 1], physics.limits)
-    apart = 0.0
+    square = 0.0
     for joint in range(len(pose)):
         for i in range(3):
-            apart += (pose[joint, i] - nearest[0, joint, i]) ** 2
-    parts[2 + person] = -0.5 * apart / physics.position_noise**2
+            square += (pose[joint, i] - nearest[0, joint, i]) ** 2
+    parts[2 + person] = -0.5 * square / physics.position_noise**2
     parts[2 + len(physics.trees) + person] = valid.size - valid.sum()
 
 
@@ -189,7 +189,7 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
     """Project a pose to a view orthographically, (J, 2), metres.
 
     Equals :func:`~probmotion.interaction.annotations.views.project_to_views` up to a rotation in
-    the image plane, to which annotations are aligned.
+    the image plane, which the alignment with annotations removes.
     """
     i, j, k = _local_frame(pose, body)
     a, b, c = views.vectors[view]

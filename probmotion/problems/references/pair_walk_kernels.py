@@ -22,7 +22,7 @@ from probmotion.problems.references.pair_moves import SHIFT, TURN, Body, propose
 __all__ = ["walk"]
 
 _SURROGATE_STEPS = 40
-"""Surrogate steps per proposal, for an acceptance of about two thirds."""
+"""Surrogate steps per proposal, for an acceptance rate of about two thirds."""
 _VIEW_PROPOSALS = 6
 """View proposals per walk."""
 
@@ -47,31 +47,31 @@ def walk(
 
     Blocks of steps target a surrogate of L_v, the graph distance to one annotation, and are
     accepted or rejected as a whole (surrogate transitions, Liu 2001). The annotation is an
-    auxiliary variable, drawn in proportion to its likelihood to the power given the pose.
+    auxiliary variable, drawn given the pose with probability ∝ likelihood^power.
 
     Updates in place: ``pose`` (J, 3), metres; ``parts`` (2 + 2 K,) of :func:`log_prior_terms`; and
     the counters of surrogate steps ``tried`` and ``taken`` (moves,).
     """
     logs, new_logs = np.empty(views.near.shape[1]), np.empty(views.near.shape[1])
-    there, parts_there = np.empty_like(pose), np.empty_like(parts)
+    new_pose, new_parts = np.empty_like(pose), np.empty_like(parts)
     if power > 0:
         log_annotations(pose, view, body, views, logs)
     for done in range(0, n_steps, _SURROGATE_STEPS):
-        there[:], parts_there[:] = pose, parts
+        new_pose[:], new_parts[:] = pose, parts
         chosen = _draw_index(power * logs, rng) if power > 0 else 0
         gained = _surrogate_walk(
-            there, parts_there, view, views.near[view, chosen], power,
+            new_pose, new_parts, view, views.near[view, chosen], power,
             min(_SURROGATE_STEPS, n_steps - done), moves, sizes, tried, taken, body, physics,
             views, rng,
         )  # fmt: skip
         if power > 0:
-            log_annotations(there, view, body, views, new_logs)
+            log_annotations(new_pose, view, body, views, new_logs)
             ratio = power * (new_logs[chosen] - logs[chosen] - gained)
             ratio += _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
             if not -rng.standard_exponential() < ratio:
                 continue
             logs[:] = new_logs
-        pose[:], parts[:] = there, parts_there
+        pose[:], parts[:] = new_pose, new_parts
     resample_placement(pose, parts, body, rng)
     if power == 0:
         view = int(rng.random() * len(views.vectors))
@@ -81,9 +81,9 @@ def walk(
         # Draw the acceptance threshold first, to terminate the evaluation early.
         other = int(rng.random() * len(views.vectors))
         least = log_l - rng.standard_exponential() / power
-        found = log_view(pose, other, body, views, least)
-        if found >= least:
-            view, log_l = other, found
+        other_log_l = log_view(pose, other, body, views, least)
+        if other_log_l >= least:
+            view, log_l = other, other_log_l
     return view, log_l
 
 
@@ -105,35 +105,35 @@ def _surrogate_walk(
     rng: np.random.Generator,
 ) -> float:
     """Take Metropolis steps on prior · surrogate^power; return the change of the log surrogate."""
-    proposed, weighed = np.empty_like(pose), np.empty_like(parts)
-    apart, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
-    start = log_surrogate(pose, view, annotation, body, views, apart, terms) if power > 0 else 0.0
-    here = start
+    proposed, new_parts = np.empty_like(pose), np.empty_like(parts)
+    errors, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
+    start = log_surrogate(pose, view, annotation, body, views, errors, terms) if power > 0 else 0.0
+    current = start
     for _ in range(n_steps):
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
         tried[number] += 1
         propose(pose, moves[number], sizes[number], body, rng, proposed)
-        weighed[:] = parts
+        new_parts[:] = parts
         # Delayed acceptance: cheap terms first (Christen and Fox 2005).
-        weighed[0] = log_measure(proposed, body)
+        new_parts[0] = log_measure(proposed, body)
         new = 0.0
         if power > 0:
-            new = log_surrogate(proposed, view, annotation, body, views, apart, terms)
-        if not -rng.standard_exponential() < weighed[0] - parts[0] + power * (new - here):
+            new = log_surrogate(proposed, view, annotation, body, views, errors, terms)
+        if not -rng.standard_exponential() < new_parts[0] - parts[0] + power * (new - current):
             continue
-        weighed[1] = log_penetration(proposed, physics)
+        new_parts[1] = log_penetration(proposed, physics)
         least = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
         # Joint limits only decrease the density, so penetration alone may suffice to reject.
-        if weighed[1] < least:
+        if new_parts[1] < least:
             continue
         if kind != TURN and kind != SHIFT:
-            write_limit_terms(proposed, body.person[joint], physics, weighed)
-        if not log_prior(weighed, physics) - weighed[0] >= least:
+            write_limit_terms(proposed, body.person[joint], physics, new_parts)
+        if not log_prior(new_parts, physics) - new_parts[0] >= least:
             continue
-        pose[:], parts[:], here = proposed, weighed, new
+        pose[:], parts[:], current = proposed, new_parts, new
         taken[number] += 1
-    return here - start
+    return current - start
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,7 +9,8 @@ whose marginal is the posterior; a step evaluates one view. Levels temper L by p
 and neighbours exchange their states (Swendsen and Wang 1986), alternating even and odd pairs, with
 powers tuned to equal rejection rates (Syed et al. 2022).
 
-A truncated density (eq. 11), f* ≤ f, adds one state of f* that exchanges with power 1.
+For a truncated density (eq. 11), f* ≤ f, one more state targets f* and is exchanged with the state
+at power 1.
 """
 
 from __future__ import annotations
@@ -119,15 +120,14 @@ class TemperedPairs:
         """Return ``draws`` states of each of ``chains`` chains; see the sampler protocol.
 
         The state of each chain is stored twice a minute in files named after ``unfinished``, from
-        which the same call resumes; the caller deletes them. Chains run on threads with independent
-        generators, so results do not depend on their number. Steps count as density evaluations,
-        although most evaluate a part of it.
+        which the same call resumes; the caller deletes them. Results do not depend on the number of
+        threads. Each step counts as one density evaluation, although most evaluate only part of it.
         """
         if not self.draws_from(posterior):
             raise ValueError(
                 "posterior must have PosePairPrior and AnnotatedPairs without occluded joints, got "
                 f"{type(posterior.prior).__name__} and {type(posterior.likelihood).__name__} with "
-                f"{_hidden(posterior)}"
+                f"{_hidden(posterior)} occluded joints"
             )
         if initial is not None:
             raise ValueError(f"initial must be None, got {type(initial).__name__}")
@@ -313,7 +313,7 @@ class _Ladder:
 
 
 class _Cut:
-    """State of the truncated density, which exchanges with the state of power 1.
+    """State of the truncated density, exchanged with the state at power 1.
 
     f*/f is 0 below the floor, cap/f above the cap, else 1.
     """
@@ -331,8 +331,8 @@ class _Cut:
         # The comparison with NaN rejects if both densities are 0.
         if not -ladder.rng.standard_exponential() < log_ratio - self.log_share:
             return
-        for own, top in ((self.pose, ladder.poses[-1]), (self.parts, ladder.parts[-1])):
-            own[:], top[:] = top.copy(), own.copy()
+        for cut, top in ((self.pose, ladder.poses[-1]), (self.parts, ladder.parts[-1])):
+            cut[:], top[:] = top.copy(), cut.copy()
         self.seen, ladder.seen[-1] = ladder.seen[-1], self.seen
         self.view, ladder.views[-1] = ladder.views[-1], self.view
         self.log_share = log_ratio
@@ -341,8 +341,8 @@ class _Cut:
         """Raise ``ValueError`` if no state within the truncation was found."""
         if self.log_share == -math.inf:
             raise ValueError(
-                "posterior must have a larger limit: the warm-up found no state above "
-                f"{self.floor:.4g} nats"
+                "posterior must have states above its truncation at "
+                f"{self.floor:.4g} nats, got none in warm-up; increase its limit"
             )
 
     def _log_ratio(self, ladder: _Ladder) -> float:

@@ -212,8 +212,8 @@ def test_occluded_outliers_and_large_bodies_are_accepted(prior, noisy):
     [
         ({"fps": 30.0}, {}, "track must have the prior's 20 frames per second, got 30; resample"),
         ({"confidence": np.zeros((60, 14))}, {}, "a joint with a confidence of 0.3 or more, got n"),
-        ({"keypoints": 183.0}, {}, "track .* must be in metres about the root, at most"),
-        ({"keypoints": 9.0}, {}, "track .* must be in metres about the root, at most"),
+        ({"keypoints": 183.0}, {}, "track .* must be in metres relative to the root, at most"),
+        ({"keypoints": 9.0}, {}, "track .* must be in metres relative to the root, at most"),
         ({"skeleton": Skeleton.preset("coco17")}, {}, "track must have the prior's .*, got nose"),
         ({"frames": 1}, {}, "track must have at least 2 frames, got 1"),
         ({}, {"noise": -1.0}, "noise must be a finite number above 0, got -1.0"),

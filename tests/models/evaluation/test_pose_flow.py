@@ -162,5 +162,5 @@ def test_invalid_input_is_rejected(tracks, validation, message):
         PoseFlowTrainee(tracks, validation, replace(TINY, blur=0.0))
     with pytest.raises(ValueError, match="share must be above 0 and at most 1, got 0"):
         FlowSettings(share=0.0)
-    with pytest.raises(ValueError, match="blur must be a number of at least 0, got -1"):
+    with pytest.raises(ValueError, match="blur must be finite and at least 0, got -1"):
         FlowSettings(blur=-1.0)

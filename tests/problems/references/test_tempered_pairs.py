@@ -55,25 +55,19 @@ def prior(dances):
 
 
 @pytest.fixture(scope="module")
-def loose(prior):
-    """Base measure only, without limits or penetration."""
-    return replace(prior, position_noise=1e6, max_invalid=32)
-
-
-@pytest.fixture(scope="module")
-def exact(loose):
-    """Independent draws of the base measure, (n, J, 3)."""
+def exact(prior):
+    """Independent draws of the base measure, without limits or penetration, (n, J, 3)."""
     rng, n = np.random.default_rng(1), 30_000
-    seed, skeleton = loose.seed[0], loose.skeleton
+    seed, skeleton = prior.seed[0], prior.skeleton
     poses = np.empty((n, *seed.shape))
     for root in skeleton.roots:
-        poses[:, root] = seed[root] + loose.root_noise * rng.standard_normal((n, 3))
+        poses[:, root] = seed[root] + prior.root_noise * rng.standard_normal((n, 3))
     for joint, parent in skeleton.bones:
-        way = rng.standard_normal((n, 3))
-        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        direction = rng.standard_normal((n, 3))
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         length = np.linalg.norm(seed[joint] - seed[parent])
-        stretch = np.exp(loose.bone_noise * rng.standard_normal((n, 1)))
-        poses[:, joint] = poses[:, parent] + length * stretch * way
+        length = length * np.exp(prior.bone_noise * rng.standard_normal((n, 1)))
+        poses[:, joint] = poses[:, parent] + length * direction
     return poses
 
 
@@ -149,15 +143,14 @@ def test_walk_updates_its_terms_correctly(prior, likelihood):
     pose, parts, moves = prior.seed[0].copy(), np.zeros(6), moves_of(body)
     log_prior_terms(pose, body, physics, parts)
     sizes, tried, taken = np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves))
-    view, log_l = walk(
-        pose, parts, 2, 1.0, 4000, moves, sizes, tried, taken, body, physics, views, rng
-    )
-    again = np.zeros(6)
+    counters = (moves, sizes, tried, taken)
+    view, log_l = walk(pose, parts, 2, 1.0, 4000, *counters, body, physics, views, rng)
     assert log_l == pytest.approx(log_views(pose, body, views)[view], rel=1e-9)
-    log_prior_terms(pose, body, physics, again)
-    np.testing.assert_allclose(parts, again, rtol=1e-9, atol=1e-9)
+    expected = np.zeros(6)
+    log_prior_terms(pose, body, physics, expected)
+    np.testing.assert_allclose(parts, expected, rtol=1e-9, atol=1e-9)
     assert (taken[tried > 0] > 0).mean() > 0.9
-    assert again[4:].sum() <= prior.max_invalid
+    assert expected[4:].sum() <= prior.max_invalid
 
 
 @pytest.mark.slow
@@ -188,15 +181,13 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
     error = np.sqrt((np.einsum("nv,nvk->nk", weight, expected - mean) ** 2).sum(axis=0))
 
     moves, summaries = moves_of(body), []
-    sizes, tried, taken = np.full(len(moves), 0.7), np.zeros(len(moves)), np.zeros(len(moves))
+    counters = (moves, np.full(len(moves), 0.7), np.zeros(len(moves)), np.zeros(len(moves)))
     for chain in range(2):
         rng, pose, parts, view = np.random.default_rng(chain), prior.seed[0].copy(), np.zeros(6), 0
         log_prior_terms(pose, body, physics, parts)
         states = []
         for _ in range(1100):
-            view, _ = walk(
-                pose, parts, view, power, 400, moves, sizes, tried, taken, body, physics, views, rng
-            )
+            view, _ = walk(pose, parts, view, power, 400, *counters, body, physics, views, rng)
             states.append((pose.copy(), view))
         poses, chosen = zip(*states[100:], strict=True)
         summaries.append(summary(np.array(poses))[np.arange(len(chosen)), list(chosen)])
