@@ -37,10 +37,7 @@ DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
         "deepmimic_human/humanoid3d_stealthy_walk",
     ),
     "test": (
-        "cmu_single/cmu_01_13",
-        "cmu_single/cmu_02_02",
-        "cmu_single/cmu_02_07",
-        "cmu_single/cmu_131_02",
+        *(f"cmu_single/cmu_{trial}" for trial in ("01_13", "02_02", "02_07", "131_02")),
         "deepmimic_human/humanoid3d_getup_faceup",
         "deepmimic_human/humanoid3d_long_walk3",
     ),
@@ -88,11 +85,8 @@ def synthetic_denoising_clips(
         index, style = divmod(number, len(_STYLES))
         gait = make_gait(_STYLES[style], index, frames=frames, fps=_FPS, seed=seed)
         clips.append(gait.retarget(skeleton))
-    return {
-        "train": clips[:n],
-        "validation": clips[n : n + held_out],
-        "test": clips[n + held_out :],
-    }
+    end = n + held_out
+    return {"train": clips[:n], "validation": clips[n:end], "test": clips[end:]}
 
 
 def _segments(path: Path) -> list[Motion]:

@@ -59,8 +59,8 @@ def savitzky_golay(
     Raises
     ------
     ValueError
-        If shapes disagree, a joint is never observed, an observed entry is not finite, the window
-        is longer than the motion, or ``order`` is not less than the window's frames.
+        If a joint is never observed, an observed entry is not finite, the window is longer than the
+        motion, or ``order`` is not less than the window's frames.
     """
     check_positive("fps", fps)
     check_positive("window_seconds", window_seconds)

@@ -97,11 +97,8 @@ def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
             raise ValueError(f"parameters of {name} must {allowed}, got {key!r}")
         if not isinstance(value, Hashable):
             raise ValueError(f"{key} must be a number such as {defaults[key]!r}, got {value!r}")
-    return name, tuple(
-        (key, scale[key])
-        for key, default in defaults.items()
-        if key in scale and scale[key] != default
-    )
+    changed = {key for key, value in scale.items() if value != defaults[key]}
+    return name, tuple((key, scale[key]) for key in defaults if key in changed)
 
 
 def _parse(words: str) -> dict[str, Any]:

@@ -76,10 +76,9 @@ def denoising_problem(
     likelihood = Joints3D.observe(
         truth, noise, seed, hidden=hidden, degrees_of_freedom=degrees_of_freedom
     )
-    fitted = prior.of(frames=truth.frames, body=body_of(likelihood, prior))
-    return simulated(
-        Problem(name, description, MotionPosterior(fitted, likelihood), truth.positions)
-    )
+    adapted = prior.of(frames=truth.frames, body=body_of(likelihood, prior))
+    posterior = MotionPosterior(adapted, likelihood)
+    return simulated(Problem(name, description, posterior, truth.positions))
 
 
 def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:

@@ -41,13 +41,9 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
     with np.load(weights / f"{name}-features.npz") as features:
-        reference = GenerationReference(
-            evaluator,
-            features["held_out"].astype(np.float64),
-            features["learnt"].astype(np.float64),
-            float(features["elevation"]),
-            float(features["distance"]),
-        )
+        held_out, learnt = (features[part].astype(np.float64) for part in ("held_out", "learnt"))
+        elevation, distance = float(features["elevation"]), float(features["distance"])
+    reference = GenerationReference(evaluator, held_out, learnt, elevation, distance)
     prior: MotionDiffusion | MotionVAE = getattr(models, kind).load(name)
     problem = Problem(name, description, MotionPosterior(prior), generation=reference)
     return simulated(problem) if isinstance(prior, Samplable) else problem

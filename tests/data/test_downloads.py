@@ -5,7 +5,6 @@ import hashlib
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import pytest
 
@@ -108,19 +107,6 @@ def test_failed_download_leaves_no_file(server, registry, tmp_path):
     served.unlink()
     assert_fails(tmp_path, r"\(404\); check the network", server.url)
     assert_fails(tmp_path, r"\(ConnectionError\); check the network", "http://127.0.0.1:9")
-
-
-def test_interrupted_download_leaves_no_file(server, registry, tmp_path, monkeypatch):
-    import pooch
-
-    def interrupted(self, url, output, *_, **__):
-        Path(output).write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pooch.HTTPDownloader, "__call__", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        download("sample", folder=tmp_path / "mine", base_url=server.url)
-    assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == []
 
 
 def test_invalid_folder_and_names(server, registry, tmp_path):

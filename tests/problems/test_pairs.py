@@ -27,8 +27,8 @@ def test_problems_are_listed_with_descriptions(problem):
     assert {"dance-pairs", "salsa-pairs", "salsa-pairs-paper"} <= set(problem_names())
     descriptions = problem_descriptions()
     assert set(descriptions) == set(problem_names())
-    for made in (problem, load_problem("gait")):
-        assert made.description == descriptions[made.name]
+    for loaded in (problem, load_problem("gait")):
+        assert loaded.description == descriptions[loaded.name]
 
 
 def test_clips_are_held_out_completely(problem):

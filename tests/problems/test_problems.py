@@ -11,7 +11,7 @@ from scipy import stats
 from probmotion import MotionPosterior
 from probmotion.comparison.results.naming import _NAME
 from probmotion.posteriors.problem import Problem
-from probmotion.problems import load_problem, problem_names
+from probmotion.problems import load_problem
 from probmotion.problems.gait import GAIT_PROBLEMS
 
 OBSERVED = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]
@@ -141,7 +141,6 @@ def test_invalid_parameters_are_rejected(name, scale, sentence):
 
 def test_noisy_joints_have_student_t_noise():
     problem = load_problem("gait-noisy3d")
-    assert "gait-noisy3d" in problem_names()
     likelihood = problem.posterior.likelihood
     residual = (likelihood.joints - problem.truth).ravel() / 0.03
     assert stats.kstest(residual, stats.t(3).cdf).pvalue > 0.001

@@ -28,11 +28,7 @@ ANIMAL_SKELETON = Skeleton.preset("quadruped21")
 """Joints of the recorded dog, without the tips of paws and tail. Procedural gaits have no hock."""
 
 DOG_CLIPS: Mapping[str, tuple[str, ...]] = {
-    "train": (
-        "deepmimic_dog/dog3d_canter",
-        "deepmimic_dog/dog3d_pace",
-        "deepmimic_dog/dog3d_spin",
-    ),
+    "train": tuple(f"deepmimic_dog/dog3d_{name}" for name in ("canter", "pace", "spin")),
     "validation": (),
     "test": ("deepmimic_dog/dog3d_trot",),
 }
@@ -52,16 +48,13 @@ def animal_clips(
     check_count("n", n)
     frames = _frames(seconds)
     held_out = max(n // 5, len(_STYLES))
-    synthetic = synthetic_animals(n + 2 * held_out, frames, _FPS, seed)
-    parts = {
-        "train": synthetic[:n],
-        "validation": synthetic[n : n + held_out],
-        "test": synthetic[n + held_out :],
-    }
+    clips = synthetic_animals(n + 2 * held_out, frames, _FPS, seed)
+    end = n + held_out
+    parts = {"train": clips[:n], "validation": clips[n:end], "test": clips[end:]}
     if folder is None:
         return parts
     dogs = dog_clips(folder, seconds=seconds)
-    return {part: [*dogs[part], *clips] for part, clips in parts.items()}
+    return {part: [*dogs[part], *synthetic] for part, synthetic in parts.items()}
 
 
 def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Motion]]:

@@ -25,10 +25,7 @@ WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
         "cmu_single/cmu_02_01",
     ),
     "validation": ("cmu_single/cmu_02_02",),
-    "test": (
-        "deepmimic_human/humanoid3d_long_walk3",
-        "deepmimic_human/humanoid3d_stealthy_walk",
-    ),
+    "test": ("deepmimic_human/humanoid3d_long_walk3", "deepmimic_human/humanoid3d_stealthy_walk"),
 }
 """Clips by part, 3352 frames at 30 fps. Excluded are excerpts of other clips (humanoid3d_walk,
 humanoid3d_zombie_walk), styles with a single clip (zombie) and runs."""
