@@ -112,7 +112,8 @@ def make_reference(
 
 
 def _long_run(problem: Problem) -> Sampler:
-    for sampler in (OutlierGibbs(), TemperedPairs()):
+    samplers: list[OutlierGibbs | TemperedPairs] = [OutlierGibbs(), TemperedPairs()]
+    for sampler in samplers:
         if sampler.draws_from(problem.posterior):
             return sampler
     if problem.posterior.differentiable:

@@ -89,6 +89,7 @@ def test_invalid_input_is_rejected(posterior, known):
     outliers = Joints3D(posterior.prior.means[0], noise=0.1, degrees_of_freedom=4)
     for error, message, call in (
         (ValueError, "alpha_bar must be between 0 and 1", lambda: known.denoise_motion(x_t, 1.0)),
+        (ValueError, "alpha_bar must be between 0 and 1", lambda: known.denoise_motion(x_t, 0.0)),
         (ValueError, r"got \(3, 2, 17, 3\)", lambda: known.denoise_motion(x_t[:, :2], 0.5)),
         (ValueError, "got perspective", lambda: known.denoise(x_t[..., :2], 0.5, perspective)),
         (NotConjugate, "must be None", lambda: known.exact_posterior(posterior.likelihood)),

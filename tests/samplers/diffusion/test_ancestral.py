@@ -10,7 +10,7 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior, NoiseSchedule, UnsupportedPosterior
 from probmotion.samplers import Ancestral3D
-from probmotion.samplers.diffusion.ancestral import MotionState, ancestral
+from probmotion.samplers.diffusion.ancestral import MotionState, ancestral, sigma
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.views import MotionDenoiser
 from probmotion.seeds import NormalStreams
@@ -106,6 +106,12 @@ def test_steps_agree_with_diffusers(gaussian):
             x = mean + deviation * torch.tensor(noises[steps - t + 1])
         else:
             np.testing.assert_allclose(mean, result, atol=1e-6)
+
+
+def test_noise_levels_match_the_schedule():
+    schedule = NoiseSchedule.cosine(10)
+    for t in range(1, 11):
+        assert 1 / (1 + sigma(schedule, t) ** 2) == pytest.approx(schedule.alpha_bar[t])
 
 
 def test_a_view_depends_only_on_its_seed_and_number(gaussian):

@@ -46,6 +46,8 @@ def test_draws_are_those_of_numpyro(posterior, two_modes, long):
         )
         fields = chain.get_extra_fields()
         np.testing.assert_array_equal(long.dataset["theta"][1], chain.get_samples())
+    density = two_modes.log_density(long.dataset["theta"].values)
+    np.testing.assert_allclose(long.dataset["log_density"], density, rtol=1e-9)
     np.testing.assert_array_equal(long.dataset["steps"][1], fields["num_steps"])
     np.testing.assert_array_equal(long.dataset["acceptance"][1], fields["accept_prob"])
     np.testing.assert_array_equal(long.dataset["divergent"][1], fields["diverging"])
