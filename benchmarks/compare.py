@@ -5,7 +5,7 @@ call of ``compare`` to its table, including the start of processes. ``worker_imp
 ``worker_problem_seconds``: start-up of a worker. ``seconds_beyond_half``: excess over half the
 serial time, of which about 4 s are process starts and at most one run's time is idle at the end.
 ``slowdown_in_samplers``: seconds within samplers with two workers over those in one process, an
-effect of the machine. Run on two idle cores.
+effect of the hardware. Run on two idle cores.
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ print(imported - start, time.perf_counter() - imported)
 
 
 def seconds(workers: int, runs: int, thin: int) -> tuple[float, float]:
-    """Return the duration of a comparison, and the part of it spent within samplers."""
+    """Return the duration of a comparison and the time spent within samplers."""
     sampler = MetropolisHastings(warmup=1000, thin=thin)
     start = time.perf_counter()
-    found = compare(
+    comparison = compare(
         "gait", sampler, draws=40, chains=4, seeds=runs, workers=workers, progress=False
     )
-    taken = time.perf_counter() - start
-    if len(found.results) != runs or found.failures:
-        raise SystemExit("some runs failed, expected all to finish")
-    return taken, sum(run.metrics["seconds"] for run in found.results)
+    duration = time.perf_counter() - start
+    if len(comparison.results) != runs or comparison.failures:
+        raise SystemExit(f"all {runs} runs must finish, got {len(comparison.failures)} failures")
+    return duration, sum(run.metrics["seconds"] for run in comparison.results)
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=32)
-    parser.add_argument("--run-seconds", type=float, default=5.0)
-    given = parser.parse_args()
-    # Here everything is imported and the problem made before the clock starts.
+    parser.add_argument("--runs", type=int, default=32, help="Number of runs; default: 32.")
+    parser.add_argument("--run-seconds", type=float, default=5.0, help="Duration of a run, s.")
+    options = parser.parse_args()
+    # Warm-up: import all modules and build the problem before timing.
     thin = 2000
     seconds(0, runs=1, thin=thin)
     _, one = seconds(0, runs=1, thin=thin)
-    thin = max(1, round(thin * given.run_seconds / one))
+    thin = max(1, round(thin * options.run_seconds / one))
     start = subprocess.check_output([sys.executable, "-c", _START], text=True).split()
     print(f"worker_import_seconds: {float(start[0]):.2f}")
     print(f"worker_problem_seconds: {float(start[1]):.2f}")
-    alone, within_one = seconds(0, given.runs, thin)
-    together, within_two = seconds(2, given.runs, thin)
+    alone, within_one = seconds(0, options.runs, thin)
+    together, within_two = seconds(2, options.runs, thin)
     print(f"seconds_in_one_process: {alone:.2f}")
     print(f"seconds_two_workers: {together:.2f}")
     print(f"seconds_beyond_half: {together - alone / 2:.2f}")

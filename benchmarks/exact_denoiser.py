@@ -1,8 +1,8 @@
 """Rate of exact 2D denoiser evaluations: 108 components, r = 10, L = 30, J = 17.
 
 ``evaluations_per_second`` uses the coordinates of ``GaussianMixtureMotion.reduced()``, which are
-exact; ``full_size_evaluations_per_second`` uses whole motions. Float64, one thread. One
-evaluation is one view of one motion at one noise level.
+exact; ``full_size_evaluations_per_second`` uses full-dimensional motions. Float64, one thread.
+One evaluation is one view of one motion at one noise level.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def evaluations_per_second(prior: GaussianMixtureMotion, n: int = 1024, repeats:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     styles = {"walk": 0.5, "run": 0.3, "march": 0.2}
     clips = make_gaits(300, styles=styles)
     labels = [clip.name.rpartition("-")[0] for clip in clips]

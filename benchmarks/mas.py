@@ -59,7 +59,7 @@ class Timer:
     begun: float = 0.0
 
     def attach(self, network: torch.nn.Module) -> None:
-        """Count every forward pass from now on."""
+        """Time every subsequent forward pass."""
         network.register_forward_pre_hook(self._begin)
         network.register_forward_hook(self._end)
 
@@ -76,7 +76,7 @@ class Timer:
 
 
 def run(prior: MotionDiffusion, draws: int, steps: int = 100) -> float:
-    """Return the seconds of MAS."""
+    """Return the duration of MAS in seconds."""
     sampler = MultiViewAncestral(steps=steps, n_views=VIEWS, perspective=True)
     begun = time.perf_counter()
     sampler.sample(MotionPosterior(prior), draws=draws, progress=False)
@@ -84,7 +84,7 @@ def run(prior: MotionDiffusion, draws: int, steps: int = 100) -> float:
 
 
 def matmul_gflops(n: int = 2048, repeats: int = 15) -> float:
-    """Return the median rate of a product of n × n float32 matrices."""
+    """Return the median rate of products of n × n float32 matrices, in gigaflops."""
     a, b = torch.randn(n, n), torch.randn(n, n)
     seconds = []
     for _ in range(repeats):
@@ -95,10 +95,10 @@ def matmul_gflops(n: int = 2048, repeats: int = 15) -> float:
 
 
 def network_gflop(network: torch.nn.Module) -> float:
-    """Return the floating-point operations of one step, V views, in units of 10⁹."""
+    """Return the number of floating-point operations of one step with V views, in 10⁹."""
     motions, levels = torch.zeros(VIEWS, FRAMES, 2 * JOINTS), torch.zeros(VIEWS)
     counter = FlopCounterMode(display=False)
-    # The counter does not know PyTorch's fused encoder layer.
+    # The counter does not support PyTorch's fused encoder layer.
     torch.backends.mha.set_fastpath_enabled(False)
     try:
         with counter, torch.no_grad():
@@ -109,7 +109,7 @@ def network_gflop(network: torch.nn.Module) -> float:
 
 
 def on_cpu(steps: int = 100) -> dict[str, float]:
-    """Return the figures of one motion on the CPU."""
+    """Return the measurements for one motion on the CPU."""
     prior, network = paper_prior()
     timer = Timer("cpu")
     timer.attach(network)
@@ -119,7 +119,7 @@ def on_cpu(steps: int = 100) -> dict[str, float]:
     before = matmul_gflops()
     seconds = run(prior, draws=1, steps=steps)
     rate = (before + matmul_gflops()) / 2
-    # Medians throughout: others may use the machine for a while.
+    # Medians are robust to temporary load from other processes.
     return {
         "outside_network_share": 1 - sum(timer.seconds) / seconds,
         "network_gflops_share": gflop / statistics.median(timer.seconds) / rate,
@@ -130,13 +130,13 @@ def on_cpu(steps: int = 100) -> dict[str, float]:
 
 
 def on_cuda() -> dict[str, float]:
-    """Return the figures of one motion and of 64 on a GPU."""
+    """Return the measurements for one motion and for 64 motions on a GPU."""
     prior, network = paper_prior("cuda")
     run(prior, draws=1, steps=10)
     one = run(prior, draws=1)
     run(prior, draws=64, steps=10)
     many = run(prior, draws=64)
-    # Waiting for the GPU at every forward pass would slow the figures above.
+    # Synchronising at every forward pass would increase the durations above.
     timer = Timer("cuda")
     timer.attach(network)
     seconds = run(prior, draws=64)
@@ -149,25 +149,25 @@ def on_cuda() -> dict[str, float]:
 
 
 def strided(draws: int = 256) -> dict[str, float]:
-    """Return FID with 20 of the 100 trained levels relative to all of them."""
+    """Return the FID of 20 of the 100 trained levels relative to that of all levels."""
     problem = load_problem("walk2d")
     assert problem.generation is not None
-    # Against the clips that were learnt from: held-out ones are so far that no step count matters.
+    # Compare with training clips; FID to held-out clips is too large to depend on the steps.
     reference = problem.generation.of_learnt()
-    found, seconds = {}, {}
+    fid, seconds = {}, {}
     for steps in (20, 100):
         sampler = MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)
         begun = time.perf_counter()
         motions = sampler.sample(problem.posterior, draws=draws, progress=False).flat()
         seconds[steps] = time.perf_counter() - begun
         scores = reference.score_motions(motions, seed=0, samples=draws // 2)
-        found[steps] = scores["fid"]
-    (few, few_sd), (all_of_them, sd) = found[20], found[100]
+        fid[steps] = scores["fid"]
+    (few, few_sd), (full, full_sd) = fid[20], fid[100]
     return {
         "fid_20_steps": few,
-        "fid_100_steps": all_of_them,
-        "strided_20_fid_ratio": few / all_of_them,
-        "strided_20_fid_gap": (few - all_of_them) / max(few_sd, sd),
+        "fid_100_steps": full,
+        "strided_20_fid_ratio": few / full,
+        "strided_20_fid_gap": (few - full) / max(few_sd, full_sd),
         "strided_20_seconds_ratio": seconds[20] / seconds[100],
     }
 
@@ -179,9 +179,9 @@ def peak_memory() -> float:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     figures = on_cpu()
-    # A fresh process, whose peak nothing else has raised.
+    # A new process, so that the peak memory is that of MAS alone.
     fresh = subprocess.run(
         [sys.executable, __file__, "--memory"], check=True, capture_output=True, text=True
     )

@@ -1,7 +1,7 @@
 """Overhead of MAS over its denoiser, in time and memory: L = 30, J = 17, 108 components, V = 5.
 
 ``mas_denoiser_share``: fraction of the time inside the exact prior's ``denoise``;
-``mas_1000_draws_gib``: growth of the process while it makes 1000 draws at once. One thread.
+``mas_1000_draws_gib``: growth of peak memory during 1000 draws in one batch. One thread.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def gait_prior() -> GaussianMixtureMotion:
 
 
 class TimedPrior:
-    """A prior whose 2D denoiser counts its seconds."""
+    """Wrapper of a prior that measures the time within its 2D denoiser."""
 
     def __init__(self, prior: GaussianMixtureMotion) -> None:
         self.prior = prior
@@ -41,7 +41,7 @@ class TimedPrior:
         return getattr(self.prior, name)
 
     def denoise(self, x_t: Any, alpha_bar: float, cameras: Cameras) -> Any:
-        """Call the prior's denoiser."""
+        """Call the denoiser of the prior and add its duration."""
         start = time.perf_counter()
         clean = self.prior.denoise(x_t, alpha_bar, cameras)
         self.seconds += time.perf_counter() - start
@@ -49,7 +49,7 @@ class TimedPrior:
 
 
 def denoiser_share(prior: GaussianMixtureMotion, draws: int = 256) -> float:
-    """Return the denoiser's share of the time of MAS."""
+    """Return the fraction of the duration of MAS spent in the denoiser."""
     timed = TimedPrior(prior)
     posterior = MotionPosterior(timed)  # type: ignore[arg-type]
     sampler = MultiViewAncestral()
@@ -61,7 +61,7 @@ def denoiser_share(prior: GaussianMixtureMotion, draws: int = 256) -> float:
 
 
 def growth_of_a_run(draws: int = 1000) -> float:
-    """Return by how many GiB this process's peak memory grows while it makes ``draws`` draws."""
+    """Return the growth of peak memory during a run of ``draws`` draws, in GiB."""
     posterior = MotionPosterior(gait_prior())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     MultiViewAncestral(batch=draws).sample(posterior, draws=draws, progress=False)
@@ -69,9 +69,9 @@ def growth_of_a_run(draws: int = 1000) -> float:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     print(f"mas_denoiser_share: {denoiser_share(gait_prior()):.3f}")
-    # A fresh process, whose peak nothing else has raised.
+    # A new process, so that the peak memory is that of MAS alone.
     fresh = subprocess.run(
         [sys.executable, __file__, "--growth"], check=True, capture_output=True, text=True
     )

@@ -34,8 +34,8 @@ def main() -> None:
     skeleton = Skeleton.preset("person14")
     walks = [clip.retarget(skeleton) for clip in synthetic_walks(3, skeleton, seconds=10.0)]
     prior, denoiser = fresh_networks(walks)
-    whole = observed(walks[0], FRAMES)
-    posterior = MotionPosterior(prior.of(frames=FRAMES, inference_network=denoiser), whole)
+    joints = observed(walks[0], FRAMES)
+    posterior = MotionPosterior(prior.of(frames=FRAMES, inference_network=denoiser), joints)
     regression = DVAEInference()
     fit = DVAEInference(mode="optimization", iterations=ITERATIONS)
 
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
-    """Return a prior and its denoiser of the published size, untrained."""
+    """Return an untrained prior of the published size and its denoiser."""
     states = BodyStates(
         walks[0].skeleton, rest_pose(walks[0].skeleton, [w.positions for w in walks])
     )
@@ -62,7 +62,7 @@ def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
 
 
 def observed(motion: Motion, frames: int) -> Joints3D:
-    """Return noisy joints of a motion's first frames."""
+    """Return noisy joints of the first frames of a motion."""
     return Joints3D.observe(motion.window(0, frames), 0.03, seed=0)
 
 

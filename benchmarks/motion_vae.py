@@ -1,11 +1,11 @@
 """Speed of motion VAE generation and training at the published size on the CPU.
 
-Weights are untrained. A training step is one of the second phase, in mixed precision. Pseudo-
-labels are computed once per frame before the first step: ``teacher_seconds_per_1000_frames``.
+Weights are untrained. Training steps are those of the second phase, in mixed precision.
+``teacher_seconds_per_1000_frames``: duration of the pseudo-labels, computed before the first step.
 
-``product_gigaflops`` is the processor's rate for bfloat16 products of two matrices of 2048 rows;
-``training_step_gigaflop`` the number of multiplications of a step;
-``training_step_share_of_products`` the fraction of its time that products alone would take.
+``product_gigaflops``: rate of bfloat16 products of two matrices of 2048 rows.
+``training_step_gigaflop``: operations of a step. ``training_step_share_of_products``: time of as
+many operations at that rate, as a fraction of the duration of a step.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def product_gigaflops(rows: int = 2048) -> float:
 
 
 def made_body() -> ArticulatedBody:
-    """Return a body of 20 bones, one after the other: the first is the rigid pose's, 19 turn."""
+    """Return a chain of 20 bones; the rigid pose determines the first, 19 rotate."""
     n_joints = BONES + 1
     names = ["root", *(f"joint {number}" for number in range(1, n_joints))]
     rest = np.tile([0.0, 0.1, 0.0], (n_joints, 1))
@@ -72,23 +72,21 @@ def made_body() -> ArticulatedBody:
 
 @torch.no_grad()
 def generate(network: MotionVAENetwork, body: ArticulatedBody) -> torch.Tensor:
-    """Return joints of drawn motions, (1 400, 10, J, 3)."""
+    """Return joint positions of drawn motions, (1400, 10, J, 3)."""
     latents = torch.randn(
         SEQUENCES, network.settings.latent, generator=torch.Generator().manual_seed(0)
     )
-    still, here = torch.eye(3), torch.zeros(3)
+    rotation, origin = torch.eye(3), torch.zeros(3)
     frames = network.settings.frames
-    found = [
-        body.positions(network.decode(some), still.expand(frames, 3, 3), here.expand(frames, 3))
-        for some in latents.split(BATCH)
-    ]
-    return torch.cat(found)
+    rotation, origin = rotation.expand(frames, 3, 3), origin.expand(frames, 3)
+    motions = [body.positions(network.decode(z), rotation, origin) for z in latents.split(BATCH)]
+    return torch.cat(motions)
 
 
 def training(
     body: ArticulatedBody, settings: MotionVAESettings
 ) -> tuple[Callable[[], None], float]:
-    """Return a step of the second phase, and the seconds of pseudo-labels for 1000 frames."""
+    """Return a second-phase training step and the seconds of pseudo-labels per 1000 frames."""
     skeleton, rng = body.skeleton, np.random.default_rng(0)
     seen = np.ones((4 * settings.frames, skeleton.n_joints))
     tracks = []
@@ -98,7 +96,7 @@ def training(
         tracks.append(KeypointTrack(keypoints, seen, skeleton, 10.0, f"made-{n}"))
     teacher = PoseNetwork(settings, skeleton.n_joints, len(body.bones), body.n_groups)
     with warnings.catch_warnings():
-        # The bones of a chain have no mirror images.
+        # Ignore the warning that the bones have no mirrored counterparts.
         warnings.simplefilter("ignore")
         trainee = MotionVAETrainee(tracks, tracks, settings, body, teacher)
     network = trainee.network.train()
@@ -114,8 +112,8 @@ def training(
     begun = time.perf_counter()
     rest = torch.as_tensor(body.rest_positions, dtype=torch.float32)
     TeacherForcedPoses(teacher, trainee.batches, rest)
-    asked = len(trainee.batches.all_frames()[0])
-    return step, 1000 * (time.perf_counter() - begun) / asked
+    frames = len(trainee.batches.all_frames()[0])
+    return step, 1000 * (time.perf_counter() - begun) / frames
 
 
 def fastest(work: Callable[[], object], times: int) -> float:

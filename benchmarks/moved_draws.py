@@ -1,9 +1,9 @@
-"""Check that a change of layout left every draw as it was.
+"""Bitwise comparison of all draws between two revisions, as a regression check.
 
-Draws with every sampler from every problem, with few steps, at this checkout and at another
-revision, and compares the bits. ``moved_draws_differ``: runs whose draws differ, or that fail at
-one of the two. ``moved_draws_compared``: runs that returned draws at both. Problems whose data is
-missing are left out of both. Takes about ten minutes on two cores.
+Runs every sampler on every problem with few steps, at HEAD and at another revision.
+``moved_draws_differ``: number of runs with different draws, or with an error at one revision only.
+``moved_draws_compared``: number of runs with draws at both revisions. Problems without data are
+skipped. The comparison takes about ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 _ROOT = Path(__file__).resolve().parent.parent
-# Enough to pass through every branch of a sampler, not enough for good draws.
+# Sufficient to execute every branch of a sampler, but not for accurate draws.
 _EFFORT = {
     "steps": 8,
     "iterations": 20,
@@ -40,16 +40,16 @@ def digests() -> dict[str, str]:
     from probmotion.comparison import quick_samplers
     from probmotion.problems import load_problem, problem_names
 
-    found = {}
+    results = {}
     for problem in problem_names():
         try:
             posterior = load_problem(problem).posterior
         except FileNotFoundError:
             continue
         for name, sampler in quick_samplers().items():
-            found[f"{problem}/{name}"] = _digest(_short(sampler), posterior)
-            print(f"{problem}/{name}: {found[f'{problem}/{name}'][:40]}", file=sys.stderr)
-    return found
+            results[f"{problem}/{name}"] = _digest(_short(sampler), posterior)
+            print(f"{problem}/{name}: {results[f'{problem}/{name}'][:40]}", file=sys.stderr)
+    return results
 
 
 def _short(sampler: Any) -> Any:
@@ -68,7 +68,7 @@ def _digest(sampler: Any, posterior: Any) -> str:
 
 
 def _digests_of_tree(folder: Path) -> dict[str, str]:
-    """Return the digests of the package in ``folder``, laid out as a wheel holds it."""
+    """Return the digests of the package installed in ``folder``."""
     environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).resolve()), "--digests"]
     done = subprocess.run(command, env=environment, cwd=folder, stdout=subprocess.PIPE, check=True)
@@ -76,7 +76,7 @@ def _digests_of_tree(folder: Path) -> dict[str, str]:
 
 
 def _lay_out(revision: str, folder: Path) -> Path:
-    """Install a revision into ``folder``, with its own entry points."""
+    """Install a revision and its entry points into ``folder``; return the installed tree."""
     source = folder / "source"
     source.mkdir(parents=True)
     archive = subprocess.run(
@@ -89,23 +89,23 @@ def _lay_out(revision: str, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the differing runs and their number."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--before", default="fe35fb8", help="Revision to compare with.")
+    parser.add_argument("--before", default="fe35fb8", help="Other revision; default: fe35fb8.")
     parser.add_argument("--digests", action="store_true", help="Print this tree's digests as JSON.")
-    parser.add_argument("--keep", type=Path, help="File that keeps the other revision's digests.")
-    given = parser.parse_args()
-    if given.digests:
+    parser.add_argument("--keep", type=Path, help="Cache file for digests of the other revision.")
+    options = parser.parse_args()
+    if options.digests:
         print(json.dumps(digests()))
         return
-    with tempfile.TemporaryDirectory() as made:
-        if given.keep and given.keep.exists():
-            before = dict(json.loads(given.keep.read_text(encoding="utf-8")))
+    with tempfile.TemporaryDirectory() as folder:
+        if options.keep and options.keep.exists():
+            before = dict(json.loads(options.keep.read_text(encoding="utf-8")))
         else:
-            before = _digests_of_tree(_lay_out(given.before, Path(made) / "before"))
-            if given.keep:
-                given.keep.write_text(json.dumps(before, indent=1), encoding="utf-8")
-        after = _digests_of_tree(_lay_out("HEAD", Path(made) / "after"))
+            before = _digests_of_tree(_lay_out(options.before, Path(folder) / "before"))
+            if options.keep:
+                options.keep.write_text(json.dumps(before, indent=1), encoding="utf-8")
+        after = _digests_of_tree(_lay_out("HEAD", Path(folder) / "after"))
     differing = [run for run in before | after if before.get(run) != after.get(run)]
     for run in differing:
         print(f"{run}: {before.get(run)} before, {after.get(run)} after")

@@ -1,15 +1,15 @@
-"""Count how many seeded faults the tests catch.
+"""Mutation testing: fraction of seeded faults detected by the tests, at two revisions.
 
-A mutant is one fault in one expression: another operator or constant, a lost sign, two swapped
-arguments. They are chosen at random, with a fixed seed, in metrics, priors, samplers and formats of
-the first revision; the same ones are looked for in the second, by function and expression, wherever
-that function is now. Each runs for at most 60 s of processor time against the test files that
-import its module, or else those of its room, the closest in name first, slow tests left out.
+A mutant has one fault in one expression: a changed operator or constant, a removed sign, or two
+swapped arguments. Mutants are sampled with a fixed seed from metrics, priors, samplers and formats
+of the first revision. In the second revision they are located by function and expression. Each is
+tested for at most 60 s of processor time with the test files that import its module, or else with
+those of its package, in order of name similarity and without slow tests.
 
-``mutants_caught_before``, ``mutants_caught_after``: share of the mutants that exist at both
-revisions whose tests fail in that time. ``mutants_gone``: those whose expression the second
-revision no longer has. Takes about two hours on two cores; results are kept in ``--out``, and the
-same command continues from there.
+``mutants_caught_before``, ``mutants_caught_after``: fraction of mutants with failing tests among
+those that exist at both revisions. ``mutants_gone``: number of mutants without a match in the
+second revision. The benchmark takes about two hours on two cores. Results are stored in ``--out``;
+run the same command again to resume an interrupted run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pathlib import Path
 _ROOT = Path(__file__).resolve().parent.parent
 _COUNT, _SEED = 200, 20261123
 _SECONDS = 60
-_PLACES = ("metrics", "formats", "io", "samplers", "models")
+_FOLDERS = ("metrics", "formats", "io", "samplers", "models")
 # Priors; other models are networks and their training.
 _PRIORS = (
     "mixture", "pose_chart", "penetration.py", "joint_limits.py", "standard_normal",
@@ -47,7 +47,7 @@ _OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault: in a function, the ``place``-th node that prints as ``old`` becomes ``new``."""
+    """Fault of one expression: occurrence ``place`` of ``old`` in a function becomes ``new``."""
 
     file: str
     function: str
@@ -66,7 +66,7 @@ def functions(tree: ast.AST, above: str = "") -> Iterator[tuple[str, ast.AST]]:
 
 
 def expressions(function: ast.AST) -> Iterator[ast.expr]:
-    """Yield the expressions of a function's body that a mutant may change."""
+    """Yield the expressions of a function body that are eligible for mutation."""
     for statement in getattr(function, "body", ()):
         waiting: list[ast.AST] = [statement]
         while waiting:
@@ -80,7 +80,7 @@ def expressions(function: ast.AST) -> Iterator[ast.expr]:
 
 
 def mutated(node: ast.expr) -> ast.expr | None:
-    """Return the expression with a fault, or None where it has no operator, number or arguments."""
+    """Return the expression with a fault, or None if no fault applies to it."""
     copy = deepcopy(node)
     if isinstance(copy, ast.BinOp) and type(copy.op) in _OPERATORS:
         if isinstance(copy.left, ast.Constant) and isinstance(copy.left.value, str):
@@ -102,13 +102,13 @@ def mutated(node: ast.expr) -> ast.expr | None:
 
 
 def choose(package: Path) -> list[Mutant]:
-    """Return the mutants of a revision, the same ones at every call."""
-    found = []
+    """Return the mutants of a revision, sampled with a fixed seed."""
+    mutants = []
     for path in sorted(package.rglob("*.py")):
         file = path.relative_to(package).as_posix()
-        place = file.split("/")[0]
-        is_prior = place != "models" or any(prior in file for prior in _PRIORS)
-        if place not in _PLACES or not is_prior or "kernels" in file:
+        folder = file.split("/")[0]
+        is_prior = folder != "models" or any(prior in file for prior in _PRIORS)
+        if folder not in _FOLDERS or not is_prior or "kernels" in file:
             continue
         for name, function in functions(ast.parse(path.read_text(encoding="utf-8"))):
             seen: dict[str, int] = {}
@@ -117,20 +117,20 @@ def choose(package: Path) -> list[Mutant]:
                 seen[old] = seen.get(old, -1) + 1
                 fault = mutated(node)
                 if fault is not None and ast.unparse(fault) != old:
-                    found.append(Mutant(file, name, seen[old], old, ast.unparse(fault)))
-    return random.Random(_SEED).sample(found, _COUNT)
+                    mutants.append(Mutant(file, name, seen[old], old, ast.unparse(fault)))
+    return random.Random(_SEED).sample(mutants, _COUNT)
 
 
 def apply(mutant: Mutant, package: Path) -> Path | None:
-    """Write the fault into the package, wherever its function is now; None where it is gone."""
+    """Write the fault to its file and return the path, or None if the expression is gone."""
     first = package / mutant.file
     name = mutant.function.rpartition(".")[2]
     for path in [first, *sorted(package.rglob("*.py"))]:
         source = path.read_text(encoding="utf-8") if path.exists() else ""
         if f"def {name}(" not in source:
             continue
-        for found, function in functions(ast.parse(source)):
-            if found != mutant.function:
+        for qualified, function in functions(ast.parse(source)):
+            if qualified != mutant.function:
                 continue
             same = [node for node in expressions(function) if ast.unparse(node) == mutant.old]
             if len(same) > mutant.place:
@@ -145,12 +145,12 @@ def _replaced(source: str, node: ast.expr, new: str) -> str:
     assert node.end_col_offset is not None
     start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
     stop = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
-    whole = b"".join(lines)
-    return (whole[:start] + f"({new})".encode() + whole[stop:]).decode()
+    text = b"".join(lines)
+    return (text[:start] + f"({new})".encode() + text[stop:]).decode()
 
 
 def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
-    """Return the test files that import a module or a public name of it, or else its room's."""
+    """Return the test files that import a module or its names, or else those of its package."""
     module = "probmotion." + ".".join(path.relative_to(package).with_suffix("").parts)
     public = {
         node.name
@@ -168,14 +168,14 @@ def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
                 found.append(test.relative_to(tests.parent).as_posix())
                 break
     if not found:
-        room = tests / path.parent.relative_to(package)
-        found = [test.relative_to(tests.parent).as_posix() for test in room.rglob("test_*.py")]
+        folder = tests / path.parent.relative_to(package)
+        found = [test.relative_to(tests.parent).as_posix() for test in folder.rglob("test_*.py")]
     words = set(path.stem.split("_"))
     return sorted(found, key=lambda test: (-len(words & set(Path(test).stem.split("_"))), test))
 
 
 def lay_out(revision: str, folder: Path) -> None:
-    """Make a tree of a revision: the package as installed, its metadata, and its tests."""
+    """Create a folder with the installed package of a revision, its metadata and its tests."""
     if (folder / "ready").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -196,7 +196,7 @@ def lay_out(revision: str, folder: Path) -> None:
 
 
 def caught(mutant: Mutant, tree: Path) -> str:
-    """Return ``caught``, ``survived``, ``untested`` or ``gone``."""
+    """Return the result of a mutant: ``caught``, ``survived``, ``untested`` or ``gone``."""
     package = tree / "probmotion"
     before: dict[Path, str] = {}
     for path in package.rglob("*.py"):
@@ -220,35 +220,35 @@ def caught(mutant: Mutant, tree: Path) -> str:
             capture_output=True, check=False, stdin=subprocess.DEVNULL,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS)),
         )  # fmt: skip
-        # A negative code: out of time without a failure. 5: no test selected.
+        # Negative codes: time limit reached without a failure. 5: no test selected.
         return "caught" if done.returncode in (1, 2, 3, 4) else "survived"
     finally:
         changed.write_text(before[changed], encoding="utf-8")
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the fraction of mutants caught at each revision."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--before", default="fe35fb8", help="First revision.")
-    parser.add_argument("--after", default="HEAD", help="Second revision.")
-    parser.add_argument("--only", choices=("before", "after"), help="Run one of the two.")
-    parser.add_argument("--workers", type=int, default=2, help="Mutants at a time.")
-    parser.add_argument("--out", type=Path, default=Path("mutants"), help="Folder of results.")
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    out = given.out.resolve()
-    lay_out(given.before, out / "before-0")
+    parser.add_argument("--before", default="fe35fb8", help="First revision; default: fe35fb8.")
+    parser.add_argument("--after", default="HEAD", help="Second revision; default: HEAD.")
+    parser.add_argument("--only", choices=("before", "after"), help="Run one revision only.")
+    parser.add_argument("--workers", type=int, default=2, help="Number of workers; default: 2.")
+    parser.add_argument("--out", type=Path, default=Path("mutants"), help="Output folder.")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    out = options.out.resolve()
+    lay_out(options.before, out / "before-0")
     mutants = choose(out / "before-0" / "probmotion")
     results = {}
     for side in ("before", "after"):
         kept = out / f"{side}.json"
         found = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
         results[side] = found
-        if given.only not in (None, side):
+        if options.only not in (None, side):
             continue
-        trees = [out / f"{side}-{worker}" for worker in range(given.workers)]
+        trees = [out / f"{side}-{worker}" for worker in range(options.workers)]
         for tree in trees:
-            lay_out(getattr(given, side), tree)
+            lay_out(getattr(options, side), tree)
 
         def run(
             worker: int,
@@ -256,7 +256,7 @@ def main() -> None:
             found: dict[str, str] = found,
             kept: Path = kept,
         ) -> None:
-            for number in range(worker, len(mutants), given.workers):
+            for number in range(worker, len(mutants), options.workers):
                 if str(number) not in found:
                     found[str(number)] = caught(mutants[number], trees[worker])
                     kept.write_text(json.dumps(found, indent=1), encoding="utf-8")
@@ -264,15 +264,15 @@ def main() -> None:
                         kept.stem, number, found[str(number)], asdict(mutants[number]), flush=True
                     )
 
-        with ThreadPoolExecutor(given.workers) as pool:
-            list(pool.map(run, range(given.workers)))
+        with ThreadPoolExecutor(options.workers) as pool:
+            list(pool.map(run, range(options.workers)))
     both = [
         n for n, result in results["after"].items() if result != "gone" and n in results["before"]
     ]
     for side in ("before", "after"):
-        some = both or list(results[side])
-        shares = [results[side].get(n) == "caught" for n in some]
-        print(f"mutants_caught_{side}: {sum(shares) / max(1, len(shares)):.3f}")
+        numbers = both or list(results[side])
+        detected = [results[side].get(n) == "caught" for n in numbers]
+        print(f"mutants_caught_{side}: {sum(detected) / max(1, len(detected)):.3f}")
     print(f"mutants_gone: {sum(result == 'gone' for result in results['after'].values())}")
 
 

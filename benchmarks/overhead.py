@@ -1,8 +1,8 @@
 """Overhead of this package over NumPyro and emcee called directly.
 
 ``nuts_ratio``, ``ensemble_ratio``: processor seconds of our sampler over those of the library on
-the same density, start and random numbers; the script stops unless both give the same draws. NUTS
-is compiled anew by both. Medians over interleaved repeats in one process. ``import_seconds``:
+the same density, start and random numbers; the script exits with an error if the draws differ.
+Both compile NUTS anew. Medians over interleaved repeats in one process. ``import_seconds``:
 ``import probmotion`` in a new process, minimum of several. Float64, one thread.
 """
 
@@ -36,7 +36,7 @@ SEED = 0
 
 
 def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
-    """Return θ of one chain drawn with NumPyro directly, and make the motions."""
+    """Return θ of one chain drawn with NumPyro directly; also compute the motions."""
     start = posterior.initial(seeds.generator(SEED, "initial", 0), 1)[0]
     with jax.enable_x64(True):
         chain = MCMC(
@@ -56,7 +56,7 @@ def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.nda
 
 
 def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
-    """Return θ of one chain by our sampler."""
+    """Return θ of one chain drawn with our sampler."""
     compiled.cache_clear()
     result = NUTS(warmup=warmup, candidates=1).sample(
         posterior, draws=draws, seed=SEED, progress=False
@@ -65,7 +65,7 @@ def nuts(posterior: MotionPosterior, warmup: int, draws: int) -> np.ndarray:
 
 
 def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
-    """Return θ of one ensemble drawn with emcee directly, and make the motions."""
+    """Return θ of one ensemble drawn with emcee directly; also compute the motions."""
     walkers = 4 * posterior.dim
     start = posterior.initial(seeds.generator(SEED, "initial", 0), walkers)
     source = np.random.RandomState(np.random.MT19937(seeds.sequence(SEED, "chain", 0)))
@@ -80,25 +80,25 @@ def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin:
 
 
 def ensemble(posterior: MotionPosterior, warmup: int, draws: int, thin: int) -> np.ndarray:
-    """Return θ of one ensemble by our sampler."""
+    """Return θ of one ensemble drawn with our sampler."""
     sampler = Ensemble(warmup=warmup, thin=thin, candidates=1)
     result = sampler.sample(posterior, draws=draws, seed=SEED, progress=False)
     return result.dataset["theta"].values[0]
 
 
 def ratio(ours: Callable[[], np.ndarray], theirs: Callable[[], np.ndarray], repeats: int) -> float:
-    """Return the median over repeats of seconds of ``ours`` over those of ``theirs``."""
+    """Return the median ratio of the processor time of ``ours`` to that of ``theirs``."""
     ratios = []
     for repeat in range(repeats):
         seconds, draws = {}, {}
-        # Who goes first alternates, so that a machine that speeds up favours neither.
+        # Alternate the order, so that a drift of the clock rate does not bias the ratio.
         for function in (ours, theirs) if repeat % 2 else (theirs, ours):
-            # Of this process alone, whatever else the machine does.
+            # Processor time of this process only, independent of other load.
             start = time.process_time()
             draws[function] = function()
             seconds[function] = time.process_time() - start
         if not np.array_equal(draws[ours], draws[theirs]):
-            raise SystemExit("the two did not make the same draws, expected them to")
+            raise SystemExit("draws of both functions must be equal, got different ones")
         ratios.append(seconds[ours] / seconds[theirs])
     return float(np.median(ratios))
 
@@ -112,7 +112,7 @@ def import_seconds(repeats: int = 7) -> float:
 
 
 def main() -> None:
-    """Print the figures; those of MAS follow from ``mas_overhead.py``."""
+    """Print the measurements, then those of ``mas_overhead.py``."""
     print(f"import_seconds: {import_seconds():.3f}")
     posterior = load_problem("gait-monocular").posterior
     of_nuts = ratio(

@@ -1,12 +1,12 @@
-"""How fast pose-pairs are drawn: full density, 32 views, the 32 nearest of 6000 annotations each.
+"""Speed of pose-pair sampling: 32 views, for each the 32 nearest of 6000 annotations.
 
 ``proposals_per_second``: density evaluations of Metropolis-Hastings on all threads (SciPy's Qhull
-takes about 220 µs for each of the 32 triangulations that one evaluation makes).
-``draws_per_second``: kept draws, one per step of every chain; the published system makes about 10
-a second on four cores. ``acceptance``; ``ess_per_second``: bulk, of the coordinate that mixes
-worst. ``triangulation_share``: of the time of an evaluation, on one thread. ``memory_gib``: the
-most that a process held that kept ``draws_kept`` draws and saved them. Made data (procedural
-dances), so that it runs anywhere; with ``--data FOLDER`` the real salsa clips there.
+takes about 220 µs for each of the 32 triangulations of an evaluation). ``draws_per_second``: one
+draw per step of every chain; the published system draws about 10 per second on four cores.
+``acceptance``: mean acceptance rate. ``ess_per_second``: bulk effective sample size of the worst
+coordinate. ``triangulation_share``: fraction of an evaluation spent on triangulations, one thread.
+``memory_gib``: peak memory of a process that draws and saves ``draws_kept`` draws. The data are
+synthetic dances, or the salsa clips in ``--data FOLDER``.
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ CHAINS, WARMUP, DRAWS = 32, 300, 400
 
 
 @numba.njit(cache=True)
-def triangulate_all(pictures: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> int:
-    """Triangulate every picture, (n, J, 2); return the number of edges."""
+def triangulate_all(keypoints: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> int:
+    """Triangulate the joints of every view, (n, J, 2); return the number of edges."""
     total = 0
-    for picture in pictures:
-        total += write_delaunay(picture, offsets, edges)[0]
+    for view in keypoints:
+        total += write_delaunay(view, offsets, edges)[0]
     return total
 
 
 def problem(folder: str | None) -> Problem:
-    """Return the problem with 6000 annotations."""
+    """Return the pose-pair problem with 6000 annotations."""
     if folder is not None:
         return pairs_problem(salsa_pairs(folder), SALSA_HELD_OUT, n_annotations=6000)
     return pairs_problem(synthetic_dances(80), ["dance-78", "dance-79"], n_annotations=6000)
 
 
 def triangulation_share(given: Problem, theta: np.ndarray) -> float:
-    """Return the share of an evaluation that its triangulations take, on one thread."""
+    """Return the fraction of an evaluation spent on triangulations, on one thread."""
     numba.set_num_threads(1)
     posterior = given.posterior
     poses = posterior.motion(theta)[:, 0]
-    pictures = project_to_views(poses, posterior.likelihood.views, posterior.skeleton)
-    pictures = np.ascontiguousarray(pictures.reshape(-1, *pictures.shape[2:]))
-    joints = pictures.shape[1]
+    keypoints = project_to_views(poses, posterior.likelihood.views, posterior.skeleton)
+    keypoints = np.ascontiguousarray(keypoints.reshape(-1, *keypoints.shape[2:]))
+    joints = keypoints.shape[1]
     edges = np.empty((max_planar_edges(joints), 2), dtype=np.int16)
     offsets = joggle_offsets(joints, 2)
     seconds = []
     for call in (
-        lambda: triangulate_all(pictures, offsets, edges),
+        lambda: triangulate_all(keypoints, offsets, edges),
         lambda: posterior.log_density(theta),
     ):
         call()
@@ -78,20 +78,20 @@ def triangulation_share(given: Problem, theta: np.ndarray) -> float:
 
 
 def keep_many(folder: str | None, draws: int) -> None:
-    """Keep and save ``draws`` draws; print the memory it took."""
+    """Draw and save ``draws`` draws; print the peak memory of the process."""
     sampler = MetropolisHastings(Isotropic(0.02), warmup=WARMUP, thin=1)
     posterior = problem(folder).posterior
-    kept = sampler.sample(posterior, draws=draws // CHAINS, chains=CHAINS, progress=False)
-    with tempfile.TemporaryDirectory() as place:
-        kept.save(Path(place) / "draws.nc")
-    print(f"draws_kept: {kept.positions.sizes['draw'] * CHAINS}")
+    result = sampler.sample(posterior, draws=draws // CHAINS, chains=CHAINS, progress=False)
+    with tempfile.TemporaryDirectory() as output:
+        result.save(Path(output) / "draws.nc")
+    print(f"draws_kept: {result.positions.sizes['draw'] * CHAINS}")
     print(f"memory_gib: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f}")
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", help="folder of the salsa clips")
+    parser.add_argument("--data", help="Folder with the salsa clips; default: synthetic dances.")
     parser.add_argument("--keep", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.keep:
@@ -109,7 +109,7 @@ def main() -> None:
     share = triangulation_share(given, draws.dataset["theta"].values[:, -1])
     print(f"triangulation_share: {share:.3f}")
     folder = ["--data", options.data] if options.data else []
-    # A process of its own, whose peak is that of keeping draws.
+    # A new process, so that the peak memory is that of drawing and saving alone.
     subprocess.run([sys.executable, __file__, "--keep", "100000", *folder], check=True)
 
 

@@ -1,14 +1,14 @@
-"""How fast and how near to the minimiser: L = 180, J = 16, V = 5, perspective, one thread, NumPy.
+"""Speed and accuracy of triangulation: L = 180, J = 16, V = 5, perspective, one thread, NumPy.
 
-Six steps of a sampler, each warm-started from the last motion, which is 20, 10, 5, 3, 2 and 1 cm
-off as the noise falls; two linearisations each. Beside it an Adam loop in torch on the same input
-(lr 0.01, the same start, until the loss no longer falls, at most 1000 iterations), as in the MAS
-authors' code. ``milliseconds`` is the closed form's shortest call; ``speed_ratio_to_adam`` compares
-all six steps, and the distances to the minimiser are root mean squares over them.
+Six calls with two linearisations each, as in the steps of a sampler: the errors of the initial
+motions are 20, 10, 5, 3, 2 and 1 cm. They are compared with Adam in PyTorch from the same initial
+motions (learning rate 0.01, until the loss stops decreasing, at most 1000 iterations), as in the
+code of the MAS authors. ``milliseconds``: minimum duration of a call. ``speed_ratio_to_adam``:
+ratio over all six calls. Distances to the minimiser are root mean squares over the calls.
 
-Adam does one of two things. From 5 cm and more it converges, nearer than two linearisations come,
-in about a second. From less its momentum carries it past the minimum in a few iterations, where it
-stops 6 to 10 mm short: ``speed_ratio_where_adam_stops_early`` is the ratio there.
+With initial errors of at least 5 cm, Adam converges in about a second and is more accurate than
+two linearisations. With smaller errors it overshoots and stops after a few iterations, 6 to 10 mm
+from the minimiser; ``speed_ratio_where_adam_stops_early`` is the ratio for these.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STARTS = (0.20, 0.10, 0.05, 0.03, 0.02, 0.01)
 
 
 def problem(seed: int = 0) -> tuple[np.ndarray, Cameras, list[np.ndarray]]:
-    """Return keypoints that disagree by 2 cm, their cameras, and a start per step."""
+    """Return keypoints with 2 cm noise, their cameras, and an initial motion per step."""
     rng = np.random.default_rng(seed)
     cameras = Cameras.ring(V, elevation=np.pi / 16, perspective=True)
     motion = 0.4 * rng.standard_normal((L, J, 3))
@@ -44,16 +44,16 @@ def problem(seed: int = 0) -> tuple[np.ndarray, Cameras, list[np.ndarray]]:
 def adam(
     keypoints: np.ndarray, cameras: Cameras, initial: np.ndarray, most: int = 1000
 ) -> np.ndarray:
-    """Return what Adam finds: it stops at the first iteration that does not lower the loss."""
+    """Return the estimate of Adam, stopped when an iteration does not reduce the loss."""
     import torch
 
     torch.set_num_threads(1)
-    wanted = torch.tensor(keypoints)
+    target = torch.tensor(keypoints)
     motion = torch.tensor(initial, requires_grad=True)
     optimiser = torch.optim.Adam([motion], lr=0.01)
     best = float("inf")
     for _ in range(most):
-        loss = ((cameras.project(motion) - wanted) ** 2).mean()
+        loss = ((cameras.project(motion) - target) ** 2).mean()
         if float(loss.detach()) >= best:
             break
         best = float(loss.detach())
@@ -64,7 +64,7 @@ def adam(
 
 
 def shortest(call: Callable[[], object], repeats: int) -> float:
-    """Return the shortest of ``repeats`` calls, seconds: other work can only add to it."""
+    """Return the minimum duration of ``repeats`` calls, in seconds."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -74,15 +74,14 @@ def shortest(call: Callable[[], object], repeats: int) -> float:
 
 
 def rms(differences: list[np.ndarray]) -> float:
-    """Return the root mean square over all steps, metres."""
+    """Return the root mean square of the differences over all steps, in metres."""
     return float(np.sqrt(np.mean(np.square(differences))))
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     keypoints, cameras, starts = problem()
-    # Many motions at once first, as a sampler has them: the memory that the system hands to the
-    # process for that is used again by the smaller calls.
+    # Warm-up with a batch of motions, as in a sampler, so that the timed calls reuse its memory.
     triangulate(np.stack([keypoints] * 16), cameras)
     adam(keypoints, cameras, starts[-1])
     ours, theirs, our_errors, their_errors = [], [], [], []

@@ -33,7 +33,7 @@ extensions = [
 exclude_patterns = ["_build", "_build_pages"]
 nitpicky = False
 
-# Inventories of other projects are read where pages are hosted; a local build stays offline.
+# Read the inventories of other projects on Read the Docs only; local builds are offline.
 intersphinx_mapping = (
     {
         "python": ("https://docs.python.org/3", None),
@@ -53,9 +53,9 @@ python_use_unqualified_type_names = True
 
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
 myst_heading_anchors = 3
-# Tutorials are executed by `make notebooks`; their outputs lie in the repository.
+# Tutorials are executed by `make notebooks`; their outputs are stored in the repository.
 nb_execution_mode = "off"
-# Shapes in types, such as (n, dim), are no references.
+# Shapes in type descriptions, such as (n, dim), are not references.
 suppress_warnings = ["mystnb.unknown_mime_type", "ref.python"]
 
 html_theme = "furo"

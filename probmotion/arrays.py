@@ -17,8 +17,8 @@ Array = Any
 def constant(value: Any, like: Array) -> Array:
     """Return ``value`` as an array of the library, dtype and device of the float array ``like``."""
     xp = array_namespace(like)
-    where = {} if is_jax_array(like) else {"device": device(like)}
-    return xp.asarray(np.asarray(value), dtype=like.dtype, **where)
+    options = {} if is_jax_array(like) else {"device": device(like)}
+    return xp.asarray(np.asarray(value), dtype=like.dtype, **options)
 
 
 def to_numpy(x: Array) -> np.ndarray:
@@ -29,12 +29,12 @@ def to_numpy(x: Array) -> np.ndarray:
 
 
 def logsumexp(x: Array, axis: int = -1) -> Array:
-    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` if all entries are."""
+    """Return ``log Σ exp(x)`` over ``axis`` without overflow; ``-inf`` if all entries are -inf."""
     xp = array_namespace(x)
     top = xp.max(x, axis=axis, keepdims=True)
     top = xp.where(xp.isfinite(top), top, xp.zeros_like(top))
     total = xp.sum(xp.exp(x - top), axis=axis, keepdims=True)
-    # NumPy would warn about log 0.
+    # Avoid NumPy's warning about log 0.
     empty = total == 0
     log_total = xp.log(xp.where(empty, xp.ones_like(total), total))
     log_total = xp.where(empty, xp.full_like(total, -float("inf")), log_total)

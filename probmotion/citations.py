@@ -61,7 +61,7 @@ OF_SETTINGS: Mapping[str, tuple[str, ...]] = {
         "computations. Annals of Statistics 37.",
     ),
 }
-"""References by a fragment of the settings' JSON."""
+"""References by fragment of the JSON text of the settings."""
 
 POSE_PAIRS = (
     "Yin, Huang, Ho, Wang, Komura, Cohen-Or, Zhang (2018). A sampling approach to generating "
@@ -77,6 +77,6 @@ def citations_of(sampler: str, settings: str = "", people: int = 1) -> list[str]
 
     ``settings`` are the sampler's settings as JSON, ``people`` the number of people in the motion.
     """
-    used = [work for words, works in OF_SETTINGS.items() if words in settings for work in works]
+    extra = [work for text, works in OF_SETTINGS.items() if text in settings for work in works]
     pairs = POSE_PAIRS if people > 1 and sampler == "mh" else ()
-    return [*CITATIONS.get(sampler, ()), *used, *pairs, _OURS]
+    return [*CITATIONS.get(sampler, ()), *extra, *pairs, _OURS]

@@ -15,7 +15,7 @@ __all__ = ["forget_killed", "writable_folder", "written_whole"]
 
 
 def _machine() -> str:
-    """Return an identifier of this machine or container; host names alone may repeat."""
+    """Return an identifier of this machine or container; host names alone are not unique."""
     parts = [platform.node()]
     with suppress(OSError):
         parts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
@@ -38,7 +38,7 @@ def written_whole(path: Path) -> Iterator[Path]:
         If the folder does not exist or is not writable.
     """
     path = Path(path)
-    # Writers choose the format by the suffix, so the temporary name ends in the same one.
+    # Writers choose the format by the suffix, so the temporary name has the same suffix.
     owner = f"{_MACHINE}.{os.getpid()}"
     unfinished = path.with_name(f".{path.stem}.{owner}.unfinished{path.suffix}")
     try:
@@ -48,15 +48,15 @@ def written_whole(path: Path) -> Iterator[Path]:
         reason = error.strerror or str(error)
         raise OSError(f"cannot write {path}: {reason}; choose a writable folder") from error
     finally:
-        # If the folder is missing, unlink fails too and must not replace the first error.
+        # If the folder is missing, unlink fails too and must not mask the original error.
         with suppress(OSError):
             unfinished.unlink()
 
 
 def forget_killed(folder: Path) -> None:
-    """Remove temporary files in ``folder`` left by killed processes of this machine.
+    """Remove temporary files in ``folder`` written by killed processes of this machine.
 
-    The processes of other machines that share the folder may still run.
+    Files of other machines that share the folder are preserved: their processes may still run.
     """
     # Only POSIX can test for a process without affecting it.
     if os.name != "posix" or not folder.is_dir():

@@ -1,6 +1,6 @@
 """Named independent random generators from one integer seed, for NumPy, PyTorch and JAX.
 
-A generator is identified by its path of names (``"draw", 3, 17``), not by the order of requests.
+A generator is determined by its path of names (``"draw", 3, 17``), not by the order of creation.
 Draws therefore do not depend on the number of workers, batches or chains.
 """
 
@@ -37,16 +37,16 @@ class RandomNumbers(Protocol):
 
 
 def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
-    """Return the ``SeedSequence`` at ``path``, names such as ``"chain", 2``, below ``seed``.
+    """Return the ``SeedSequence`` for ``seed`` and ``path``, for example ``"chain", 2``.
 
     Raises
     ------
     ValueError
-        If ``seed`` is not an integer of at least 0.
+        If ``seed`` is not a non-negative integer.
     """
     if isinstance(seed, bool) or not isinstance(seed, _INTEGERS) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-    # The type tag prevents a string and an integer from addressing the same node.
+    # The type tag prevents collisions between strings and integers.
     key: list[int] = []
     for name in path:
         key += (1, zlib.crc32(name.encode())) if isinstance(name, str) else (0, int(name))
@@ -54,7 +54,7 @@ def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
 
 
 def generator(seed: int, *path: Name) -> np.random.Generator:
-    """Return the NumPy generator at ``path`` below ``seed``."""
+    """Return the NumPy generator for ``seed`` and ``path``."""
     return np.random.Generator(np.random.PCG64(sequence(seed, *path)))
 
 
@@ -81,19 +81,19 @@ def resumed_generator(words: np.ndarray) -> np.random.Generator:
 
 
 def integer(seed: int, *path: Name) -> int:
-    """Return the 63-bit integer at ``path`` below ``seed``, for libraries that take an integer."""
+    """Return the 63-bit integer for ``seed`` and ``path``, for libraries with integer seeds."""
     return int(sequence(seed, *path).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def torch_generator(seed: int, *path: Name, device: str = "cpu") -> torch.Generator:
-    """Return the torch generator at ``path`` below ``seed``."""
+    """Return the torch generator for ``seed`` and ``path``."""
     import torch
 
     return torch.Generator(device=device).manual_seed(integer(seed, *path))
 
 
 def jax_key(seed: int, *path: Name) -> Any:
-    """Return the JAX key at ``path`` below ``seed``."""
+    """Return the JAX key for ``seed`` and ``path``."""
     import jax
 
     return jax.random.key(integer(seed, *path) & 0xFFFFFFFF)
@@ -123,11 +123,11 @@ class NormalStreams:
         return self.random((len(self.generators), *shape))
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:
-        """Return :meth:`uniform`; ``size`` begins with the number of draws."""
+        """Return uniform numbers; the first entry of ``size`` must be the number of draws."""
         return self._filled("random", size)
 
     def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
-        """Return :meth:`normal`; ``size`` begins with the number of draws."""
+        """Return normal numbers; the first entry of ``size`` must be the number of draws."""
         return self._filled("standard_normal", size)
 
     def _filled(self, method: str, size: tuple[int, ...]) -> np.ndarray:

@@ -27,16 +27,16 @@ def only_one_thread() -> bool:
 def one_thread() -> Iterator[None]:
     """Limit linear algebra and torch to one thread inside the block.
 
-    Several threads may be inside at once. Process-wide limits (the environment and the BLAS pools)
-    are set by the first to enter and restored by the last to leave; torch's and OpenMP's per-thread
-    limits are restored as each thread leaves. Libraries first loaded inside the block take their
-    limit from the environment.
+    Several threads may enter concurrently. Process-wide limits (environment and BLAS pools) are set
+    by the first thread to enter and restored by the last thread to exit; per-thread limits of torch
+    and OpenMP are restored when each thread exits. Libraries first loaded inside the block read
+    their limit from the environment.
     """
-    # SciPy has its own BLAS, which can be limited only once it is loaded.
+    # SciPy bundles a separate BLAS, which can be limited only after loading.
     import scipy.linalg  # noqa: F401
 
-    # On an executor, another thread may be importing torch or JAX, and array libraries would see
-    # the half-imported module. import_module waits until the import is complete.
+    # On an executor, another thread may be importing torch or JAX, and array libraries would use
+    # the partially imported module. import_module waits until the import is complete.
     if current_thread() is not main_thread():
         for name in ("torch", "jax"):
             importlib.import_module(name)
@@ -88,8 +88,8 @@ def _limit_linear_algebra() -> Callable[[], None]:
     """Limit the BLAS pools; return a function that restores them from any thread."""
     from threadpoolctl import OpenBLASController, ThreadpoolController
 
-    # Since 3.8, threadpoolctl silently ignores calls from a thread other than the one that set the
-    # limit, but the last thread to leave need not be the first that entered.
+    # Since version 3.8, threadpoolctl ignores calls from threads that did not set the limit, but
+    # the last thread to exit may differ from the first thread to enter.
     release = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
     release(force=True)
     limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
@@ -122,8 +122,8 @@ def _per_thread_limits(torch: Any) -> Iterator[None]:
     from threadpoolctl import ThreadpoolController
 
     before = torch.get_num_threads() if torch else 0
-    # A thread that loads torch while another one is inside inherits a count of 1 and would restore
-    # that 1 on leaving.
+    # A thread that loads torch while another thread is in the block inherits a count of 1 and would
+    # restore 1 on exit.
     if before == 1 and not only_one_thread():
         before = _SHARED.torch_threads or before
     try:

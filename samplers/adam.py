@@ -18,14 +18,14 @@ class Adam:
         self.n_steps = 0
 
     def descend(self, gradient: np.ndarray) -> None:
-        """Take one step."""
+        """Update the parameters by one descent step."""
         self.n_steps += 1
         self.mean *= 0.9
         self.mean += 0.1 * gradient
         self.square *= 0.999
         self.square += 0.001 * gradient**2
-        # The divisors correct the bias of moments that start at 0.
-        size = np.sqrt(self.square / (1 - 0.999**self.n_steps))
-        size += 1e-8
+        # Correct the bias of moments initialised at 0.
+        scale = np.sqrt(self.square / (1 - 0.999**self.n_steps))
+        scale += 1e-8
         step = self.learning_rate / (1 - 0.9**self.n_steps)
-        self.parameters -= step * self.mean / size
+        self.parameters -= step * self.mean / scale

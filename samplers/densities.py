@@ -1,4 +1,4 @@
-"""Shared code of samplers that evaluate a log density: counting, starting points, restarts."""
+"""Log densities with evaluation counts, starting points and continuation of runs."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Density:
         self.evaluations = 0
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
-        """Return log p(θ) + log p(y | θ): ``(n, dim) → (n,)``; NaN and +∞ are errors."""
+        """Return log p(θ) + log p(y | θ): ``(n, dim) → (n,)``; NaN and +∞ raise ``ValueError``."""
         return _below_infinity(self._counted(self.posterior.log_density, theta), theta)
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None, guided: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log density, (n,), and the guide of proposals at ``theta``, (n, dim).
+        """Return the log density, (n,), and the proposal guide at ``theta``, (n, dim).
 
-        With ``generators``, one per point, the density is estimated from freshly drawn views. The
+        With ``generators``, one per point, the density is estimated from random views. The
         guide has shape (n, dim) if ``guided``, else (n, 0).
         """
         if generators is None and not guided:
@@ -104,11 +104,11 @@ def starting_points(
 ) -> np.ndarray:
     """Return ``initial``, or prior draws resampled in proportion to their likelihood.
 
-    Every chain draws ``candidates`` from the prior and resamples among them (sampling-importance-
-    resampling, Rubin 1987). With enough candidates a start is almost a draw from the posterior, so
-    starts cover its modes in proportion to their mass and R-hat detects chains that do not mix. If
-    the prior has seeds, chains start at them in turn. ``shape`` is (chains, dim) or (chains,
-    walkers, dim).
+    Every chain resamples ``candidates`` prior draws (sampling-importance-resampling, Rubin 1987).
+    With enough candidates, starting points are approximate posterior draws: they cover the modes in
+    proportion to their mass, and R-hat detects chains that do not mix. If the prior has seeds,
+    chain c starts at seed c modulo their number. ``shape`` is (chains, dim) or (chains, walkers,
+    dim).
     """
     if initial is not None:
         assert not isinstance(initial, MotionDraws)
@@ -129,7 +129,7 @@ def starting_points(
             starts.append(posterior.initial(rng, n))
             continue
         draws = posterior.initial(rng, candidates)
-        # Gumbel top-n: n choices without replacement, with probability ∝ likelihood.
+        # Gumbel top-n: sample n without replacement, with probability ∝ likelihood.
         keys = log_likelihood(draws) + rng.gumbel(size=candidates)
         starts.append(draws[np.argsort(-keys, kind="stable")[:n]])
     return np.stack(starts).reshape(shape)
@@ -147,7 +147,7 @@ def continued(
     Raises
     ------
     ValueError
-        If the run had another sampler, settings, seed, number of chains or posterior.
+        If the sampler, settings, seed, number of chains or posterior differ from that run.
     """
     check_count("chains", chains)
     if not isinstance(initial, MotionDraws):
@@ -166,7 +166,7 @@ def continued(
                 "new run at its end, pass an array of points"
             )
     last = initial.dataset.isel(draw=-1)
-    # With estimated densities the state contains the deterministic values to compare with.
+    # If densities are estimated, the state contains deterministic densities for comparison.
     stored = initial.state.get("fixed", last["log_density"].values)
     recomputed = log_density(last["theta"].values)
     if not np.allclose(recomputed, stored, rtol=1e-6, atol=1e-6):
@@ -180,7 +180,7 @@ def continued(
 def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int) -> np.ndarray:
     """Return one motion per θ: ``(chains, draws, dim) → (chains, draws, L, J, 3)``, metres.
 
-    ``first`` is the number of the first draw in its chain.
+    ``first`` is the index of the first draw in its chain.
     """
     chains, draws, _ = theta.shape
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)

@@ -1,4 +1,4 @@
-"""Independent draws from posteriors in closed form."""
+"""Sampler of posteriors with a closed form."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["ExactSampler"]
 
 @dataclass(frozen=True)
 class ExactSampler(IndependentSampler):
-    """Independent draws from a posterior in closed form, or from the prior without observations."""
+    """Exact sampler of closed-form posteriors, or of the prior without observations."""
 
     name: ClassVar[str] = "exact"
     requires: ClassVar[tuple[Any, ...]] = (HasExactPosterior | Samplable,)
@@ -47,7 +47,7 @@ class ExactSampler(IndependentSampler):
 
 
 def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable | None, str, str]:
-    """Return the posterior in closed form, or ``None``; the reason, and the reason in one word."""
+    """Return the closed-form posterior or ``None``, the reason, and the reason in one word."""
     prior = posterior.prior
     if posterior.truncated:
         return None, "cannot draw from a posterior with a truncated density", "truncated"

@@ -1,4 +1,4 @@
-"""Base of samplers with independent draws: batches, random streams, provenance."""
+"""Base class of samplers with independent draws."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ __all__ = ["Batches", "IndependentSampler"]
 class Batches:
     """Batches of at most ``size`` draws.
 
-    ``draw(streams, tick)`` returns motions, (B, L, J, 3), in units of ``scale`` metres. It ticks
-    ``steps`` times, updates the evaluation ``counts``, and may append θ, (B, dim), to ``thetas``;
-    the result then has θ and log densities.
+    ``draw(streams, tick)`` returns motions, (B, L, J, 3), in units of ``scale`` metres. It calls
+    ``tick`` ``steps`` times, updates the evaluation ``counts``, and may append θ, (B, dim), to
+    ``thetas`` for θ and log densities in the result.
     """
 
     draw: Callable[[NormalStreams, Callable[[], Any]], np.ndarray]
@@ -40,9 +40,9 @@ class Batches:
 
 
 class IndependentSampler:
-    """Base of samplers with independent draws, which are frozen dataclasses.
+    """Base class of samplers with independent draws; subclasses are frozen dataclasses.
 
-    Every draw has its own random stream and does not depend on the number of draws or chains.
+    Every draw has a separate random stream and does not depend on the number of draws or chains.
     """
 
     name: ClassVar[str]
@@ -79,7 +79,7 @@ class IndependentSampler:
         check_count("draws", draws)
         check_count("chains", chains)
         start = time.perf_counter()
-        # Ordered by draw, so that an interrupted run has the same number of draws in every chain.
+        # Order by draw, so that an interrupted run has the same number of draws in every chain.
         pairs = [(chain, draw) for draw in range(draws) for chain in range(chains)]
         done: list[np.ndarray] = []
         spent = dict(source.counts)
@@ -100,8 +100,8 @@ class IndependentSampler:
             return _with_coordinates(result, posterior, thetas) if thetas else result
 
         bars = progress_bar(source.steps * -(-len(pairs) // source.size), self.name, progress)
-        # Multithreaded products round differently for different batch sizes, and a hundred steps
-        # amplify the difference.
+        # Rounding of multithreaded matrix products depends on the batch size, and a hundred steps
+        # amplify the differences.
         try:
             with threadpool_limits(1, user_api="blas"), bars as bar:
                 for batch in batches(pairs, source.size):
@@ -121,10 +121,10 @@ class IndependentSampler:
 def _with_coordinates(
     result: MotionDraws, posterior: MotionPosterior, thetas: Sequence[np.ndarray]
 ) -> MotionDraws:
-    """Return draws with θ and log densities added."""
+    """Return the draws with θ and log densities added."""
     shape = (result.dataset.sizes["draw"], result.dataset.sizes["chain"])
     theta = np.concatenate(thetas)[: math.prod(shape)]
-    # Row by row: the rounding of a product depends on its batch.
+    # Evaluate row by row, because rounding of matrix products depends on the batch size.
     with one_thread():
         log_density = np.concatenate([to_numpy(posterior.log_density(row[None])) for row in theta])
     return MotionDraws(

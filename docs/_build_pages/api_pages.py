@@ -1,4 +1,4 @@
-"""Write one reference page per room, with every public name of it."""
+"""Reference pages of the documentation: one per package, listing its public names."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ _TITLE = "API reference"
 
 @cache
 def rooms() -> list[str]:
-    """Return every package of probmotion, from its folders."""
+    """Return the names of all packages of probmotion, from the folders."""
     root = Path(probmotion.__file__).parent
     names = []
-    for wing, folder in (
+    for top, folder in (
         ("probmotion", root),
         ("probmotion.samplers", root.parent / "samplers"),
         ("probmotion.models", root.parent / "models"),
     ):
-        for face in sorted(folder.rglob("__init__.py")):
-            parts = face.parent.relative_to(folder).parts
-            names.append(".".join([wing, *parts]))
+        for init in sorted(folder.rglob("__init__.py")):
+            parts = init.parent.relative_to(folder).parts
+            names.append(".".join([top, *parts]))
     return names
 
 
 def _home(room: str, name: str) -> str:
-    """Return the room whose page describes a name: the one of the file that defines it."""
+    """Return the package whose page documents a name: that of the defining module."""
     value = getattr(importlib.import_module(room), name)
     module = getattr(value, "__module__", None) or room
     return module.rpartition(".")[0] if module not in rooms() else module
@@ -54,7 +54,7 @@ def _page(room: str) -> str:
         if not inspect.ismodule(getattr(module, name))
     ]
     lines = [f"``{room}``", "=" * (len(room) + 4), "", (module.__doc__ or "").strip(), ""]
-    # Links to names that other rooms describe come first, as one list.
+    # Links to names documented by other packages come first.
     here = [name for name in names if _home(room, name) == room]
     lines += [_directive(room, name).rstrip() for name in names if name not in here]
     lines += ["", *(_directive(room, name) for name in here)]

@@ -1,4 +1,4 @@
-"""Write the command-line page from the commands' own help texts."""
+"""Command-line page of the documentation, generated from the help texts."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _help(command: tuple[str, ...]) -> str:
 
 def write(docs: Path) -> None:
     """Write ``command-line.md``."""
-    parts = ["# Command line", "", "`probmotion COMMAND --help` prints the same texts.", ""]
+    parts = ["# Command line", "", "`probmotion COMMAND --help` prints these texts.", ""]
     for command in _COMMANDS:
         text = "\n".join(line.rstrip() for line in _help(command).splitlines()).strip()
         if not text:

@@ -1,4 +1,4 @@
-"""Execute a tutorial and store it, with its outputs, beside its script."""
+"""Execution of tutorials: writes the notebook with its outputs next to the script."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SECONDS = 900
 
 
 def execute(script: Path) -> None:
-    """Write ``script`` as an executed notebook; files it makes stay in a temporary folder."""
+    """Execute ``script`` in a temporary folder and write it as a notebook."""
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     notebook = jupytext.read(script)
     with tempfile.TemporaryDirectory() as folder:
@@ -33,7 +33,7 @@ def execute(script: Path) -> None:
         cell["id"] = f"cell-{number}"
         cell.metadata.pop("execution", None)
         if "outputs" in cell:
-            # Warnings name files of this machine.
+            # Warnings contain paths of this machine.
             cell.outputs = [each for each in cell.outputs if each.get("name") != "stderr"]
         for output in cell.get("outputs", ()):
             data = output.get("data", {})

@@ -1,4 +1,4 @@
-"""Render formulas as MathML, which browsers show without a script or a network."""
+"""MathML renderer for formulas, which requires no JavaScript or network access."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ def _block(writer: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Any) -> None:
-    """Register the renderer."""
+    """Register the MathML renderer with Sphinx."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))

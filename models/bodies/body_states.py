@@ -1,10 +1,10 @@
 """Pose vectors of an articulated body: root translation and joint rotations.
 
-The state of a frame is the root's translation (3) followed by the 6D rotation (Zhou et al. 2019) of
-every joint with children, root first (Motion-DVAE's x_t). Bone lengths belong to the body.
+The state of a frame (x_t of Motion-DVAE) consists of the root translation (3) and the 6D rotations
+(Zhou et al. 2019) of all joints with children, root first. Bone lengths are stored separately.
 
 A trunk joint with paired limbs, such as the neck of ``person14``, has an additional rotation for
-the trunk: otherwise skeletons without spine joints would tilt the hips with every bow.
+the trunk. Otherwise the hips of skeletons without spine joints would tilt when the trunk bends.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ __all__ = [
 _GUIDE = 0.07
 """Position of a trunk's guide joint, as a fraction of the trunk's length."""
 _LONGEST = 3.0
-"""Maximum bone length, metres; longer bones indicate another unit."""
+"""Maximum bone length, metres; longer bones suggest that the unit is not metres."""
 _SHORTEST = 1e-6
-"""Minimum bone length, metres; shorter bones have no direction."""
+"""Minimum bone length, metres; the direction of shorter bones is undefined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class BodyStates:
     Raises
     ------
     ValueError
-        If the skeleton has several roots, a shape is wrong, or a bone has length 0 or more than
+        If the skeleton has several roots, a shape is invalid, or a bone length is 0 or above
         3 m.
     """
 
@@ -68,8 +68,8 @@ class BodyStates:
     def _rig(self) -> Skeleton:
         """Skeleton with two additional joints per trunk.
 
-        One rotates the trunk, at its lower end. The other, a guide slightly above, rotates with the
-        limbs and determines the pitch of the lower joint when the limbs are collinear with it.
+        The first, at the lower end of the trunk, rotates the trunk. The second, a guide slightly
+        above, rotates with the limbs and sets the pitch of the lower joint if these are collinear.
         """
         names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
         for joint in self._trunks:
@@ -88,17 +88,17 @@ class BodyStates:
         return xp.concat(parts, axis=-2)
 
     def _rig_positions(self, positions: np.ndarray) -> np.ndarray:
-        below = positions[:, [self.skeleton.parents[joint] for joint in self._trunks]]
-        guides = below + _GUIDE * (positions[:, list(self._trunks)] - below)
-        more = np.stack([below, guides], axis=2).reshape(len(positions), -1, 3)
-        return np.concatenate([positions, more], axis=1)
+        lower = positions[:, [self.skeleton.parents[joint] for joint in self._trunks]]
+        guides = lower + _GUIDE * (positions[:, list(self._trunks)] - lower)
+        added = np.stack([lower, guides], axis=2).reshape(len(positions), -1, 3)
+        return np.concatenate([positions, added], axis=1)
 
     @cached_property
     def turning(self) -> tuple[int, ...]:
-        """Joints with children, root first, trunks last; only these have rotations."""
+        """Rotating joints: the joints with children, root first, trunks last."""
         root = self.skeleton.roots[0]
-        below = set(self._rig.parents) - {root}
-        return (root, *(joint for joint in range(self._rig.n_joints) if joint in below))
+        parents = set(self._rig.parents) - {root}
+        return (root, *(joint for joint in range(self._rig.n_joints) if joint in parents))
 
     @property
     def dim(self) -> int:
@@ -111,23 +111,23 @@ class BodyStates:
         return (("translation", 0, 3), ("orientation", 3, 9), ("rotations", 9, self.dim))
 
     def body(self, positions: np.ndarray) -> np.ndarray:
-        """Return the rest offsets of the moving body β, ``(L, J, 3) → (J, 3)``, metres.
+        """Return the rest offsets β of a recorded body, ``(L, J, 3) → (J, 3)``, metres.
 
-        Bones have their mean lengths. Where a joint has several children, bones also have their
-        mean directions, since bodies differ in the width of hips and shoulders.
+        Bone lengths are means over frames. Directions are means for joints with several children,
+        since bodies differ in the width of hips and shoulders, and those of ``rest`` otherwise.
         """
         lengths = np.zeros(self.skeleton.n_joints)
         for joint, parent in self.skeleton.bones:
             bones = positions[:, joint] - positions[:, parent]
             lengths[joint] = np.linalg.norm(bones, axis=-1).mean()
-        # Rotations must be fitted to a body of the same size, or joints would not coincide.
+        # Fit the rotations to a body of the same size, or the joints would not coincide.
         offsets = self.of_lengths(lengths)
-        turns = self._turns(positions, offsets)
+        rotations = self._turns(positions, offsets)
         parents = self._rig.parents
         for joint, parent in self.skeleton.bones:
             if parents.count(parents[joint]) > 1:
                 bones = positions[:, joint] - positions[:, parent]
-                direction = np.einsum("lji,lj->i", turns[:, parent], bones)
+                direction = np.einsum("lji,lj->i", rotations[:, parent], bones)
                 offsets[joint] = direction * lengths[joint] / np.linalg.norm(direction)
         return offsets
 
@@ -138,15 +138,15 @@ class BodyStates:
         return self.rest * (np.asarray(lengths)[:, None] / np.where(bones > 0, bones, 1.0))
 
     def states(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the closest states to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
+        """Return the states closest to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
 
         Positions do not determine the twist of a limb; see
         :func:`~probmotion.motion.kinematics.fit_rotations`.
         """
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), self._rigged(body))
-        numbers = matrix_to_rotation_6d(rotations[:, list(self.turning)])
+        rotations_6d = matrix_to_rotation_6d(rotations[:, list(self.turning)])
         root = positions[:, self.skeleton.roots[0]]
-        return np.concatenate([root, numbers.reshape(len(positions), -1)], axis=-1)
+        return np.concatenate([root, rotations_6d.reshape(len(positions), -1)], axis=-1)
 
     def positions(self, states: Array, body: Array) -> Array:
         """Return the joint positions M_β(x): ``(…, L, dim), (…, J, 3) → (…, L, J, 3)``, metres.
@@ -155,12 +155,12 @@ class BodyStates:
         """
         check_shape("states", states, ("…", "L", self.dim))
         xp = array_namespace(states)
-        numbers = xp.reshape(states[..., 3:], (*states.shape[:-1], len(self.turning), 6))
-        matrices = rotation_6d_to_matrix(numbers)
-        still = xp.zeros_like(matrices[..., 0, :, :]) + constant(np.eye(3), states)
-        which = {joint: at for at, joint in enumerate(self.turning)}
+        rotations_6d = xp.reshape(states[..., 3:], (*states.shape[:-1], len(self.turning), 6))
+        matrices = rotation_6d_to_matrix(rotations_6d)
+        identity = xp.zeros_like(matrices[..., 0, :, :]) + constant(np.eye(3), states)
+        index = {joint: at for at, joint in enumerate(self.turning)}
         joints = range(self._rig.n_joints)
-        rotations = [matrices[..., which[j], :, :] if j in which else still for j in joints]
+        rotations = [matrices[..., index[j], :, :] if j in index else identity for j in joints]
         offsets = self._rigged(constant(body, states) if isinstance(body, np.ndarray) else body)
         joints, _ = forward_kinematics(
             self._rig, xp.stack(rotations, axis=-3), states[..., None, :3], offsets
@@ -171,19 +171,19 @@ class BodyStates:
         """Return the global rotations of the rig's joints, (L, J', 3, 3)."""
         rest = self._rigged(body)
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), rest)
-        still = np.zeros((len(positions), 1, 3))
-        return forward_kinematics(self._rig, rotations, still, rest)[1]
+        translation = np.zeros((len(positions), 1, 3))
+        return forward_kinematics(self._rig, rotations, translation, rest)[1]
 
 
 def trunk_joints(skeleton: Skeleton) -> tuple[int, ...]:
-    """Return the upper ends of trunks: unpaired joints whose parent also has paired children."""
+    """Return the upper ends of trunks: unpaired siblings of paired joints."""
     paired = {joint for pair in skeleton.mirrored_pairs for joint in pair}
-    limbed = {parent for joint, parent in skeleton.bones if joint in paired}
-    return tuple(j for j, parent in skeleton.bones if parent in limbed and j not in paired)
+    branching = {parent for joint, parent in skeleton.bones if joint in paired}
+    return tuple(j for j, parent in skeleton.bones if parent in branching and j not in paired)
 
 
 def check_single_root(skeleton: Skeleton) -> None:
-    """Raise ``ValueError`` unless the skeleton is of one body."""
+    """Raise ``ValueError`` unless the skeleton has exactly one root."""
     if len(skeleton.roots) != 1:
         raise ValueError(f"skeleton must have one root, got {len(skeleton.roots)}")
 
@@ -202,9 +202,9 @@ def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
 
 
 def heading_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the closest rotation angle about Y, ``(…, 3, 3) → (…)``, radians.
+    """Return the angle of the closest rotation about Y, ``(…, 3, 3) → (…)``, radians.
 
-    It is unstable near half turns about horizontal axes.
+    It is ill-conditioned close to half turns about horizontal axes.
     """
     return np.arctan2(matrix[..., 0, 2] - matrix[..., 2, 0], matrix[..., 0, 0] + matrix[..., 2, 2])
 
@@ -219,7 +219,7 @@ def turned_about_vertical(positions: Array, angle: Array) -> Array:
 
 
 def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array:
-    """Return canonical motions, rotated about Y and then translated on the ground.
+    """Return canonical motions in the world: rotated about Y, then translated on the ground.
 
     ``(…, L, J, 3), (…), (…, 2) → (…, L, J, 3)``: heading in radians, X and Z in metres.
     """
@@ -230,7 +230,7 @@ def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array
 
 
 def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
-    """Return mean bone directions and lengths of motions (L, J, 3): (J, 3) offsets, metres.
+    """Return rest offsets with the mean bones of motions (L, J, 3): (J, 3), metres.
 
     Every frame is first rotated so that its left side points to +X and it faces +Z.
 
@@ -240,7 +240,7 @@ def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
         If there is no motion, the skeleton has no left-right pairs, or a bone has length 0.
     """
     if not motions:
-        raise ValueError("motions must contain at least one, got none")
+        raise ValueError("motions must contain at least one motion, got none")
     pairs = skeleton.mirrored_pairs
     if not pairs:
         raise ValueError("skeleton must have left-right pairs to determine the heading, got none")

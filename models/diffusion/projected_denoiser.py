@@ -1,6 +1,6 @@
 """2D denoiser of a 3D prior, trained on projections of its motions.
 
-It makes samplers that require a 2D denoiser, such as `mas`, available for priors without one.
+It allows samplers that require a 2D denoiser, such as `mas`, for priors without one.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def denoiser_of(
 ) -> MotionDiffusion:
     """Return a 2D motion diffusion model trained on projections of a prior's motions.
 
-    Motions drawn from the prior are projected by cameras around them without detection errors; a
-    tenth is held out. The same call resumes an interrupted run.
+    Motions drawn from the prior are projected without detection errors by cameras around them; a
+    tenth of the motions is held out. Repeat the call to resume an interrupted run.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ def denoiser_of(
     motions : int
         Number of motions, at least 2.
     views : int
-        Cameras per motion.
+        Number of cameras per motion.
     filming : Filming, optional
-        Camera placement; defaults of :class:`~probmotion.data.projections.Filming`.
+        Camera placement; by default that of :class:`~probmotion.data.projections.Filming`.
     training : TrainingSettings, optional
-        Training settings; default :func:`usual_training` of the size.
+        Training settings; :func:`usual_training` of the size by default.
     seed : int
         Seed of motions, cameras and initial weights.
     progress : bool
@@ -66,8 +66,8 @@ def denoiser_of(
     Raises
     ------
     ValueError
-        If the prior cannot be sampled, a number or size is invalid, or ``out`` contains another
-        run.
+        If the prior has no ``sample`` method, a number or size is invalid, or ``out``
+        contains another run.
     Diverged
         If training diverges.
     """
@@ -81,7 +81,7 @@ def denoiser_of(
         Motion(positions, prior.skeleton, prior.fps, name=f"drawn-{number}")
         for number, positions in enumerate(drawn)
     ]
-    # Without detection errors, which are not part of the prior.
+    # Detection errors are not part of the prior.
     noise = DetectorNoise.none()
     tracks = project_clips(clips, views=views, seed=seed, filming=filming, noise=noise)
     held_out = views * max(1, motions // _HELD_OUT)

@@ -24,9 +24,9 @@ class DiffusionTrainee(TrackTrainee):
     """Trainee of a motion diffusion model.
 
     The loss is the mean squared error of the estimate of x₀ (not of ε), in standardised units, over
-    visible joints, at random levels t ~ U{1..T}. Parameters are those of
+    visible joints, at noise levels t ~ U{1..T}. Parameters are those of
     :class:`~probmotion.models.training.track_trainee.TrackTrainee`.
-    Every joint must be visible somewhere in ``tracks``.
+    Every joint must be visible in at least one frame of ``tracks``.
     """
 
     kind = KIND
@@ -58,33 +58,33 @@ class DiffusionTrainee(TrackTrainee):
         levels = rng.integers(1, self.size.steps + 1, n)
         noise = rng.standard_normal(drawn.keypoints.shape, dtype=np.float32)
 
-        def moved(values: np.ndarray) -> torch.Tensor:
+        def to_device(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values, device=device)
 
         scale = self.standards.scale
-        mean = moved((self.standards.mean / scale).astype(np.float32))
-        deviation = moved((self.standards.deviation / scale).astype(np.float32))
-        # Occluded joints are set to their mean: they have no loss, but attention reads them.
-        shown = np.where(drawn.seen[..., None], drawn.keypoints, self.standards.mean)
-        clean = moved((shown / scale).astype(np.float32))
-        alpha_bar = self._alpha_bar.to(device)[moved(levels)][:, None, None, None]
-        noisy = alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * moved(noise)
+        mean = to_device((self.standards.mean / scale).astype(np.float32))
+        deviation = to_device((self.standards.deviation / scale).astype(np.float32))
+        # Set occluded joints to their mean: the loss excludes them, but attention does not.
+        filled = np.where(drawn.seen[..., None], drawn.keypoints, self.standards.mean)
+        clean = to_device((filled / scale).astype(np.float32))
+        alpha_bar = self._alpha_bar.to(device)[to_device(levels)][:, None, None, None]
+        noisy = alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * to_device(noise)
         # Standardise by the variance at each level, so that inputs have unit variance.
         spread = torch.sqrt(alpha_bar * deviation**2 + (1 - alpha_bar))
-        entered = (noisy - alpha_bar.sqrt() * mean) / spread
-        estimate = network(entered.flatten(2), moved(levels), moved(drawn.valid))
+        inputs = (noisy - alpha_bar.sqrt() * mean) / spread
+        estimate = network(inputs.flatten(2), to_device(levels), to_device(drawn.valid))
         estimate = estimate.unflatten(2, (-1, 2))
-        moves = deviation > 0
-        wanted = (clean - mean) / torch.where(moves, deviation, 1.0)
-        weight = moved(drawn.seen)[..., None] * moves
-        return (weight * (estimate.float() - wanted) ** 2).sum() / weight.sum().clamp(min=1)
+        varies = deviation > 0
+        target = (clean - mean) / torch.where(varies, deviation, 1.0)
+        weight = to_device(drawn.seen)[..., None] * varies
+        return (weight * (estimate.float() - target) ** 2).sum() / weight.sum().clamp(min=1)
 
 
 def usual_training(size: str) -> TrainingSettings:
-    """Return the training settings of ``tiny``, ``small``, ``paper`` or ``reference-code``.
+    """Return the training settings of size ``tiny``, ``small``, ``paper`` or ``reference-code``.
 
-    The paper states "Adam, 0.1 lr", with which training diverges; ``paper`` is AdamW at 1e-4 with a
-    moving average and clipping. ``reference-code`` follows the authors' released code.
+    Training diverges with the paper's "Adam, 0.1 lr"; ``paper`` is AdamW with learning rate 1e-4, a
+    moving average and gradient clipping. ``reference-code`` follows the authors' released code.
     """
     known = {
         "tiny": TrainingSettings(steps=1000, learning_rate=2e-3, ema=0.99),

@@ -24,7 +24,7 @@ class EncoderInputs(NamedTuple):
 
     ``observed`` (B, L, M): features from :meth:`DVAEModel.observed`; ``joints`` (B, L, J, 3): y,
     metres, ignored where occluded; ``trust`` (B, L, J): weights, 0 where occluded; ``pose``: M_β,
-    maps standardised states (B, D) to joints (B, J, 3), metres.
+    which maps standardised states (B, D) to joints (B, J, 3), metres.
     """
 
     observed: torch.Tensor
@@ -34,10 +34,10 @@ class EncoderInputs(NamedTuple):
 
 
 class JointEncoder(nn.Module):
-    """Published encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) with joints as inputs (A.2).
+    """Encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) of the paper, with joints as inputs (A.2).
 
-    The published encoder reads states x_t. Joint positions carry the same information and allow
-    noise and occlusion, so an encoder trained on clean motion can be fine-tuned on noisy joints.
+    The inputs of the published encoder are states x_t. Joint positions allow noise and occlusion,
+    so an encoder trained on clean motion can be fine-tuned on noisy joints.
     """
 
     def __init__(self, size: DVAESettings, dim: int, joints: int) -> None:
@@ -61,7 +61,7 @@ class _JointPosterior:
     read: torch.Tensor
 
     def start(self, initial: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return e_ini(x₀)."""
+        """Return the initial recurrent state e_ini(x₀)."""
         hidden, cell = self.encoder.starts(initial).chunk(2, dim=-1)
         return torch.tanh(hidden), cell
 
@@ -69,30 +69,30 @@ class _JointPosterior:
         self, state: tuple[torch.Tensor, torch.Tensor], frame: int, moved: State
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log scale of q(z_t | …) from [h^lat_{t−1}, h^data_t]."""
-        both = torch.cat([state[0], self.read[:, frame - 1]], dim=-1)
-        return mean_and_log_scale(self.encoder.latents(both))
+        inputs = torch.cat([state[0], self.read[:, frame - 1]], dim=-1)
+        return mean_and_log_scale(self.encoder.latents(inputs))
 
     def step(
         self, state: tuple[torch.Tensor, torch.Tensor], latent: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return h^lat_t."""
+        """Return the recurrent state h^lat_t."""
         return self.encoder.recurrent(latent, state)
 
 
 class TrackingEncoder(nn.Module):
-    """Encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) that reads the tracking error of the current motion.
+    """Encoder q(z_t | z_{1:t−1}, y_{t:T}, x₀) with the current tracking error as an input.
 
-    z_{1:t−1} and x₀ enter through the state and pose of the generative model, so no second
-    recurrent network is needed. As in a Kalman filter, the encoder reads the innovation: observed
-    joints at t minus the pose at t − 1.
+    The state and pose of the generative model summarise z_{1:t−1} and x₀, so no second recurrent
+    network is needed. As in a Kalman filter, the tracking error is the innovation: observed joints
+    at t minus the pose at t − 1.
     """
 
     def __init__(self, size: DVAESettings, dim: int, joints: int) -> None:
         super().__init__()
         width, groups = size.hidden, size.groups
         self.reader = nn.LSTM(n_encoder_inputs(joints), width, batch_first=True)
-        read = 2 * width + dim + 4 * joints
-        self.latents = perceptron(read, 2 * size.latent, width, groups)
+        n_inputs = 2 * width + dim + 4 * joints
+        self.latents = perceptron(n_inputs, 2 * size.latent, width, groups)
 
     def conditioned(self, inputs: EncoderInputs) -> Inference:
         """Return the inference model conditioned on observations."""
@@ -123,6 +123,6 @@ class _TrackingPosterior:
 
 
 def _read_backwards(reader: nn.LSTM, inputs: EncoderInputs) -> torch.Tensor:
-    """Return (B, T, H) features; entry t summarises the frames t to T."""
-    read, _ = reader(inputs.observed[:, 1:].flip(1))
-    return read.flip(1)
+    """Return (B, T, H) features; entry t summarises frames t to T."""
+    features, _ = reader(inputs.observed[:, 1:].flip(1))
+    return features.flip(1)

@@ -1,8 +1,8 @@
-"""Amortised inference from noisy joints: q(x₀, z, v | y) and its evidence lower bound (B to E).
+"""Amortised inference from noisy joints: q(x₀, z, v | y) and its evidence lower bound.
 
 q = q_ω(x₀ | y) Π_t q_φ(z_t | z_{1:t−1}, y_{t:T}, x₀) q_γ(v_t | z_{1:t}, y_t, x₀) with the networks
-of the prior fixed. q_ω also covers position and heading, which noisy joints determine only
-approximately.
+of the prior frozen (Motion-DVAE supplement, B to E). q_ω also models position and heading, which
+noisy joints determine only approximately.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from probmotion.models.dvae.variational_terms import (
 
 __all__ = ["Bound", "Denoiser", "DenoisingNetworks", "InferenceDraw"]
 
-# Units of the residual placement: metres and radians.
+# Units of the placement corrections, metres and radians.
 _GROUND, _TURN = 0.1, 0.3
 _LOG_SCALE_BOUND = 5.0
-# Below this, the noise is numerically Gaussian and the scale-mixture terms cancel.
+# Smaller reciprocal degrees of freedom are treated as Gaussian, as scale-mixture terms cancel.
 _GAUSSIAN_TAILS = 1e-4
 
 
 class DenoisingNetworks(nn.Module):
     """Trainable networks: latent encoder q_φ, initial-state network q_ω and noise network q_γ.
 
-    q_φ is initialised with the encoder of ``prior``, the others from ``seed``.
+    q_φ is initialised with the encoder of ``prior``, q_ω and q_γ from ``seed``.
     """
 
     def __init__(self, prior: MotionDVAE, seed: int = 0) -> None:
         super().__init__()
         size, joints = prior.settings, prior.skeleton.n_joints
-        read = n_encoder_inputs(joints)
+        n_inputs = n_encoder_inputs(joints)
         self.encoder = copy.deepcopy(prior.model.encoder).requires_grad_(True)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "denoiser"))
-            self.first_reader = nn.LSTM(read, size.hidden, batch_first=True)
+            self.first_reader = nn.LSTM(n_inputs, size.hidden, batch_first=True)
             self.first = perceptron(size.hidden, 2 * (3 + prior.rank), size.hidden, size.groups)
-            self.noise = perceptron(size.hidden + read, 6 * joints, size.hidden, size.groups)
+            self.noise = perceptron(size.hidden + n_inputs, 6 * joints, size.hidden, size.groups)
         nn.init.zeros_(self.noise[-1].weight)
         nn.init.zeros_(self.noise[-1].bias)
 
     def first_state(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and log scale of q_ω: ground (2), heading (1) and pose (r)."""
+        """Return mean and log scale of q_ω: ground position (2), heading (1) and pose (r)."""
         read, _ = self.first_reader(observed.flip(1))
         mean, raw = self.first(read[:, -1]).chunk(2, dim=-1)
         return mean, _LOG_SCALE_BOUND * torch.tanh(raw / _LOG_SCALE_BOUND) - 1
@@ -71,17 +71,17 @@ class DenoisingNetworks(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return α and β of q_γ, (B, L, J, 3) each, in units of noise².
 
-        Given the motion, v is exactly IG(λ/2 + ½, λ/2 + ½ r²/s²). The network e_b starts there and
-        returns factors for both parameters. Takes generative states (B, L, H), encoder features
+        Given the motion, v is exactly IG(λ/2 + ½, λ/2 + ½ r²/s²). The network e_b returns
+        factors of both, initially 1. Arguments are generative states (B, L, H), encoder features
         (B, L, M), ``half`` λ/2 (B,) and squared standardised residuals r²/s² (B, L, J, 3).
         """
-        both = torch.cat([hidden, observed], dim=-1)
-        raw = self.noise(both.flatten(0, 1)).unflatten(0, both.shape[:2])
+        features = torch.cat([hidden, observed], dim=-1)
+        raw = self.noise(features.flatten(0, 1)).unflatten(0, features.shape[:2])
         alpha, beta = (torch.exp(torch.tanh(part)) for part in raw.chunk(2, dim=-1))
-        begin = half[:, None, None, None]
+        base = half[:, None, None, None]
         return (
-            (begin + 0.5) * alpha.unflatten(-1, (-1, 3)),
-            (begin + 0.5 * squares) * beta.unflatten(-1, (-1, 3)),
+            (base + 0.5) * alpha.unflatten(-1, (-1, 3)),
+            (base + 0.5 * squares) * beta.unflatten(-1, (-1, 3)),
         )
 
 
@@ -90,7 +90,7 @@ class Bound:
     """Terms of the evidence lower bound of each window, (B,) each.
 
     ``data``: E_q[log N(y; M_β(μ_x), v)]; ``latents``: KL(q_φ ‖ p_θ) of z; ``noise``: KL(q_γ ‖ p) of
-    v; ``first``: KL(q_ω ‖ p) of x₀ and placement, or 0 where omitted (C.2.2).
+    v; ``first``: KL(q_ω ‖ p) of x₀ and placement, 0 if omitted (C.2.2).
     """
 
     data: torch.Tensor
@@ -99,7 +99,7 @@ class Bound:
     first: torch.Tensor
 
     def total(self, latent_weight: float = 1.0) -> torch.Tensor:
-        """Return the bound with a weight on the latent divergence."""
+        """Return the bound, with a weight on the KL term of z."""
         return self.data - latent_weight * self.latents - self.noise - self.first
 
 
@@ -107,7 +107,7 @@ class Bound:
 class InferenceDraw:
     """One draw from q per window.
 
-    ``positions`` (B, L, J, 3): M_β(μ_x) in the world, metres; ``rolled``: z and innovations;
+    ``positions`` (B, L, J, 3): M_β(μ_x) in world coordinates; ``rolled``: z and innovations;
     ``first`` (B, r): coordinates of x₀; ``heading`` (B,), radians; ``ground`` (B, 2), metres;
     ``observed`` (B, L, M): encoder features in the drawn frame; ``hidden`` (B, L, H): generative
     states; ``first_kl`` (B,): KL of x₀ and placement against the prior.
@@ -124,14 +124,14 @@ class InferenceDraw:
 
 
 class Denoiser:
-    """A frozen Motion-DVAE with inference networks: draws, bounds and predictions."""
+    """Inference networks with a frozen Motion-DVAE: draws from q, bounds and noise variances."""
 
     def __init__(self, prior: MotionDVAE, networks: DenoisingNetworks) -> None:
         self.prior = prior
         self.networks = networks
 
     def noise_numbers(self, length: int) -> tuple[int, tuple[int, int]]:
-        """Return the numbers of random normals per window: for x₀, and (T, Z)."""
+        """Return the shapes of standard normals per window: 3 + r for q_ω, and (T, Z) for z."""
         return 3 + self.prior.rank, (length - 1, self.prior.settings.latent)
 
     def infer(
@@ -139,7 +139,7 @@ class Denoiser:
     ) -> InferenceDraw:
         """Return one draw from q per window.
 
-        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; 0 for the means.
+        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; 0 for the mean of q.
         """
         model = self.prior.model
         trust = torch.where(windows.seen, trust_weight(windows.noise), 0.0)
@@ -147,9 +147,9 @@ class Denoiser:
         mean, log_scale = self.networks.first_state(model.observed(placed, trust, windows.tails))
         drawn = mean + torch.exp(log_scale) * first_noise
         heading = windows.heading + _TURN * drawn[:, 2]
-        moved = on_ground(_GROUND * drawn[:, :2])[:, None, None, :]
-        ground = windows.ground + turned_about_vertical(moved, windows.heading)[:, 0, 0, [0, 2]]
-        # Everything below is relative to the drawn frame.
+        offset = on_ground(_GROUND * drawn[:, :2])[:, None, None, :]
+        ground = windows.ground + turned_about_vertical(offset, windows.heading)[:, 0, 0, [0, 2]]
+        # From here, joints are in the drawn canonical frame.
         joints = windows.in_frame(heading, ground)
         inputs = model.encoder_inputs(
             joints, trust, windows.tails, self.prior.states, windows.bodies
@@ -191,7 +191,7 @@ class Denoiser:
     def drawn_variance(
         self, windows: NoisyWindows, inferred: InferenceDraw, rng: np.random.Generator
     ) -> torch.Tensor:
-        """Draw v from q_γ, (B, L, J, 3), metres²; the known variance for Gaussian noise."""
+        """Return draws of v from q_γ, (B, L, J, 3), metres²; the known variance if Gaussian."""
         square = (windows.noise**2)[..., None].expand_as(inferred.positions)
         heavy = windows.tails > _GAUSSIAN_TAILS
         if not bool(heavy.any()):
@@ -217,14 +217,14 @@ class Denoiser:
         at_origin = -on_ground(windows.ground)[:, None, None, :]
         origin = turned_about_vertical(at_origin, -windows.heading)[:, 0, 0, [0, 2]] / _GROUND
         log_spread = torch.full_like(origin, math.log(spread))
-        place = gaussian_kl(mean[:, :2], log_scale[:, :2], origin, log_spread)
+        position = gaussian_kl(mean[:, :2], log_scale[:, :2], origin, log_spread)
         zero = torch.zeros_like(mean[:, 3:])
         pose = gaussian_kl(mean[:, 3:], log_scale[:, 3:], zero, zero)
         entropy = 0.5 * math.log(2 * math.pi * math.e) + log_scale[:, 2] + math.log(_TURN)
-        # The uniform distribution has the largest entropy on the circle.
-        return place + pose + torch.relu(math.log(2 * math.pi) - entropy)
+        # The entropy on the circle is at most that of the uniform distribution.
+        return position + pose + torch.relu(math.log(2 * math.pi) - entropy)
 
 
 def _half_freedom(windows: NoisyWindows, heavy: torch.Tensor) -> torch.Tensor:
-    """Return λ/2 for windows with Student-t noise and 1 for the others, which ignore it."""
+    """Return λ/2 for windows with Student-t noise and 1, which is unused, for Gaussian noise."""
     return torch.where(heavy, 0.5 / windows.tails.clamp(min=_GAUSSIAN_TAILS), 1.0)

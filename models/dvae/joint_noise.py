@@ -24,7 +24,7 @@ class NoisyJoints(NamedTuple):
 
 @dataclass(frozen=True)
 class JointNoise:
-    """Distribution of the corruption that a denoiser is trained on.
+    """Distribution of the corruption in the training data of a denoiser.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class JointNoise:
 
     @classmethod
     def nearly_clean(cls) -> JointNoise:
-        """Return 5 mm of Gaussian noise without occlusion."""
+        """Return Gaussian noise of 5 mm without occlusion."""
         return cls(least=5e-3, most=5e-3, outliers=0.0, hidden=0.0)
 
     def apply(
@@ -69,7 +69,7 @@ class JointNoise:
         heavy = np.less(rng.random(n), self.outliers)
         freedom = np.exp(rng.uniform(np.log(2.0), np.log(8.0), n))
         error = rng.standard_normal(joints.shape)
-        # A Student-t variable is a normal one divided by the root of χ²/ν.
+        # A Student-t variable is a normal variable divided by √(χ²/ν).
         nu = freedom[:, None, None, None]
         square = rng.chisquare(nu, joints.shape) / nu
         error = np.where(heavy[:, None, None, None], error / np.sqrt(square), error)
@@ -86,7 +86,7 @@ class JointNoise:
         for _ in range(rng.integers(1, 4)):
             top = int(rng.integers(skeleton.n_joints))
             limb = [j for j in range(skeleton.n_joints) if j == top or top in skeleton.ancestors(j)]
-            # Keep whole-body occlusions short: the motion cannot be recovered from nothing.
+            # Limit occlusions of most joints to a quarter of the window, for identifiability.
             most = frames // 4 if len(limb) > skeleton.n_joints // 2 else frames
             length = int(rng.integers(1, most + 1))
             start = int(rng.integers(0, frames - length + 1))

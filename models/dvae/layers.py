@@ -14,7 +14,7 @@ _HALF_WEIGHT_NOISE = 0.05
 
 
 class State(NamedTuple):
-    """LSTM state, (B, H) each, and the standardised mean μ_x so far, (B, D)."""
+    """LSTM state, (B, H) each, and the current standardised mean μ_x, (B, D)."""
 
     hidden: torch.Tensor
     cell: torch.Tensor
@@ -47,5 +47,5 @@ def n_encoder_inputs(joints: int) -> int:
 
 
 def trust_weight(noise: torch.Tensor) -> torch.Tensor:
-    """Return the weight of a joint by its noise in metres: 1 at 0, ½ at 5 cm, 0 at infinity."""
+    """Return the weight of a joint with noise in metres: 1 at 0, ½ at 5 cm, 0 at infinity."""
     return 1 / (1 + (noise / _HALF_WEIGHT_NOISE) ** 2)

@@ -1,4 +1,4 @@
-"""`MotionDenoiser`: amortised inference of motion from noisy joints in a Motion-DVAE."""
+"""`MotionDenoiser`: amortised inference of motion from noisy joints with a Motion-DVAE."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class MotionDenoiser:
 
     @classmethod
     def load(cls, source: str | Path, prior: MotionDVAE) -> MotionDenoiser:
-        """Load a trained denoiser of a prior: a file, the folder of a run or a shipped name.
+        """Load a trained denoiser of a prior from a file, a run folder or a shipped name.
 
         Raises ``CheckpointError`` for a damaged file, another kind of network or the denoiser of
         another prior, ``FileNotFoundError`` for a missing file, and ``ValueError`` unless the prior
@@ -66,7 +66,7 @@ class MotionDenoiser:
         with valid_settings(source, "denoiser"):
             digest = checkpoint.settings["network"]["prior_weights"]
         if digest != weights_digest(prior.model):
-            raise CheckpointError(f"{source} must be a denoiser of the given prior, got another's")
+            raise CheckpointError(f"{source} must be a denoiser of the given prior, got another")
         networks = DenoisingNetworks(prior)
         load_weights(networks, checkpoint.tensors)
         return cls(networks, prior, checkpoint.settings)
@@ -77,11 +77,11 @@ class MotionDenoiser:
         Raises ``ValueError`` if there is no training record.
         """
         if "network" not in self.card:
-            raise ValueError("denoiser must have a training record to be saved; train or load it")
+            raise ValueError("denoiser must have a training record to be saved, got none")
         save_checkpoint(path, Checkpoint(KIND, self.card, self.networks.state_dict()), half=half)
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether the observations are noisy 3D joints."""
+        """Return whether the observations are noisy 3D joints."""
         return isinstance(likelihood, Joints3D)
 
     def on(
@@ -92,17 +92,17 @@ class MotionDenoiser:
         degrees_of_freedom: float | None = None,
         overlap: int = 10,
     ) -> NoisyMotion:
-        """Return the inference of one recording, with a copy of the networks.
+        """Return the inference for one recording, with a copy of the networks.
 
-        ``prior`` is this denoiser's prior, with any length and body. ``degrees_of_freedom``
-        overrides the likelihood's λ (``inf``: Gaussian noise). Windows overlap by ``overlap``
-        frames, fewer than their length. Raises ``ValueError`` for another prior, a window without a
-        visible joint, or an overlap out of range.
+        ``prior`` is this denoiser's prior, of any length and body. ``degrees_of_freedom``
+        overrides the likelihood's λ (``inf``: Gaussian noise). ``overlap`` is the number of
+        frames shared by successive windows. Raises ``ValueError`` for another prior, a window
+        without a visible joint, or an overlap out of range.
         """
         _check_kind(prior)
         same = prior.model is self.prior.model
         if not same and weights_digest(prior.model) != weights_digest(self.prior.model):
-            raise ValueError("prior must be the one that the denoiser was trained for")
+            raise ValueError("prior must be that of the denoiser's training, got other weights")
         freedom = degrees_of_freedom
         if freedom is None:
             freedom = likelihood.entries.degrees_of_freedom
@@ -119,7 +119,7 @@ class MotionDenoiser:
 
 
 class NoisyMotion:
-    """Inference of one recording in windows; its networks may be optimised for it."""
+    """Windowed inference for one recording; its networks can be optimised on the recording."""
 
     def __init__(self, denoiser: Denoiser, windows: NoisyWindows, stitching: Stitching) -> None:
         self.denoiser = denoiser
@@ -141,11 +141,11 @@ class NoisyMotion:
     def loss(
         self, rng: np.random.Generator, *, initial_entropy: bool, latent_weight: float
     ) -> torch.Tensor:
-        """Return minus the bound, summed over windows, at one draw."""
+        """Return the negative bound, summed over windows, at one draw."""
         return -self.bound(rng, initial_entropy=initial_entropy).total(latent_weight).sum()
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return draws (n, L, J, 3), metres, and their θ for a single window."""
+        """Return draws (n, L, J, 3), metres, and their θ if there is a single window."""
         count = len(self.windows)
         drawn = streams.standard_normal((n, count, self._total))
         positions, thetas = [], []
@@ -162,7 +162,7 @@ class NoisyMotion:
         windows = np.concatenate(positions)
         if count == 1:
             theta = np.concatenate(thetas)
-            # The observations do not inform the length of the two heading numbers.
+            # The likelihood does not depend on the length of the two heading coordinates.
             length = np.linalg.norm(streams.standard_normal((n, 2)), axis=-1, keepdims=True)
             theta[:, 2:4] *= length
             return windows[:, 0], theta
@@ -172,7 +172,7 @@ class NoisyMotion:
     def predict(self, rng: np.random.Generator, *, average: bool = True) -> np.ndarray:
         """Return the predicted motion, (L, J, 3), metres (D, equation 11).
 
-        The mean over draws of the precision-weighted average of observed and decoded joints; the
+        Averages draws of the precision-weighted mean of observed and decoded joints, or of the
         decoded joints where occluded. Frame 0 is M_β(μ_ω). ``average=False`` decodes the means of q
         once instead ("NN output").
         """
@@ -184,9 +184,9 @@ class NoisyMotion:
         inferred = self.denoiser.infer(windows, *self._numbers(rng, _AVERAGED))
         square = self.denoiser.prior.joint_scale**2
         v = self.denoiser.drawn_variance(windows, inferred, rng)
-        between = (v * inferred.positions + square * windows.joints) / (v + square)
+        combined = (v * inferred.positions + square * windows.joints) / (v + square)
         seen = windows.seen[..., None]
-        mean = self._by_window(torch.where(seen, between, inferred.positions)).mean(axis=0)
+        mean = self._by_window(torch.where(seen, combined, inferred.positions)).mean(axis=0)
         mean[:, 0] = decoded[:, 0]
         return self.stitching.mean(mean)
 
@@ -223,6 +223,5 @@ class NoisyMotion:
 def _check_kind(prior: Any) -> None:
     if not isinstance(prior, MotionDVAE):
         raise ValueError(
-            "prior must be the Motion-DVAE that the denoiser was trained for, "
-            f"got {type(prior).__name__}"
+            f"prior must be the Motion-DVAE of the denoiser's training, got {type(prior).__name__}"
         )

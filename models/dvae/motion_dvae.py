@@ -46,26 +46,26 @@ _CHUNK = 256
 class MotionDVAE(StandardNormalPrior):
     """Autoregressive motion prior learnt from motion capture.
 
-    θ ~ N(0, I) contains the ground position of the first root in units of ``spread`` (2), two
-    numbers whose direction is the initial heading (2), the principal coordinates of the first pose
-    (r), and ε_t of z_t = μ_z(h_{t−1}) + σ_z(h_{t−1}) ε_t for frames 1 to L − 1.
+    θ ~ N(0, I) contains the initial ground position of the root in units of ``spread`` (2), the
+    initial heading as a 2D direction (2), the principal coordinates of the first pose (r), and the
+    innovations ε_t of z_t = μ_z(h_{t−1}) + σ_z(h_{t−1}) ε_t for frames 1 to L − 1.
 
-    Y is up and the floor is at Y = 0. Transform observations with another floor accordingly.
+    Y is up and the floor is at Y = 0. Transform other observations to this floor first.
 
     Parameters
     ----------
     model : DVAEModel
         Trained networks.
     settings : DVAESettings
-        Their size.
+        Network size.
     states : BodyStates
         Conversion between poses and state vectors.
     fps : float
         Frames per second.
     frames : int, optional
-        L; by default the training length. Longer motions are extrapolated.
+        Motion length L; by default the training length. Longer motions are extrapolated.
     body : ndarray, (J, 3), optional
-        Rest offsets of the body, metres; those of ``states`` by default.
+        Rest offsets of the body, metres; ``states.rest`` by default.
     spread : float
         Standard deviation of the ground position, metres.
     card : mapping, optional
@@ -77,7 +77,7 @@ class MotionDVAE(StandardNormalPrior):
     Raises
     ------
     ValueError
-        If a shape disagrees or a number is out of range.
+        If a shape is invalid or a number is out of range.
     """
 
     floor = 0.0
@@ -113,11 +113,11 @@ class MotionDVAE(StandardNormalPrior):
 
     @classmethod
     def load(cls, source: str | Path = "body-dvae", **options: Any) -> MotionDVAE:
-        """Load a trained prior: a checkpoint file, the folder of a run or a shipped name.
+        """Load a trained prior from a checkpoint file, a run folder or a shipped name.
 
         ``options`` are ``frames``, ``body`` and ``spread`` of :class:`MotionDVAE`. Raises
         ``CheckpointError`` for a damaged file or another kind of network, and ``FileNotFoundError``
-        for a missing one.
+        for a missing file.
         """
         checkpoint = load_checkpoint(source, KIND)
         with valid_settings(source, "Motion-DVAE"):
@@ -136,7 +136,7 @@ class MotionDVAE(StandardNormalPrior):
         Raises ``ValueError`` if there is no training record.
         """
         if "network" not in self.card:
-            raise ValueError("prior must have a training record to be saved; train or load it")
+            raise ValueError("prior must have a training record to be saved, got none")
         save_checkpoint(path, Checkpoint(KIND, self.card, self.model.state_dict()), half=half)
 
     def of(
@@ -182,9 +182,9 @@ class MotionDVAE(StandardNormalPrior):
     def coordinates(
         self, ground: np.ndarray, heading: np.ndarray, first: np.ndarray, innovations: np.ndarray
     ) -> np.ndarray:
-        """Return the θ of motions, with unit length of the two heading numbers.
+        """Return θ of motions, with unit length of the two heading coordinates.
 
-        Takes X and Z of the first root (…, 2), metres, the initial heading (…), radians,
+        Arguments are X and Z of the initial root (…, 2), metres, the initial heading (…), radians,
         coordinates of the first pose (…, r) and innovations ε (…, L − 1, Z).
         """
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
@@ -193,7 +193,7 @@ class MotionDVAE(StandardNormalPrior):
 
     def _motion(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, J, 3)``."""
-        # Densities need double precision.
+        # Densities require double precision.
         model = self.model if theta.dtype == torch.float32 else self._double
         ground = self.spread * theta[:, :2]
         heading = torch.atan2(theta[:, 3], theta[:, 2])

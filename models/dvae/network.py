@@ -17,7 +17,7 @@ from probmotion.models.dvae.settings import DVAESettings
 __all__ = ["PARTS", "DVAEModel", "DVAENetwork"]
 
 PARTS = 4
-"""Parts with a decoder scale: root translation, root rotation, joint rotations, joints."""
+"""Number of decoder scales: root translation, root rotation, joint rotations, joints."""
 
 
 class DVAENetwork(nn.Module):
@@ -36,14 +36,14 @@ class DVAENetwork(nn.Module):
         self.cumulative = size.decoder == "cumulative"
         if self.cumulative:
             self.straight = nn.Linear(size.latent, dim, bias=False)
-            # Consecutive frames initially barely differ.
+            # Small initial increments, as consecutive frames barely differ.
             with torch.no_grad():
                 self.decoder[-1].weight.mul_(0.1)
                 self.decoder[-1].bias.zero_()
         self.log_scales = nn.Parameter(torch.full((parts,), math.log(0.1)))
 
     def start(self, initial: torch.Tensor) -> State:
-        """Return h₀ = d_ini(x₀): ``(B, D)``, standardised."""
+        """Return the initial state h₀ = d_ini(x₀) from standardised x₀, (B, D)."""
         hidden, cell = self.starts(initial).chunk(2, dim=-1)
         return State(torch.tanh(hidden), cell, initial)
 
@@ -57,8 +57,8 @@ class DVAENetwork(nn.Module):
         # The direct decoder decodes all frames at once, in `decode`.
         if not self.cumulative:
             return State(hidden, cell, state.motion)
-        moved = state.motion + self.decoder(hidden) + self.straight(latent)
-        return State(hidden, cell, moved)
+        mean = state.motion + self.decoder(hidden) + self.straight(latent)
+        return State(hidden, cell, mean)
 
     def decode(self, states: list[State]) -> torch.Tensor:
         """Return μ_x of all frames, ``T × (B, H) → (B, T, D)``, standardised."""
@@ -70,7 +70,7 @@ class DVAENetwork(nn.Module):
 class DVAEModel(nn.Module):
     """Generative network, encoder, standardisation and initial-state distribution p(x₀).
 
-    ``dim`` D is that of a state, ``rank`` r the number of principal directions of the first state.
+    ``dim`` D is the dimension of a state, ``rank`` r the number of principal directions of x₀.
     """
 
     state_mean: torch.Tensor
@@ -114,9 +114,9 @@ class DVAEModel(nn.Module):
     ) -> torch.Tensor:
         """Return encoder features of frames, (…, L, 4 J + 1).
 
-        Takes canonical joints (…, L, J, 3), metres, ignored where occluded, their weights (…, L, J)
-        from :func:`trust_weight`, 0 where occluded, and reciprocal degrees of freedom (…), 0 for
-        Gaussian noise.
+        Arguments are canonical joints (…, L, J, 3), metres, ignored where occluded, their weights
+        (…, L, J) from :func:`trust_weight`, 0 where occluded, and reciprocal degrees of
+        freedom (…), 0 for Gaussian noise.
         """
         visible = (joints - self.joint_mean) / self.joint_deviation
         visible = torch.where(trust[..., None] > 0, visible, 0.0)

@@ -1,4 +1,4 @@
-"""Overlapping windows of noisy joints and their stitching to whole motions."""
+"""Overlapping windows of noisy joints and their stitching into full motions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PLACEMENT_FRAMES = 5
 
 @dataclass(frozen=True)
 class NoisyWindows:
-    """B windows of noisy joints in the world with an approximate initial placement.
+    """B windows of noisy joints in world coordinates with an approximate initial placement.
 
     ``joints`` (B, L, J, 3): y, metres, 0 where occluded; ``noise`` (B, L, J): standard deviation
     (Student-t: scale), metres, 1 where occluded; ``seen`` (B, L, J): visibility; ``tails`` (B,):
@@ -47,7 +47,7 @@ class NoisyWindows:
         bodies: np.ndarray,
         skeleton: Skeleton,
     ) -> NoisyWindows:
-        """Build windows from arrays in the shapes above and estimate their placement."""
+        """Return windows of arrays in the shapes above, with their estimated placement."""
         heading, ground = rough_placement(joints, seen, skeleton)
         joints, noise = np.where(seen[..., None], joints, 0.0), np.where(seen, noise, 1.0)
         single = partial(torch.tensor, dtype=torch.float32)
@@ -68,7 +68,7 @@ class NoisyWindows:
         return NoisyWindows(*(part.repeat(n, *[1] * (part.ndim - 1)) for part in parts))
 
     def in_frame(self, heading: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
-        """Return canonical joints, (B, L, J, 3); meaningless where occluded."""
+        """Return canonical joints, (B, L, J, 3); undefined where occluded."""
         moved = self.joints - on_ground(ground)[:, None, None, :]
         return turned_about_vertical(moved, -heading)
 
@@ -84,10 +84,10 @@ def rough_placement(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate headings (B,), radians, and ground points (B, 2), metres, of B windows.
 
-    The heading comes from left-right joint pairs in the first frames with a visible pair. The
-    ground point is the root, or the mean visible joint, in the first frames where it is visible.
-    Takes world positions (B, L, J, 3), ignored where occluded, and visibility (B, L, J). Raises
-    ``ValueError`` for a window without a visible joint.
+    The heading is estimated from left-right joint pairs in the first frames with a visible pair,
+    the ground point from the first visible roots, or mean visible joints if the root is occluded.
+    Arguments are world positions (B, L, J, 3), ignored where occluded, and visibility (B, L, J).
+    Raises ``ValueError`` for a window without a visible joint.
     """
     empty = np.flatnonzero(~seen.any(axis=(1, 2)))
     if len(empty):
@@ -96,23 +96,23 @@ def rough_placement(
             f"{len(joints)}"
         )
     left, right = (list(side) for side in zip(*skeleton.mirrored_pairs, strict=True))
-    both = seen[:, :, left] & seen[:, :, right]
-    offsets = np.where(both[..., None], joints[:, :, left] - joints[:, :, right], 0.0).sum(axis=2)
-    across = _over_first(offsets, both.any(axis=2)).sum(axis=1)
+    paired = seen[:, :, left] & seen[:, :, right]
+    offsets = np.where(paired[..., None], joints[:, :, left] - joints[:, :, right], 0.0).sum(axis=2)
+    across = _over_first(offsets, paired.any(axis=2)).sum(axis=1)
     heading = np.arctan2(-across[:, 2], across[:, 0])
     root = skeleton.roots[0]
     count = seen.sum(axis=2)
     visible = np.where(seen[..., None], joints, 0.0).sum(axis=2) / np.maximum(count, 1)[..., None]
-    rooted = seen[:, :, root].sum(axis=1) > 0
-    points = np.where(rooted[:, None, None], np.nan_to_num(joints[:, :, root]), visible)
-    valid = np.where(rooted[:, None], seen[:, :, root], count > 0)
+    root_seen = seen[:, :, root].sum(axis=1) > 0
+    points = np.where(root_seen[:, None, None], np.nan_to_num(joints[:, :, root]), visible)
+    valid = np.where(root_seen[:, None], seen[:, :, root], count > 0)
     first = _over_first(np.ones_like(valid, dtype=float)[..., None], valid)
     ground = (first * points).sum(axis=1) / first.sum(axis=1)
     return heading, ground[:, [0, 2]]
 
 
 def _over_first(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Zero values (B, L, …) outside the first valid frames of each window."""
+    """Return values (B, L, …), set to 0 outside the first valid frames of each window."""
     order = np.cumsum(valid, axis=1)
     return np.where((valid & (order <= _PLACEMENT_FRAMES))[..., None], values, 0.0)
 
@@ -122,8 +122,8 @@ class Stitching:
     """Segmentation of a motion into overlapping windows, and its inverse.
 
     A motion of ``frames`` frames L is cut into windows of ``window`` frames, or is one window if it
-    is shorter. Neighbours overlap by at least ``overlap`` frames; the last window ends with the
-    motion.
+    is shorter. Neighbours overlap by at least ``overlap`` frames; the last window ends at the
+    last frame.
     """
 
     frames: int
@@ -132,20 +132,20 @@ class Stitching:
 
     @property
     def length(self) -> int:
-        """Frames of every window."""
+        """Number of frames per window."""
         return min(self.window, self.frames)
 
     @property
     def starts(self) -> list[int]:
-        """First frames of the windows."""
+        """Index of the first frame of each window."""
         last = self.frames - self.length
         return [*range(0, last, self.window - self.overlap), last]
 
     @property
     def weights(self) -> np.ndarray:
-        """Weights of each window per frame, (B, length), which sum to 1 in every frame.
+        """Weight of each window in its frames, (B, length), with a sum of 1 in every frame.
 
-        They follow sin² ramps over the overlap.
+        Weights are sin² ramps over the overlap.
         """
         from_edge = np.minimum(np.arange(self.length), np.arange(self.length)[::-1]) + 1
         ramp = np.sin(0.5 * math.pi * np.minimum(1, from_edge / (self.overlap + 1))) ** 2
@@ -157,7 +157,7 @@ class Stitching:
         return np.stack([values[at : at + self.length] for at in self.starts])
 
     def joined(self, windows: np.ndarray) -> np.ndarray:
-        """Return the overlap-added windows, ``(…, B, length, D) → (…, L, D)``."""
+        """Return the sum of overlapping windows, ``(…, B, length, D) → (…, L, D)``."""
         out = np.zeros((*windows.shape[:-3], self.frames, windows.shape[-1]))
         for number, at in enumerate(self.starts):
             out[..., at : at + self.length, :] += windows[..., number, :, :]
@@ -169,15 +169,15 @@ class Stitching:
         return self.joined(flat).reshape(*windows.shape[:-4], self.frames, *windows.shape[-2:])
 
     def draws(self, windows: np.ndarray, means: np.ndarray) -> np.ndarray:
-        """Return draws of whole motions (n, L, J, 3) from independent draws of windows.
+        """Return draws of full motions (n, L, J, 3) from independent draws of windows.
 
         Averaging independent draws reduces their variance. Deviations from the window ``means``
         (B, length, J, 3) are therefore divided by the root of the summed squared weights, which
         preserves a common variance.
         """
         squares = self.joined(self.weights[..., None] ** 2)[:, 0]
-        around = self.mean(windows - means) / np.sqrt(squares)[:, None, None]
-        return self.mean(means) + around
+        deviations = self.mean(windows - means) / np.sqrt(squares)[:, None, None]
+        return self.mean(means) + deviations
 
 
 def windows_of(

@@ -20,17 +20,17 @@ class DVAESettings:
     Parameters
     ----------
     frames : int
-        Frames of a training window.
+        Number of frames per training window.
     latent : int
         Dimension of z_t.
     hidden : int
         Width of the recurrent states and hidden layers.
     groups : int
-        Groups of the group normalisation.
+        Number of groups in group normalisation.
     decoder : {"cumulative", "direct"}
         ``direct`` (published): μ_x = d_x(h_t). ``cumulative``: μ_x adds d_x(h_t) and a linear map
-        of z_t to the previous frame, starts exactly at x₀ and uses a ``TrackingEncoder``; it needs
-        much less training motion.
+        of z_t to the previous frame, starts exactly at x₀ and uses a ``TrackingEncoder``;
+        it requires much less training data.
     decoder_scale : {"learned", "unit"}
         s_x: one learned standard deviation per part of the state, or 1 (published).
 
@@ -62,7 +62,7 @@ class DVAESettings:
 
     @classmethod
     def tiny(cls) -> DVAESettings:
-        """Return a size for tests that trains in seconds."""
+        """Return a size for tests, which trains in seconds."""
         return cls(frames=12, latent=6, hidden=32, groups=4, decoder="cumulative")
 
     @classmethod

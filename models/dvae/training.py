@@ -1,4 +1,4 @@
-"""Training of the Motion-DVAE from clean motion (A.3, A.4)."""
+"""Training of the Motion-DVAE on clean motion (A.3, A.4)."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _EXPLAINED_VARIANCE = 0.999
 
 
 class DVAETrainee(WindowTrainee):
-    """Loss and data for :func:`~probmotion.models.training.trainer.train` of a Motion-DVAE.
+    """Trainee of a Motion-DVAE for :func:`~probmotion.models.training.trainer.train`.
 
     The loss is −log p(x | z, x₀) + KL(q ‖ p) + the joint position error, per frame. With learned
-    decoder scales the errors are Gaussian; with unit scales they are squared, as published.
+    decoder scales, errors have Gaussian densities; with unit scales, they are squared (published).
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class DVAETrainee(WindowTrainee):
         n, scales = len(errors[0]), torch.exp(network.generative.log_scales)
         if self.size.decoder_scale == "unit":
             squares = sum((error**2).sum() for error in errors) / n
-            # Trains only the joint scale, which eq. 11 needs; hence the detached error.
+            # Detach the error to train only the joint scale, which eq. 11 requires.
             return squares - log_normal(errors[-1].detach(), scales[-1]).mean()
         densities = [log_normal(*pair).sum() / n for pair in zip(errors, scales, strict=True)]
         return -torch.stack(densities).sum()
@@ -153,8 +153,8 @@ def _reconstruct(
 def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0) -> float:
     """Set the joint decoder scale to its RMS error on held-out clips and return it, metres.
 
-    Changes the prior in place. The training error underestimates this scale, which weights the
-    decoder in eq. 11. ``seed`` is that of the encoder draws.
+    The prior is modified in place. The training error underestimates this scale, which weights the
+    decoder in eq. 11. ``seed`` seeds the encoder draws.
     """
     windows = MotionWindows(clips, prior.states, prior.settings.frames).spread(VALIDATION_BATCH)
     rng, device = seeds.generator(seed, "scale"), torch.device("cpu")
@@ -166,10 +166,10 @@ def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0)
 
 
 def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
-    """Return the training settings of a size and its KL annealing steps.
+    """Return the training settings of a size and the number of its KL annealing steps.
 
-    ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4); an epoch of AMASS is
-    1000 steps here. Raises ``ValueError`` for an unknown size.
+    ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4); an epoch is 1000
+    steps here. Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=600, batch=32, learning_rate=3e-3, ema=0.98)
     small = replace(tiny, steps=4500, learning_rate=1e-3, ema=0.998, halve_at=(2000, 3000, 3800))
@@ -183,11 +183,11 @@ def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
 
 
 def _first_poses(states: np.ndarray) -> np.ndarray:
-    """Return the principal directions of first states times their deviations, (D, r)."""
-    _, size, directions = np.linalg.svd(states - states.mean(axis=0), full_matrices=False)
-    explained = np.cumsum(size**2) / (size**2).sum()
+    """Return principal directions of first states, scaled by their deviations, (D, r)."""
+    _, singular, directions = np.linalg.svd(states - states.mean(axis=0), full_matrices=False)
+    explained = np.cumsum(singular**2) / (singular**2).sum()
     rank = int(np.searchsorted(explained, _EXPLAINED_VARIANCE)) + 1
-    return (directions[:rank] * (size[:rank, None] / math.sqrt(len(states)))).T
+    return (directions[:rank] * (singular[:rank, None] / math.sqrt(len(states)))).T
 
 
 def _description(clips: Sequence[Motion], windows: int) -> dict[str, Any]:

@@ -21,7 +21,7 @@ def gaussian_kl(
 ) -> Tensor:
     """Return KL(q ‖ p) of diagonal Gaussians, ``(…, D) → (…)``.
 
-    Takes means and logarithms of standard deviations, first those of q, then those of p.
+    Arguments are the means and log standard deviations of q, then of p.
     """
     ratio = log_scale - prior_log_scale
     offset = (mean - prior_mean) * torch.exp(-prior_log_scale)
@@ -37,7 +37,7 @@ def inverse_gamma_kl(
     (α − α₀) ψ(α) − log Γ(α) + log Γ(α₀) + α₀ (log β − log β₀) + α (β₀ − β)/β; the last term of
     the bound has α₀ = β₀ = λ/2. Computed in double precision, returned in the dtype of ``alpha``.
     """
-    # log Γ is of the order of 10⁶ for λ = 10⁶, which cancels in single precision.
+    # log Γ exceeds 10⁶ for λ = 10⁶, so single precision would be too coarse.
     a, b = alpha.double(), beta.double()
     a0, b0 = (
         torch.as_tensor(value, dtype=torch.float64, device=alpha.device)
@@ -54,8 +54,8 @@ def expected_log_normal(
     """Return E[log N(residual; 0, s² v̄)] over v̄ ~ IG(α, β), elementwise.
 
     −½ (log 2π + log s² + log β − ψ(α) + (α/β) residual²/s²), as E[1/v̄] = α/β and
-    E[log v̄] = log β − ψ(α). The supplement omits E[log v], which makes its bound grow without
-    limit in v. ``residual`` and ``scale`` (s) are in metres.
+    E[log v̄] = log β − ψ(α). The supplement omits E[log v], which makes its bound unbounded
+    in v. ``residual`` and ``scale`` (s) are in metres.
     """
     log_variance = torch.log(beta) - torch.digamma(alpha)
     square = (residual / scale) ** 2

@@ -1,7 +1,7 @@
 """Feature extractor for the comparison of generated and real 2D motions.
 
-The encoder of a variational autoencoder trained on 2D data (MAS, section 6.3, after Guo et al.
-2020); the decoder is only used in training.
+It is the encoder of a variational autoencoder trained on 2D data (MAS, section 6.3, after Guo et
+al. 2020); the decoder is only used in training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from probmotion.validation import check_finite, check_shape
 __all__ = ["KIND", "EvaluatorSettings", "TrackEvaluator"]
 
 KIND = "track-evaluator"
-# Chunks have a fixed shape, so that the features of a motion do not depend on the batch.
+# Tokens per chunk. The fixed shape makes features independent of the batch.
 _TOKENS = 1024
 _GPU_TOKENS = 200_000
 _ENCODER = "encoder."
@@ -28,9 +28,9 @@ _ENCODER = "encoder."
 class TrackEvaluator(TrackNetwork):
     """Features of 2D motions: the latent mean of a variational autoencoder.
 
-    Used to compare sets of 2D motions (:mod:`probmotion.metrics.generation`). Features represent
-    only the variation in the training data, and are comparable for the same file, frame rate,
-    centring and camera distance. Parameters are those of
+    Use the features to compare sets of motions (:mod:`probmotion.metrics.generation`). They
+    represent only the variation in the training data and are comparable only for the same file,
+    frame rate, centring and camera distance. Parameters are those of
     :class:`~probmotion.models.training.track_network.TrackNetwork`.
     """
 
@@ -95,8 +95,8 @@ class TrackEvaluator(TrackNetwork):
         Raises
         ------
         ValueError
-            If a shape or length is wrong, a number is not finite, or the root is not at the origin
-            although it is in the training data.
+            If a shape or length is invalid, a number is not finite, or the root is not at the
+            origin although it is in the training data.
         """
         check_shape("views", views, ("N", "L", self.skeleton.n_joints, 2))
         N, L = views.shape[:2]
@@ -132,12 +132,12 @@ class TrackEvaluator(TrackNetwork):
         if distance > 1e-6:
             raise ValueError(
                 f"views must have the {self.skeleton.joint_names[root]} at the origin, as in the "
-                f"training data, got {distance:.3g} m from it"
+                f"training data, got a distance of {distance:.3g} m"
             )
 
 
 def _valid_frames(lengths: np.ndarray | None, N: int, L: int) -> np.ndarray:
-    """Return which frames are valid, (N, L) bool."""
+    """Return the mask of valid frames, (N, L) bool."""
     if lengths is None:
         return np.ones((N, L), bool)
     counts = np.asarray(lengths)

@@ -1,4 +1,4 @@
-"""Lifting of 2D poses to 3D poses, frame by frame, trained on 2D poses only.
+"""Frame-by-frame lifting of 2D poses to 3D poses, trained on 2D poses only.
 
 The network estimates the depth of each joint and the elevation of the camera (Wandt, Little and
 Rhodin, "ElePose", CVPR 2022). A joint at p in the image and z metres behind the root is at
@@ -42,7 +42,7 @@ class LifterSettings:
     blocks : int
         Residual blocks of each of the two branches.
     deepest : float
-        Maximum depth of a joint relative to the root, metres, below ``distance``.
+        Maximum depth of a joint relative to the root, metres, less than ``distance``.
     steepest : float
         Maximum camera elevation, radians. The minimum is 0, because a motion and its reflection
         seen from below have nearly the same 2D projection.
@@ -62,7 +62,7 @@ class LifterSettings:
         for name in ("deepest", "steepest", "distance"):
             check_positive(name, getattr(self, name))
         if not self.deepest < self.distance:
-            raise ValueError(f"deepest must be below distance, {self.distance}, got {self.deepest}")
+            raise ValueError(f"deepest must be below distance={self.distance}, got {self.deepest}")
         if not self.steepest < math.pi / 2:
             raise ValueError(f"steepest must be below pi/2, got {self.steepest}")
 
@@ -103,7 +103,7 @@ class LifterNetwork(nn.Module):
         deepest = self.settings.deepest
         depth = poses.new_zeros(poses.shape[:2])
         depth[:, self.joints] = deepest * torch.tanh(self.depth(hidden) / deepest)
-        # The initial elevation is half of the steepest one.
+        # The initial elevation is half of the maximum.
         elevation = self.settings.steepest * torch.sigmoid(self.elevation(hidden)[:, 0])
         return depth, elevation
 
@@ -216,7 +216,7 @@ class PoseLifter:
     def elevations(self, views: np.ndarray) -> np.ndarray:
         """Return the camera elevation of each motion, radians: ``(N, L, J, 2) → (N,)``.
 
-        The mean over frames, since the camera is assumed to be static.
+        This is the mean over frames, since the camera is assumed to be static.
         """
         return self._estimates(views)[2]
 

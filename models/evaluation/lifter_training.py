@@ -1,8 +1,8 @@
 """Training of the lifter on 2D poses only (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
 
 Each 2D pose is lifted, rotated to a random azimuth and projected at the estimated elevation of
-another pose's camera. The projection must be likely under a normalising flow of 2D poses, and
-lifting it again must give the same 3D pose.
+another pose's camera. The loss is low if a normalising flow of 2D poses assigns the projection a
+high density and the pose lifted from the projection equals the first 3D pose.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["LifterTrainee", "LossWeights", "bone_sizes", "lifting_losses"]
 
-# Quantile of the 2D lengths of a bone that estimates its length: most bones are parallel to the
+# Quantile of a bone's 2D lengths, as an estimate of its 3D length: most bones are parallel to the
 # image in some frames, and the largest 2D lengths are detection errors.
 _QUANTILE = 0.9
 
@@ -43,9 +43,9 @@ class LossWeights:
     likelihood : float
         Weight of the negative log density of the new projections, nats per coordinate.
     points : float
-        Weight of the squared distance between both 3D poses, metres².
+        Weight of the squared distance between the first and second 3D pose, metres².
     picture : float
-        Weight of the squared distance of the final projection from the input, metres².
+        Weight of the squared distance between the input and the final projection, metres².
     bones : float
         Weight of the squared relative error of bone lengths.
     """
@@ -58,24 +58,24 @@ class LossWeights:
     def __post_init__(self) -> None:
         for name, weight in asdict(self).items():
             if not 0 <= weight < float("inf"):
-                raise ValueError(f"{name} must be a number of at least 0, got {weight}")
+                raise ValueError(f"{name} must be a finite number of at least 0, got {weight}")
 
 
 def bone_sizes(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
     """Return bone lengths estimated from 2D poses, equal for mirrored bones: (K,), metres.
 
     The 2D length of a bone is at most its length. The 90 % quantile over the data replaces the body
-    proportions that ElePose takes from 3D data.
+    proportions that ElePose estimates from 3D data.
     """
     lengths = {
         (joint, parent): np.linalg.norm(poses[:, joint] - poses[:, parent], axis=-1)
         for joint, parent in skeleton.bones
     }
-    other = skeleton.mirrored_order
+    mirror = skeleton.mirrored_order
     sizes = []
     for joint, parent in skeleton.bones:
-        twin = lengths.get((other[joint], other[parent]), lengths[joint, parent])
-        sizes.append(np.quantile(np.concatenate([lengths[joint, parent], twin]), _QUANTILE))
+        mirrored = lengths.get((mirror[joint], mirror[parent]), lengths[joint, parent])
+        sizes.append(np.quantile(np.concatenate([lengths[joint, parent], mirrored]), _QUANTILE))
     return np.array(sizes)
 
 
@@ -91,31 +91,31 @@ def lifting_losses(
     """Return the terms of the loss, named as in :class:`LossWeights`.
 
     The lifter maps root-centred poses (N, J, 2) to depths (N, J) and elevations (N,). ``azimuth``
-    (N,) is that of the new cameras relative to the original ones, ``order`` (N,) a permutation of
-    the estimated elevations among them, ``sizes`` (K,) the bone lengths.
+    (N,) is that of the new cameras relative to the original ones, ``order`` (N,) the permutation
+    that assigns them the estimated elevations, ``sizes`` (K,) the bone lengths.
     """
     bones = torch.tensor(flow.skeleton.bones, device=poses.device)
-    here = torch.zeros_like(azimuth)
+    zero = torch.zeros_like(azimuth)
     depth, elevation = network(poses)
-    points = raise_points(poses, depth, here, elevation, distance)
+    points = raise_points(poses, depth, zero, elevation, distance)
     projections = project_points(points, azimuth, elevation[order], distance)
     depth_again, elevation_again = network(projections)
     again = raise_points(projections, depth_again, azimuth, elevation_again, distance)
-    back = project_points(again, here, elevation, distance)
+    final = project_points(again, zero, elevation, distance)
     lengths = torch.linalg.norm(points[:, bones[:, 0]] - points[:, bones[:, 1]], dim=-1)
     return {
         "likelihood": -flow.log_density(projections).mean() / (2 * len(flow.joints)),
         "points": ((again - points) ** 2).sum(dim=-1).mean(),
-        "picture": ((back - poses) ** 2).sum(dim=-1).mean(),
+        "picture": ((final - poses) ** 2).sum(dim=-1).mean(),
         "bones": ((lengths / sizes - 1) ** 2).mean(),
     }
 
 
 class LifterTrainee(PoseTrainee):
-    """Trainee of a lifter, with 2D data only.
+    """Trainee of a lifter on 2D data.
 
-    Parameters are those of :class:`~probmotion.models.evaluation.pose_flow_training.PoseTrainee`, a
-    flow trained on similar tracks, and weights of the loss terms.
+    Parameters are those of :class:`~probmotion.models.evaluation.pose_flow_training.PoseTrainee`,
+    plus a flow trained on similar tracks and the weights of the loss terms.
     """
 
     kind = KIND
@@ -134,7 +134,7 @@ class LifterTrainee(PoseTrainee):
     ) -> None:
         super().__init__(tracks, validation, size, **options)
         if flow.skeleton != self.skeleton:
-            raise ValueError("flow must have the same skeleton as tracks")
+            raise ValueError("flow must have the same skeleton as tracks, got another")
         self.weights = LossWeights() if weights is None else weights
         self.sizes = bone_sizes(self.skeleton, self.poses.astype(np.float64))
         root = self.skeleton.roots[0]

@@ -1,4 +1,4 @@
-"""Training of the density of 2D poses, on fully visible frames of tracks."""
+"""Training of a pose flow, a density of 2D poses, on fully visible frames of tracks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray
     chosen = []
     for track in tracks:
         if track.skeleton != skeleton:
-            raise ValueError(f"tracks must have one skeleton, {track.name!r} has other joints")
+            raise ValueError(f"tracks must share one skeleton, got another in {track.name!r}")
         visible = (track.confidence >= threshold) & (track.confidence > 0)
         chosen.append(track.keypoints[visible.all(axis=1)])
     poses = np.concatenate(chosen)
@@ -50,7 +50,7 @@ class PoseTrainee:
     Parameters
     ----------
     tracks, validation : sequence of KeypointTrack
-        Prepared tracks of one skeleton, metres; validation is of other clips.
+        Prepared tracks of one skeleton, metres; validation tracks are from other clips.
     size : dataclass
         Settings of the network.
     threshold : float
@@ -75,7 +75,7 @@ class PoseTrainee:
         self.held_out = whole_poses(validation, threshold).astype(np.float32)
         self.skeleton = tracks[0].skeleton
         if validation[0].skeleton != self.skeleton:
-            raise ValueError("validation must have the same skeleton as tracks")
+            raise ValueError("validation must have the same skeleton as tracks, got another")
         self._seed = seed
         self.settings: Mapping[str, Any] = {
             "size": asdict(size),
@@ -89,12 +89,12 @@ class PoseTrainee:
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
-        """Return the loss of random poses."""
+        """Return the loss on a random batch of poses."""
         chosen = self.poses[rng.integers(len(self.poses), size=batch)]
         return self._loss(network, chosen, rng, device)
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss of fixed held-out poses."""
+        """Return the loss on a fixed batch of held-out poses."""
         rng = seeds.generator(self._seed, "validation")
         chosen = self.held_out[rng.permutation(len(self.held_out))[: self._validation_poses]]
         return float(self._loss(network, chosen, rng, device).detach())

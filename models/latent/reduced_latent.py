@@ -1,7 +1,7 @@
 """Low-dimensional subspace of a latent prior.
 
-It keeps the k directions along which the decoded motion varies most, so that random-walk samplers
-mix.
+It is spanned by the k directions along which the decoded motion varies most, so that random-walk
+samplers mix.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _ROWS = 64
 class ReducedLatent(StandardNormalPrior):
     """Prior over θ ~ N(0, I_k) with latent code z = U θ.
 
-    U (Z, k) holds the leading eigenvectors of E[JᵀJ], J = ∂X/∂z the decoder's Jacobian at prior
-    draws. It is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one vector-Jacobian product per draw.
+    U (Z, k) contains the leading eigenvectors of E[JᵀJ], with J = ∂X/∂z the decoder's Jacobian at
+    prior draws. E[JᵀJ] is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one product per draw.
 
     Parameters
     ----------
     prior : MotionVAE
-        Any prior with z ~ N(0, I) and a motion that torch can differentiate.
+        Prior with z ~ N(0, I) and a ``motion`` method differentiable by torch.
     k : int
         Number of directions, at most the prior's ``dim``.
     seed : int
@@ -55,7 +55,7 @@ class ReducedLatent(StandardNormalPrior):
         self.skeleton: Skeleton = prior.skeleton
         self.frames: int = prior.frames
         self.fps: float = prior.fps
-        # How to obtain a protocol that the prior lacks; shown when a sampler is not applicable.
+        # Hints for obtaining missing protocols, shown if a sampler is not applicable.
         self.stand_ins: Mapping[str, str] = getattr(prior, "stand_ins", {})
         values, vectors = np.linalg.eigh(_mean_square(prior, seeds.generator(seed, "directions")))
         leading = np.argsort(values)[::-1][:k]
@@ -67,9 +67,9 @@ class ReducedLatent(StandardNormalPrior):
     @cached_property
     def explained(self) -> float:
         """Fraction of tr E[JᵀJ] along the directions, estimated from independent draws."""
-        other = _mean_square(self.prior, seeds.generator(self.seed, "kept"))
-        along = np.einsum("zk,zy,yk->", self.directions, other, self.directions)
-        return float(along / np.trace(other))
+        mean_square = _mean_square(self.prior, seeds.generator(self.seed, "kept"))
+        along = np.einsum("zk,zy,yk->", self.directions, mean_square, self.directions)
+        return float(along / np.trace(mean_square))
 
     @property
     def dim(self) -> int:

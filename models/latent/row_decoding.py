@@ -21,7 +21,7 @@ def decode_rows(
     shape: tuple[int, ...],
     rows: int,
 ) -> Array:
-    """Return the decoded θ, ``(…, dim) → (…, *shape)``, as an array of the same library.
+    """Return decoded θ, ``(…, dim) → (…, *shape)``, as an array of the same library.
 
     ``decode`` maps ``(B, dim) → (B, *shape)`` in the precision of its input. NumPy arrays are
     decoded in single or double precision, without gradients, ``rows`` at a time to limit memory.
@@ -31,7 +31,7 @@ def decode_rows(
     TypeError
         If θ is neither a NumPy array nor a torch tensor.
     ValueError
-        If θ has another length, or a NumPy array is not finite.
+        If θ has the wrong length, or a NumPy array is not finite.
     """
     if not (is_numpy_array(theta) or is_torch_array(theta)):
         kind = "JAX array" if is_jax_array(theta) else type(theta).__name__

@@ -1,6 +1,6 @@
 """Base class of priors over standard-normal coordinates.
 
-Subclasses decode θ into motions; density, draws and denoiser of θ itself are exact.
+Subclasses decode θ into motions. The density, draws and denoiser of θ are exact.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["StandardNormalPrior"]
 
 
 class StandardNormalPrior(ABC):
-    """θ ~ N(0, I), for NumPy, torch and JAX arrays."""
+    """Prior with coordinates θ ~ N(0, I), as NumPy, torch or JAX arrays."""
 
     @property
     @abstractmethod

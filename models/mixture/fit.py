@@ -1,4 +1,4 @@
-"""Fitting the Gaussian mixture: windows, heading alignment, probabilistic PCA per style."""
+"""Fitting of Gaussian mixtures: windows, heading alignment, probabilistic PCA per style."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def fit_styles(
     windows = _common_heading(windows, motions[0])
     flat = windows.reshape(len(windows), -1)
     if np.ptp(flat, axis=0).max() < 1e-9:
-        raise ValueError(f"motions must contain windows that differ, got {len(windows)} equal ones")
+        raise ValueError(f"motions must contain different windows, got {len(windows)} equal ones")
     if isinstance(styles, int):
         check_count("styles", styles)
         labels = _cluster(flat, styles, rank, seed)
@@ -82,10 +82,10 @@ def fit_styles(
 def cut_windows(
     motions: Sequence[Motion], frames: int, stride: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return all windows of clips, centred on the root, (n, frames, J, 3), and their clips (n,).
+    """Return all windows of clips, centred on the root, (n, frames, J, 3), and clip indices (n,).
 
-    ``stride`` frames lie between the starts of windows, by default ``frames // 4``; shorter clips
-    are skipped.
+    ``stride`` is the number of frames between window starts, by default ``frames // 4``. Clips
+    shorter than ``frames`` are skipped.
 
     Raises
     ------
@@ -116,13 +116,13 @@ def cut_windows(
     if not windows:
         longest = max(motion.frames for motion in motions)
         raise ValueError(
-            f"motions must contain a clip of at least {frames} frames, the longest has {longest}"
+            f"motions must contain a clip of at least {frames} frames, got at most {longest}"
         )
     return np.stack(windows), np.array(clip_of)
 
 
 def turn_to(motions: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return motions rotated about the vertical onto ``target`` by least squares over the yaw.
+    """Return motions rotated about the vertical to fit ``target`` by least squares.
 
     ``(n, L, J, 3), (L, J, 3) → (n, L, J, 3)``.
     """
@@ -135,7 +135,7 @@ def turn_to(motions: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _common_heading(windows: np.ndarray, motion: Motion) -> np.ndarray:
     """Rotate every window so that its mean left-to-right axis points along −X.
 
-    For a skeleton without left-right pairs, align the windows with the first one instead.
+    Without left-right pairs, windows are aligned with the first window instead.
     """
     pairs = motion.skeleton.mirrored_pairs
     if not pairs:

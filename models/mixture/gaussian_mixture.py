@@ -31,12 +31,12 @@ __all__ = ["GaussianMixtureMotion"]
 
 @dataclass(frozen=True, eq=False)
 class GaussianMixtureMotion:
-    """A mixture of K·A Gaussians over motions of one skeleton, centred on the root.
+    """Mixture of K·A Gaussians over root-centred motions of one skeleton.
 
     Parameters
     ----------
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     fps : float
         Frames per second.
     means : ndarray, (K, L, J, 3)
@@ -87,7 +87,7 @@ class GaussianMixtureMotion:
         check_positive("fps", self.fps)
         check_count("azimuths", self.azimuths)
         if self.weights.min() <= 0 or abs(self.weights.sum() - 1) > 1e-9:
-            raise ValueError(f"weights must be numbers above 0 that sum to 1, got {self.weights}")
+            raise ValueError(f"weights must be positive and sum to 1, got {self.weights}")
         names = tuple(self.styles) or tuple(f"style-{k}" for k in range(K))
         if len(names) != K:
             raise ValueError(f"styles must contain {K} names, one per mean, got {len(names)}")
@@ -128,7 +128,7 @@ class GaussianMixtureMotion:
         rank : int
             r: latent dimensions per style.
         styles : int or sequence of str
-            Number of styles to find by k-means, or one label per clip.
+            Number of k-means clusters, or one label per clip.
         weights : sequence of float, optional
             Probabilities of the styles, in the order of their sorted names; by default their
             proportions among the windows.
@@ -170,7 +170,7 @@ class GaussianMixtureMotion:
 
     @property
     def yaws(self) -> np.ndarray:
-        """The azimuths ψ_a, radians, (A,)."""
+        """Azimuths ψ_a, radians, (A,)."""
         return 2 * np.pi * np.arange(self.azimuths) / self.azimuths
 
     @cached_property
@@ -182,7 +182,7 @@ class GaussianMixtureMotion:
 
     @cached_property
     def base_fields(self) -> np.ndarray:
-        """The three base fields of each mean and factor, metres, (K, 1 + r, 3, L·J, 3)."""
+        """Three base fields of each mean and factor, metres, (K, 1 + r, 3, L·J, 3)."""
         return turning_fields(self._fields)
 
     @property
@@ -198,7 +198,7 @@ class GaussianMixtureMotion:
         return self.exact_posterior(None).sample(rng, n)
 
     def motion(self, theta: Array) -> Array:
-        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; ``positions`` only."""
+        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; not for latent θ."""
         if self.coordinates == "latent":
             raise ValueError(
                 "coordinates must be 'positions', got 'latent', where the motion at θ is random; "
@@ -262,7 +262,7 @@ class GaussianMixtureMotion:
         Raises
         ------
         ValueError
-            If a camera is perspective: its marginals are not Gaussian mixtures.
+            If a camera is perspective, as its marginals are not Gaussian mixtures.
         """
         out = np.empty_like(x_t)
         for view, mixture in enumerate(self._seen_by(cameras, x_t)):
@@ -310,7 +310,7 @@ class GaussianMixtureMotion:
         return self._metres.responsibilities(flat).sum(axis=2)
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
-        """Return the variance outside the most likely component's subspace, over δ²: (n,).
+        """Return the variance outside the most likely component's subspace, divided by δ²: (n,).
 
         The expectation under the prior is 1.
         """
@@ -328,9 +328,9 @@ class GaussianMixtureMotion:
     def reduced(self) -> tuple[GaussianMixtureMotion, np.ndarray]:
         """Return the same prior on the span of its scalar fields, and a basis of that span.
 
-        Frames and joints enter only through the x, y and z fields of the means and factors.
-        Operations that are linear and treat all entries alike (rotation, orthographic projection,
-        triangulation, isotropic noise) are unchanged on the span of these fields.
+        The prior depends on frames and joints only through the x, y and z fields of the means and
+        factors. Operations that are linear and treat all entries alike (rotation, orthographic
+        projection, triangulation, isotropic noise) are unchanged on the span of these fields.
 
         Returns
         -------

@@ -1,9 +1,9 @@
 """Exact posterior of the Gaussian-mixture prior under a linear Gaussian likelihood.
 
-The posterior is again a mixture. At one joint and frame the likelihood of a position x is
+The posterior is also a mixture. At one joint and frame, the likelihood of a position x is
 exp(−½ xᵀΛx + ηᵀx). With the noise δ ε integrated out, it has the same form in m_k + W_k z with
-Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Rotations enter through the three base fields of each mean and
-factor (``turned_mixture``), so the Gram matrices of all K·A components follow from K small ones.
+Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Rotated means and factors are combinations of three base
+fields (``turned_mixture``), so K small Gram matrices determine those of all K·A components.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["MixturePosterior"]
 
 
 class MixturePosterior:
-    """p(X | y) of a rotated Gaussian mixture; without a likelihood, the prior itself.
+    """Posterior p(X | y) of a rotated Gaussian mixture; the prior if there is no likelihood.
 
     Created by :meth:`GaussianMixtureMotion.exact_posterior` from base fields (K, 1 + r, 3, L·J, 3),
     yaws (A,), style probabilities (K,), noise δ, the shape (L, J, 3) and a likelihood with
@@ -48,15 +48,15 @@ class MixturePosterior:
         variance = noise**2
         self._shrink = np.linalg.inv(np.eye(3) + variance * self.information)
         metric = self._shrink @ self.information
-        pull = np.einsum("fij,fj->fi", self._shrink, self.shift)
+        shrunk_shift = np.einsum("fij,fj->fi", self._shrink, self.shift)
         moved = np.einsum("fij,knefj->knefi", metric, base_fields)
         gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, moved, optimize=True)
         turns = self._turns
         self._gram = np.einsum("kijcd,ac,ad->kaij", gram, turns, turns, optimize=True)
-        linear = np.einsum("fx,kicfx->kic", pull, base_fields, optimize=True)
+        linear = np.einsum("fx,kicfx->kic", shrunk_shift, base_fields, optimize=True)
         self._linear = np.einsum("kic,ac->kai", linear, turns)
         constant_part -= 0.5 * np.linalg.slogdet(np.linalg.inv(self._shrink))[1].sum()
-        constant_part += 0.5 * variance * float((self.shift * pull).sum())
+        constant_part += 0.5 * variance * float((self.shift * shrunk_shift).sum())
         log_weights = np.log(weights)[:, None] - math.log(len(yaws))
         # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z
         self._offset = (
@@ -75,7 +75,7 @@ class MixturePosterior:
 
     @cached_property
     def _latent_root(self) -> np.ndarray:
-        """C with C Cᵀ = Cov[z | y, k, a], (K, A, r, r): precision = L Lᵀ, so C = L⁻ᵀ."""
+        """Matrix C with C Cᵀ = Cov[z | y, k, a], (K, A, r, r): precision = L Lᵀ, so C = L⁻ᵀ."""
         lower = np.linalg.cholesky(self._latent_precision)
         return np.swapaxes(np.linalg.inv(lower), -1, -2)
 
@@ -86,18 +86,18 @@ class MixturePosterior:
 
     @cached_property
     def _log_joint(self) -> np.ndarray:
-        """log p(y, k, a), (K, A)."""
+        """Log joint density log p(y, k, a), (K, A)."""
         log_det = np.linalg.slogdet(self._latent_precision)[1]
         return self._offset + 0.5 * ((self._slope * self._latent_mean).sum(axis=-1) - log_det)
 
     @property
     def log_marginal_likelihood(self) -> float:
-        """log p(y)."""
+        """Log marginal likelihood log p(y)."""
         return float(logsumexp(self._log_joint.reshape(-1)))
 
     @property
     def component_probabilities(self) -> np.ndarray:
-        """p(style k, azimuth a | y), (K, A)."""
+        """Probabilities p(style k, azimuth a | y), (K, A)."""
         return np.exp(self._log_joint - self.log_marginal_likelihood)
 
     def mean(self) -> np.ndarray:
@@ -133,7 +133,7 @@ class MixturePosterior:
         return logsumexp(self._log_terms(latent))
 
     def log_density(self, positions: Array) -> Array:
-        """Return the normalised log p(X | y): ``(…, L, J, 3) → (…)``, any array library."""
+        """Return log p(X | y), normalised: ``(…, L, J, 3) → (…)``; NumPy, torch or JAX."""
         xp = array_namespace(positions)
         K, width, _, F, _ = self._fields.shape
         A = len(self._turns)
@@ -172,7 +172,7 @@ class MixturePosterior:
         return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
 
     def _log_terms(self, latent: Array) -> Array:
-        """log π p(y | z, k, a), ``(…, r) → (…, K·A)``."""
+        """Return log π p(y | z, k, a), ``(…, r) → (…, K·A)``."""
         xp = array_namespace(latent)
         rank = self._slope.shape[-1]
         batch = latent.shape[:-1]
@@ -186,7 +186,7 @@ class MixturePosterior:
         return xp.reshape(terms, (*batch, terms.shape[-1]))
 
     def _given_clean(self, clean: np.ndarray) -> np.ndarray:
-        """E[X | m + W z = clean, y] = S (clean + δ² η): ``(…, F, 3) → (…, F, 3)``."""
+        """Return E[X | m + W z = clean, y] = S (clean + δ² η): ``(…, F, 3) → (…, F, 3)``."""
         return np.einsum("fij,...fj->...fi", self._shrink, clean + self.noise**2 * self.shift)
 
     def _motions(

@@ -1,12 +1,12 @@
-"""Gaussian mixture of components rotated about the vertical, with exact algebra.
+"""Gaussian mixture of components rotated about the vertical, with exact density and denoiser.
 
 Component (k, a) has mean R(ψ_a) m_k, factors R(ψ_a) W_k and isotropic noise δ². A rotated field is
 a trigonometric combination of three base fields,
 
     R(ψ) f = cos ψ (f_x, 0, f_z) + sin ψ (f_z, 0, −f_x) + (0, f_y, 0),
 
-and so is its image in any orthographic camera. Products with all K·A components therefore reduce
-to products with 3·K·(1 + r) base fields, combined per azimuth.
+and its orthographic projections have the same form. Products with all K·A components therefore
+reduce to products with 3·K·(1 + r) base fields, combined per azimuth.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from probmotion.arrays import Array, array_namespace, constant, logsumexp
 __all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
 
 _BLOCK = 64
-"""Points per block, so that products stay in a core's cache. The last block is padded with zeros:
+"""Points per block, so that products fit into a core's cache. The last block is padded with zeros:
 rounding of a point must not depend on the batch size, as a sampler's steps amplify differences."""
 
 
@@ -46,7 +46,7 @@ def turning_coefficients(yaws: np.ndarray) -> np.ndarray:
 
 
 class _Level(NamedTuple):
-    """Quantities that depend on the noise level alone.
+    """Quantities that depend only on the noise level.
 
     √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r);
     and the matrices from base products and a constant 1 to whitened latents, (K, A r, 3 r + 1).
@@ -72,10 +72,10 @@ class _State(NamedTuple):
 
 
 class TurnedMixture:
-    """x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε', in D dimensions.
+    """Mixture of x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε' in D dimensions.
 
-    Given base fields of means (first) and factors (K, 1 + r, 3, D), equally likely azimuths ψ (A,),
-    style probabilities (K,) and the variance δ².
+    Parameters are base fields of means (first) and factors (K, 1 + r, 3, D), equally likely
+    azimuths ψ (A,), style probabilities (K,) and the variance δ².
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class TurnedMixture:
         # Base products → products with every rotated eigenvector: (K, A r, 3 r).
         spread = np.einsum("ac,kair->karic", self.turns, basis, optimize=True)
         self.to_latent = np.ascontiguousarray(spread.reshape(K, A * self.rank, 3 * self.rank))
-        # A row of zeros per style leaves room for the constant 1 that shifts the latents.
+        # A row of zeros per style, for the constant 1 in the products, which shifts the latents.
         rows = np.zeros((K, 3 * width + 1, D))
         rows[:, :-1] = fields.reshape(K, 3 * width, D)
         self._fields = rows.reshape(-1, D)
@@ -144,7 +144,7 @@ class TurnedMixture:
         return out
 
     def log_density(self, x: Array) -> Array:
-        """Return the normalised log density of x₀: ``(…, D) → (…)``, for any array library."""
+        """Return the normalised log density of x₀: ``(…, D) → (…)``; NumPy, torch or JAX."""
         xp = array_namespace(x)
         level = self._level(1.0)
         K, A = self.shape
@@ -174,9 +174,9 @@ class TurnedMixture:
         """
         level = self._level(1.0)
         # ‖x − m‖² minus its component inside the subspace, Σ (Bᵀ Wᵀ (x − m))² / λ.
-        present = self.eigenvalues > 0
+        positive = self.eigenvalues > 0
         inverse = np.zeros_like(self.eigenvalues)
-        inverse[present] = 1 / (level.root**2 * self.eigenvalues)[present]
+        inverse[positive] = 1 / (level.root**2 * self.eigenvalues)[positive]
         out = np.empty(len(x))
         for rows, n in _blocks(len(x)):
             block = _filled(x[rows])

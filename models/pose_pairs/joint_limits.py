@@ -1,14 +1,14 @@
 """Pose-conditioned joint-angle limits (Akhter and Black 2015).
 
 The directions allowed for a bone depend on the direction of its parent. Twist is not limited, as
-joint positions do not determine it. Parent directions are binned coarsely, bone directions finely,
-and a table has one bit per pair, set if it occurs in or close to motion capture data
+joint positions do not determine it. Parent directions have coarse bins, bone directions fine cells.
+A table has one bit per bin and cell, set if they occur in or close to motion capture data
 (:mod:`.joint_limits_learning`).
 
-The frame of the pelvis has its left axis from hip to hip and its up axis closest to the spine; that
-of the neck and arms its left axis from shoulder to shoulder and its up axis closest to the chest's
-bone. Other bones use their parent's frame, rotated by the minimal rotation from the parent's mean
-direction, which puts the singularity opposite to the usual directions.
+The left axis of the pelvis frame is parallel to the line of the hips, its up axis closest to the
+spine. The frame of neck and arms uses the shoulders and the chest's bone instead. Other bones use
+their parent's frame, rotated by the minimal rotation from the parent's mean direction, so that the
+singularity is opposite to the usual directions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class JointLimits:
     allowed : ndarray of bool, (9, bins, cells)
         Allowed direction cells per bin of the parent's direction; at least one per bin. The nine
         parts are the bones ending in hip, knee, ankle, chest, shoulder, elbow, wrist, neck and
-        head, shared by both sides. The spine has ``tilt`` instead.
+        head, shared by both sides. ``tilt`` limits the spine instead.
     rest : ndarray, (9, 3)
         Mean direction of each bone in its frame, unit vectors.
     tilt : float
@@ -73,7 +73,7 @@ class JointLimits:
         check_shape("rest", self.rest, (len(PARTS), 3))
         check_finite("rest", self.rest)
         if not np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max() < 1e-9:
-            raise ValueError("rest must contain unit vectors")
+            raise ValueError("rest must contain unit vectors, got other lengths")
         if not 0 < self.tilt < np.pi / 2:
             raise ValueError(f"tilt must be between 0 and π/2, got {self.tilt!r}")
         empty = np.argwhere(~self.allowed.any(axis=-1))
@@ -99,8 +99,8 @@ class JointLimits:
     def is_valid(self, pose: np.ndarray) -> np.ndarray:
         """Return a mask of the bones within their limits, ``(…, J, 3) → (…, bones)``.
 
-        In the order of ``skeleton.bones``. Ancestors are corrected first, so that an invalid
-        shoulder does not invalidate the arm.
+        Bones are in the order of ``skeleton.bones``. Ancestors are corrected first, so that an
+        invalid shoulder does not invalidate the arm.
         """
         return self.project(pose)[0]
 
@@ -109,7 +109,7 @@ class JointLimits:
 
         ``(…, J, 3) → (…, J, 3)``, metres. The new direction is on the boundary of the allowed
         cells, towards the nearest one. Roots and bone lengths are preserved, descendants rotate
-        along, and valid poses are unchanged.
+        with the bone, and valid poses are unchanged.
         """
         return self.project(pose)[1]
 
@@ -143,7 +143,7 @@ class JointLimits:
 
     @cached_property
     def arrays(self) -> LimitArrays:
-        """Arrays for compiled code."""
+        """Arrays of the limits for compiled code."""
         return LimitArrays(
             np.ascontiguousarray(self.allowed, dtype=np.bool_),
             sphere_rings(self.bin_rings)[0],
@@ -197,9 +197,9 @@ def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
     counts = 2 * np.round(n_rings * np.sin(heights)).astype(np.int64)
     rings = np.stack([counts, np.cumsum(counts) - counts], axis=1)
     height = np.repeat(heights, counts)
-    place = np.arange(counts.sum()) - np.repeat(rings[:, 1], counts)
-    turn = (place + 0.5) * 2.0 * np.pi / np.repeat(counts, counts)
+    index = np.arange(counts.sum()) - np.repeat(rings[:, 1], counts)
+    angle = (index + 0.5) * 2.0 * np.pi / np.repeat(counts, counts)
     centres = np.stack(
-        [np.sin(height) * np.sin(turn), np.cos(height), np.sin(height) * np.cos(turn)], axis=1
+        [np.sin(height) * np.sin(angle), np.cos(height), np.sin(height) * np.cos(angle)], axis=1
     )
     return rings, centres

@@ -25,9 +25,9 @@ def cell_of(direction: Vector, rings: np.ndarray) -> int:
     height = min(1.0, max(-1.0, direction[1]))
     ring = min(len(rings) - 1, int(np.arccos(height) / np.pi * len(rings)))
     cells = rings[ring, 0]
-    turn = np.arctan2(direction[0], direction[2]) / (2.0 * np.pi)
-    place = int(np.floor(turn * cells))
-    return rings[ring, 1] + place % cells
+    angle = np.arctan2(direction[0], direction[2]) / (2.0 * np.pi)
+    index = int(np.floor(angle * cells))
+    return rings[ring, 1] + index % cells
 
 
 @numba.njit(cache=True)
@@ -132,9 +132,9 @@ def closeness_of(
 ) -> np.ndarray:
     """Return the cosine between each cell's centre and the nearest sample, (bins, cells).
 
-    A bin uses the samples whose parent is in the bin or has a cosine of at least ``bin_reach`` to
-    its centre. Cells that contain a sample get 1, bins without samples -2. Compiled also for a
-    fixed order of summation.
+    A bin uses the samples with a parent direction in the bin or at a cosine of at least
+    ``bin_reach`` to its centre. The value of a cell with a sample is 1, of a bin without samples
+    -2. Compiled code sums in a fixed order.
     """
     closeness = np.full((len(bins), len(centres)), -2.0)
     for sample in range(len(parents)):

@@ -1,6 +1,6 @@
 """Learning of joint limits from motion capture.
 
-The shipped limits are reproduced from CMU clips in DATA/cmu_single and DATA/cmu_salsa_pairs by
+Reproduce the shipped limits from CMU clips in DATA/cmu_single and DATA/cmu_salsa_pairs with
 
     python -m probmotion.models.pose_pairs.joint_limits_learning --data DATA --out joint_limits.npz
 """
@@ -34,12 +34,12 @@ HELD_OUT = (
     "cmu_01_07", "cmu_02_05", "cmu_02_09", "cmu_131_02",
     "cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11",
 )  # fmt: skip
-"""Clips held out from the shipped limits, for evaluation."""
+"""Clips excluded from the data of the shipped limits, for evaluation."""
 
 _PERSON = Skeleton.preset("person17")
-# The hips must keep their sides, or a correction would flip the frame of the pelvis.
+# Minimum left component of a hip: swapped hips would flip the frame of the pelvis.
 _LEAST_LEFT_OF_HIP = 0.1
-# Robust to outlier frames.
+# Below 1, for robustness to outlier frames.
 _TILT_QUANTILE = 0.999
 
 
@@ -51,7 +51,7 @@ def learn_limits(
     bin_rings: int = 6,
     cell_rings: int = 22,
 ) -> JointLimits:
-    """Learn limits that allow the directions in ``motions`` and nearby ones.
+    """Return limits that allow the directions in ``motions`` and close directions.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def learn_limits(
         Motions of one person, metres, with the joints of ``person17`` or retargetable to it.
         Mirror images are included.
     dilation : float
-        Maximum angle of an allowed direction to an observed one, radians, in [0, π/2).
+        Maximum angle between an allowed and an observed direction, radians, in [0, π/2).
     bin_dilation : float
         Maximum angle between parent directions that share observations, radians, in [0, π/2).
     bin_rings, cell_rings : int
@@ -116,7 +116,7 @@ def main(data: Path, out: Path, dilation: float = 10.0, bin_dilation: float = 20
     out
         Output file.
     dilation
-        Maximum angle of an allowed direction to an observed one, degrees.
+        Maximum angle between an allowed and an observed direction, degrees.
     bin_dilation
         Maximum angle between parent directions that share observations, degrees.
     """
@@ -124,7 +124,7 @@ def main(data: Path, out: Path, dilation: float = 10.0, bin_dilation: float = 20
     pairs = sorted((data / "cmu_salsa_pairs").glob("*.npz"))
     missing = set(HELD_OUT) - {path.stem for path in [*singles, *pairs]}
     if missing:
-        raise ValueError(f"data must contain {', '.join(sorted(missing))}, missing in {data}")
+        raise ValueError(f"data must contain {', '.join(sorted(missing))}, got {data} without them")
     learnt = [path for path in [*singles, *pairs] if path.stem not in HELD_OUT]
     motions = [person for path in learnt for person in clips_of_people(path)]
     provenance: dict[str, Any] = {
@@ -181,8 +181,8 @@ def _local(poses: np.ndarray, rest: np.ndarray, bin_rings: int, cell_rings: int)
     """Return parent and bone directions of all joints, (n, 17, 2, 3)."""
     bins, bin_centres = sphere_rings(bin_rings)
     cells, centres = sphere_rings(cell_rings)
-    anything = np.ones((len(PARTS), len(bin_centres), len(centres)), dtype=bool)
-    limits = LimitArrays(anything, bins, cells, centres, rest, 1.0)
+    all_allowed = np.ones((len(PARTS), len(bin_centres), len(centres)), dtype=bool)
+    limits = LimitArrays(all_allowed, bins, cells, centres, rest, 1.0)
     return local_directions(np.ascontiguousarray(poses), limits)
 
 
@@ -200,7 +200,7 @@ def _mean_directions(poses: np.ndarray, bin_rings: int, cell_rings: int) -> np.n
 
 
 def _without_empty_rows(allowed: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """Fill the bins without observations from the nearest bins with observations."""
+    """Return the table with empty bins filled from the nearest non-empty bins."""
     filled = allowed.copy()
     for part, rows in enumerate(allowed):
         known = np.flatnonzero(rows.any(axis=-1))

@@ -26,9 +26,9 @@ _LIKELIHOOD = (
 class PairSettings:
     """Settings of the pose-pair posterior.
 
-    Defaults are those of the paper except for ``limit``: truncation at 100 times the seed's density
-    is flat over most draws. The paper gives no unit for ``noise``; 0.01 m was chosen in
-    ``notebooks/ablations/pose_pairs.py`` (parts noise and calibration).
+    Defaults are those of the paper except for ``limit``: a density truncated at 100 times that of
+    the seed is constant over most draws. The paper states no unit for ``noise``; 0.01 m was
+    chosen in ``notebooks/ablations/pose_pairs.py`` (parts noise and calibration).
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class PairSettings:
     noise : float
         σ_l of eq. 9, metres (dimensionless for shape contexts).
     limit : float
-        c of eq. 11; infinity for no truncation.
+        c of eq. 11; infinity disables truncation.
     n_views, n_near : int
-        Number of views m, and of annotations compared per view.
+        Number of views m, and number of annotations compared per view.
     measure, graph : str
         See :class:`~probmotion.interaction.annotated_pairs.AnnotatedPairs`.
     bone_noise, root_noise : float
@@ -129,6 +129,6 @@ def pair_posterior(
         worst = int(log_density.argmin())
         raise ValueError(
             f"seed {worst} must have at least 1/{settings.limit:g} of the first seed's density, "
-            "got less: increase limit or choose another seed"
+            "got less; increase limit or choose another seed"
         )
     return posterior

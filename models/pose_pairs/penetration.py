@@ -1,7 +1,7 @@
 """Penetration depth of skeletons with bone radii (Yin et al. 2018, eq. 2).
 
-Each bone is a capsule: the points within its radius (``skeleton.radii``) of the segment from joint
-to parent.
+Each bone is a capsule around the segment from joint to parent, with the radius of the joint
+(``skeleton.radii``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Capsules", "capsules_of", "penetrating_bones", "penetration_depth"]
 
 
 class Capsules(NamedTuple):
-    """Arrays for compiled code."""
+    """Arrays of capsules for compiled code."""
 
     bones: np.ndarray  # (B, 2), joints
     radii: np.ndarray  # (B,), metres
@@ -30,9 +30,9 @@ class Capsules(NamedTuple):
 def capsules_of(skeleton: Skeleton) -> Capsules:
     """Return a skeleton's capsules and the pairs tested for penetration.
 
-    Tested are all pairs of bones of different trees and, within a tree, bones that neither share a
-    joint nor have a common neighbour: neighbouring capsules overlap at rest, and their folding is
-    subject to the joint limits.
+    The pairs are all bones of different trees and, within a tree, bones that neither share a joint
+    nor have a common neighbour. Close capsules of a tree overlap at rest, and the joint limits
+    restrict their folding.
     """
     if skeleton.radii is None:
         raise ValueError("skeleton must have radii, one per joint, got none")
@@ -43,7 +43,7 @@ def capsules_of(skeleton: Skeleton) -> Capsules:
 def penetration_depth(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """Return the total penetration depth ρ = Σ max(0, r_a + r_b − d_ab), metres.
 
-    d_ab is the distance of the segments of bones a and b; pairs as in :func:`capsules_of`.
+    d_ab is the distance between the segments of bones a and b; pairs as in :func:`capsules_of`.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def penetration_depth(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, str, float]]:
     """Return the penetrating bones of a pose (J, 3), deepest first.
 
-    Each is (joint, joint, depth in metres), named by end joints; the depths sum to
+    Each entry is (bone, bone, depth in metres), with bones named by end joint; depths sum to
     :func:`penetration_depth`.
     """
     bones, radii, pairs = capsules_of(skeleton)
@@ -85,7 +85,7 @@ def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, s
 def _capsules(bones: tuple[tuple[int, int], ...], radii: tuple[float, ...]) -> Capsules:
     ends = np.array(bones, dtype=np.int64).reshape(-1, 2)
     touching = (ends[:, None, :, None] == ends[None, :, None, :]).any(axis=(-2, -1))
-    # A bone touches itself, so the product contains touching bones and those with a neighbour.
+    # A bone touches itself, so the product marks bones that touch or have a common neighbour.
     tested = ~(touching @ touching)
     return Capsules(
         bones=ends,

@@ -84,7 +84,7 @@ class PoseChart:
         frames = vector_to_matrix(turns)
         joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
         positions = [joints]
-        # Process one generation of bones at a time, for few large matrix products.
+        # Process one generation of bones at a time, to use few large matrix products.
         for bones, above in self._generations:
             frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
             joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
@@ -119,8 +119,8 @@ class PoseChart:
             places[..., k, :] = positions[..., root, :] - self.seed[root]
         for bone in (bone for bones, _ in self._generations for bone in bones):
             above = frames[starts[bone]]
-            aim = (np.swapaxes(above, -1, -2) @ vectors[..., bone, :, None])[..., 0]
-            vector = _least_turn(self._bones[bone] / rest[bone], aim / lengths[..., bone, None])
+            target = (np.swapaxes(above, -1, -2) @ vectors[..., bone, :, None])[..., 0]
+            vector = _least_turn(self._bones[bone] / rest[bone], target / lengths[..., bone, None])
             bends[..., bone, :] = vector @ self._bases[bone]
             frames[ends[bone]] = above @ vector_to_matrix(vector)
         return theta
@@ -128,8 +128,8 @@ class PoseChart:
     def log_measure(self, theta: Array) -> Array:
         """Return the log density of the base measure of poses: ``(…, dim) → (…)``, NumPy.
 
-        Uniform root rotations (Haar) and bone directions, Gaussian root positions and log lengths,
-        all normalised. Rotations beyond π have density 0, so that each direction counts once.
+        Root rotations (Haar) and bone directions are uniform, root positions and log lengths
+        Gaussian, all normalised. Rotations beyond π have density 0: directions are counted once.
         """
         theta = to_numpy(theta)
         turns, places, bends, stretches = self._parts(theta)
@@ -145,7 +145,7 @@ class PoseChart:
         return np.where(inside, total, -np.inf)
 
     def speeds(self, turn: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-        """Return the mean squared step of each coordinate, (…, dim), from those of joints (eq. 12).
+        """Return mean squared steps of the coordinates, (…, dim), from steps of joints (eq. 12).
 
         Parameters
         ----------
@@ -211,7 +211,7 @@ def _least_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     axis = np.cross(start, end)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
     angle = np.arctan2(sine, (end @ start)[..., None])
-    # For opposite directions any orthogonal axis will do.
+    # For opposite directions, any orthogonal axis is valid.
     opposite = _square_to(start[None])[0, :, 0]
     return angle * np.where(sine > 1e-12, axis / np.where(sine > 0, sine, 1.0), opposite)
 

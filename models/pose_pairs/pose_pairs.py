@@ -22,7 +22,7 @@ _JITTER = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PosePairPrior:
-    """f(Θ) = 0 with more than ``max_invalid`` invalid joint angles, else exp(−E(X(Θ))/2σ_p²).
+    """Prior f(Θ) = exp(−E(X(Θ))/2σ_p²), 0 with more than ``max_invalid`` invalid joint angles.
 
     ``E = ‖X − X̂‖² + w ρ²`` (eq. 2), with X̂ the nearest pose within the joint limits and ρ the total
     penetration depth, metres. The unnormalised density is relative to the base measure
@@ -31,8 +31,8 @@ class PosePairPrior:
     Parameters
     ----------
     seed : ndarray, (J, 3) or (S, J, 3)
-        Initial poses of chains, metres; the first is θ = 0. Must be close people in metres, within
-        the support.
+        Initial poses of chains, metres; the first is θ = 0. Poses must be of close people and
+        within the support.
     skeleton : Skeleton
         Skeleton of the J joints, K trees, with bone radii.
     fps : float
@@ -40,9 +40,9 @@ class PosePairPrior:
     limits : JointLimits, optional
         Joint limits; the shipped ones by default.
     penetration_weight : float
-        w.
+        w of eq. 2.
     position_noise : float
-        σ_p, metres.
+        σ_p of eq. 2, metres.
     max_invalid : int
         Maximum number of joint angles beyond the limits.
     bone_noise, root_noise : float
@@ -105,7 +105,7 @@ class PosePairPrior:
         return self.chart.coordinates(poses)
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n initial points, (n, dim): the seeds in turn, with small noise."""
+        """Return n initial points, (n, dim): the seeds cyclically, with small noise."""
         chosen = self.seed_coordinates()[np.arange(n) % len(self.seed)]
         return chosen + _JITTER * rng.standard_normal((n, self.dim))
 

@@ -1,6 +1,6 @@
-"""Enhanced lifting of single people with joint limits, a baseline (Yin et al. 2018, figure 10).
+"""Single-person lifting with joint limits, a baseline (Yin et al. 2018, figure 10).
 
-Minimises, for each person of a 2D pair separately and with the bone lengths of the seed,
+The energy is minimised for each person of a 2D pair separately, with the seed's bone lengths:
 
     E = Σ_visible ‖x_j − p_j‖² + w_v ‖X − X̂‖² + w_s Σ ‖α‖²
 
@@ -56,15 +56,15 @@ def lift_people(
     validity_weight : float
         w_v.
     seed_weight : float
-        w_s, m² per square radian.
+        w_s, m²/rad².
     rounds : int
         Number of minimisations over X.
 
     Returns
     -------
     positions : ndarray, (J, 3)
-        Metres in the annotation's axes: right, up, towards the viewer. Depths of the people are
-        those of the seed.
+        Metres in the annotation's axes: right, up, towards the viewer. Root depths are those
+        of the seed.
     """
     n_joints = skeleton.n_joints
     check_shape("keypoints", keypoints, (n_joints, 2))
@@ -83,9 +83,9 @@ def lift_people(
     seed = np.asarray(seed, dtype=np.float64)
     # The seed in image axes, aligned in the image plane to the visible joints.
     right, up = image_axes(pair_frames(seed[None], skeleton), np.asarray(view)[None])[0, :, 0].T
-    turned = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
-    moved = align_rigidly(turned[:, :2], keypoints, visible)
-    positions = np.concatenate([moved, turned[:, 2:]], axis=-1)
+    rotated = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
+    aligned = align_rigidly(rotated[:, :2], keypoints, visible)
+    positions = np.concatenate([aligned, rotated[:, 2:]], axis=-1)
     weights = (validity_weight**0.5, seed_weight**0.5)
     for root in skeleton.roots:
         joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
@@ -104,8 +104,8 @@ def _lift_person(
     rounds: int,
 ) -> np.ndarray:
     """Return the pose of one person in image axes, (J, 3)."""
-    # θ: the root's turn (3) and place (3), then two angles and a log length per bone.
-    # The depth and the bone lengths are fixed.
+    # θ: root rotation (3) and position (3), then two angles and a log length per bone.
+    # The root depth and the bone lengths are fixed.
     free = np.delete(np.arange(chart.dim), [5, *range(6 + 2, chart.dim, 3)])
 
     def pose_at(point: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Checkpoints of networks: safetensors files with a JSON header.
 
-Loading such a file cannot run code. The header's ``probmotion`` entry contains the format version,
-the kind of network, its settings and the SHA-256 of settings and tensors.
+Such files cannot run code when loaded. The header's ``probmotion`` entry contains the format
+version, the kind of network, its settings and the SHA-256 of settings and tensors.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Kind of network, JSON settings (to rebuild it and describe its training) and weights."""
+    """Kind of a network, JSON settings (for its size and training record) and weights."""
 
     kind: str
     settings: Mapping[str, Any]
@@ -113,13 +113,13 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     except (SafetensorError, json.JSONDecodeError, OSError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
-        raise CheckpointError(f"{path} is not a checkpoint of probmotion")
+        raise CheckpointError(f"{path} must be a checkpoint of probmotion, got another file")
     if header["format"] != _FORMAT:
         raise CheckpointError(
-            f"{path} is a checkpoint of version {header['format']}, expected version {_FORMAT}"
+            f"{path} must be a checkpoint of version {_FORMAT}, got version {header['format']}"
         )
     if header.get("kind") != kind:
-        raise CheckpointError(f"{path} contains a {header.get('kind')}, expected a {kind}")
+        raise CheckpointError(f"{path} must contain a {kind}, got a {header.get('kind')}")
     settings = header.get("settings", {})
     if header.get("sha256") != _digest(settings, tensors):
         raise CheckpointError(f"{path} is damaged: the checksum does not match")
@@ -131,21 +131,21 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
 
 @contextmanager
 def valid_settings(source: str | Path, network: str) -> Iterator[None]:
-    """Convert errors of missing or invalid settings to ``CheckpointError``."""
+    """Convert errors due to missing or invalid settings to ``CheckpointError``."""
     try:
         yield
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"{source} does not contain valid {network} settings: {error}"
+            f"{source} must contain valid {network} settings, got an error: {error}"
         ) from error
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Load tensors into a network; raise ``CheckpointError`` if they do not fit."""
+    """Load tensors into a network; raise ``CheckpointError`` if names or shapes differ."""
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:
-        raise CheckpointError("the checkpoint's weights do not match its settings") from error
+        raise CheckpointError("weights must match the checkpoint's settings, got others") from error
 
 
 def weights_digest(network: nn.Module) -> str:
@@ -168,8 +168,8 @@ def _find(source: str | Path, kind: str) -> Path:
         return shipped
     known = [file.stem for file in sorted(WEIGHTS.glob("*.safetensors")) if _kind(file) == kind]
     raise FileNotFoundError(
-        f"there is no checkpoint {path}; use a file, the folder of a training run or one of "
-        f"{', '.join(known) or 'no names'}"
+        "source must be a file, the folder of a training run or one of "
+        f"{', '.join(known) or 'no names'}, got {str(source)!r}"
     )
 
 

@@ -1,4 +1,4 @@
-"""State of a training run, and how it is saved and resumed."""
+"""Saving and resuming of training runs."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from probmotion.models.training.settings import TrainingSettings
 __all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run", "steps_taken"]
 
 STATE, LOSSES = "state.safetensors", "losses.csv"
-"""File names of the state to resume from and of the losses, in the folder of a run."""
+"""Names of the files for resuming and of the losses, in the folder of a run."""
 
 _LONGEST_DIFFERENCE = 200
 
 
 @dataclass(eq=False)
 class Run:
-    """State that changes from step to step."""
+    """State of a training run after ``step`` steps."""
 
     network: nn.Module
     average: nn.Module
@@ -47,9 +47,9 @@ class Run:
 def keep_run(
     run: Run, kind: str, described: dict[str, Any], folder: Path, *, model: bool = True
 ) -> None:
-    """Write the model, its losses and, last, the state to resume from.
+    """Write the model, the losses and, last, the state for resuming.
 
-    With ``model`` false an existing model is not overwritten.
+    If ``model`` is false, an existing model is not overwritten.
     """
     card = described | {"step": run.step, "seconds": run.seconds, "history": run.history}
     if model or not (folder / MODEL).exists():
@@ -70,14 +70,14 @@ def keep_run(
 
 
 def steps_taken(folder: Path, kind: str) -> int:
-    """Return the number of steps of the run in a folder, 0 if there is none."""
+    """Return the number of steps of the run in a folder, 0 without a run."""
     if (folder / STATE).exists():
         return int(load_checkpoint(folder / STATE, _state_of(kind)).settings["step"])
     return 0
 
 
 def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> None:
-    """Restore a run from its folder, and its model from the state if missing or damaged.
+    """Restore a run from its folder; restore a missing or damaged model from the state.
 
     Raises ``CheckpointError`` for a damaged state or another kind of network, and ``ValueError``
     for other settings or data.
@@ -110,19 +110,18 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
 def check_same_run(
     saved: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> None:
-    """Raise ``ValueError`` unless the parts of saved settings are as described."""
-    # A run saved before a setting existed used what is now the default.
+    """Raise ``ValueError`` unless saved and described settings are equal."""
+    # Runs saved before a setting was introduced used its present default.
     defaults = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part, settings in described.items():
         for name, wanted in settings.items():
             got = saved[part].get(name, defaults[part].get(name))
-            # These two settings do not change any step.
+            # These two settings do not affect the training steps.
             if got != wanted and name not in ("steps", "checkpoint_every"):
-                difference = f"{name} {got}, expected {wanted}"
-                if len(difference) > _LONGEST_DIFFERENCE:
-                    difference = f"another {name}, expected the same"
+                if len(f"{got}{wanted}") > _LONGEST_DIFFERENCE:
+                    got, wanted = "the same", "another"
                 raise ValueError(
-                    f"out is {folder}, which contains a run with {difference}; use another folder"
+                    f"{name} must be {got} to resume {folder}, got {wanted}; use another folder"
                 )
 
 

@@ -13,7 +13,7 @@ __all__ = ["TrainingSettings"]
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Settings of a training run: constant learning rate after a linear warm-up.
+    """Settings of a training run: optimiser, learning-rate schedule, checkpoints and stopping.
 
     Parameters
     ----------
@@ -24,13 +24,13 @@ class TrainingSettings:
     learning_rate : float
         Learning rate of the optimiser.
     warmup : int
-        Steps over which the learning rate rises from 0.
+        Initial steps over which the learning rate rises linearly from 0.
     weight_decay : float
         Weight decay of the optimiser.
     ema : float
-        Decay of the moving average of the weights, which is validated and saved; 0 for none.
+        Decay of the moving average of the weights, which is validated and saved; 0 disables it.
     clip : float
-        Maximum norm of the gradient; ``inf`` for none.
+        Maximum norm of the gradient; ``inf`` disables clipping.
     checkpoint_every : int
         Steps between checkpoints, each with a validation loss.
     seed : int
@@ -46,7 +46,7 @@ class TrainingSettings:
     Raises
     ------
     ValueError
-        If a number is out of range.
+        If a parameter is out of range.
     """
 
     steps: int = 10_000
@@ -75,7 +75,7 @@ class TrainingSettings:
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be at least 0 and below 1, got {self.ema}")
         if not self.clip > 0:
-            raise ValueError(f"clip must be above 0, or inf for none, got {self.clip}")
+            raise ValueError(f"clip must be above 0, or inf to disable clipping, got {self.clip}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(
                 f"weight_decay must be a finite number of at least 0, got {self.weight_decay}"

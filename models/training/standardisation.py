@@ -13,9 +13,9 @@ __all__ = ["Standards"]
 
 @dataclass(frozen=True, eq=False)
 class Standards:
-    """Mean and standard deviation of the joints' coordinates, metres, (J, 2) each.
+    """Mean and standard deviation of joint coordinates, metres, (J, 2) each.
 
-    A coordinate that never varies, such as that of a centred root, has deviation 0.
+    Constant coordinates, such as those of a centred root, have deviation 0.
     """
 
     mean: np.ndarray
@@ -29,10 +29,10 @@ class Standards:
         if self.deviation.min() < 0:
             raise ValueError(f"deviation must be at least 0, got {self.deviation.min():g}")
         if not (self.deviation > 0).any():
-            raise ValueError("deviation must be above 0 for a coordinate, got 0 everywhere")
+            raise ValueError("deviation must be above 0 for at least one coordinate, got only 0")
 
     @property
     def scale(self) -> float:
         """Root mean square of the nonzero deviations, metres."""
-        moving = self.deviation[self.deviation > 0]
-        return float(np.sqrt((moving**2).mean()))
+        nonzero = self.deviation[self.deviation > 0]
+        return float(np.sqrt((nonzero**2).mean()))

@@ -26,11 +26,11 @@ class Augmentation:
     shortest : float
         Minimum length of a random window, as a fraction of the full length; in (0, 1].
     scale : float
-        Tracks are scaled by a factor from 1 − scale to 1 + scale.
+        Windows are scaled by a random factor from 1 − scale to 1 + scale.
     shift : float
-        Tracks are translated by up to this distance, metres.
+        Maximum random translation of windows along each axis, metres.
     mirror : bool
-        Mirror every other track, with left and right joints exchanged.
+        Mirror windows with probability 1/2, exchanging left and right joints.
 
     Raises
     ------
@@ -49,27 +49,27 @@ class Augmentation:
         if not 0 <= self.scale < 1:
             raise ValueError(f"scale must be at least 0 and below 1, got {self.scale}")
         if not 0 <= self.shift < np.inf:
-            raise ValueError(f"shift must be a number of at least 0, got {self.shift}")
+            raise ValueError(f"shift must be a finite number of at least 0, got {self.shift}")
 
     @classmethod
     def none(cls) -> Augmentation:
-        """Return no augmentation."""
+        """Return settings without augmentation."""
         return cls(1.0, 0.0, 0.0, False)
 
 
 class Batch(NamedTuple):
-    """Tracks padded to one length."""
+    """Windows of tracks, padded to one length."""
 
     keypoints: np.ndarray
     """(B, L, J, 2) float32, metres; 0 where occluded or padded."""
     confidence: np.ndarray
     """(B, L, J) float32; 0 where below the threshold."""
     valid: np.ndarray
-    """(B, L) bool: frames with a visible joint, not padding."""
+    """(B, L) bool: frames with a visible joint; False for padding."""
     frames: np.ndarray
     """(B, L): index into :meth:`TrackBatches.all_frames`; -1 for padding."""
     scale: np.ndarray
-    """(B,) float32: scale factor of each track."""
+    """(B,) float32: scale factor of each window."""
 
     @property
     def seen(self) -> np.ndarray:
@@ -78,9 +78,9 @@ class Batch(NamedTuple):
 
 
 class TrackBatches:
-    """Random windows of tracks.
+    """Sampler of random windows of tracks.
 
-    Tracks are drawn in proportion to their length.
+    Tracks are drawn in proportion to their length; shorter tracks than a window count as one.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ class TrackBatches:
     Raises
     ------
     ValueError
-        If there is no track, tracks differ in skeleton or frame rate, none has a confident joint,
-        or a number is out of range.
+        If ``tracks`` is empty, tracks differ in skeleton or frame rate, no joint is visible, or a
+        number is out of range.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class TrackBatches:
     ) -> None:
         check_count("frames", frames, least=2)
         if not 0 <= threshold < np.inf:
-            raise ValueError(f"threshold must be a number of at least 0, got {threshold}")
+            raise ValueError(f"threshold must be a finite number of at least 0, got {threshold}")
         _check_alike(tracks)
         self.skeleton: Skeleton = tracks[0].skeleton
         self.fps = tracks[0].fps
@@ -123,13 +123,13 @@ class TrackBatches:
         self._seen = [confidence > 0 for confidence in self._confidence]
         if not any(seen.any() for seen in self._seen):
             raise ValueError(
-                f"tracks must contain joints with a confidence of {threshold:g} or more, got none"
+                f"tracks must contain joints with a confidence of at least {threshold:g}, got none"
             )
         self._keypoints = [
             np.where(seen[..., None], track.keypoints, 0.0).astype(np.float32)
             for track, seen in zip(tracks, self._seen, strict=True)
         ]
-        # Windows per track: a short track is one window.
+        # Windows per track: a short track counts as one.
         lengths = np.array([track.frames for track in tracks])
         windows = lengths / np.minimum(lengths, frames)
         windows *= [seen.any() for seen in self._seen]
@@ -144,13 +144,13 @@ class TrackBatches:
         if not seen.all():
             never = np.array(self.skeleton.joint_names)[~seen]
             raise ValueError(
-                f"tracks must show every joint with a confidence of {self.threshold:g} or more, "
-                f"never got {', '.join(never)}; choose a skeleton without them"
+                f"tracks must show every joint with a confidence of at least {self.threshold:g}, "
+                f"never got {', '.join(never)}; choose a skeleton without these joints"
             )
 
     @property
     def standards(self) -> Standards:
-        """Mean and standard deviation of visible joints, including mirroring and translation.
+        """Mean and standard deviation of visible joints under mirroring and translation.
 
         Scaling is ignored: with factors of .95 to 1.05 it increases the variance of projected walks
         by a seventh.
@@ -228,14 +228,14 @@ def learning_and_held_out(
     threshold: float,
     augmentation: Augmentation,
 ) -> tuple[TrackBatches, TrackBatches]:
-    """Return batches for training and, without augmentation, for validation.
+    """Return samplers of training windows and of validation windows without augmentation.
 
-    Raises ``ValueError`` if they differ in skeleton or frame rate.
+    Raises ``ValueError`` if the tracks differ in skeleton or frame rate.
     """
     batches = TrackBatches(tracks, frames, threshold, augmentation)
     held_out = TrackBatches(validation, frames, threshold, Augmentation.none())
     if held_out.skeleton != batches.skeleton:
-        raise ValueError("validation must have the same skeleton as tracks")
+        raise ValueError("validation must have the same skeleton as tracks, got another")
     if held_out.fps != batches.fps:
         raise ValueError(
             f"validation must have the frame rate of tracks, {batches.fps:g}, got {held_out.fps:g}"
@@ -244,7 +244,7 @@ def learning_and_held_out(
 
 
 def describe_tracks(tracks: Sequence[KeypointTrack]) -> dict[str, Any]:
-    """Return the numbers of tracks and frames, the names of clips and a digest of the data."""
+    """Return the numbers of tracks and frames, the names of clips and the SHA-256 of the data."""
     digest = hashlib.sha256()
     for track in tracks:
         digest.update(np.nan_to_num(track.keypoints, nan=0.0).tobytes())
@@ -261,11 +261,11 @@ def _check_alike(tracks: Sequence[KeypointTrack]) -> None:
     for track in tracks:
         if track.skeleton != first.skeleton:
             raise ValueError(
-                f"tracks must have one skeleton, {track.name or 'one'} differs from "
-                f"{first.name or 'the first'}"
+                f"tracks must have the same skeleton, got another for {track.name or 'a track'} "
+                f"than for {first.name or 'the first'}"
             )
         if track.fps != first.fps:
             raise ValueError(
-                f"tracks must have one frame rate, got {track.fps:g} for {track.name or 'one'} and "
-                f"{first.fps:g} for {first.name or 'the first'}"
+                f"tracks must have one frame rate, got {track.fps:g} for {track.name or 'a track'} "
+                f"and {first.fps:g} for {first.name or 'the first'}"
             )

@@ -1,4 +1,4 @@
-"""Base class of trained networks of 2D tracks."""
+"""Base class of trained networks for 2D tracks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Size = TypeVar("Size")
 
 
 class TrackNetwork:
-    """Trained network in standardised units, with its size ``settings`` and training ``card``.
+    """Trained network on standardised 2D data, with its ``settings`` and training record ``card``.
 
     Raises ``ValueError`` if shapes are inconsistent, ``fps`` is not positive or the device is not
     available.
@@ -52,7 +52,7 @@ class TrackNetwork:
 def load_track_checkpoint(
     source: str | Path, kind: str, size: type[Size]
 ) -> tuple[Checkpoint, Size, Standards, Skeleton, float]:
-    """Return a checkpoint and the settings, standards, skeleton and frame rate in it."""
+    """Return a checkpoint and its settings, standardisation, skeleton and frame rate."""
     checkpoint = load_checkpoint(source, kind)
     with valid_settings(source, kind):
         stored = checkpoint.settings["network"]

@@ -20,12 +20,12 @@ _VALIDATION_BATCH = 256
 
 
 class TrackTrainee:
-    """Base class: data, standards and settings of a network trained on windows of 2D tracks.
+    """Data, standardisation and settings of a network trained on windows of 2D tracks.
 
-    Takes prepared tracks of one skeleton and frame rate (metres, centred), tracks of held-out
+    Requires prepared tracks of one skeleton and frame rate (metres, centred), tracks of held-out
     clips, and the network's settings with its ``frames``. ``threshold`` is the minimum confidence
-    of a joint in the loss (design of the data sets, section 6.1: .3 for people, .5 for horses, .01
-    with a ball). Raises ``ValueError`` as :class:`TrackBatches`.
+    of joints in the loss: .3 for people, .5 for horses, .01 for data with a ball. Raises
+    ``ValueError`` under the conditions of :class:`TrackBatches`.
     """
 
     network: nn.Module
@@ -41,10 +41,10 @@ class TrackTrainee:
         augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
-        varied = augmentation or Augmentation()
+        augmentation = augmentation or Augmentation()
         self.size = size
         self.batches, self.held_out = learning_and_held_out(
-            tracks, validation, size.frames, threshold, varied
+            tracks, validation, size.frames, threshold, augmentation
         )
         self.standards = self.batches.standards
         self._seed = seed
@@ -57,7 +57,7 @@ class TrackTrainee:
             "mean": self.standards.mean.tolist(),
             "deviation": self.standards.deviation.tolist(),
             "threshold": threshold,
-            "augmentation": asdict(varied),
+            "augmentation": asdict(augmentation),
             "data": self.batches.description,
             "validation_data": self.held_out.description,
         }

@@ -1,7 +1,7 @@
-"""Trainer of all networks, with exact resumption and detection of divergence.
+"""Training loop of all networks, with exact resumption and detection of divergence.
 
-Batch and noise of step k are derived from (seed, k) rather than from a running state, so a run that
-was stopped and resumed takes the same steps as an uninterrupted one.
+Batch and noise of step k are derived from (seed, k) rather than from a running state, so a resumed
+run takes the same steps as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ __all__ = ["Anneals", "Diverged", "Trainee", "TrainingResult", "check_device", "
 
 
 class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
-    """The loss or gradient is not finite; the message names the last good checkpoint."""
+    """A loss, gradient or weight is not finite; the message names the last good checkpoint."""
 
 
 class Trainee(Protocol):
     """Interface of a network with its loss and data.
 
-    ``kind`` names its checkpoints. ``settings`` is JSON data that rebuilds the network and
-    describes its data, so that a run is not resumed with other data.
+    ``kind`` identifies its checkpoints. ``settings``, JSON-compatible, specifies the network and
+    its data, so that a run is not resumed with other data.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class Trainee(Protocol):
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
-        """Return the loss of a fresh batch; all random numbers except dropout come from ``rng``."""
+        """Return the loss of a random batch; ``rng`` determines all randomness except dropout."""
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
         """Return the loss on held-out data; deterministic."""
@@ -57,7 +57,7 @@ class Trainee(Protocol):
 
 @runtime_checkable
 class Anneals(Protocol):
-    """A trainee with a loss that changes during the run."""
+    """Interface of a trainee whose loss changes during training."""
 
     def anneal(self, step: int) -> None:
         """Set the current step, counted from 1; called before each training loss."""
@@ -72,10 +72,10 @@ class TrainingResult:
     model : Path
         Checkpoint of the network, with the moving average of the weights.
     history : list of dict
-        Per checkpoint: step, loss (mean since the last one), validation_loss, seconds.
+        Per checkpoint: step, loss (mean since the previous one), validation_loss, seconds.
     saved : dict
-        Entry of ``history`` whose weights were saved: that of the lowest validation loss with
-        ``patience``, else the last.
+        Entry of ``history`` for the saved weights: the lowest validation loss with ``patience``,
+        otherwise the last.
     steps : int
         Steps taken by this call, 0 if the run was already finished.
     """
@@ -103,7 +103,7 @@ def train(
     device: str = "cpu",
     progress: bool = True,
 ) -> TrainingResult:
-    """Train a network; the same call resumes an interrupted run.
+    """Train a network; repeat the call to resume an interrupted run.
 
     Networks compute in mixed precision (bfloat16) on CUDA and in single precision on the CPU.
 
@@ -112,9 +112,9 @@ def train(
     trainee : Trainee
         Network, loss and data.
     settings : TrainingSettings
-        Training settings. A finished run is continued if only ``steps`` is larger.
+        Training settings. To extend a finished run, increase only ``steps``.
     out : str or Path
-        Folder of ``model.safetensors``, ``state.safetensors`` (to resume from) and ``losses.csv``;
+        Folder for ``model.safetensors``, ``state.safetensors`` (to resume from) and ``losses.csv``;
         created if missing. A missing or damaged model is restored from the state.
     device : str
         ``cpu`` or ``cuda``.
@@ -124,22 +124,22 @@ def train(
     Raises
     ------
     Diverged
-        If the loss or gradient is not finite; the last good checkpoint remains.
+        If a loss, gradient or weight is not finite; the last good checkpoint remains.
     ValueError
         If ``out`` contains a run with other settings or data, or the device is not available.
     KeyboardInterrupt
-        On Ctrl-C or SIGTERM, after the current step has been finished and saved.
+        On Ctrl-C or SIGTERM, after finishing the current step and saving the run.
     """
     target = check_device(device)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     run = _start(trainee, settings, target)
-    # As JSON represents them.
+    # Use the JSON representation.
     clip = None if math.isinf(settings.clip) else settings.clip
     training = asdict(settings) | {"halve_at": list(settings.halve_at), "clip": clip}
-    described = {"network": dict(trainee.settings), "training": training}
+    record = {"network": dict(trainee.settings), "training": training}
     if (folder / STATE).exists():
-        resume_run(run, folder, trainee.kind, described)
+        resume_run(run, folder, trainee.kind, record)
     with (
         _stop_requested() as stop,
         progress_bar(settings.steps, f"train {trainee.kind}", progress) as bar,
@@ -157,9 +157,9 @@ def train(
             if run.step % settings.checkpoint_every == 0 or run.step == settings.steps:
                 _validate(run, trainee, target, folder)
                 best = settings.patience == 0 or _since_best(run) == 0
-                keep_run(run, trainee.kind, described, folder, model=best)
+                keep_run(run, trainee.kind, record, folder, model=best)
             if stop():
-                keep_run(run, trainee.kind, described, folder, model=settings.patience == 0)
+                keep_run(run, trainee.kind, record, folder, model=settings.patience == 0)
                 raise KeyboardInterrupt(
                     f"stopped at step {run.step} of {settings.steps}, saved in {folder}; run the "
                     "same command to resume"
@@ -197,9 +197,9 @@ def _take_step(
         rng = seeds.generator(settings.seed, "step", step)
         loss = trainee.training_loss(run.network, rng, settings.batch, device)
     loss.backward()
-    size = nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
+    norm = nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
     value = float(loss.detach())
-    if not (math.isfinite(value) and math.isfinite(float(size))):
+    if not (math.isfinite(value) and math.isfinite(float(norm))):
         problem = "the gradient is not finite" if math.isfinite(value) else f"the loss is {value:g}"
         raise _diverged(step, problem, folder)
     run.optimiser.step()
@@ -226,7 +226,7 @@ def _out_of_patience(run: Run, settings: TrainingSettings) -> bool:
 def _diverged(step: int, problem: str, folder: Path) -> Diverged:
     last, where = "there is no checkpoint yet", ""
     if (folder / STATE).exists():
-        # A run in a folder cannot change its learning rate.
+        # The learning rate of a stored run cannot be changed.
         last, where = f"the last good checkpoint is {folder / MODEL}", " in another folder"
     return Diverged(
         f"training diverged at step {step}: {problem}; {last}; try a smaller learning_rate{where}"
@@ -258,7 +258,7 @@ def _dropout_of(seed: int, step: int, device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def _stop_requested() -> Iterator[Any]:
-    """Yield a function that returns whether Ctrl-C or SIGTERM arrived; a second one raises."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM arrived; raise on a second signal."""
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
@@ -266,12 +266,12 @@ def _stop_requested() -> Iterator[Any]:
 
     def handle(number: int, frame: Any) -> None:
         if received:
-            raise KeyboardInterrupt("stopped within a step; the last checkpoint remains")
+            raise KeyboardInterrupt("stopped during a step; the last checkpoint remains")
         received.append(number)
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(received)
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -28,11 +28,11 @@ class VAEEncoder:
     """
 
     def __repr__(self) -> str:
-        """Summary for tables and stored draws."""
+        """Return a summary for tables and stored draws."""
         return f"{type(self).__name__}()"
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether the observations are keypoints of one view."""
+        """Return whether the observations are keypoints of one view."""
         return isinstance(likelihood, Keypoints2D) and likelihood.cameras.n_views == 1
 
     def on(
@@ -43,11 +43,11 @@ class VAEEncoder:
         degrees_of_freedom: float | None = None,
         overlap: int = 0,
     ) -> EncodedLatent:
-        """Return the inference of one track.
+        """Return the approximate posterior q(z) of one track.
 
         ``degrees_of_freedom`` overrides those of the likelihood (``inf``: Gaussian noise);
         ``overlap`` is ignored, as a motion is one window. Raises ``ValueError`` if the prior is not
-        a motion VAE, the observations are unsuitable, a whole frame is occluded, or the rigid path
+        a motion VAE, the observations are unsuitable, no joint of a frame is visible, or the path
         is beside or behind the camera.
         """
         if not isinstance(getattr(prior, "model", None), MotionVAEModel):
@@ -59,7 +59,7 @@ class VAEEncoder:
 
 
 class EncodedLatent:
-    """q(z) = N(μ, diag σ²) of one track, from the encoder or optimised for the track.
+    """Approximate posterior q(z) = N(μ, diag σ²) of one track, initialised by the encoder.
 
     ``mean`` and ``log_deviation`` are μ and log σ, (Z,), in double precision.
     """
@@ -85,7 +85,7 @@ class EncodedLatent:
     ) -> torch.Tensor:
         """Return minus the evidence lower bound at one draw: −log p(y | X(z)) + w KL(q ‖ N(0, I)).
 
-        ``latent_weight`` is w; ``initial_entropy`` is ignored: there is no separate first pose.
+        ``latent_weight`` is w. ``initial_entropy`` is ignored because z includes the first pose.
         """
         noise = torch.as_tensor(rng.standard_normal(self.prior.dim))
         z = self.mean + torch.exp(self.log_deviation) * noise
@@ -106,7 +106,7 @@ class EncodedLatent:
     def predict(self, rng: np.random.Generator, *, average: bool = True) -> np.ndarray:
         """Return the predicted motion, (L, J, 3), metres: the mean over draws, or the motion at μ.
 
-        Averaging shortens bones where draws disagree; the motion at μ has the body's lengths.
+        Averaging shortens bones where draws disagree; the motion at μ has the body's bone lengths.
         """
         if average:
             return self.draw(rng, _AVERAGED)[0].mean(axis=0)

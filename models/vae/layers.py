@@ -3,8 +3,8 @@
 Source: Ponymation, section 3.3 and table 5.
 
 Decoders attend to a memory of one token. The softmax over one token is 1, so cross-attention is a
-linear map of the memory, the same for every query, and is computed once. The names of weights are
-those of the shipped checkpoints.
+linear map of the memory, the same for every query, and is computed once. Names of weights match the
+shipped checkpoints.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ ImageFeatures = tuple[torch.Tensor, torch.Tensor]
 FRAMES_AT_ONCE = 160
 """Batch size in frames for networks over joints or bones.
 
-Bounds the memory and fits the processor cache: training steps take 10 % less time than with 640.
+Limits memory and fits the processor cache: training steps take 10 % less time than with 640 frames.
 """
 
 _INITIAL_SCALE = 0.05
 
 
 class TransformerLayer(nn.Module):
-    """Pre-norm transformer layer: self-attention, optional memory and a perceptron.
+    """Pre-norm transformer layer: self-attention, optional cross-attention and a perceptron.
 
     ``memory`` is the size of the memory token of a decoder layer; 0 for an encoder layer.
     """
@@ -72,8 +72,8 @@ class TransformerLayer(nn.Module):
     ) -> torch.Tensor:
         """Return the tokens after this layer, ``(N, K, width) → (N, first, width)``.
 
-        N may be 1 for queries shared by all memories (N, memory). ``seen`` (N, K) masks the tokens
-        to attend to. ``first`` limits the result to the first tokens.
+        N may be 1 for queries shared by all memories (N, memory). ``seen`` (N, K) is True for
+        tokens to attend to. ``first`` limits the result to the first tokens.
         """
         normalised = self.attention_norm(tokens)
         if first is None:
@@ -112,7 +112,7 @@ class TransformerLayer(nn.Module):
 class Readout(nn.Linear):
     """Linear map to physical quantities that always multiplies in the precision of its weights.
 
-    ``quiet`` scales the initial weights so that first motions are close to the rest pose.
+    ``quiet`` scales the initial weights so that initial motions are close to the rest pose.
     """
 
     def __init__(self, width: int, outputs: int, *, quiet: bool = True) -> None:
@@ -180,7 +180,7 @@ class FrameEncoder(nn.Module):
 
 
 class BoneDecoder(nn.Module):
-    """D_s: decodes frame vectors into bone rotations; queries are bones."""
+    """D_s: decodes frame vectors into bone rotations, with one query per bone."""
 
     def __init__(self, size: MotionVAESettings, n_bones: int) -> None:
         super().__init__()
@@ -216,7 +216,7 @@ def _attend(packed: torch.Tensor, heads: int, seen: torch.Tensor | None) -> torc
 def mixed_precision(network: nn.Module, device: torch.device) -> torch.autocast:
     """Return the autocast context of a network: bfloat16 in training if its settings request it.
 
-    An autocast already enabled by the trainer is kept.
+    An autocast enabled by the trainer remains active.
     """
     enabled = network.settings.mixed_precision and network.training
     enabled = enabled or torch.is_autocast_enabled(device.type)
@@ -254,12 +254,12 @@ def check_frames(
     check_shape("rest", rest, (n_joints, 3))
     if not n_features:
         if features is not None:
-            raise ValueError("features must be None for image_features=0")
+            raise ValueError(f"features must be None for image_features=0, got {type(features)}")
         return
     if not (isinstance(features, tuple) and len(features) == 2):
         raise ValueError(
-            f"features must be a tuple (of frames, of joints) for image_features={n_features}, "
-            f"got {type(features).__name__}"
+            "features must be a tuple (frame features, joint features) for "
+            f"image_features={n_features}, got {type(features).__name__}"
         )
     check_shape("features[0]", features[0], (batch, frames, n_features))
     check_shape("features[1]", features[1], (batch, frames, n_joints, n_features))

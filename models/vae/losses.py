@@ -52,9 +52,9 @@ def roughness(
 ) -> torch.Tensor:
     """Return the temporal regulariser R_temp = Σ_t ‖ξ_t − ξ_{t−1}‖², ``(…)``.
 
-    Takes rotation vectors of bones (…, L, B, 3), rotations of the body (…, L, 3, 3) and root
-    positions (…, L, D), metres. Half the squared difference of two close rotation matrices is their
-    squared angle.
+    ``turns`` (…, L, B, 3): rotation vectors of bones; ``rotation`` (…, L, 3, 3): of the body;
+    ``translation`` (…, L, D): root positions, metres. Half the squared difference of two close
+    rotation matrices approximates their squared angle.
     """
     bones = turns.diff(dim=-3).square().sum(dim=(-3, -2, -1))
     angles = 0.5 * rotation.diff(dim=-3).square().sum(dim=(-3, -2, -1))
@@ -91,7 +91,7 @@ def weighted_sum(terms: Mapping[str, torch.Tensor], settings: MotionVAESettings)
 
 
 def best_hypothesis(hypotheses: PoseHypotheses, losses: torch.Tensor) -> PoseHypotheses:
-    """Return the view hypothesis of smallest loss (B, H) of each sequence, without the axis H.
+    """Return the view hypothesis with the smallest loss (B, H) per sequence, without the axis H.
 
     The choice is not differentiated.
     """

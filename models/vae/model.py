@@ -1,4 +1,4 @@
-"""Both networks of the motion VAE as one model, and its checkpoint settings."""
+"""Motion VAE network and pose network as one model, with its checkpoint settings."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """`MotionVAE`: a prior over articulated motion with one latent code per sequence (Ponymation).
 
 z ~ N(0, I); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. The rigid path, the
-position and orientation of the body, is not part of the code and is given separately.
+position and orientation of the body, is not part of the code but a separate parameter.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class MotionVAE(StandardNormalPrior):
     pose_network : PoseNetwork
         Trained network of rigid poses.
     settings : MotionVAESettings
-        Their size.
+        Size of both networks.
     body : ArticulatedBody
         Skeleton, rest pose and joint ranges.
     fps : float
@@ -73,7 +73,7 @@ class MotionVAE(StandardNormalPrior):
     Raises
     ------
     ValueError
-        If a shape disagrees or a number is out of range.
+        If shapes are inconsistent or a number is out of range.
     """
 
     stand_ins: ClassVar[Mapping[str, str]] = {
@@ -114,7 +114,7 @@ class MotionVAE(StandardNormalPrior):
 
     @classmethod
     def load(cls, source: str | Path, **options: Any) -> MotionVAE:
-        """Load a trained prior: a checkpoint file, the folder of a run or a shipped name.
+        """Load a trained prior from a checkpoint file, a run folder or a shipped name.
 
         ``options`` are ``rigid``, ``log_lengths`` and ``inference_network`` of :class:`MotionVAE`.
         Raises ``CheckpointError`` for a damaged file or another kind of network, and
@@ -142,7 +142,7 @@ class MotionVAE(StandardNormalPrior):
         save_checkpoint(path, Checkpoint(KIND, self.card, self.model.state_dict()), half=half)
 
     def placed(self, rigid: RigidPath, log_lengths: np.ndarray | None = None) -> MotionVAE:
-        """Return the prior on another rigid path and, if given, with other log bone lengths."""
+        """Return the prior with another rigid path and, if given, other log bone lengths."""
         return MotionVAE(
             self.model.vae,
             self.model.pose,
@@ -156,10 +156,10 @@ class MotionVAE(StandardNormalPrior):
         )
 
     def placed_by(self, likelihood: Likelihood) -> MotionVAE:
-        """Return the prior on the rigid path that its pose network estimates from one view.
+        """Return the prior with a rigid path estimated from one view by its pose network.
 
         Path and bone lengths are those of the best view hypothesis
-        (:func:`~probmotion.models.vae.rigid_paths.estimate_body`); z sets the bone rotations.
+        (:func:`~probmotion.models.vae.rigid_paths.estimate_body`); z determines the bone rotations.
         Raises ``ValueError`` unless the likelihood is keypoints of one view with matching frames,
         frame rate and joints, and a visible joint in every frame.
         """
@@ -180,7 +180,7 @@ class MotionVAE(StandardNormalPrior):
     def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if the rigid path was not set.
 
-        Codes cannot move or turn the body, so observations of a body elsewhere would distort them.
+        z does not contain the body's position and orientation; a wrong rigid path would bias it.
         """
         if not self._placed:
             raise ValueError(
@@ -206,7 +206,7 @@ class MotionVAE(StandardNormalPrior):
     def row_by_row(self, theta: np.ndarray) -> np.ndarray:
         """Return :meth:`motion`, ``(n, dim) → (n, L, J, 3)``, bit-identical in any batch.
 
-        The rounding of a product depends on its shape, so all batches have the same shape.
+        Rounding of a matrix product depends on its shape, so all batches have the same shape.
         """
         padding = -len(theta) % _ROWS
         rows = np.pad(theta, [(0, padding), (0, 0)])
@@ -218,7 +218,7 @@ class MotionVAE(StandardNormalPrior):
 
     def _turns(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, bones, 3)``."""
-        # Densities need double precision.
+        # Densities require double precision.
         model = self.model if theta.dtype == torch.float32 else self._double
         return model.vae.decode(theta)
 

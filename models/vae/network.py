@@ -32,7 +32,7 @@ _LOG_VARIANCE_BOUND = 10.0
 
 
 class FrameMap(nn.Module):
-    """Linear replacement of E_s for the ablation: frame descriptor → frame vector.
+    """Linear map from frame descriptors to frame vectors, which replaces E_s in the ablation.
 
     As published (table 7), it uses image features of frames, not of joints; occluded joints are 0.
     """
@@ -52,8 +52,8 @@ class FrameMap(nn.Module):
         """Return frame vectors, (B, T, width); see :meth:`MotionVAENetwork.encode`."""
         check_frames(keypoints, confidence, rest, features, self.n_joints, self.features)
         visible = torch.where(confidence[..., None] > 0, keypoints, 0.0) / body_size(rest)
-        known = (rest / body_size(rest)).flatten().expand(*confidence.shape[:2], -1)
-        parts = [visible.flatten(2), confidence, known]
+        rest_pose = (rest / body_size(rest)).flatten().expand(*confidence.shape[:2], -1)
+        parts = [visible.flatten(2), confidence, rest_pose]
         if features is not None:
             parts.append(features[0])
         return self.enter(torch.cat(parts, dim=-1))
@@ -94,7 +94,7 @@ class TimeEncoder(nn.Module):
 
 
 class TimeDecoder(nn.Module):
-    """D_t: decodes z into frame vectors; queries are timestamps."""
+    """D_t: decodes z into frame vectors, with one query per timestamp."""
 
     def __init__(self, size: MotionVAESettings) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Keypoints of a known camera in the normalised format of the motion VAE's training tracks.
+"""Keypoints from a known camera in the normalised format of the motion VAE's training tracks.
 
 Training tracks are in metres at the subject's distance, x right and y down, with the root at the
 origin of every frame. The root position in the camera is stored separately.
@@ -82,12 +82,12 @@ class ObservedView:
 def observed_view(
     likelihood: Keypoints2D, skeleton: Skeleton, *, distance: float | None = None
 ) -> ObservedView:
-    """Convert observations of one view to a network's normalised view.
+    """Convert observations of one view to the normalised format of the networks.
 
     Joints below .3 of the largest confidence are masked, as in training by default. An occluded
     root is interpolated in time. ``distance`` is the depth of the subject in a perspective camera,
-    metres; the default 1 gives slopes. Raises ``ValueError`` for several views, other joints, a
-    frame without a visible joint, or a root that is never visible.
+    metres, 1 by default. Raises ``ValueError`` for several views, other joints, a frame without a
+    visible joint, or a root that is never visible.
     """
     _check_observations(likelihood, skeleton)
     camera, root = likelihood.cameras, skeleton.roots[0]
@@ -98,9 +98,9 @@ def observed_view(
     if length is not None:
         check_positive("distance", length)
     plane = slopes if length is None else length * slopes
-    middle = _interpolated(plane[:, root], visible[:, root])
-    about = np.where(visible[..., None], plane - middle[:, None], 0.0)
-    return ObservedView(about, visible.astype(np.float64), middle, camera, length)
+    centre = _interpolated(plane[:, root], visible[:, root])
+    centred = np.where(visible[..., None], plane - centre[:, None], 0.0)
+    return ObservedView(centred, visible.astype(np.float64), centre, camera, length)
 
 
 def _check_observations(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
@@ -115,13 +115,13 @@ def _check_observations(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
     root = skeleton.roots[0]
     if not visible[:, root].any():
         name = skeleton.joint_names[root]
-        raise ValueError(f"likelihood must show the root {name} in at least one frame")
+        raise ValueError(f"likelihood must show the root {name} in at least one frame, got none")
 
 
 def _visibility(likelihood: Keypoints2D) -> np.ndarray:
     """Return the mask of joints for the network, (L, J).
 
-    The noise scale is free, so only ratios of confidences are meaningful.
+    The confidence scale is arbitrary, so only ratios of confidences are meaningful.
     """
     confidence = likelihood.entries.confidence[0]
     return (confidence > 0) & (confidence >= CONFIDENCE_THRESHOLD * confidence.max())

@@ -1,8 +1,8 @@
 """Pose network: the pose of each frame from its 2D joints, for several view hypotheses.
 
 Source: Ponymation, section 3.2 (rigid pose and bone rotations from a single image, with one
-hypothesis per quadrant). It is trained first and serves as the teacher of the motion VAE; its rigid
-poses remain in use because the latent code does not contain them.
+hypothesis per quadrant). It is trained first and is the teacher of the motion VAE; inference uses
+its rigid poses because the latent code does not contain them.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class PoseHypotheses:
 
 
 class PoseNetwork(nn.Module):
-    """Predicts the pose of a frame from its 2D joints, for each view hypothesis.
+    """Network that predicts the pose of a frame from its 2D joints for each view hypothesis.
 
     Frames are independent, except that bone lengths are predicted from their mean. The body has
     ``n_joints`` joints, ``n_bones`` bones and ``n_groups`` groups of bones with a common length;
-    ``seed`` is that of the initial weights.
+    ``seed`` determines the initial weights.
     """
 
     quarters: torch.Tensor
@@ -68,7 +68,7 @@ class PoseNetwork(nn.Module):
             torch.manual_seed(seeds.integer(seed, "pose weights"))
             self.frame_encoder = FrameEncoder(settings, n_joints)
             self.views = nn.Parameter(torch.randn(settings.hypotheses, width))
-            # Six rotation numbers and two of the translation.
+            # Six outputs for the rotation and two for the translation.
             self.rigid = nn.Sequential(nn.Linear(width, width), nn.GELU(), Readout(width, 8))
             self.bone_decoder = BoneDecoder(settings, n_bones)
             self.log_lengths = Readout(width, n_groups)
@@ -85,7 +85,7 @@ class PoseNetwork(nn.Module):
     ) -> PoseHypotheses:
         """Return the poses of frames under every view hypothesis.
 
-        Takes the arguments of :meth:`MotionVAENetwork.encode`, with any number of frames.
+        Arguments are as for :meth:`MotionVAENetwork.encode`, with any number of frames.
         """
         with mixed_precision(self, keypoints.device):
             frames = self.frame_encoder(keypoints, confidence, rest, features)

@@ -1,4 +1,4 @@
-"""Rigid paths: root rotation and position per frame, which the latent code of a motion VAE omits.
+"""Rigid paths of the motion VAE: root rotation and position per frame, not part of its latent code.
 
 The pose network estimates the rigid pose ξ_{t,1} relative to the camera (Ponymation, section 3.3);
 the camera converts it to the world.
@@ -24,7 +24,7 @@ __all__ = ["BodyEstimate", "RigidPath", "estimate_body"]
 
 _OFF_ORTHONORMAL = 1e-4
 _PASSES = 3
-"""Alternating updates of distance and pose; the initial distance is already close."""
+"""Number of alternating updates of distance and pose; the initial distance is already close."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +55,11 @@ class RigidPath:
         check_count("frames", len(rotations))
         check_finite("rotations", rotations)
         check_finite("translations", translations)
-        gap = float(np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max())
-        if gap > _OFF_ORTHONORMAL or (np.linalg.det(rotations) < 0).any():
+        deviation = float(np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max())
+        if deviation > _OFF_ORTHONORMAL or (np.linalg.det(rotations) < 0).any():
             raise ValueError(
-                "rotations must be orthonormal with determinant 1 to "
-                f"{_OFF_ORTHONORMAL:g}, got a deviation of {gap:.2g}"
+                "rotations must be orthonormal with determinant 1 within "
+                f"{_OFF_ORTHONORMAL:g}, got a deviation of {deviation:.2g}"
             )
         object.__setattr__(self, "rotations", rotations)
         object.__setattr__(self, "translations", translations)
@@ -68,8 +68,8 @@ class RigidPath:
     def upright(cls, body: ArticulatedBody, frames: int) -> RigidPath:
         """Return the path of a body upright at the origin, facing +Z, its lowest joint at Y = 0."""
         check_count("frames", frames)
-        still, rest = np.eye(3)[None], np.zeros((1, len(body.bones), 3))
-        pose = body.positions(rest, still, np.zeros((1, 3)))
+        rotation, rest = np.eye(3)[None], np.zeros((1, len(body.bones), 3))
+        pose = body.positions(rest, rotation, np.zeros((1, 3)))
         root = np.array([0.0, -pose[..., 1].min(), 0.0])
         return cls(np.tile(np.eye(3), (frames, 1, 1)), np.tile(root, (frames, 1)))
 
@@ -83,7 +83,7 @@ class RigidPath:
 class BodyEstimate:
     """Best view hypothesis of a pose network for one track.
 
-    ``path``: in the world; ``turns`` (L, bones, 3): rotation vectors relative to parents;
+    ``path``: rigid path in the world; ``turns`` (L, bones, 3): bone rotation vectors;
     ``log_lengths`` (G,): relative to the rest pose; ``losses`` (H,): of all hypotheses;
     ``distance``: from a perspective camera to the root, metres, or None.
     """
@@ -103,13 +103,13 @@ def estimate_body(
 ) -> BodyEstimate:
     """Estimate the body in the world from one view with a pose network.
 
-    Selects the view hypothesis of smallest training loss: reprojection error, joint ranges, bone
-    lengths and smoothness.
+    Selects the view hypothesis with the smallest training loss: reprojection error, joint ranges,
+    bone lengths and smoothness.
 
-    An orthographic camera leaves the root depth open, which is then that of the world origin. For a
-    perspective camera, one distance for all frames is chosen such that the posed body of rest-pose
-    size matches the image; distances per frame would be noisy. A larger body is therefore placed
-    too close, with the same projection.
+    With an orthographic camera, the root depth is undetermined and set to that of the world origin.
+    With a perspective camera, one distance for all frames is estimated such that the posed body of
+    rest-pose size matches the image; distances per frame would be noisy. A larger subject is
+    therefore placed too close, with the same projection.
 
     Raises ``ValueError`` for several views, other joints or a frame without a visible joint, and if
     the estimated body is beside or behind the camera.
@@ -139,14 +139,14 @@ def _best_hypothesis(
 
 
 def _first_distance(view: ObservedView, body: ArticulatedBody) -> float:
-    """Return an initial distance: the mean projection of a bone is π/4 of its length."""
+    """Estimate the initial distance: bones project to π/4 of their length on average."""
     joints, parents = (list(side) for side in zip(*body.skeleton.bones, strict=True))
     visible = (view.confidence[:, joints] > 0) & (view.confidence[:, parents] > 0)
     bones = np.linalg.norm(view.keypoints[:, joints] - view.keypoints[:, parents], axis=-1)
     lengths = np.linalg.norm(body.rest[joints], axis=-1)
     projected = (visible * bones).sum()
     if not projected > 0:
-        raise ValueError("likelihood must show both ends of at least one bone")
+        raise ValueError("likelihood must show both ends of at least one bone, got none")
     assert view.distance is not None
     return float(math.pi / 4 * (visible * lengths).sum() / projected * view.distance)
 
@@ -157,8 +157,8 @@ def _size_ratio(best: PoseHypotheses, body: ArticulatedBody, view: ObservedView)
     # Free bone lengths would compensate for a wrong distance.
     posed = body.positions(best.turns, best.rotation, place)[0].double().numpy()
     weight = view.confidence[..., None]
-    across = (weight * view.keypoints * view.seen(posed)).sum()
+    product = (weight * view.keypoints * view.seen(posed)).sum()
     size = (weight * view.keypoints**2).sum()
-    if not across > 0:
-        raise ValueError("likelihood must show keypoints similar to the estimated body")
-    return float(across / size)
+    if not product > 0:
+        raise ValueError(f"likelihood must correlate with the body, got a product of {product:.2g}")
+    return float(product / size)

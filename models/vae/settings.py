@@ -11,7 +11,7 @@ from probmotion.validation import check_count
 __all__ = ["CONFIDENCE_THRESHOLD", "MotionVAESettings"]
 
 CONFIDENCE_THRESHOLD = 0.3
-"""Smallest confidence of a joint that is used in training and by the networks."""
+"""Minimum confidence of visible joints in training and inference."""
 
 _WEIGHTS = ("reconstruction", "smoothness", "ranges", "lengths", "kl", "teacher")
 
@@ -23,11 +23,11 @@ class MotionVAESettings:
     Parameters
     ----------
     frames : int
-        T, frames of a motion.
+        T, number of frames per motion.
     width : int
         Token width of all transformers.
     layers, heads : int
-        Layers of each of E_s, E_t, D_t and D_s, and heads per layer.
+        Number of layers of each of E_s, E_t, D_t and D_s, and of attention heads per layer.
     feedforward : int
         Hidden width of each layer; not published. A quarter of ``width`` reconstructs as well as
         the full width at size ``small``.
@@ -36,12 +36,12 @@ class MotionVAESettings:
     spatial : bool
         Use E_s and D_s; otherwise linear maps of all joints and bones (ablation, table 7).
     hypotheses : int
-        H, view hypotheses of the pose network, 1 to 4, a quarter turn apart.
+        H, number of view hypotheses of the pose network, 1 to 4, at quarter turns.
     image_features : int
-        F, size of image features per frame and per joint; 0 for tracks alone.
+        F, size of image features per frame and per joint; 0 for tracks without images.
     mixed_precision : bool
         Multiply in bfloat16 during training; weights, sums, outputs and losses stay in single
-        precision. Several times as fast on processors with AVX-512 BF16 or AMX.
+        precision. Several times faster on processors with AVX-512 BF16 or AMX.
     reconstruction : float
         Weight of the squared reprojection error, m².
     smoothness : float
@@ -89,7 +89,7 @@ class MotionVAESettings:
             )
         if self.hypotheses > 4:
             raise ValueError(
-                f"hypotheses must be 1 to 4, a quarter turn apart, got {self.hypotheses}"
+                f"hypotheses must be 1 to 4, one per quarter turn, got {self.hypotheses}"
             )
         for name in ("spatial", "mixed_precision"):
             if not isinstance(getattr(self, name), bool):
@@ -102,16 +102,16 @@ class MotionVAESettings:
 
     @classmethod
     def tiny(cls) -> MotionVAESettings:
-        """Return a size for tests that trains in seconds."""
+        """Return settings for tests, with networks that train in seconds."""
         size = cls(width=32, layers=1, heads=2, latent=8, mixed_precision=False)
         return replace(size, smoothness=0.01, teacher=0.1)
 
     @classmethod
     def small(cls) -> MotionVAESettings:
-        """Return the size of the shipped priors, which trains in minutes on two cores.
+        """Return the settings of the shipped priors, which train in minutes on two cores.
 
-        Smoothness and teacher weights are .01 and .1 instead of the published 1, which suppresses
-        all motion: the reconstruction loss is in m² here, a few hundredths.
+        Smoothness and teacher weights are .01 and .1: the published 1 would suppress all motion,
+        because the reconstruction loss is only a few hundredths of a m² here.
         """
         size = cls(width=96, layers=2, heads=2, feedforward=96, latent=48)
         return replace(size, smoothness=0.01, teacher=0.1)

@@ -1,7 +1,7 @@
 """Attention over few tokens in bfloat16 on the CPU, with a custom backward pass.
 
-For short sequences, data movement costs more than the products. This implementation splits and
-merges the heads once per direction and saves only Q, K, V and the bfloat16 weights for autograd.
+For short sequences, data movement costs more than the matrix products. This implementation splits
+and merges the heads once per pass and saves only Q, K, V and the bfloat16 weights for autograd.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def short_attention(
     """Return softmax(Q Kᵀ/√d) V (Vaswani et al. 2017, eq. 1) with a single-precision softmax.
 
     ``packed`` (N, K, 3 · heads · d) contains Q, K and V, each with concatenated heads. ``seen``
-    (N, K) masks the tokens to attend to, at least one. The result is (N, K, heads · d).
+    (N, K) is True for tokens to attend to, at least one per row. The result is (N, K, heads · d).
     """
     return _ShortAttention.apply(packed, heads, seen)
 

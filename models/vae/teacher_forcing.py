@@ -17,8 +17,8 @@ class TeacherForcedPoses:
     """Teacher poses of all frames of tracks and their mirror images, under every view hypothesis.
 
     The teacher is fixed and treats frames independently, so its output for a frame can be reused
-    in every window; scaled windows use :func:`scaled`. Takes about 3 kB per frame of a person. The
-    rest pose (J, 3) also sets the device. Raises ``ValueError`` if ``batches`` shifts windows.
+    in every window; scaled windows use :func:`scaled`. A frame of a person requires about 3 kB. The
+    device is that of the rest pose (J, 3). Raises ``ValueError`` if ``batches`` shifts windows.
     """
 
     @torch.no_grad()
@@ -43,9 +43,9 @@ class TeacherForcedPoses:
         )
 
     def of(self, drawn: Batch) -> PoseHypotheses:
-        """Return the teacher poses of drawn windows, before scaling; none may be padded."""
-        if (drawn.frames < 0).any():
-            raise ValueError("drawn must not contain padded windows")
+        """Return the teacher poses of drawn windows, before scaling, without padded windows."""
+        if padded := int((drawn.frames < 0).any(axis=1).sum()):
+            raise ValueError(f"drawn must not contain padded windows, got {padded}")
         frames = torch.as_tensor(drawn.frames, device=self._poses.turns.device)
         poses = self._poses.at(frames)
         return PoseHypotheses(
@@ -58,15 +58,15 @@ class TeacherForcedPoses:
 
 
 def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:
-    """Return the poses of a larger body whose projections are scaled by ``scale``, (B,).
+    """Return poses with root positions and bone lengths scaled by ``scale``, (B,).
 
-    Exact for orthographic cameras. For a camera at 7 m and a body 5 % larger, a joint .5 m closer
-    than the root projects 3 mm off.
+    This scales projections exactly for orthographic cameras. For a camera at 7 m and a body 5 %
+    larger, the error is 3 mm at a joint .5 m closer than the root.
     """
     factor = scale.reshape(-1, *[1] * (hypotheses.translation.ndim - 1))
-    longer = scale.log().reshape(-1, *[1] * (hypotheses.log_lengths.ndim - 1))
+    log_factor = scale.log().reshape(-1, *[1] * (hypotheses.log_lengths.ndim - 1))
     return replace(
         hypotheses,
         translation=factor * hypotheses.translation,
-        log_lengths=hypotheses.log_lengths + longer,
+        log_lengths=hypotheses.log_lengths + log_factor,
     )

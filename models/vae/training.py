@@ -1,7 +1,7 @@
 """Two-phase training of the motion VAE from 2D tracks (Ponymation, sections 3.2 and 3.3).
 
-The first phase trains the pose network on single frames; the second trains the VAE, with one latent
-code per sequence, with the pose network as teacher.
+The first phase trains the pose network on single frames. The second trains the VAE, with one latent
+code per sequence and the pose network as teacher.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from probmotion.validation import check_positive
 
 __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 
-# Loss weight of all hypotheses, so that none stops learning.
+# Loss weight of unselected hypotheses, so that all continue to learn.
 _OTHERS = 0.05
 # Tolerance of the root position for rounding, metres.
 _CENTRED = 1e-3
-# Initial steps that select the hypothesis with the rest pose.
+# Number of initial steps in which hypotheses are selected with the body in its rest pose.
 _AT_REST = 500
 
 
@@ -123,7 +123,7 @@ class _VAETrainee(TrackTrainee):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return keypoints (n, L, J, 2), visibility (n, L, J) and rest pose (J, 3).
 
-        Networks read visibility instead of confidence, which differs between detectors.
+        Network inputs contain visibility instead of confidence, which differs between detectors.
         """
         return (
             torch.as_tensor(drawn.keypoints, device=device),
@@ -153,15 +153,15 @@ class PoseTrainee(_VAETrainee):
     distance : float, optional
         Distance of the cameras from the subject, metres; orthographic by default.
     threshold : float
-        Smallest confidence of a joint that is used.
+        Minimum confidence of visible joints.
     seed : int
         Seed of the initial weights and the validation sequences.
 
     Raises
     ------
     ValueError
-        If no track is as long as a sequence, tracks differ in skeleton or frame rate, their
-        skeleton is not the body's, or a joint is never visible.
+        If all tracks are shorter than a sequence, tracks differ in skeleton or frame rate, their
+        skeleton differs from the body's, or a joint is never visible.
     """
 
     kind = "motion-vae-poses"
@@ -223,8 +223,8 @@ class PoseTrainee(_VAETrainee):
     ) -> torch.Tensor:
         """Return the losses of all views with rest-pose bones, (B, H).
 
-        Bent bones can compensate for a wrong view: the first hypothesis to learn would win other
-        quadrants too, and the rest would never be selected.
+        Bone rotations can compensate for a wrong view: the first hypothesis to learn would also be
+        selected for other quadrants, and the rest never.
         """
         rest_pose = replace(
             hypotheses,
@@ -238,8 +238,8 @@ class PoseTrainee(_VAETrainee):
 class MotionVAETrainee(_VAETrainee):
     """Second phase: one latent code for the bone rotations of a sequence (equations 2 to 7).
 
-    E_s and D_s start from the pose network's weights. The pose network stays fixed and provides
-    the rigid poses.
+    E_s and D_s are initialised with the pose network's weights. The pose network is fixed and
+    provides the rigid poses.
 
     Parameters
     ----------
@@ -267,14 +267,14 @@ class MotionVAETrainee(_VAETrainee):
     ) -> None:
         super().__init__(tracks, validation, size, body, **options)
         vae = MotionVAENetwork(size, body.skeleton.n_joints, len(body.bones), self._seed)
-        wanted, given = (
-            (one.width, one.layers, one.heads, one.feedforward, one.image_features)
-            for one in (size, pose_network.settings)
+        required, actual = (
+            (sizes.width, sizes.layers, sizes.heads, sizes.feedforward, sizes.image_features)
+            for sizes in (size, pose_network.settings)
         )
-        if wanted != given:
+        if required != actual:
             raise ValueError(
                 "pose_network must have the width, layers, heads, feedforward and image_features "
-                f"of size, {wanted}, got {given}"
+                f"of size, {required}, got {actual}"
             )
         counts = (body.skeleton.n_joints, len(body.bones), body.n_groups)
         got = (pose_network.n_joints, pose_network.n_bones, pose_network.n_groups)
@@ -302,21 +302,21 @@ class MotionVAETrainee(_VAETrainee):
         drawn = batches.draw(rng, n)
         keypoints, seen, rest = self._inputs(drawn, device)
         confidence = torch.as_tensor(drawn.confidence, device=device)
-        guess = self._teacher_poses(batches, drawn, keypoints, confidence, rest)
+        teacher = self._teacher_poses(batches, drawn, keypoints, confidence, rest)
         mean, log_variance = network.vae.encode(keypoints, seen, rest)
         noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
         latent = mean + (0.5 * log_variance).exp() * torch.as_tensor(noise, device=device)
         turns = network.vae.decode(latent)
-        translation = nn.functional.pad(guess.translation, (0, 1))
-        positions = self.body.positions(turns, guess.rotation, translation, guess.log_lengths)
+        translation = nn.functional.pad(teacher.translation, (0, 1))
+        positions = self.body.positions(turns, teacher.rotation, translation, teacher.log_lengths)
         zero = torch.zeros_like(mean)
         terms = {
             "reconstruction": reconstruction(positions, keypoints, confidence, self.distance),
-            "smoothness": roughness(turns, guess.rotation, guess.translation),
+            "smoothness": roughness(turns, teacher.rotation, teacher.translation),
             "ranges": self.body.range_excess(turns).sum(dim=-1),
             # Equation 6 is printed with σ instead of σ².
             "kl": gaussian_kl(mean, 0.5 * log_variance, zero, zero),
-            "teacher": (turns - guess.turns).square().sum(dim=(-3, -2, -1)),
+            "teacher": (turns - teacher.turns).square().sum(dim=(-3, -2, -1)),
         }
         return weighted_sum(terms, self.size).mean()
 
@@ -334,16 +334,16 @@ class MotionVAETrainee(_VAETrainee):
             self._poses[batches] = TeacherForcedPoses(self._teacher, batches, rest)
         hypotheses = self._poses[batches].of(drawn)
         scale = torch.as_tensor(drawn.scale, device=keypoints.device)
-        # Undo the scaling, which must not affect the choice of the view.
+        # Undo the scaling, which must not affect the selection of the hypothesis.
         unscaled = keypoints / scale[:, None, None, None]
         terms = hypothesis_losses(self.body, hypotheses, unscaled, confidence, self.distance)
         return scaled(best_hypothesis(hypotheses, weighted_sum(terms, self.size)), scale)
 
 
 def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSettings]:
-    """Return the training settings of both phases of a size: ``tiny``, ``small`` or ``paper``.
+    """Return the training settings of both phases for a size: ``tiny``, ``small`` or ``paper``.
 
-    The paper trains for 120 and 180 epochs of its data; ``paper`` counts 1000 steps per epoch.
+    The paper trains for 120 and 180 epochs; ``paper`` assumes 1000 steps per epoch.
     Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97)
@@ -360,7 +360,7 @@ def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSett
 
 
 def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float) -> None:
-    """Raise ``ValueError`` for tracks with a moving root: inference centres the root."""
+    """Raise ``ValueError`` for tracks with a moving root, because inference centres the root."""
     root = tracks[0].skeleton.roots[0]
     for track in tracks:
         seen = (track.confidence[:, root] >= threshold) & (track.confidence[:, root] > 0)
@@ -368,14 +368,14 @@ def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float)
         if offset > _CENTRED:
             raise ValueError(
                 f"{name} must have the root at the origin in every frame, got {offset:.2g} m in "
-                f"{track.name or 'one'}; use prepare_tracks"
+                f"{track.name or 'a track'}; use prepare_tracks"
             )
 
 
 def _long_enough(
     name: str, tracks: Sequence[KeypointTrack], frames: int
 ) -> Sequence[KeypointTrack]:
-    """Return the tracks that contain a whole sequence."""
+    """Return the tracks with at least ``frames`` frames."""
     long = [track for track in tracks if track.frames >= frames]
     if tracks and not long:
         raise ValueError(

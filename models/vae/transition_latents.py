@@ -1,7 +1,7 @@
 """Long motions from several latent codes, joined by optimised transitions (Ponymation, appendix A).
 
-Latents are drawn for consecutive segments, and transition latents are optimised so that their
-first and last frames match the neighbours.
+Latents are drawn for consecutive segments. Transition latents are optimised so that their first and
+last frames match the neighbouring segments.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["greatest_acceleration", "long_motion"]
 
 _SHARED = 2
-"""Frames shared by neighbours: two determine the pose and its velocity."""
+"""Frames shared by neighbouring segments: two determine the pose and its velocity."""
 _MOST = 4
-"""Largest number of codes in a transition."""
+"""Maximum number of codes in a transition."""
 _SMOOTH = 10.0
 """Weight of squared accelerations relative to squared angle mismatches."""
 
@@ -37,11 +37,11 @@ def long_motion(
 ) -> np.ndarray:
     """Return one long motion: the segments of the codes with a transition between each pair.
 
-    A transition consists of one or more motions of the prior. Its first two frames match the last
-    two of the previous segment and its last two the first two of the next. L-BFGS minimises the
+    A transition consists of one or more motions of the prior. Its first two frames match the end
+    of the previous segment, its last two frames the start of the next. L-BFGS minimises the
     squared angles between these frames, plus squared accelerations and a weak ‖z‖² penalty. The
     remaining mismatch is removed by small bone rotations, interpolated by the cubic in time through
-    the four frames. Segments are unchanged, and the body stays at the start of the prior's path.
+    the four frames. Segments are unchanged; the root pose is that of the first frame of the path.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def long_motion(
     Returns
     -------
     ndarray, (frames, J, 3)
-        Metres; a transition of M codes adds M (L − 2) − 2 frames to the S L of the segments.
+        Positions, metres: S L frames of the segments, M (L − 2) − 2 per transition of M codes.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def long_motion(
         if least > allowed:
             warnings.warn(
                 f"the transition after segment {len(parts) // 2} has {least / allowed:.2f} times "
-                "the largest acceleration of the segments; no smoother one was found",
+                "the largest acceleration of the segments; increase iterations or transitions",
                 stacklevel=2,
             )
         parts += [transition[_SHARED:-_SHARED], neighbours[1]]
@@ -164,7 +164,7 @@ def _joined(
         ends = torch.cat([joined[-_SHARED:], motion[-_SHARED:]])
         mismatch = mismatch + _mismatch(motion, ends)
         joined = torch.cat([joined, _corrected(motion, ends)[_SHARED:]])
-    # Spread this correction over the whole transition.
+    # Spread this correction over the entire transition.
     ends = torch.cat([before[-_SHARED:], after[:_SHARED]])
     return _corrected(joined, ends), mismatch + _mismatch(joined, ends)
 
@@ -182,14 +182,14 @@ def _shared_frames(frames: int) -> list[int]:
 def _corrected(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
     """Return rotations (L, bones, 3, 3) that equal ``ends`` at the shared frames."""
     times = np.arange(len(rotations), dtype=np.float64)
-    known = _shared_frames(len(rotations))
-    left = matrix_to_vector(rotations[known].mT @ ends)
+    shared = _shared_frames(len(rotations))
+    gaps = matrix_to_vector(rotations[shared].mT @ ends)
     # Lagrange polynomials of the cubic through four frames, (L, 4).
     cubic = np.stack(
         [
-            np.prod([(times - other) / (at - other) for other in known if other != at], axis=0)
-            for at in known
+            np.prod([(times - other) / (at - other) for other in shared if other != at], axis=0)
+            for at in shared
         ],
         axis=-1,
     )
-    return rotations @ vector_to_matrix(torch.einsum("tk,kbi->tbi", torch.as_tensor(cubic), left))
+    return rotations @ vector_to_matrix(torch.einsum("tk,kbi->tbi", torch.as_tensor(cubic), gaps))

@@ -24,7 +24,7 @@ from probmotion.validation import check_count
 
 __all__ = ["HypothesisAccuracy", "evaluate_hypotheses"]
 
-# A hypothesis counts as right up to this multiple of the smallest error.
+# A hypothesis counts as correct up to this multiple of the smallest error.
 _AS_GOOD = 1.2
 _TO_Y_UP = np.array([1.0, -1.0, -1.0])
 
@@ -38,11 +38,11 @@ class HypothesisAccuracy:
     right : float
         Proportion of sequences with an error of at most 1.2 times that of the best hypothesis.
     depth_right : float
-        Proportion of sequences closer to the truth than their own mirror image in depth.
+        Proportion of sequences closer to the truth than their mirror image in depth.
     error : float
-        Mean joint distance of the selected hypothesis, relative to the root, metres.
+        Mean joint error of the selected hypothesis, relative to the root, metres.
     least_error : float
-        The same for the hypothesis closest to the truth.
+        Mean joint error of the hypothesis closest to the truth, metres.
     proportions : tuple of float
         Selection frequency of each hypothesis.
     """
@@ -66,16 +66,16 @@ def evaluate_hypotheses(
     noise: DetectorNoise | None = None,
     seed: int = 0,
 ) -> HypothesisAccuracy:
-    """Evaluate the selection of view hypotheses on clips with known 3D.
+    """Evaluate the selection of view hypotheses on clips with known 3D motion.
 
     Parameters
     ----------
     network : PoseNetwork
         Trained network.
     settings : MotionVAESettings
-        Its settings, with the loss weights that select a hypothesis.
+        Settings of the network, with the loss weights that select a hypothesis.
     body : ArticulatedBody
-        Its body.
+        Body of the network.
     clips : sequence of Motion
         3D clips with the body's joints.
     n : int
@@ -92,7 +92,7 @@ def evaluate_hypotheses(
     Raises
     ------
     ValueError
-        If no clip is as long as a sequence.
+        If all clips are shorter than a sequence.
     """
     check_count("n", n)
     filming, noise = filming or Filming(), noise or DetectorNoise(share=0.0)
@@ -108,13 +108,13 @@ def evaluate_hypotheses(
         settings,
         body,
         (keypoints - keypoints[:, :, [body.skeleton.roots[0]]]).astype(np.float32),
-        # As in training, the networks read visibility rather than confidence.
+        # As in training, network inputs contain visibility rather than confidence.
         (confidence >= CONFIDENCE_THRESHOLD).astype(np.float32),
         filming.distance if filming.perspective else None,
     )
-    still = torch.zeros_like(hypotheses.rotation[..., 0])
+    origin = torch.zeros_like(hypotheses.rotation[..., 0])
     estimates = body.positions(
-        hypotheses.turns, hypotheses.rotation, still, hypotheses.log_lengths
+        hypotheses.turns, hypotheses.rotation, origin, hypotheses.log_lengths
     ).numpy()
     truth = np.einsum("nij,nlkj->nlki", cameras.rotation, chosen) * _TO_Y_UP
     errors = np.linalg.norm(estimates - truth[:, None], axis=-1).mean(axis=(2, 3))
@@ -138,6 +138,6 @@ def _sequences(
     long = [centre_motion(motion).positions for motion in motions if motion.frames >= frames]
     if not long:
         raise ValueError(
-            f"clips must contain one of at least {frames} frames at {fps:g} frames per second"
+            f"clips must include one of at least {frames} frames at {fps:g} fps, got none"
         )
     return np.concatenate([windows(positions, frames) for positions in long])

@@ -3,9 +3,9 @@
     python notebooks/ablations/error_decomposition.py --out budgets
     python notebooks/ablations/error_decomposition.py --quick --out quick  (short motions, 2 min)
 
-``--settings`` selects settings; each writes a table and a figure. Results are stored in ``--out``,
-and an interrupted study continues from there. The setting ``network`` trains a denoiser on 2D
-views of the problem's own prior.
+Each of the ``--settings`` writes a table and a figure. Results are stored in ``--out``; run the
+same command again to resume an interrupted study. The setting ``network`` trains a denoiser on 2D
+views of draws from the prior of the problem.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from probmotion.problems import load_problem
 
 @dataclass(frozen=True)
 class Setting:
-    """A problem and the settings of MAS; ``network`` trains a denoiser for it."""
+    """Problem and settings of MAS; with ``network``, a denoiser is trained for the problem."""
 
     problem: str = "gait"
     steps: int = 100
@@ -53,33 +53,33 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Study:
-    """Sizes of the study and its output folder."""
+    """Output folder and size of the study."""
 
     out: Path
     quick: bool
 
     def budget(self, name: str) -> ErrorDecomposition:
-        """Return a setting's error decomposition; write its table and figure."""
-        asked = SETTINGS[name]
+        """Return the error decomposition of a setting; write its table and figure."""
+        setting = SETTINGS[name]
         scale = {"frames": 6, "components": 12} if self.quick else {}
-        problem = load_problem(asked.problem, **scale)
+        problem = load_problem(setting.problem, **scale)
         folder = self.out / name.replace(" ", "-")
         budget = decompose_error(
             problem,
-            steps=asked.steps // (10 if self.quick else 1),
+            steps=setting.steps // (10 if self.quick else 1),
             seeds=2 if self.quick else 5,
             draws=30 if self.quick else 200,
-            settings=asked.settings,
-            shared_noise=asked.shared_noise,
-            learnt=self.network(problem, folder / "network") if asked.network else None,
+            settings=setting.settings,
+            shared_noise=setting.shared_noise,
+            learnt=self.network(problem, folder / "network") if setting.network else None,
             out=folder,
         )
         budget.plot(folder / "decompose_error.png")
         return budget
 
     def network(self, problem: Problem, folder: Path) -> MotionDiffusion:
-        """Return a 2D denoiser trained on views of the problem's prior."""
-        # As the exact denoiser sees them: orthographic, level, centred on average.
+        """Return a 2D denoiser trained on views of draws from the prior of the problem."""
+        # The projection of the exact denoiser: orthographic, level, centred on average.
         filming = Filming(tilt=0.0, perspective=False, centre="sequence")
         steps = 60 if self.quick else 4000
         return denoiser_of(
@@ -94,20 +94,20 @@ class Study:
 
 
 def main() -> None:
-    """Run the selected settings and write one table of all."""
+    """Run the selected settings and write one table of all results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="short motions, few draws")
+    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
+    parser.add_argument("--quick", action="store_true", help="Short motions and few draws.")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
-    asked = parser.parse_args()
-    study = Study(asked.out, asked.quick)
-    asked.out.mkdir(parents=True, exist_ok=True)
+    options = parser.parse_args()
+    study = Study(options.out, options.quick)
+    options.out.mkdir(parents=True, exist_ok=True)
     tables = []
-    for name in asked.settings:
+    for name in options.settings:
         budget = study.budget(name)
         tables.append(budget.table().assign(setting=f"{name}: {budget.setting}"))
         print(f"\n{budget.setting} ({name})", *budget.findings, *budget.notes, sep="\n", flush=True)
-    with written_whole(asked.out / "bias_budgets.csv") as path:
+    with written_whole(options.out / "bias_budgets.csv") as path:
         pd.concat(tables).to_csv(path, index=False)
 
 

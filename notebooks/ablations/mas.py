@@ -1,12 +1,12 @@
 """MAS on our clips: tables 2 and 3 of Kapon et al. (2024), and errors in 3D.
 
     python notebooks/ablations/mas.py --out mas
-    python notebooks/ablations/mas.py --quick --out quick     (synthetic walks, tiny networks, 1 min)
+    python notebooks/ablations/mas.py --quick --out quick    (synthetic walks, tiny networks, 1 min)
 
-``--parts`` selects table, strided and exact. The networks of walk2d come with the package; the
+``--parts`` selects table, strided and exact. The package includes the networks of walk2d; the
 lifter is trained here on the same tracks. Draws are stored in ``--out/comparisons``, views of the
-2D model and lifted motions in ``--out/motions``; an interrupted study continues from there. Clips
-are read from ``--data``, by default ../shared/data beside the repository.
+2D model and lifted motions in ``--out/motions``; run the same command again to resume an
+interrupted study. Clips are read from ``--data``, by default ../shared/data of the repository.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Study:
-    """Data, networks and numbers of draws."""
+    """Data, networks and size of the study."""
 
     out: Path
     data: Path
@@ -87,7 +87,7 @@ class Study:
 
     @cached_property
     def clips(self) -> dict[str, list[Motion]]:
-        """3D clips by part; of training clips only 2D views are used."""
+        """3D clips by part; only 2D views of the training clips are used."""
         if self.quick:
             walks = synthetic_walks(24, seconds=4)
             return {"train": walks[:16], "validation": walks[16:18], "test": walks[18:]}
@@ -108,7 +108,7 @@ class Study:
     def motions(self, part: str) -> np.ndarray:
         """Return all 3D windows of a part and their mirror images, (n, L, J, 3), metres.
 
-        Mirror images are included because models are trained on mirrored views too.
+        Mirror images are included because models are also trained on mirrored views.
         """
         clips = [
             centre_motion(clip.retarget(PERSON).resample(FPS)).positions
@@ -130,11 +130,11 @@ class Study:
 
     @cached_property
     def reference(self) -> GenerationReference:
-        """Held-out real 2D motion and the evaluator of its features."""
+        """Held-out real 2D motion and the evaluator network for its features."""
         if not self.quick:
-            found = load_problem("walk2d").generation
-            assert found is not None
-            return found
+            reference = load_problem("walk2d").generation
+            assert reference is not None
+            return reference
         trainee = EvaluatorTrainee(
             self.tracks.train, self.tracks.validation, EvaluatorSettings.tiny(20)
         )
@@ -159,13 +159,13 @@ class Study:
         return self.prior.frames
 
     def trained(self, name: str, trainee: object, settings: TrainingSettings) -> Path:
-        """Train a network, or continue; return its checkpoint."""
+        """Train a network, or resume its training; return the checkpoint."""
         return train(trainee, settings, self.out / name, progress=False).model
 
     def once(
         self, name: str, made_from: object, make: Callable[[], np.ndarray]
     ) -> tuple[np.ndarray, float]:
-        """Return motions or views and their seconds; compute them if they are not stored."""
+        """Return motions or views and the seconds of their computation; load them if stored."""
         path = self.out / "motions" / f"{name}.npz"
         origin = fingerprint(made_from)
         if not path.exists():
@@ -181,7 +181,7 @@ class Study:
         with np.load(path) as archive:
             if str(archive["origin"]) != origin:
                 raise SystemExit(
-                    f"{path} was made with other settings or weights: use another --out"
+                    f"{path} must have the same settings and weights; use another --out"
                 )
             return archive["made"].astype(np.float64), float(archive["seconds"])
 
@@ -191,7 +191,7 @@ class Study:
         problems: Mapping[str, Problem | MotionPosterior],
         samplers: Mapping[str, Sampler],
     ) -> Comparison:
-        """Return the comparison of a part; finished runs are not repeated."""
+        """Return the comparison of a part; stored runs are reused."""
         return compare(
             problems,
             samplers,
@@ -204,7 +204,7 @@ class Study:
 
 
 def samplers(iterations: int) -> dict[str, Sampler]:
-    """Return the samplers of table 2 and those that this project adds."""
+    """Return the samplers of table 2 and additional variants."""
     return {
         "MAS": MultiViewAncestral(perspective=True),
         "MAS, orthographic": MultiViewAncestral(),
@@ -218,7 +218,7 @@ def samplers(iterations: int) -> dict[str, Sampler]:
 
 
 def table(study: Study) -> pd.DataFrame:
-    """Tables 2 and 3: 2D against held-out 2D, from all sides and from the side; 3D against 3D."""
+    """Return tables 2 and 3: metrics of 2D views, of side views and of 3D motions."""
     posterior = study.problem.posterior
     real = study.motions("test")
     rows: list[dict[str, object]] = []
@@ -229,17 +229,17 @@ def table(study: Study) -> pd.DataFrame:
         rows.append(score(study, name, motions, views, real, seconds))
         print(rows[-1], flush=True)
 
-    # As many real motions as there are draws, other ones in every repeat.
+    # Ten times as many windows as draws, so that each repeat has different ones.
     add("held-out clips, 2D", None, study.views("test", 10 * study.draws, seed=3), math.nan)
     add("truth, 2D", None, study.views("train", 10 * study.draws, seed=3), math.nan)
     rng = seeds.generator(SEED, "truth")
     shown = study.motions("train")
     shown = shown[rng.choice(len(shown), study.draws)]
-    # Clips walk one way; a draw may be turned to any.
-    turned = [
-        Motion(one, PERSON, FPS).turned(rng.uniform(0, 2 * math.pi)).positions for one in shown
+    # Clips have one heading, draws have random headings.
+    rotated = [
+        Motion(clip, PERSON, FPS).turned(rng.uniform(0, 2 * math.pi)).positions for clip in shown
     ]
-    add("truth, 3D", np.stack(turned), None, math.nan)
+    add("truth, 3D", np.stack(rotated), None, math.nan)
     views, seconds = study.once(
         "2D model",
         [Ancestral2D(), study.prior, study.draws],
@@ -247,12 +247,12 @@ def table(study: Study) -> pd.DataFrame:
     )
     add("2D model", None, views, seconds / study.draws)
     drawn = {}
-    found = study.compared("table", {"walks": study.problem}, samplers(study.iterations))
-    for run in found.results:
-        rows.append(score_run(study, run.sampler, found, run, real))
+    comparison = study.compared("table", {"walks": study.problem}, samplers(study.iterations))
+    for run in comparison.results:
+        rows.append(score_run(study, run.sampler, comparison, run, real))
         print(rows[-1], flush=True)
         if run.failure is None:
-            drawn[run.sampler] = found.draws(run.problem, run.sampler).flat()
+            drawn[run.sampler] = comparison.draws(run.problem, run.sampler).flat()
     lifted = study.views("train", study.draws)
     with written_whole(study.out / "to_lift.npz") as path, open(path, "wb") as file:
         np.savez_compressed(file, keypoints=lifted, fps=FPS, joint_names=PERSON.joint_names)
@@ -281,32 +281,32 @@ def score(
     real: np.ndarray,
     seconds: float,
 ) -> dict[str, object]:
-    """Return one row; 2D views have no side and no 3D errors."""
+    """Return one row of the table; side-view and 3D metrics require ``motions``."""
     row: dict[str, object] = {"name": name, "seconds": seconds}
-    # Other halves of the draws in every repeat, so that the ± holds the chance of draws.
-    asked = {"seed": SEED, "samples": study.draws // 2, "repeats": study.repeats}
-    found = {}
+    # Each repeat uses a random half of the draws, so that ± includes the sampling error.
+    settings = {"seed": SEED, "samples": study.draws // 2, "repeats": study.repeats}
+    scores = {}
     if motions is None:
         assert views is not None
-        found[""] = study.reference.score_views(views, **asked)
-        found["_learnt"] = study.reference.of_learnt().score_views(views, **asked)
+        scores[""] = study.reference.score_views(views, **settings)
+        scores["_learnt"] = study.reference.of_learnt().score_views(views, **settings)
     else:
-        found[""] = study.reference.score_motions(motions, **asked)
-        found["_side"] = study.reference.score_motions(motions, **asked, angles="side")
-        found["_learnt"] = study.reference.of_learnt().score_motions(motions, **asked)
-        found["_learnt_side"] = study.reference.of_learnt().score_motions(
-            motions, **asked, angles="side"
+        scores[""] = study.reference.score_motions(motions, **settings)
+        scores["_side"] = study.reference.score_motions(motions, **settings, angles="side")
+        scores["_learnt"] = study.reference.of_learnt().score_motions(motions, **settings)
+        scores["_learnt_side"] = study.reference.of_learnt().score_motions(
+            motions, **settings, angles="side"
         )
-        near = nearest_distances(motions, real)
+        distances = nearest_distances(motions, real)
         row |= {
-            "to_real_mm": 1000 * near.of_draws,
-            "of_real_mm": 1000 * near.of_real,
+            "to_real_mm": 1000 * distances.of_draws,
+            "of_real_mm": 1000 * distances.of_real,
             "mirrored": mirrored_fraction(motions, real),
             "bones_mm": 1000 * bone_changes(motions),
         }
-    for where, scores in found.items():
-        for measured, (mean, sd) in scores.items():
-            row |= {f"{measured}{where}": mean, f"{measured}{where}_sd": sd}
+    for suffix, metrics in scores.items():
+        for metric, (mean, sd) in metrics.items():
+            row |= {f"{metric}{suffix}": mean, f"{metric}{suffix}_sd": sd}
     row["collapsed"] = row["recall"] < COLLAPSED_BELOW
     return row
 
@@ -314,7 +314,7 @@ def score(
 def score_run(
     study: Study, name: str, found: Comparison, run: RunResult, real: np.ndarray
 ) -> dict[str, object]:
-    """Return the row of a sampler of the comparison, or of its failure."""
+    """Return the row of a run of the comparison, or the reason for its failure."""
     if run.failure is not None:
         return {"name": name, "failed": str(run.failure)}
     motions = found.draws(run.problem, run.sampler).flat()
@@ -322,7 +322,7 @@ def score_run(
 
 
 def bone_changes(motions: np.ndarray) -> float:
-    """Return the standard deviation in time of a bone's length, mean over bones and motions."""
+    """Return the temporal standard deviation of bone lengths, mean over bones and motions."""
     ends, starts = np.array(PERSON.bones).T
     lengths = np.linalg.norm(motions[:, :, ends] - motions[:, :, starts], axis=-1)
     return float(lengths.std(axis=1).mean())
@@ -330,7 +330,7 @@ def bone_changes(motions: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predictions of another lifter for ``to_lift.npz``."""
+    """Motions predicted from ``to_lift.npz`` by an external lifter."""
 
     motions: np.ndarray
 
@@ -338,14 +338,14 @@ class Predictions:
         """Return the lifted motions."""
         if len(self.motions) != len(views):
             raise SystemExit(
-                f"predictions are {len(self.motions)} motions, expected those of the {len(views)} "
-                "in to_lift.npz"
+                f"predictions must contain the {len(views)} motions of to_lift.npz, "
+                f"got {len(self.motions)}"
             )
         return self.motions
 
 
 class Flat:
-    """Negative control: a lifter that gives every joint the depth of the root."""
+    """Negative control: lifter that sets the depth of every joint to that of the root."""
 
     def lift(self, views: np.ndarray) -> np.ndarray:
         """Return the lifted motions."""
@@ -354,7 +354,7 @@ class Flat:
 
 
 def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
-    """Return functions that lift 2D views, (n, L, J, 2) → (n, L, J, 3)."""
+    """Return the lifters of 2D views, (n, L, J, 2) → (n, L, J, 3)."""
     flow_trainee = PoseFlowTrainee(
         study.tracks.train,
         study.tracks.validation,
@@ -370,35 +370,34 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
         LifterSettings.tiny() if study.quick else LifterSettings.small(),
     )
     lifter = PoseLifter.load(study.trained("lifter", trainee, settings))
-    found: dict[str, PoseLifter | Predictions | Flat] = {"lifter": lifter, "lifter, flat": Flat()}
+    named: dict[str, PoseLifter | Predictions | Flat] = {"lifter": lifter, "lifter, flat": Flat()}
     if study.predictions is not None:
-        read = read_predictions(study.predictions, PERSON, frames=study.frames, fps=FPS)
-        found[study.predictions.stem] = Predictions(read)
-    return found
+        motions = read_predictions(study.predictions, PERSON, frames=study.frames, fps=FPS)
+        named[study.predictions.stem] = Predictions(motions)
+    return named
 
 
 def strided(study: Study) -> pd.DataFrame:
-    """MAS and mvpc with fewer noise levels than the network was trained on."""
+    """Return the metrics of MAS and mvpc at fewer noise levels than in training."""
     real = study.motions("test")
-    ways: dict[tuple[int, str], Sampler] = {}
+    variants: dict[tuple[int, str], Sampler] = {}
     for steps in (10, 20, 50, 100):
         fewer = {"steps": steps, "trained_steps": 100}
-        ways[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
-        ways[steps, "mvpc"] = MultiViewPredictorCorrector(**fewer)
-    labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in ways.items()}
-    found = study.compared("strided", {"walks": study.problem}, labelled)
+        variants[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
+        variants[steps, "mvpc"] = MultiViewPredictorCorrector(**fewer)
+    labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in variants.items()}
+    comparison = study.compared("strided", {"walks": study.problem}, labelled)
     rows = []
-    for (steps, name), run in zip(ways, found.results, strict=True):
-        rows.append({"steps": steps, **score_run(study, name, found, run, real)})
+    for (steps, name), run in zip(variants, comparison.results, strict=True):
+        rows.append({"steps": steps, **score_run(study, name, comparison, run, real)})
         print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
 
 def exact(study: Study) -> pd.DataFrame:
-    """Error that a network adds to a sampler: it is trained on views of the prior of ``gait``.
+    """Return the errors of samplers with an exact denoiser and with a network, on ``gait``.
 
-    Each sampler draws with the exact 2D denoiser and with the network; both are compared with exact
-    draws.
+    The network is trained on views of prior draws. Metrics compare with exact draws.
     """
     problem = load_problem("gait")
     known = problem.posterior.prior
@@ -408,7 +407,7 @@ def exact(study: Study) -> pd.DataFrame:
         Motion(motion, known.skeleton, known.fps, name=f"gait-{number}")
         for number, motion in enumerate(drawn)
     ]
-    # As the exact denoiser sees them: orthographic, one elevation, centred on average.
+    # The projection of the exact denoiser: orthographic, one elevation, centred on average.
     filming = Filming(tilt=0.0, perspective=False, centre="sequence")
     tracks = project_clips(clips, views=4, filming=filming, noise=DetectorNoise.none())
     held = len(tracks) // 10
@@ -417,7 +416,7 @@ def exact(study: Study) -> pd.DataFrame:
     trainee = DiffusionTrainee(tracks[held:], tracks[:held], size, augmentation=plain)
     settings = TrainingSettings(steps=study.steps // (10 if study.quick else 1), learning_rate=1e-3)
     learnt = MotionDiffusion.load(study.trained("gait", trainee, settings))
-    found = study.compared(
+    comparison = study.compared(
         "exact",
         {"exact": problem, "network": MotionPosterior(learnt)},
         {
@@ -426,7 +425,7 @@ def exact(study: Study) -> pd.DataFrame:
             "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
         },
     )
-    kept = (
+    metrics = (
         "swd_ratio",
         "variance_ratio",
         "mean_error_sd",
@@ -436,13 +435,13 @@ def exact(study: Study) -> pd.DataFrame:
         "recall",
     )
     rows = []
-    # The two rows of a sampler one below the other.
-    for run in sorted(found.results, key=lambda run: run.sampler):
+    # Rows are sorted by sampler.
+    for run in sorted(comparison.results, key=lambda run: run.sampler):
         row: dict[str, object] = {"sampler": run.sampler, "denoiser": run.problem}
         if run.failure is None:
-            # The grid cannot compare the network's draws with exact ones: its posterior knows none.
-            measured = measure(problem, found.draws(run.problem, run.sampler), SEED)
-            row |= {key: measured[key] for key in kept}
+            # The comparison lacks these metrics, as the network has no exact draws.
+            values = measure(problem, comparison.draws(run.problem, run.sampler), SEED)
+            row |= {metric: values[metric] for metric in metrics}
         else:
             row["failed"] = str(run.failure)
         rows.append(row)
@@ -460,25 +459,25 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
-    parser.add_argument("--draws", type=int, help="motions per sampler")
-    parser.add_argument("--iterations", type=int, help="of SDS")
-    parser.add_argument("--steps", type=int, default=4000, help="of training what is trained here")
-    parser.add_argument("--predictions", type=Path, help="another lifter's motions, npz")
-    asked = parser.parse_args()
+    parser.add_argument("--draws", type=int, help="Number of motions per sampler.")
+    parser.add_argument("--iterations", type=int, help="Iterations of SDS.")
+    parser.add_argument("--steps", type=int, default=4000, help="Training steps of networks.")
+    parser.add_argument("--predictions", type=Path, help="Motions of an external lifter, npz.")
+    options = parser.parse_args()
     study = Study(
-        out=asked.out,
-        data=asked.data,
-        quick=asked.quick,
-        draws=asked.draws or (24 if asked.quick else 256),
-        iterations=asked.iterations or (50 if asked.quick else 10_000),
+        out=options.out,
+        data=options.data,
+        quick=options.quick,
+        draws=options.draws or (24 if options.quick else 256),
+        iterations=options.iterations or (50 if options.quick else 10_000),
         repeats=10,
-        steps=asked.steps,
-        predictions=asked.predictions,
+        steps=options.steps,
+        predictions=options.predictions,
     )
-    asked.out.mkdir(parents=True, exist_ok=True)
-    for part in asked.parts:
+    options.out.mkdir(parents=True, exist_ok=True)
+    for part in options.parts:
         made = PARTS[part](study)
-        with written_whole(asked.out / f"{part}.csv") as path:
+        with written_whole(options.out / f"{part}.csv") as path:
             made.to_csv(path, index=False)
         print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
 

@@ -1,13 +1,13 @@
-"""Denoising with Motion-DVAE: ablations (Fiche et al. 2023, table 2), filters, speed, calibration.
+"""Ablations of Motion-DVAE denoising (Fiche et al. 2023, table 2), filters, speed and calibration.
 
     python notebooks/ablations/motion_dvae.py --out dvae
-    python notebooks/ablations/motion_dvae.py --quick --out quick    (synthetic clips, tiny networks)
+    python notebooks/ablations/motion_dvae.py --quick --out quick   (synthetic clips, tiny networks)
 
 ``--parts`` selects table, speed, recording and posterior. Recordings are simulated from held-out
-clips with noise, outliers and occluded limbs. The prior and its denoiser come with the package;
-the networks of the ablations "no prior" and "no noisy training" are trained here for as many
-steps. Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
-../shared/data beside the repository.
+clips with noise, outliers and occluded limbs. The package includes the prior and its denoiser; the
+networks of the ablations "no prior" and "no noisy training" are trained here for as many steps.
+Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
+../shared/data of the repository.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ KINDS: Mapping[str, tuple[float, float | None, str]] = {
     "occluded": (0.04, None, "for a while"),
     "cut off": (0.04, None, "from the ends"),
 }
-"""Scale of the noise in metres, degrees of freedom, and whether limbs hide."""
+"""Noise scale in metres, degrees of freedom, and frames in which limbs are occluded."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A held-out motion and its noisy joints."""
+    """Held-out motion, its noisy joints and a mask of occluded joints."""
 
     truth: Motion
     observed: Joints3D
@@ -111,7 +111,7 @@ class Study:
         return prior.of(inference_network=self.trained("full", prior))
 
     def trained(self, name: str, prior: MotionDVAE, **changes: object) -> MotionDenoiser:
-        """Return a denoiser trained here for as many steps as the shipped one."""
+        """Return a denoiser trained here for as many steps as the included one."""
         settings, annealing = usual_denoiser_training("tiny" if self.quick else "small")
         trainee = DenoiserTrainee(
             self.clips["train"],
@@ -125,13 +125,13 @@ class Study:
         return MotionDenoiser.load(folder, prior)
 
     def recordings(self, kind: str) -> list[Recording]:
-        """Return recordings of a kind, spread evenly over the test clips."""
+        """Return the recordings of a kind, evenly spaced in the test clips."""
         noise, freedom, hides = KINDS[kind]
         made = []
         for clip in self.clips["test"]:
             frames = min(FRAMES, clip.frames)
             room = clip.frames - frames
-            # A clip that is no longer than a recording gives one.
+            # Clips of at most FRAMES frames provide one recording.
             count = min(self.per_clip, room // (frames // 2) + 1)
             for start in np.linspace(0, room, count).astype(int):
                 truth = replace(clip.window(int(start), frames), name=f"{clip.name}/{start}")
@@ -150,10 +150,7 @@ class Study:
     def posterior(
         self, recording: Recording, network: MotionDenoiser | None = None
     ) -> MotionPosterior:
-        """Return the calibration of draws: spread, error and coverage of central 90 % intervals.
-
-        One window of a held-out clip, short enough for NUTS, which starts at draws of the DVAE.
-        """
+        """Return the posterior of a recording, with ``network`` for inference if given."""
         prior = self.prior.of(
             frames=recording.truth.frames,
             body=body_of(recording.observed, self.prior),
@@ -164,7 +161,7 @@ class Study:
     def dvae(
         self, sampler: DVAEInference, network: MotionDenoiser | None = None, average: bool = True
     ) -> Estimate:
-        """Return the estimate of Motion-DVAE."""
+        """Return a function that denoises a recording with Motion-DVAE."""
 
         def estimate(recording: Recording) -> np.ndarray:
             posterior = self.posterior(recording, network)
@@ -174,17 +171,17 @@ class Study:
 
 
 def noisy(recording: Recording) -> np.ndarray:
-    """Return the recording itself, occluded joints interpolated."""
+    """Return the noisy joints, with occluded joints interpolated."""
     return filled_between(recording.observed.joints, ~recording.hidden)
 
 
 def filtered(recording: Recording) -> np.ndarray:
-    """Return a Savitzky-Golay filter's estimate."""
+    """Return the estimate of a Savitzky-Golay filter."""
     return savitzky_golay(recording.observed.joints, ~recording.hidden, fps=recording.truth.fps)
 
 
 def smoothed(recording: Recording) -> np.ndarray:
-    """Return a Kalman smoother's mean; heavy-tailed noise enters by its variance."""
+    """Return the mean of a Kalman smoother; Student-t noise is replaced by Gaussian noise."""
     observed = recording.observed
     mean, _ = kalman_smooth(
         observed.joints,
@@ -196,11 +193,11 @@ def smoothed(recording: Recording) -> np.ndarray:
 
 
 def mixture(study: Study) -> Estimate:
-    """Return the exact posterior mean under a Gaussian mixture fitted to the training clips."""
+    """Return a function that computes the exact mean under a Gaussian-mixture prior."""
     frames = study.prior.settings.frames
     clips = [clip for clip in study.clips["train"] if clip.frames >= frames]
     order = list(clips[0].skeleton.mirrored_order)
-    # Mirrored too, as the DVAE saw them.
+    # Mirrored clips too, as in the training of the DVAE.
     mirrored = [replace(c, positions=c.positions[:, order] * [-1.0, 1.0, 1.0]) for c in clips]
     known = GaussianMixtureMotion.fit(
         [*clips, *mirrored], frames, rank=20, styles=4 if study.quick else 6, seed=study.seed
@@ -214,18 +211,18 @@ def mixture(study: Study) -> Estimate:
         for joints, confidence in zip(
             stitching.cut(observed.joints), stitching.cut(observed.entries.confidence), strict=True
         ):
-            # The mixture is of motions whose root is centred.
+            # The mixture models root-centred motions.
             seen = confidence[:, root] > 0
             centre = joints[seen, root].mean(axis=0)
-            here = Joints3D(joints - centre, gaussian_noise(observed), confidence)
-            found.append(known.exact_posterior(here).mean() + centre)
+            centred = Joints3D(joints - centre, gaussian_noise(observed), confidence)
+            found.append(known.exact_posterior(centred).mean() + centre)
         return stitching.mean(np.stack(found))
 
     return estimate
 
 
 def estimates(study: Study) -> dict[str, Estimate]:
-    """Return all methods, by name."""
+    """Return the denoising methods by name."""
     fit = DVAEInference(mode="optimization", iterations=50)
     regression = DVAEInference()
     known = mixture(study)
@@ -253,7 +250,7 @@ def estimates(study: Study) -> dict[str, Estimate]:
 
 
 def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
-    """Return errors of an estimate, mm, and its acceleration ratio."""
+    """Return the errors of an estimate in mm, and its acceleration ratio."""
     truth = recording.truth.positions
     root = recording.truth.skeleton.roots[0]
     local = accuracy.joint_errors(
@@ -273,36 +270,36 @@ def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
 def table(study: Study) -> pd.DataFrame:
     """Return mean errors of every method, by kind of recording.
 
-    Rows in ``--out/table.csv`` are reused; rows of other networks or another number of recordings
-    are refused.
+    Stored rows of ``--out/table.csv`` are reused. They must have the same networks and number of
+    recordings.
     """
-    place = study.out / "table.csv"
-    rows = pd.read_csv(place).to_dict("records") if place.exists() else []
+    stored = study.out / "table.csv"
+    rows = pd.read_csv(stored).to_dict("records") if stored.exists() else []
     made_of = {"per_clip": study.per_clip, "weights": weights_digest(study.prior.model)[:12]}
     for row in rows:
         if any(str(row.get(name)) != str(value) for name, value in made_of.items()):
-            raise ValueError(f"out has {place} of other recordings or networks, expected a new one")
+            raise ValueError(f"{stored} must have rows of {made_of}; use another --out")
     made = {(row["kind"], row["estimate"]) for row in rows}
-    ways = estimates(study)
+    methods = estimates(study)
     for kind in KINDS:
         recordings = study.recordings(kind)
-        for name, estimate in ways.items():
-            # Noise that is Gaussian is believed to be, unless told otherwise.
+        for name, estimate in methods.items():
+            # "Gaussian noise" equals "optimization" if the simulated noise is Gaussian.
             same = name.startswith("Gaussian") and KINDS[kind][1] is None
             if same or (kind, name) in made:
                 continue
             found = table_row(recordings, estimate)
             rows.append({"kind": kind, "estimate": name, **found, **made_of})
             print(rows[-1], flush=True)
-            with written_whole(place) as path:
+            with written_whole(stored) as path:
                 pd.DataFrame(rows).to_csv(path, index=False)
     return pd.DataFrame(rows)
 
 
 def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, float]:
-    """Return mean errors of one method; if a recording fails, only the failures are counted.
+    """Return the mean errors of one method, or only the number of failures if there are any.
 
-    Rows are comparable only on the same recordings.
+    A mean over the successful recordings is not comparable with other rows.
     """
     begun = time.perf_counter()
     found, failed = [], 0
@@ -317,7 +314,7 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
     if failed:
         return row
     errors = pd.DataFrame([measured(*pair) for pair in found])
-    # Recordings of one clip are alike: clips are what varies.
+    # Recordings of a clip are correlated, so standard errors are computed over clips.
     clips = errors.groupby([one.truth.name.partition("/")[0] for one in recordings]).mean()
     frames = sum(recording.truth.frames for recording in recordings)
     return row | {
@@ -329,7 +326,7 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
 
 
 def speed(study: Study) -> pd.DataFrame:
-    """Return errors and seconds by number of iterations, for recordings with occluded limbs."""
+    """Return errors and duration by number of iterations, with occluded limbs."""
     recordings = study.recordings("occluded")
     rows = []
     for iterations in (0, 10, 25, 50, 100) if study.quick else (0, 10, 25, 50, 100, 200):
@@ -354,7 +351,7 @@ def speed(study: Study) -> pd.DataFrame:
         print(rows[-1], flush=True)
     made = pd.DataFrame(rows)
     figure, left = plt.subplots(figsize=(6, 4), layout="constrained")
-    for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_occluded", "hidden joints")):
+    for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_occluded", "occluded joints")):
         left.plot(made["seconds_per_frame"], made[name], "o-", label=label)
     for _, row in made.iterrows():
         left.annotate(f"{row['iterations']:.0f}", (row["seconds_per_frame"], row["g_mpjpe"]))
@@ -371,23 +368,23 @@ def speed(study: Study) -> pd.DataFrame:
 def recording(study: Study) -> pd.DataFrame:
     """Return distances to the filtered joints of the real four-camera recording.
 
-    The noisy input is triangulated frame by frame; the filtered joints are the authors' and not a
-    ground truth. Limbs are hidden as in the simulated recordings.
+    The noisy input is triangulated frame by frame; the authors' filtered joints are not ground
+    truth. Limbs are occluded as in the simulated recordings.
     """
-    found = read_recording(study.data / "pose2sim_multiview" / BALANCING)
-    # What is compared with says how large the noise is: the rms of a coordinate's difference is
-    # 1.8 cm, which Student-t noise with four degrees of freedom has at this scale.
+    real = read_recording(study.data / "pose2sim_multiview" / BALANCING)
+    # The rms difference of coordinates from the filtered joints is 1.8 cm, that of Student-t noise
+    # with four degrees of freedom and this scale.
     scale = 0.0126
     rows = []
     for hides in (False, True):
-        truth = Motion(found.filtered, found.skeleton, found.fps, name=found.name)
-        hidden = (limb_occlusions(truth) & hides) | ~found.seen
+        truth = Motion(real.filtered, real.skeleton, real.fps, name=real.name)
+        hidden = (limb_occlusions(truth) & hides) | ~real.seen
         observed = Joints3D(
-            found.joints, scale, (~hidden).astype(float), 4.0, found.skeleton, found.fps
+            real.joints, scale, (~hidden).astype(float), 4.0, real.skeleton, real.fps
         )
         one = Recording(truth, observed, hidden)
         fit = DVAEInference(mode="optimization", iterations=50)
-        ways = {
+        methods = {
             "noisy input": noisy,
             "Savitzky-Golay": filtered,
             "Kalman smoother": smoothed,
@@ -395,7 +392,7 @@ def recording(study: Study) -> pd.DataFrame:
             "optimization": study.dvae(fit),
             "optimization, 200 iterations": study.dvae(replace(fit, iterations=200)),
         }
-        for name, estimate in ways.items():
+        for name, estimate in methods.items():
             rows.append({"hidden": hides, "estimate": name, **measured(one, estimate(one))})
             print(rows[-1], flush=True)
     return pd.DataFrame(rows)
@@ -403,7 +400,7 @@ def recording(study: Study) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class StartedNUTS:
-    """NUTS started at draws of Motion-DVAE; the seconds are those of NUTS alone."""
+    """NUTS initialised at draws of Motion-DVAE; its duration excludes that of Motion-DVAE."""
 
     name: ClassVar[str] = "nuts"
     requires: ClassVar[tuple[type, ...]] = NUTS.requires
@@ -414,7 +411,7 @@ class StartedNUTS:
     def sample(
         self, posterior: MotionPosterior, *, chains: int, seed: int, progress: bool, **how: Any
     ) -> MotionDraws:
-        """Return NUTS draws; each chain starts at one DVAE draw."""
+        """Return NUTS draws; each chain starts at a Motion-DVAE draw."""
         begun = self.start.sample(posterior, draws=1, chains=chains, seed=seed, progress=progress)
         how["initial"] = begun.dataset["theta"].values[:, 0]
         return self.nuts.sample(posterior, chains=chains, seed=seed, progress=progress, **how)
@@ -423,7 +420,7 @@ class StartedNUTS:
 def posterior(study: Study) -> pd.DataFrame:
     """Return the calibration of draws: spread, error and coverage of central 90 % intervals.
 
-    One window of a held-out clip, short enough for NUTS, which starts at draws of the DVAE.
+    The recording is one window of a held-out clip, which is short enough for NUTS.
     """
     recording = study.recordings("occluded")[0]
     frames = study.prior.settings.frames
@@ -438,14 +435,14 @@ def posterior(study: Study) -> pd.DataFrame:
     )
     fit = DVAEInference(mode="optimization", iterations=50 if study.quick else 200)
     nuts = NUTS(warmup=10 if study.quick else 150, max_tree_depth=3 if study.quick else 6)
-    # A chain is not asked for as many draws as networks, whose draws cost nothing.
+    # Fewer draws of NUTS, since each is much more expensive than a draw of the networks.
     grids: tuple[tuple[str, dict[str, Sampler], int], ...] = (
         ("dvae", {"dvae, regression": DVAEInference(), "dvae, optimization": fit}, 200),
         ("nuts", {"nuts": StartedNUTS(fit, nuts)}, 10 if study.quick else 100),
     )
     rows = []
     for name, samplers, draws in grids:
-        found = compare(
+        comparison = compare(
             problem,
             samplers,
             draws=draws,
@@ -454,10 +451,10 @@ def posterior(study: Study) -> pd.DataFrame:
             workers=0,
             progress=not study.quick,
         )
-        for run in found.results:
+        for run in comparison.results:
             row: dict[str, object] = {"sampler": run.sampler}
             if run.failure is None:
-                drawn = found.draws(run.problem, run.sampler)
+                drawn = comparison.draws(run.problem, run.sampler)
                 row |= honesty(drawn.flat(), truth, hidden)
                 row["log_density"] = float(drawn.dataset["log_density"].mean())
                 row["seconds"] = run.metrics["seconds"]
@@ -469,7 +466,7 @@ def posterior(study: Study) -> pd.DataFrame:
 
 
 def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, float]:
-    """Return spread and error of draws, mm, and coverage of the central 90 % interval."""
+    """Return spread and error of draws in mm, and coverage of central 90 % intervals."""
     middle = drawn.mean(axis=0)
     spread = np.sqrt(((drawn - middle) ** 2).sum(axis=-1).mean(axis=0))
     error = np.linalg.norm(middle - truth.positions, axis=-1)
@@ -493,16 +490,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--quick", action="store_true", help="made clips and tiny networks")
-    parser.add_argument("--per-clip", type=int, default=6, help="recordings of a test clip")
-    asked = parser.parse_args()
-    study = Study(asked.out, asked.data, asked.quick, 2 if asked.quick else asked.per_clip)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    for part in asked.parts:
+    parser.add_argument("--quick", action="store_true", help="Synthetic clips and tiny networks.")
+    parser.add_argument("--per-clip", type=int, default=6, help="Recordings per test clip.")
+    options = parser.parse_args()
+    per_clip = 2 if options.quick else options.per_clip
+    study = Study(options.out, options.data, options.quick, per_clip)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for part in options.parts:
         if part == "recording" and study.quick:
-            continue  # it is of the real recording
+            continue  # requires the real recording
         made = PARTS[part](study)
-        with written_whole(asked.out / f"{part}.csv") as path:
+        with written_whole(options.out / f"{part}.csv") as path:
             made.to_csv(path, index=False)
         print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
 

@@ -1,14 +1,14 @@
-"""Motion VAE from 2D tracks: ablations (Sun et al. 2024), and generation beside MAS and SDS.
+"""Ablations of the motion VAE (Sun et al. 2024) and comparison of generation with MAS and SDS.
 
     python notebooks/ablations/motion_vae.py --out vae
     python notebooks/ablations/motion_vae.py --quick --out quick    (synthetic walks, tiny networks)
 
 ``--parts`` selects views (accuracy of view hypotheses), table (tables 6, 7 and 8 of the paper),
 data (tables 3 and 4: more clips, then smoothness) and generation. All variants are trained here
-on the same tracks, their second phase for ``--steps`` steps; networks in ``--out/networks`` are
+on the same tracks, with ``--steps`` steps in the second phase; networks in ``--out/networks`` are
 reused. Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
-../shared/data beside the repository; 3D clips are filmed for training and used as truth for
-evaluation.
+../shared/data of the repository; 3D clips are projected to 2D for training and are the truth in
+the evaluation.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "KL 0.0001": {"kl": 0.0001},
     "no smoothness": {"smoothness": 0.0},
 }
-# Of the clips one in how many is learnt from, and the variant that learns: the paper's MagicPony
-# data, with its own videos, with smoothness.
+# Every n-th clip is used for training, and the variant: the paper compares MagicPony data, added
+# videos, and added smoothness.
 DATA: Mapping[str, tuple[int, str]] = {
     "a quarter of the clips": (4, "no smoothness"),
     "all clips": (1, "no smoothness"),
@@ -87,7 +87,7 @@ SEEDS = 3
 
 @dataclass(frozen=True)
 class Study:
-    """Clips, cameras and training lengths; one clip in ``every`` is used for training."""
+    """Data and size of the study; every ``every``-th training clip is used."""
 
     out: Path
     data: Path
@@ -109,12 +109,12 @@ class Study:
     def tracks(self) -> dict[str, list[KeypointTrack]]:
         """Prepared 2D tracks by part."""
         views = dict.fromkeys(("train", "validation"), 4 if self.quick else 64)
-        some = self.clips | {"train": self.clips["train"][:: self.every]}
+        clips_by_part = self.clips | {"train": self.clips["train"][:: self.every]}
         return {
             part: certain(
                 film_clips(clips, PERSON, FPS, views=views.get(part, 16), seed=self.seed).tracks
             )
-            for part, clips in some.items()
+            for part, clips in clips_by_part.items()
         }
 
     @cached_property
@@ -128,15 +128,15 @@ class Study:
         return replace(usual, **changes)
 
     def poses(self, changes: Mapping[str, Any]) -> PoseNetwork:
-        """Return the first phase's network; variants with the same loss share it."""
-        own = {name: value for name, value in changes.items() if name in OF_POSES}
-        trainee = self._trainee(PoseTrainee, self.size(own))
-        folder = self.out / "networks" / " ".join(["poses", *map(str, own.values())])
+        """Return the network of the first phase, shared by variants with the same loss."""
+        used = {name: value for name, value in changes.items() if name in OF_POSES}
+        trainee = self._trainee(PoseTrainee, self.size(used))
+        folder = self.out / "networks" / " ".join(["poses", *map(str, used.values())])
         self._train(trainee, 0, folder)
         return trainee.learnt(folder)
 
     def variant(self, name: str) -> MotionVAE:
-        """Return the prior of a variant, trained here."""
+        """Train a variant and return its prior."""
         changes = VARIANTS[name]
         trainee = self._trainee(MotionVAETrainee, self.size(changes), self.poses(changes))
         folder = self.out / "networks" / name
@@ -144,8 +144,8 @@ class Study:
         return MotionVAE.load(folder)
 
     def _trainee(self, kind: Any, size: MotionVAESettings, *more: Any) -> Any:
-        # Where no clip that is watched is as long, those learnt from are: nothing is chosen by it.
-        long = [one for one in self.tracks["validation"] if one.frames >= size.frames]
+        # Use training tracks if all validation tracks are too short; no setting depends on them.
+        long = [track for track in self.tracks["validation"] if track.frames >= size.frames]
         return kind(
             self.tracks["train"],
             long or self.tracks["train"],
@@ -163,36 +163,36 @@ class Study:
         train(trainee, settings, folder, progress=not self.quick)
 
     def real_windows(self, part: str, frames: int, fps: float = FPS) -> np.ndarray:
-        """Return every window of a part's 3D clips about the root, (N, frames, J, 3)."""
+        """Return all root-centred windows of the 3D clips of a part, (N, frames, J, 3)."""
         motions = [centre_motion(c.retarget(PERSON).resample(fps)) for c in self.clips[part]]
         return np.concatenate(
             [windows(motion.positions, frames) for motion in motions if motion.frames >= frames]
         )
 
     def real_views(self, part: str, n: int) -> np.ndarray:
-        """Return windows of clips filmed anew without a detector's errors, (n, frames, J, 2)."""
+        """Return new 2D views of clips without detector noise, (n, frames, J, 2)."""
         rng = seeds.generator(self.seed, "real views", part)
         every = self.real_windows(part, FRAMES)
         return film_motions(every[rng.integers(0, len(every), n)], rng)
 
 
 def views(study: Study) -> pd.DataFrame:
-    """Return how often the correct view hypothesis wins, by number of views."""
+    """Return the accuracy of view selection by number of view hypotheses."""
     rows = []
     n = 100 if study.quick else 1000
     for hypotheses in (1, 2, 4):
         changes = {} if hypotheses == 4 else {"hypotheses": hypotheses}
         network, size = study.poses(changes), study.size(changes)
         for part in ("train", "test"):
-            judged = evaluate_hypotheses(network, size, study.body, study.clips[part], n=n, fps=FPS)
+            result = evaluate_hypotheses(network, size, study.body, study.clips[part], n=n, fps=FPS)
             rows.append(
                 {
                     "hypotheses": hypotheses,
                     "clips": part,
-                    "right": judged.right,
-                    "depth_right": judged.depth_right,
-                    "mpjpe": 1000 * judged.error,
-                    "least_mpjpe": 1000 * judged.least_error,
+                    "right": result.right,
+                    "depth_right": result.depth_right,
+                    "mpjpe": 1000 * result.error,
+                    "least_mpjpe": 1000 * result.least_error,
                 }
             )
             print(rows[-1], flush=True)
@@ -202,53 +202,53 @@ def views(study: Study) -> pd.DataFrame:
 def reconstructed(
     study: Study, changes: Mapping[str, Any], prior: MotionVAE | None = None
 ) -> dict[str, float]:
-    """Return PCK@0.1 and velocity error, both %, of held-out tracks; of poses alone without VAE."""
+    """Return PCK and velocity error in % on held-out tracks; without ``prior``, of poses only."""
     poses, size = study.poses(changes), study.size(changes)
     tracks = study.tracks["test"]
     keypoints = np.concatenate([pieces(track.keypoints, size.frames) for track in tracks])
     visible = np.concatenate([pieces(track.confidence, size.frames) for track in tracks]) >= 0.3
-    whole = visible.any(axis=(1, 2))
-    keypoints, visible = keypoints[whole], visible[whole]
+    detected = visible.any(axis=(1, 2))
+    keypoints, visible = keypoints[detected], visible[detected]
     shown = np.where(visible[..., None], keypoints, 0.0)
-    given = torch.as_tensor(shown, dtype=torch.float32)
+    observed = torch.as_tensor(shown, dtype=torch.float32)
     weight = torch.as_tensor(visible, dtype=torch.float32)
     rest = torch.as_tensor(study.body.rest_positions, dtype=torch.float32)
     distance = Filming().distance
     with torch.no_grad():
-        guesses = poses.eval()(given, weight, rest)
-        terms = hypothesis_losses(study.body, guesses, given, weight, distance)
+        guesses = poses.eval()(observed, weight, rest)
+        terms = hypothesis_losses(study.body, guesses, observed, weight, distance)
         guess = best_hypothesis(guesses, weighted_sum(terms, size))
         turns = guess.turns
         if prior is not None:
-            turns = prior.model.vae.decode(prior.model.vae.encode(given, weight, rest)[0])
-        place = torch.nn.functional.pad(guess.translation, (0, 1))
-        joints = study.body.positions(turns, guess.rotation, place, guess.log_lengths)
-        found = project_to_image(joints, distance).numpy()
+            turns = prior.model.vae.decode(prior.model.vae.encode(observed, weight, rest)[0])
+        translation = torch.nn.functional.pad(guess.translation, (0, 1))
+        joints = study.body.positions(turns, guess.rotation, translation, guess.log_lengths)
+        projected = project_to_image(joints, distance).numpy()
     sizes = image_extent(shown, visible)
     return {
-        "pck": percentage_of_correct_keypoints(found, shown, sizes, visible=visible),
+        "pck": percentage_of_correct_keypoints(projected, shown, sizes, visible=visible),
         "pck_0.05": percentage_of_correct_keypoints(
-            found, shown, sizes, visible=visible, share=0.05
+            projected, shown, sizes, visible=visible, threshold=0.05
         ),
-        "velocity_error": 100 * velocity_error(found, shown, visible),
+        "velocity_error": 100 * velocity_error(projected, shown, visible),
     }
 
 
 def pieces(values: np.ndarray, frames: int) -> np.ndarray:
-    """Return (L, …) cut into consecutive sequences, (n, frames, …)."""
+    """Return consecutive segments of an array (L, …), as (n, frames, …)."""
     n = len(values) // frames
     return values[: n * frames].reshape(n, frames, *values.shape[1:])
 
 
 def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
-    """Return distances of filmed motions to real views, cm², and of motions to real ones, mm."""
+    """Return the motion chamfer distance between 2D views of motions and real views, cm²."""
     rng = seeds.generator(study.seed, "film", seed)
-    pictures = film_motions(motions, rng)
+    views_2d = film_motions(motions, rng)
     row = {}
     for part in ("test", "train"):
-        found = motion_chamfer_distance(pictures, study.real_views(part, study.draws))
-        row[f"mcd_{part}"] = 1e4 * found.mean
-        row[f"mcd_{part}_of_generated"] = 1e4 * found.of_generated
+        distance = motion_chamfer_distance(views_2d, study.real_views(part, study.draws))
+        row[f"mcd_{part}"] = 1e4 * distance.mean
+        row[f"mcd_{part}_of_generated"] = 1e4 * distance.of_generated
     return row
 
 
@@ -283,23 +283,23 @@ def table(study: Study) -> pd.DataFrame:
 
 
 def data(study: Study) -> pd.DataFrame:
-    """Return the effect of more clips and of smoothness, on poses alone and on the VAE."""
+    """Return the metrics of poses and of the VAE by amount of data and smoothness."""
     rows: list[dict[str, Any]] = []
     for name, (every, variant) in DATA.items():
-        some = study if every == 1 else replace(study, out=study.out / name, every=every)
-        alone = reconstructed(some, VARIANTS[variant])
-        row = {f"poses_{measure}": value for measure, value in alone.items()}
-        rows.append({"learnt from": name} | row | measured(some, variant))
+        subset = study if every == 1 else replace(study, out=study.out / name, every=every)
+        of_poses = reconstructed(subset, VARIANTS[variant])
+        row = {f"poses_{metric}": value for metric, value in of_poses.items()}
+        rows.append({"learnt from": name} | row | measured(subset, variant))
         print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
 
 def generation(study: Study) -> pd.DataFrame:
-    """Return generation beside MAS and SDS, which draw from a diffusion model of the same clips."""
+    """Return the generation metrics of the VAE, and of MAS and SDS with the prior walk2d."""
     other = load_problem("walk2d")
     longer = other.posterior
     per_motion = longer.frames // round(longer.fps / FPS) // FRAMES
-    # A run of the grid has ten draws at least.
+    # A run has at least ten draws.
     n = max(10, study.draws // 10)
     ours = MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
     iterations = 50 if study.quick else 1000
@@ -315,7 +315,7 @@ def generation(study: Study) -> pd.DataFrame:
     )
     rows = []
     for name, source, samplers, draws in grids:
-        found = compare(
+        comparison = compare(
             {name: source},
             samplers,
             draws=draws,
@@ -324,10 +324,10 @@ def generation(study: Study) -> pd.DataFrame:
             workers=0,
             progress=not study.quick,
         )
-        for run in found.results:
+        for run in comparison.results:
             row: dict[str, Any] = {"way": run.sampler}
             if run.failure is None:
-                motions = sequences(found.draws(run.problem, run.sampler))
+                motions = sequences(comparison.draws(run.problem, run.sampler))
                 row |= {"sequences": len(motions), "seconds": run.metrics["seconds"]}
                 row |= beside_real(study, motions)
             else:
@@ -344,19 +344,19 @@ def generation(study: Study) -> pd.DataFrame:
 
 
 def sequences(draws: MotionDraws) -> np.ndarray:
-    """Return draws as sequences of the study's frames and rate, (n, FRAMES, J, 3)."""
+    """Return draws as sequences at the frame rate of the study, (n, FRAMES, J, 3)."""
     thinned = draws.flat()[:, :: round(draws.fps / FPS)]
     return np.concatenate([pieces(motion, FRAMES) for motion in thinned])
 
 
 def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
-    """Return distances of motions and their views to real ones, root-centred."""
+    """Return distances of root-centred motions and their views to real ones."""
     centred = motions - motions[:, :, :1]
     row = generated(study, centred, 0)
     truth = {part: study.real_windows(part, FRAMES)[::3] for part in ("test", "train")}
     for part, real in truth.items():
-        near = nearest_distances(centred, real)
-        row |= {f"to_{part}_mm": 1000 * near.of_draws, f"of_{part}_mm": 1000 * near.of_real}
+        error = nearest_distances(centred, real)
+        row |= {f"to_{part}_mm": 1000 * error.of_draws, f"of_{part}_mm": 1000 * error.of_real}
     return row | {"mirrored": mirrored_fraction(centred, truth["test"])}
 
 
@@ -370,15 +370,15 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
-    parser.add_argument("--steps", type=int, help="of the second phase, in place of the size's own")
-    parser.add_argument("--draws", type=int, help="sequences that are generated, 1400 by default")
-    asked = parser.parse_args()
-    draws = asked.draws or (60 if asked.quick else 1400)
-    study = Study(asked.out, asked.data, asked.quick, asked.steps, draws)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    for part in asked.parts:
+    parser.add_argument("--steps", type=int, help="Training steps of the second phase.")
+    parser.add_argument("--draws", type=int, help="Generated sequences; default: 1400.")
+    options = parser.parse_args()
+    draws = options.draws or (60 if options.quick else 1400)
+    study = Study(options.out, options.data, options.quick, options.steps, draws)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for part in options.parts:
         made = PARTS[part](study)
-        with written_whole(asked.out / f"{part}.csv") as path:
+        with written_whole(options.out / f"{part}.csv") as path:
             made.to_csv(path, index=False)
         print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
 

@@ -5,8 +5,8 @@
 
 ``--parts`` selects noise, calibration, paired, truncation, velocity, coverage, embedding and
 completion; each writes a CSV file and figures to ``--out``. Draws are stored in
-``--out/comparisons`` (3 GB in all), and an interrupted study continues from there. The parts
-embedding and completion use the draws of the part coverage. Data are located by
+``--out/comparisons`` (3 GB in total); run the same command again to resume an interrupted study.
+The parts embedding and completion use the draws of the part coverage. The data are located by
 :func:`probmotion.data.downloads.salsa_pairs`.
 """
 
@@ -60,15 +60,15 @@ from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic, Proposal, VelocityBiased
 
 SEED = 0
-# σ_l of the part "coverage", from the part "noise" on the validation clips: for the others where
-# they cover best, for interaction coordinates the middle one of their three best.
+# σ_l of the part "coverage", chosen by the part "noise" on the validation clips: the value with the
+# best coverage, except for interaction coordinates, where it is the middle of the three best.
 VALIDATION = ("cmu_60_61_02", "cmu_60_61_10")
 NOISE = {"interaction": 0.005, "cartesian": 0.01, "shape-context": 0.005}
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Settings of each problem by name, and the comparison of their draws."""
+    """Comparison of a part, and the settings of its problems by name."""
 
     asked: Mapping[str, Mapping[str, Any]]
     found: Comparison
@@ -81,7 +81,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Study:
-    """Data and numbers of draws."""
+    """Data and size of the study."""
 
     out: Path
     quick: bool
@@ -97,15 +97,15 @@ class Study:
     def clips(self) -> tuple[list, list]:
         """Training clips and held-out clips.
 
-        Validation clips, on which settings are chosen, are held out of the training clips.
+        With ``validating``, validation clips are held out of the training clips instead.
         """
         if self.quick:
-            shown, hidden = hold_out(synthetic_dances(8), ["dance-6", "dance-7"])
+            training, test = hold_out(synthetic_dances(8), ["dance-6", "dance-7"])
         else:
-            shown, hidden = hold_out(salsa_pairs(), SALSA_HELD_OUT)
+            training, test = hold_out(salsa_pairs(), SALSA_HELD_OUT)
         if self.validating:
-            return hold_out(shown, ["dance-5"] if self.quick else VALIDATION)
-        return shown, hidden
+            return hold_out(training, ["dance-5"] if self.quick else VALIDATION)
+        return training, test
 
     @cached_property
     def held_in(self) -> np.ndarray:
@@ -119,24 +119,24 @@ class Study:
 
     @cached_property
     def seed_pose(self) -> np.ndarray:
-        """The one 3D pose-pair, (J, 3)."""
+        """The 3D seed pose of both people, (J, 3)."""
         return self.held_in[choose_seed(self.held_in)]
 
     def pictures(self, repeat: int) -> DrawnAnnotations:
-        """Annotated 2D frames and the 3D poses behind them; different in every repeat."""
+        """Return 2D annotations and their 3D poses, different in every repeat."""
         frames = [dance_frames(clip) for clip in self.clips[0]]
-        n = min(self.n_annotations, sum(int(some.sum()) for some in frames))
+        n = min(self.n_annotations, sum(int(mask.sum()) for mask in frames))
         return draw_annotations(self.clips[0], n, repeat, frames=frames)
 
     def posterior(
         self, density: str = "interaction", repeat: int = 0, **changes: object
     ) -> TruncatedPosterior:
-        """Return the posterior over a density: a measure's name, or ``"prior"``."""
+        """Return the posterior for a measure of dissimilarity, or ``"prior"`` for the prior."""
         if density == "prior":
             return pair_posterior(self.seed_pose, None, replace(PairSettings(), **changes))
         settings = replace(PairSettings(measure=density, noise=NOISE[density]), **changes)
-        pictures = self.pictures(repeat).annotations
-        return pair_posterior(self.seed_pose, pictures, settings, view_seed=repeat)
+        annotations = self.pictures(repeat).annotations
+        return pair_posterior(self.seed_pose, annotations, settings, view_seed=repeat)
 
     def run(
         self,
@@ -145,9 +145,9 @@ class Study:
         proposals: Mapping[str, Proposal] | None = None,
         draws: int | None = None,
     ) -> Runs:
-        """Return all states after warm-up of chains that start at the seed, side by side.
+        """Return the comparison of proposals, with all states after warm-up, started at the seed.
 
-        Each repeat has its own annotations and views, and is a separate problem of the comparison.
+        Each repeat has different annotations and views and is a separate problem.
         """
         problems = {
             name: Problem(
@@ -177,21 +177,21 @@ class Study:
 
     @cached_property
     def by_density(self) -> Runs:
-        """All draws of four densities (part "coverage", used by other parts too)."""
-        asked = {
+        """Draws of the part "coverage" from four densities, also used by other parts."""
+        problems = {
             f"{density}, repeat {repeat}": {"density": density, "repeat": repeat}
             for density in ("interaction", "cartesian", "prior", "shape-context")
-            # Shape contexts cost several times as much, and are drawn once.
+            # Shape contexts are several times more expensive, so they have one repeat.
             for repeat in range(1 if density == "shape-context" else self.repeats)
         }
-        return self.run("coverage", asked, draws=self.draws)
+        return self.run("coverage", problems, draws=self.draws)
 
     def table(
         self, runs: Runs, fewer: Sequence[int] = (), also: Sequence[str] = ()
     ) -> pd.DataFrame:
-        """Return coverage by all draws of every run, and by the first n, step by step.
+        """Return the coverage of every run by all draws, and by the first draws of all chains.
 
-        ``also`` names further metrics of the comparison.
+        ``fewer`` lists numbers of first draws, ``also`` additional metrics of the comparison.
         """
         rows = []
         for run in runs.found.results:
@@ -220,7 +220,7 @@ class Study:
         return pd.DataFrame(rows)
 
     def covered(self, poses: np.ndarray, counts: Sequence[int]) -> dict[tuple[str, int], float]:
-        """Return coverage by the first n poses, by dissimilarity and number."""
+        """Return the coverage by the first poses, for each measure and number of poses."""
         if not counts:
             return {}
         return {
@@ -234,7 +234,7 @@ class Study:
     def draw_states(
         self, runs: Mapping[str, MotionDraws | None], path: Path, compared: str
     ) -> None:
-        """Draw the states of the first chain that the paper shows, aligned to the seed."""
+        """Plot states of the first chain as in the paper, aligned to the seed."""
         rows = {}
         for label, draws in runs.items():
             if draws is not None:
@@ -253,18 +253,18 @@ class Study:
 
 
 def step_by_step(draws: MotionDraws) -> np.ndarray:
-    """Return the poses of all chains, first step first: (chains × draws, J, 3)."""
+    """Return the poses of all chains in order of steps, (chains × draws, J, 3)."""
     poses = np.swapaxes(draws.positions.values[:, :, 0], 0, 1)
     return poses.reshape(-1, *poses.shape[2:])
 
 
 def evenly(poses: np.ndarray, n: int) -> np.ndarray:
-    """Return about n of the poses, evenly spaced."""
+    """Return about n evenly spaced poses."""
     return poses[:: max(1, len(poses) // n)]
 
 
 def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return log prior, log likelihood and their sum for poses (n, J, 3)."""
+    """Return the log prior, log likelihood and log posterior of poses (n, J, 3)."""
     motions = poses[:, None]
     prior = posterior.prior.log_plausibility(motions)
     likelihood = posterior.likelihood.log_density(motions)
@@ -272,7 +272,7 @@ def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.nda
 
 
 def calibration(study: Study) -> pd.DataFrame:
-    """Log density of real pairs, of the seed and of draws, at several σ_l."""
+    """Return log densities of real pairs, the seed and draws at several σ_l."""
     rng = seeds.generator(SEED, "calibration")
     real = study.held_in[rng.choice(len(study.held_in), min(400, len(study.held_in)), False)]
     sizes = {f"noise {size}": size for size in (0.005, PairSettings().noise, 0.02)}
@@ -284,65 +284,65 @@ def calibration(study: Study) -> pd.DataFrame:
         if (draws := runs.draws(name)) is not None:
             poses["draws"] = evenly(step_by_step(draws), 400)
         poses["seed"] = study.seed_pose[None]
-        found = {kind: levels(posterior, some) for kind, some in poses.items()}
+        log_densities = {kind: levels(posterior, kind_poses) for kind, kind_poses in poses.items()}
         if size == PairSettings().noise:
-            draw_calibration(found, study.out / "calibration.png")
+            draw_calibration(log_densities, study.out / "calibration.png")
         rows += [
             (size, kind, part, *np.percentile(values, [10, 50, 90]).round(1))
-            for kind, parts in found.items()
+            for kind, parts in log_densities.items()
             for part, values in parts.items()
         ]
     return pd.DataFrame(rows, columns=["noise", "of", "part", "10 %", "median", "90 %"])
 
 
 def noise(study: Study) -> pd.DataFrame:
-    """σ_l: acceptance, step size and coverage of the validation clips, used to choose defaults."""
+    """Return acceptance, step size and coverage of the validation clips by σ_l."""
     study = replace(study, validating=True)
     scales = {
         "interaction": (0.003, 0.005, 0.01, 0.02, 0.05),
         "cartesian": (0.0025, 0.005, 0.01, 0.02),
         "shape-context": (0.005, 0.01, 0.02),
     }
-    asked = {
+    problems = {
         f"{density} {size}, repeat {repeat}": {"density": density, "noise": size, "repeat": repeat}
         for repeat in range(study.repeats)
         for density, sizes in scales.items()
         for size in sizes
     }
-    return study.table(study.run("noise", asked))
+    return study.table(study.run("noise", problems))
 
 
 def paired(study: Study) -> pd.DataFrame:
-    """Interaction against Cartesian coordinates at the same σ_l, annotations and views."""
-    asked = {
+    """Return coverage of both coordinates at equal σ_l, annotations and views."""
+    problems = {
         f"{density} {size}, repeat {repeat}": {"density": density, "noise": size, "repeat": repeat}
         for repeat in range(study.repeats)
         for size in (0.005, 0.01)
         for density in ("interaction", "cartesian")
     }
-    return study.table(study.run("paired", asked))
+    return study.table(study.run("paired", problems))
 
 
 def truncation(study: Study) -> pd.DataFrame:
-    """c of eq. 11: proportion of draws where the density is truncated, and coverage."""
-    asked = {
+    """Return coverage and fractions of draws at the density bounds, by c of eq. 11."""
+    problems = {
         f"limit {limit:.3g}, repeat {repeat}": {"limit": limit, "repeat": repeat}
         for repeat in range(study.repeats)
         for limit in (100.0, limit_for_dimension(108), np.inf)
     }
-    return study.table(study.run("truncation", asked), also=("at_cap", "near_floor"))
+    return study.table(study.run("truncation", problems), also=("at_cap", "near_floor"))
 
 
 def velocity(study: Study) -> pd.DataFrame:
-    """Biased against unbiased proposals at the same acceptance and number of draws (figure 7)."""
+    """Return coverage by proposal at equal acceptance and number of draws (figure 7)."""
     proposals = {
         "isotropic": Isotropic(0.02),
         "biased-1": VelocityBiased(base=0.02, bias=1.0),
         "biased-10": VelocityBiased(base=0.02, bias=10.0),
         "velocity-alone": VelocityBiased(base=0.001, bias=1.0),
     }
-    asked = {f"repeat {repeat}": {"repeat": repeat} for repeat in range(study.repeats)}
-    runs = study.run("velocity", asked, proposals)
+    problems = {f"repeat {repeat}": {"repeat": repeat} for repeat in range(study.repeats)}
+    runs = study.run("velocity", problems, proposals)
     study.draw_states(
         {
             "unbiased": runs.draws("repeat 0"),
@@ -355,7 +355,7 @@ def velocity(study: Study) -> pd.DataFrame:
 
 
 def densities(study: Study) -> pd.DataFrame:
-    """Coverage against the number of draws, four densities, three dissimilarities (figure 9)."""
+    """Return coverage by number of draws, density and measure (figure 9)."""
     runs = study.by_density
     table = study.table(runs, fewer=(study.draws // 100, study.draws // 10))
     draw_coverage(table, study.out / "figure9.png")
@@ -384,16 +384,16 @@ def densities(study: Study) -> pd.DataFrame:
 
 
 def embedding(study: Study) -> pd.DataFrame:
-    """Draws over the space of the real pairs, by multidimensional scaling (figure 8)."""
+    """Return multidimensional scaling coordinates of draws and real pairs (figure 8)."""
     sets = {"real": evenly(study.held_out, 150)}
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
         if (draws := study.by_density.draws(f"{density}, repeat 0")) is not None:
-            # Of two thousand draws evenly apart some of the first 20, of the first 200 and of all.
+            # Of 2000 evenly spaced draws, a subset of the first 20, of the first 200 and of all.
             states = evenly(step_by_step(draws), 2000)
             sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
     poses = np.concatenate(list(sets.values()))
-    kinds = [kind for kind, some in sets.items() for _ in some]
+    kinds = [kind for kind, members in sets.items() for _ in members]
     points = classical_scaling(pose_distances(poses, poses, "interaction"))
     counts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
     counts[f"{study.draws} draws"] = len(poses)
@@ -402,25 +402,25 @@ def embedding(study: Study) -> pd.DataFrame:
 
 
 def completion(study: Study) -> pd.DataFrame:
-    """Error of occluded joints of held-out pairs, with two baselines, in the image plane, metres.
+    """Return image-plane errors of occluded joints of held-out pairs by method, metres.
 
-    Every method gets the same estimate of the view, from the torsos.
+    All methods use the same estimate of the view, from the torsos.
     """
     frames = [dance_frames(clip) for clip in study.clips[1]]
     n = 10 if study.quick else 60
-    asked = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
-    whole = draw_annotations(study.clips[1], n, SEED, frames=frames)
+    test = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
+    complete = draw_annotations(study.clips[1], n, SEED, frames=frames)
     annotated = study.pictures(0).annotations
     skeleton = annotated.skeleton
-    views = annotation_views(asked.annotations, study.seed_pose)
+    views = annotation_views(test.annotations, study.seed_pose)
     draws = study.by_density.draws("interaction, repeat 0")
     states = None if draws is None else evenly(step_by_step(draws), 10_000)
     rows = []
     for index in range(n):
-        keypoints, visible = asked.annotations.keypoints[index], asked.annotations.visible[index]
-        truth = whole.annotations.keypoints[index]
+        keypoints, visible = test.annotations.keypoints[index], test.annotations.visible[index]
+        truth = complete.annotations.keypoints[index]
         view = views[index]
-        if np.isnan(view).any():  # too little of a torso is seen
+        if np.isnan(view).any():  # too few torso joints are visible
             continue
         lifted = lift_people(keypoints, visible, study.seed_pose, skeleton, view)
         seed = project_to_views(study.seed_pose[None], view[None], skeleton)[0, 0]
@@ -454,19 +454,19 @@ PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
 
 
 def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Return what is printed for a part: means over chains and pairs."""
+    """Return the printed table of a part: means over chains and pairs."""
     keys = [k for k in ("density", "proposal", "noise", "limit", "draws") if k in table]
     if name == "completion":
         return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
     if "measure" not in table:
         return table if name == "calibration" else table.groupby("kind").size().to_frame("poses")
-    others = [
+    columns = [
         c for c in ("acceptance", "scale", "ess", "seconds", "at_cap", "near_floor") if c in table
     ]
     means = table.groupby([*keys, "measure"], sort=False)["coverage"].mean()
     wide = means.unstack("measure", sort=False)
-    if others:
-        wide = wide.join(table.groupby(keys)[others].mean())
+    if columns:
+        wide = wide.join(table.groupby(keys)[columns].mean())
     return wide.round(4)
 
 
@@ -475,14 +475,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose-pairs"))
     parser.add_argument("--parts", nargs="*", choices=list(PARTS), default=list(PARTS))
-    parser.add_argument("--quick", action="store_true", help="made dances, few draws")
-    parser.add_argument("--draws", type=int, help="of all chains; 100000 by default")
-    parser.add_argument("--repeats", type=int, default=3, help="with other annotations each")
+    parser.add_argument("--quick", action="store_true", help="Synthetic dances and few draws.")
+    parser.add_argument("--draws", type=int, help="Draws of all chains; default: 100000.")
+    parser.add_argument("--repeats", type=int, default=3, help="Number of repeats.")
     options = parser.parse_args()
-    # A tenth of them is shared among four chains.
+    # Parts with a tenth of the draws divide them among four chains.
     given = 400 if options.draws is None else options.draws
     if options.repeats < 1 or given < 400 or given % 40:
-        parser.error("expected --repeats of at least 1, --draws of at least 400, a multiple of 40")
+        parser.error("--repeats must be at least 1, --draws a multiple of 40 and at least 400")
     options.out.mkdir(parents=True, exist_ok=True)
     study = Study(
         options.out,

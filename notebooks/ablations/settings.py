@@ -1,10 +1,10 @@
-"""Effect of each sampler's own settings.
+"""Effect of the settings of each sampler.
 
     python notebooks/ablations/settings.py --out settings
     python notebooks/ablations/settings.py --out quick --draws 12 --seeds 1     (two minutes)
 
-``--studies`` selects studies. Each is a comparison in a folder of ``--out`` with its table and
-report; an interrupted study continues from there.
+``--studies`` selects studies. Each is a comparison, stored with its table and report in a folder of
+``--out``; run the same command again to resume an interrupted study.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from probmotion.samplers import (
 
 @dataclass(frozen=True)
 class Study:
-    """Variants of a sampler and the problems they are run on."""
+    """Variants of a sampler and the problems to which they are applied."""
 
     about: str
     problems: tuple[str, ...]
@@ -36,7 +36,7 @@ class Study:
 
 STUDIES = {
     "views": Study(
-        "how many views, and whether they share their noise",
+        "number of views, and noise shared between views",
         ("gait", "gait-monocular"),
         {
             **{f"mas, {n} views": MultiViewAncestral(n_views=n) for n in (2, 3, 5, 9)},
@@ -44,7 +44,7 @@ STUDIES = {
         },
     ),
     "correctors": Study(
-        "how much is corrected, at how many levels",
+        "number of corrector steps and of noise levels",
         ("gait", "gait-monocular"),
         {
             "mvpc, no corrector": MultiViewPredictorCorrector(corrector_steps=0),
@@ -55,7 +55,7 @@ STUDIES = {
         },
     ),
     "chains": Study(
-        "how long chains run",
+        "length of chains",
         ("gait-monocular", "gait-sparse"),
         {
             **{f"mh, every {n}th": MetropolisHastings(thin=n) for n in (5, 20, 80)},
@@ -69,25 +69,25 @@ STUDIES = {
 def main() -> None:
     """Run the selected studies and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
     parser.add_argument("--studies", nargs="+", choices=STUDIES, default=list(STUDIES))
-    parser.add_argument("--draws", type=int, default=100)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=2)
-    asked = parser.parse_args()
-    for name in asked.studies:
+    parser.add_argument("--draws", type=int, default=100, help="Number of draws per run.")
+    parser.add_argument("--seeds", type=int, default=3, help="Number of seeds.")
+    parser.add_argument("--workers", type=int, default=2, help="Number of processes.")
+    options = parser.parse_args()
+    for name in options.studies:
         study = STUDIES[name]
-        found = compare(
+        comparison = compare(
             study.problems,
             study.samplers,
-            draws=asked.draws,
+            draws=options.draws,
             chains=4,
-            seeds=asked.seeds,
-            workers=asked.workers,
-            out=asked.out / name,
+            seeds=options.seeds,
+            workers=options.workers,
+            out=options.out / name,
         )
-        page = found.report(asked.out / name / "report.html")
-        print(f"\n{name}: {study.about}\n\n{found.table()}\n\nwrote {page}", flush=True)
+        report = comparison.report(options.out / name / "report.html")
+        print(f"\n{name}: {study.about}\n\n{comparison.table()}\n\nwrote {report}", flush=True)
 
 
 if __name__ == "__main__":

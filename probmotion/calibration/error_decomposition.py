@@ -1,17 +1,17 @@
 """Decomposition of a multi-view sampler's error on a problem with exact draws.
 
-A chain of samplers leads from exact draws to `mas`, changing one component at a time. The part of a
-component is the difference between neighbours:
+The samplers of a chain from exact draws to `mas` differ by one component each. The part of a
+component is the difference between consecutive samplers:
 
 - ``remainder``: exact draws → `ancestral3d` with 10 T steps; about 0 for a correct implementation
 - ``discretisation``: → T steps
-- ``single view``: → `mas` with the exact denoiser of each view, given the observations if any
+- ``single view``: → `mas` with the exact denoiser of each view, conditional on any observations
 - ``noise sharing``: → independent noise in each view
 - ``guidance``: → unconditional denoiser with guidance, if there are observations
 - ``network``: → a learnt 2D denoiser
 
-Measures are signed (:mod:`~probmotion.calibration.error_measures`), so the parts add up exactly,
-seed by seed. Samplers share seeds; intervals are Student's, of differences within seeds.
+Measures are signed (:mod:`~probmotion.calibration.error_measures`), so the parts of each seed add
+up exactly. Samplers share seeds; intervals are Student's t intervals of paired differences.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from probmotion.validation import check_count
 __all__ = ["decompose_error"]
 
 _MORE = 10
-# Settings of `mas` for which the earlier samplers have a counterpart.
+# Settings of `mas` that are compatible with the decomposition.
 _SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance", "batch")
 _SHARED = ("schedule_power", "batch")
 
@@ -59,14 +59,14 @@ def decompose_error(
     Parameters
     ----------
     problem : Problem
-        A problem with an exact posterior and exact 3D and 2D denoisers; with observations, also
-        given them (:func:`~probmotion.problems.conditioned.conditioned`).
+        Problem with an exact posterior and exact 3D and 2D denoisers, conditional on observations
+        if there are any (:func:`~probmotion.problems.conditioned.conditioned`).
     steps : int
-        T.
+        T, number of denoising steps.
     seeds : int
-        Replicates, at least 2.
+        Number of replicates, at least 2.
     draws : int
-        Draws per sampler and seed, at least 10.
+        Number of draws per sampler and seed, at least 10.
     settings : mapping, optional
         Settings of `mas`: n_views, elevation, view_weights, schedule_power, guidance, batch.
     shared_noise : bool, optional
@@ -74,18 +74,18 @@ def decompose_error(
         default only with observations, where guidance requires it.
     learnt : MotionPrior, optional
         Prior of the same motions with a learnt 2D denoiser, e.g. from
-        `probmotion.models.diffusion.projected_denoiser.denoiser_of`, for the network part, which
-        includes effects of its normalisation and training views.
+        `probmotion.models.diffusion.projected_denoiser.denoiser_of`. The network part includes
+        effects of its normalisation and training views.
     out : str or Path, optional
-        Folder for intermediate values, to resume an interrupted call, and ``decompose_error.csv``.
+        Folder for ``decompose_error.csv`` and the values needed to resume an interrupted call.
     progress : bool
-        Show a progress bar.
+        Whether to show a progress bar.
 
     Raises
     ------
     ValueError
-        If the problem is not exact, an argument is invalid, ``learnt`` has other motions, or
-        ``out`` belongs to another decomposition.
+        If the problem has no exact posterior, an argument is invalid, ``learnt`` has other frames
+        or joints, or ``out`` contains another decomposition.
     UnsupportedPosterior
         If the prior or ``learnt`` lacks a denoiser.
     """
@@ -119,7 +119,7 @@ def decompose_error(
 
 @dataclass(frozen=True)
 class _Link:
-    """A sampler in the chain, named by the part that it adds; the first is exact draws."""
+    """Sampler in the chain, named after its part of the error; the first returns exact draws."""
 
     name: str
     sampler: Sampler
@@ -174,13 +174,13 @@ def _chain(
                 f"got {learnt.frames} frames and {learnt.skeleton.n_joints} joints"
             )
         links.append(_Link("network", last, MotionPosterior(learnt, likelihood)))
-    for link in links:  # fail before the first long run
+    for link in links:  # Fail before the first long run.
         require(link.sampler, link.posterior)
     return links, notes
 
 
 def _title(problem: Problem, links: list[_Link], steps: int) -> str:
-    """Return a title of the setting."""
+    """Return a title with the problem and the main settings."""
     sampler: Any = next(link.sampler for link in reversed(links) if link.sampler.name == "mas")
     words = [problem.name, f"V = {sampler.n_views}", f"T = {steps}"]
     if not np.isclose(sampler.elevation, load_sampler("mas")().elevation):

@@ -1,4 +1,4 @@
-"""Signed error measures of sets of draws, additive along a chain of samplers."""
+"""Signed error measures of draws; their differences along a chain of samplers add up."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LARGE = 0.95
 class ErrorMeasures:
     """Error measures of draws from a problem with an exact posterior.
 
-    - ``spread``: log of the trace of the covariance over the exact one; negative: overconfident
+    - ``spread``: log of the covariance trace over that of exact draws; negative: overconfident
     - ``small``: mean log(variance / exact variance) over the small principal directions, beyond
       those that account for 95 % of the exact variance
     - ``off``: log of the mean variance off the manifold over that of exact draws, if defined
@@ -43,14 +43,14 @@ class ErrorMeasures:
     def __init__(self, problem: Problem) -> None:
         require_exact(problem)
         self.problem = problem
-        # The same pool for every decomposition of the problem.
+        # Use the same pool for every decomposition of the problem.
         pool = problem.reference(seeds.integer(0, "bias measures"), _POOL)
         flat = pool.reshape(_POOL, -1)
         variances, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
         self.total = float(variances.sum())
-        held = np.cumsum(variances[::-1])[::-1]
+        tails = np.cumsum(variances[::-1])[::-1]
         # A direction is small if the larger ones account for 95 % of the variance.
-        self.small = axes[:, held - variances >= _LARGE * self.total]
+        self.small = axes[:, tails - variances >= _LARGE * self.total]
         self.small_variances = np.var(flat @ self.small, axis=0, ddof=1)
         prior = problem.posterior.prior
         self.manifold = prior if isinstance(prior, HasManifold) else None
@@ -66,8 +66,8 @@ class ErrorMeasures:
         exact = self.problem.reference(seeds.integer(seed, "exact sets"), _SETS * n)
         exact = exact.reshape(_SETS * n, -1)
         spread = float(flat.var(axis=0, ddof=1).sum())
-        chance = spread / n + float(exact.var(axis=0, ddof=1).sum()) / len(exact)
-        apart = float(((flat.mean(axis=0) - exact.mean(axis=0)) ** 2).sum())
+        expected = spread / n + float(exact.var(axis=0, ddof=1).sum()) / len(exact)
+        squared = float(((flat.mean(axis=0) - exact.mean(axis=0)) ** 2).sum())
         values = {"spread": float(np.log(spread / self.total))}
         if self.small.shape[1]:
             ratios = np.var(flat @ self.small, axis=0, ddof=1) / self.small_variances
@@ -75,7 +75,7 @@ class ErrorMeasures:
         if self.manifold is not None and self.off is not None:
             off = float(self.manifold.off_manifold(positions).mean())
             values["off"] = float(np.log(off / self.off))
-        values["mean"] = (apart - chance) / self.total
+        values["mean"] = (squared - expected) / self.total
         rng = seeds.generator(seed, "directions")
         directions = random_directions(rng, _DIRECTIONS, flat.shape[1])
         distances = [float(sliced_wasserstein(flat, x, directions)) for x in np.split(exact, _SETS)]

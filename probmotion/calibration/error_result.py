@@ -1,4 +1,4 @@
-"""Parts of a sampler's error, with confidence intervals."""
+"""Result of an error decomposition: parts of a sampler's error with confidence intervals."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _FLOOR, _WHOLE = "floor", "whole"
 
 
 class ErrorDecomposition:
-    """The parts of a sampler's error on one problem at one setting.
+    """Parts of a sampler's error on one problem, by measure and seed.
 
     Parameters
     ----------
     setting : str
-        Title.
+        Title with the problem and the main settings.
     values : mapping of str to sequence of mapping
-        Measures by sampler in the order of the chain (exact draws first), then by seed. A sampler
-        is named by the part that it adds.
+        Measures by sampler in the order of the chain (exact draws first), then by seed. Samplers
+        are named after their part of the error.
     notes : sequence of str
         Notes on absent parts.
     """
@@ -57,7 +57,7 @@ class ErrorDecomposition:
         }
 
     def differences(self, measure: str) -> dict[str, np.ndarray]:
-        """Return each part by seed, (seeds,); they add up to the whole."""
+        """Return each part by seed, (seeds,); the parts add up to the total error."""
         if measure not in self.values:
             raise ValueError(f"measure must be one of {', '.join(self.values)}, got {measure!r}")
         links = list(self.values[measure].items())
@@ -82,7 +82,7 @@ class ErrorDecomposition:
 
     @property
     def findings(self) -> list[str]:
-        """A sentence per measure: its significant parts, the largest first."""
+        """Summary of each measure: its significant parts in decreasing order of size."""
         sentences = []
         table = self.table().set_index(["measure", "part"])
         for measure in self.values:
@@ -95,13 +95,13 @@ class ErrorDecomposition:
             if clear:
                 ordered = sorted(clear, key=lambda part: -abs(clear[part]["mean"]))
                 words.append(", ".join(f"{part} {_in_words(clear[part])}" for part in ordered))
-            if quiet := [part for part in rows if part not in clear]:
-                words.append(f"not significant: {', '.join(quiet)}")
+            if unclear := [part for part in rows if part not in clear]:
+                words.append(f"not significant: {', '.join(unclear)}")
             sentences.append("; ".join(words))
         return sentences
 
     def plot(self, path: str | Path) -> Path:
-        """Draw the parts, a panel per measure, to a ``.png`` file; return its path."""
+        """Plot the parts, one panel per measure, to a ``.png`` file; return its path."""
         from probmotion.plots.error_plots import draw_error_decomposition
 
         draw_error_decomposition(self.table(), path, words=MEASURES, notes=self.notes)
@@ -114,9 +114,9 @@ class ErrorDecomposition:
 
 
 class StoredValues:
-    """Measures of each sampler and seed, stored as JSON in ``folder`` if given.
+    """Store of the measures of each sampler and seed, as JSON in ``folder`` if it is not None.
 
-    ``question`` identifies the decomposition; a folder with another one is a ``ValueError``.
+    ``question`` identifies the decomposition. Raises ``ValueError`` for a folder with another one.
     """
 
     def __init__(self, folder: Path | None, question: Any) -> None:

@@ -1,7 +1,7 @@
 """Calibration of samplers on simulated observations.
 
-Simulation-based calibration (Talts et al. 2018) and expected coverage (Hermans et al. 2022; Lemos
-et al. 2023), of any sampler on any problem that can be simulated.
+Computes simulation-based calibration (Talts et al. 2018) and expected coverage (Hermans et al.
+2022; Lemos et al. 2023) of any sampler on any problem that can be simulated.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from probmotion.validation import check_count
 __all__ = ["calibrate"]
 
 FEWEST_SIMULATIONS = 10
-# Offset of the numbers of simulations whose truths serve as random reference points.
+# Offset of simulation numbers for random reference points (truths of other simulations).
 _ELSEWHERE = 2**32
 
 
@@ -62,23 +62,23 @@ def calibrate(
     """Simulate every problem, run every sampler on each simulation, and rank the truth.
 
     A simulation is a truth from the prior and observations of it. If a sampler is correct, the
-    truth is exchangeable with its draws. Only ranks are stored, as soon as they are known, like a
-    run of :func:`~probmotion.comparison.compare` whose seed is the number of the simulation; the
-    same call resumes an interrupted one, and more ``simulations`` extend it.
+    truth is exchangeable with its draws. Only ranks are stored, after each simulation, as a run of
+    :func:`~probmotion.comparison.compare` with the simulation number as seed. Repeat the call to
+    resume an interrupted calibration; increase ``simulations`` to extend it.
 
     Parameters
     ----------
     problems, samplers
-        As for :func:`~probmotion.comparison.compare`; problems need ``simulate``.
+        As for :func:`~probmotion.comparison.compare`; problems must define ``simulate``.
     simulations : int
-        Simulations per problem, at least 10.
+        Number of simulations per problem, at least 10.
     draws : int
-        Draws per simulation in all; those of chains are thinned to about independent ones.
+        Total number of draws per simulation; correlated draws are thinned.
     chains : int
         Number of chains.
     out : str or Path, optional
-        Folder whose subfolder ``calibration`` receives ranks, ``table.csv`` and ``failures.json``;
-        may be a comparison's; temporary by default.
+        Folder for ranks, ``table.csv`` and ``failures.json`` in the subfolder ``calibration``; may
+        be that of a comparison. Temporary by default.
     workers, executor, time_limit, progress
         As for :func:`~probmotion.comparison.compare`.
     budget : Budget, optional
@@ -90,9 +90,9 @@ def calibrate(
         If an argument is invalid, a problem cannot be simulated, or ``out`` contains ranks of
         the same names with other settings.
     OSError
-        If ``out`` cannot be written to.
+        If ``out`` is not writable.
     KeyboardInterrupt
-        At Ctrl-C; the message reports finished simulations and their folder.
+        On Ctrl-C; the message reports finished simulations and their folder.
     """
     check_count("simulations", simulations, least=FEWEST_SIMULATIONS)
     check_grid_options(draws, chains, workers, budget, time_limit)
@@ -102,7 +102,7 @@ def calibrate(
         problem = load_problem(source) if isinstance(source, str) else source
         if problem.simulate is None:
             raise ValueError(
-                f"problems must have simulate, got {name!r} without; add it with "
+                f"problems must have simulate, got {name!r} without it; define it with "
                 "posteriors.problem.simulated() if the prior can be sampled"
             )
     # Workers may have another working directory.
@@ -115,7 +115,7 @@ def calibrate(
         refuse_other_settings(folder, [*grid.pilots(), *grid.runs()])
         plan.save(folder)
         run_grid(grid, workers, executor, progress, label="simulations")
-        # A run of other problems in this folder may have left its own plan.
+        # Concurrent runs of other problems in this folder may have overwritten the plan.
         plan.save(folder)
         calibration = Calibration(folder, plan, temporary=out is None)
         calibration.write()
@@ -124,7 +124,7 @@ def calibrate(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationRun(GridRun):
-    """One sampler on the simulation with number ``seed``; its metrics are the ranks."""
+    """Run of one sampler on simulation number ``seed``; its metrics are the ranks."""
 
     stores_draws: ClassVar[bool] = False
 
@@ -150,6 +150,6 @@ class CalibrationRun(GridRun):
 
 
 class CalibrationGrid(Grid):
-    """Grid with a run per simulation instead of per seed."""
+    """Grid with one run per simulation instead of per seed."""
 
     run_class: ClassVar[type[GridRun]] = CalibrationRun

@@ -19,12 +19,12 @@ _CHANGED = ("positions", "theta", "log_density")
 
 @dataclass(frozen=True)
 class Overconfident:
-    """Draws of another sampler, shrunk towards their mean.
+    """Sampler that shrinks the draws of another sampler towards their mean.
 
     Parameters
     ----------
     sampler : Sampler
-        The sampler to shrink draws of.
+        Original sampler.
     factor : float
         Shrinkage factor, between 0 and 1.
     """
@@ -50,29 +50,29 @@ class Overconfident:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` overconfident draws; raises as the other sampler."""
+        """Return ``chains`` × ``draws`` overconfident draws; raise as the original sampler."""
         try:
-            right = self.sampler.sample(
+            drawn = self.sampler.sample(
                 posterior, draws=draws, chains=chains, seed=seed, initial=initial, progress=progress
             )
         except Interrupted as stop:
             raise Interrupted(self._shrunk(posterior, stop.draws, seed)) from stop
-        return self._shrunk(posterior, right, seed)
+        return self._shrunk(posterior, drawn, seed)
 
-    def _shrunk(self, posterior: MotionPosterior, right: MotionDraws, seed: int) -> MotionDraws:
-        positions = right.positions.values
+    def _shrunk(self, posterior: MotionPosterior, drawn: MotionDraws, seed: int) -> MotionDraws:
+        positions = drawn.positions.values
         mean = positions.mean(axis=(0, 1))
         return MotionDraws.of(
             posterior,
             self,
             mean + self.factor * (positions - mean),
             seed=seed,
-            seconds=right.seconds,
+            seconds=drawn.seconds,
             statistics={
                 str(name): values.values
-                for name, values in right.dataset.data_vars.items()
+                for name, values in drawn.dataset.data_vars.items()
                 if values.dims[:1] == ("chain",) and name not in _CHANGED
             },
-            counts=right.counts,
-            independent=right.independent,
+            counts=drawn.counts,
+            independent=drawn.independent,
         )

@@ -1,4 +1,4 @@
-"""Scalar quantities of motions in which the truth is ranked among draws."""
+"""Scalar quantities of motions, by which the truth is ranked among draws."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DIRECTIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """A scalar quantity of motions; ``evaluate`` maps (n, L, J, 3), metres, to (n,)."""
+    """Scalar quantity of motions; ``evaluate`` maps (n, L, J, 3), metres, to (n,)."""
 
     name: str
     evaluate: Callable[[np.ndarray], np.ndarray]
@@ -36,7 +36,7 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
     - ``hidden <joint>``: a random occluded joint, if any, along a random direction
     - ``speed``: mean step length over joints and frames, metres, for several frames
 
-    ``posterior`` is that of the problem, not of a simulation; ``seed`` determines the choice.
+    ``posterior`` is that of the problem, not of a simulation; ``seed`` determines random choices.
     """
     rng = seeds.generator(seed, "quantities")
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)
@@ -46,8 +46,8 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
         direction = rng.standard_normal(shape)
         direction /= np.sqrt((direction**2).sum())
         chosen.append(Quantity(f"direction {k + 1}", partial(_along, direction, root)))
-    others = [joint for joint in range(shape[1]) if joint != root] or [root]
-    frame, joint = int(rng.integers(shape[0])), int(rng.choice(others))
+    joints = [joint for joint in range(shape[1]) if joint != root] or [root]
+    frame, joint = int(rng.integers(shape[0])), int(rng.choice(joints))
     name = posterior.skeleton.joint_names[joint]
     chosen.append(Quantity(f"height of {name}", partial(_height, frame, joint)))
     visible = visible_joints(posterior)
@@ -55,10 +55,10 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
     if visible is not None and not visible.all():
         occluded = np.argwhere(~visible)
         frame, joint = (int(index) for index in occluded[rng.integers(len(occluded))])
-        at = np.zeros(shape)
-        at[frame, joint] = direction / np.sqrt((direction**2).sum())
+        weights = np.zeros(shape)
+        weights[frame, joint] = direction / np.sqrt((direction**2).sum())
         name = posterior.skeleton.joint_names[joint]
-        chosen.append(Quantity(f"hidden {name}", partial(_along, at, root)))
+        chosen.append(Quantity(f"hidden {name}", partial(_along, weights, root)))
     if posterior.frames > 1:
         chosen.append(Quantity("speed", _speed))
     return chosen

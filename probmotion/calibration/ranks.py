@@ -22,7 +22,7 @@ _FEWEST = 4
 
 
 class Rank(NamedTuple):
-    """Randomised rank of the truth in [0, 1], and the number of draws that it is among."""
+    """Randomised rank of the truth in [0, 1], and the number of draws compared with it."""
 
     value: float
     draws: int
@@ -31,20 +31,20 @@ class Rank(NamedTuple):
 def rank(truth: float, draws: np.ndarray, rng: np.random.Generator) -> float:
     """Return (r + U) / (L + 1), r the rank of the truth among L draws, ties broken at random.
 
-    ``truth`` and ``draws`` (L,) are values of one quantity, the draws independent. The rank is
-    uniform on [0, 1] for every L if truth and draws are exchangeable, so that runs of different
-    lengths can be pooled.
+    ``truth`` and ``draws`` (L,) are values of one quantity; draws must be independent. The rank is
+    uniform on [0, 1] for every L if truth and draws are exchangeable, so runs of different lengths
+    can be pooled.
     """
     below, equal = int((draws < truth).sum()), int((draws == truth).sum())
     return float((below + (equal + 1) * rng.random()) / (len(draws) + 1))
 
 
 def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
-    """Return values (chain, draw) of a run, thinned evenly to about independent ones, (n,).
+    """Return values (chain, draw) of a run, evenly thinned to about independent values, (n,).
 
-    Their number is the effective sample size of the quantity (bulk, Vehtari et al. 2021; of an
-    ensemble, draws / autocorrelation time), or all for independent draws; it is 1 if values are
-    constant or not finite, chains have fewer than 4 draws, or the autocorrelation time is NaN.
+    n is the effective sample size of the quantity (bulk, Vehtari et al. 2021; draws /
+    autocorrelation time for an ensemble), or the number of draws if independent. It is 1 if values
+    are constant or not finite, chains have fewer than 4 draws, or the autocorrelation time is NaN.
     """
     flat = values.reshape(-1)
     if draws.independent:
@@ -58,7 +58,7 @@ def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
 
         size = float(array_stats.ess(values, method="bulk", chain_axis=0, draw_axis=1))
     n = min(len(flat), int(size)) if math.isfinite(size) and size >= 1 else 1
-    # Midpoints of equal stretches, to avoid the starts of chains.
+    # Select the midpoints of equal segments, to avoid the starts of chains.
     return flat[((np.arange(n) + 0.5) * len(flat) / n).astype(int)]
 
 
@@ -75,9 +75,9 @@ def ranks_of_truth(
     simulation, ``elsewhere``, in metres. ``seed`` breaks ties.
     """
     if simulation.truth is None or elsewhere.truth is None:
-        raise ValueError(f"simulations of {problem.name} must have a truth")
+        raise ValueError(f"simulations of {problem.name} must have a truth, got none")
     positions = np.concatenate([simulation.truth[None], draws.flat()])
-    values_of = {one.name: one.evaluate(positions) for one in quantities(problem.posterior)}
+    values_of = {item.name: item.evaluate(positions) for item in quantities(problem.posterior)}
     values_of |= log_densities(simulation, positions)
     square = ((positions - elsewhere.truth) ** 2).sum(axis=-1)
     values_of[DISTANCE] = np.sqrt(square.mean(axis=(1, 2)))
@@ -86,9 +86,9 @@ def ranks_of_truth(
     for name, values in values_of.items():
         if unknown := int(np.isnan(values).sum()):
             raise ValueError(
-                f"{name} must not be NaN, got NaN for {unknown} of the truth and the draws"
+                f"{name} must not be NaN, got {unknown} NaN values for the truth and the draws"
             )
-        among = independent_draws(values[1:].reshape(shape), draws)
+        thinned = independent_draws(values[1:].reshape(shape), draws)
         rng = seeds.generator(seed, "ties", name)
-        ranks[name] = Rank(rank(float(values[0]), among, rng), len(among))
+        ranks[name] = Rank(rank(float(values[0]), thinned, rng), len(thinned))
     return ranks

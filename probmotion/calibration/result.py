@@ -37,9 +37,9 @@ class Calibration:
     folder : Path
         Folder of the runs; unfinished ones are skipped.
     plan : Plan
-        Plan of the grid; its ``seeds`` are simulations.
+        Plan of the grid; its ``seeds`` is the number of simulations.
     temporary : bool
-        Remove the folder with this object.
+        Delete the folder when this object is garbage-collected.
     """
 
     # Subfolder of the ``out`` of calibrate().
@@ -66,25 +66,25 @@ class Calibration:
 
     def runs(self, problem: str, sampler: str) -> list[RunResult]:
         """Return the finished runs of a sampler on a problem, in the order of simulations."""
-        for what, name, known in (
+        for kind, name, names in (
             ("problem", problem, self.plan.problems),
             ("sampler", sampler, self.plan.samplers),
         ):
-            if name not in known:
-                raise ValueError(f"{what} must be one of {', '.join(known)}, got {name!r}")
-        place = (problem, sampler)
-        return [result for result in self.results if (result.problem, result.sampler) == place]
+            if name not in names:
+                raise ValueError(f"{kind} must be one of {', '.join(names)}, got {name!r}")
+        pair = (problem, sampler)
+        return [result for result in self.results if (result.problem, result.sampler) == pair]
 
     def ranks(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
-        """Return the truth's ranks in [0, 1] by quantity, (n,), one per successful simulation."""
+        """Return the ranks of the truth in [0, 1] by quantity, (n,), per successful simulation."""
         return self._values(problem, sampler, "rank ")
 
     def ranked_among(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
-        """Return by quantity the number of draws that each truth is ranked among."""
+        """Return the number of draws compared with each truth, by quantity."""
         return self._values(problem, sampler, "draws ")
 
     def _values(self, problem: str, sampler: str, kind: str) -> dict[str, np.ndarray]:
-        """Return the values of a kind by quantity, if all successful simulations have it."""
+        """Return the values of a kind by quantity, for quantities of all successful simulations."""
         rows = self._successful(problem, sampler)
         shared = [name for name in (rows[0] if rows else ()) if all(name in row for row in rows)]
         names = [name.removeprefix(kind) for name in shared if name.startswith(kind)]
@@ -95,7 +95,7 @@ class Calibration:
         return [run.metrics for run in self.runs(problem, sampler) if run.failure is None]
 
     def _partial(self, problem: str, sampler: str) -> list[str]:
-        """Return the quantities that only some simulations have."""
+        """Return the quantities that are missing in at least one successful simulation."""
         rows = self._successful(problem, sampler)
         names = {name for row in rows for name in row if name.startswith("rank ")}
         names = {name.removeprefix("rank ") for name in names}
@@ -107,7 +107,7 @@ class Calibration:
         return bool(self._blocks(self.plan.problems))
 
     def _blocks(self, problems: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Return the ranks of every sampler with more than one, by its verdict."""
+        """Return the ranks of every sampler with at least two simulations, by its verdict."""
         blocks = {}
         for problem, sampler in product(problems, self.plan.samplers):
             ranks = self.ranks(problem, sampler)
@@ -119,8 +119,8 @@ class Calibration:
     def notes(self) -> list[str]:
         """Notes on budget, failures, unfinished simulations and thinning."""
         notes = [*self.plan.notes]
-        places = list(product(self.plan.problems, self.plan.samplers))
-        if used := used_of_budget(result for place in places for result in self.runs(*place)):
+        pairs = list(product(self.plan.problems, self.plan.samplers))
+        if used := used_of_budget(result for pair in pairs for result in self.runs(*pair)):
             notes.append(f"used per simulation: {', '.join(used)}")
         counted = Counter(
             f"{result.sampler} on {result.problem}: {result.failure.message}"
@@ -129,39 +129,39 @@ class Calibration:
         )
         for sentence, times in counted.items():
             notes.append(f"{sentence} ({times} of {self.plan.seeds} simulations)")
-        for problem, sampler in places:
+        for problem, sampler in pairs:
             where = f"{sampler} on {problem}"
             if (done := len(self.runs(problem, sampler))) < self.plan.seeds:
                 notes.append(f"{where}: {done} of {self.plan.seeds} simulations finished")
-            if only := self._partial(problem, sampler):
-                notes.append(f"{where}: {', '.join(only)} skipped, not in all simulations")
+            if partial := self._partial(problem, sampler):
+                notes.append(f"{where}: {', '.join(partial)} skipped, not in all simulations")
             among = self.ranked_among(problem, sampler)
             fewest = min((float(np.median(sizes)) for sizes in among.values()), default=math.inf)
             if fewest < self.plan.draws:
                 notes.append(
-                    f"{where}: ranks are among about {fewest:.0f} independent draws of "
-                    f"{self.plan.draws} for the slowest quantity"
+                    f"{where}: about {fewest:.0f} of {self.plan.draws} draws are independent for "
+                    "the slowest quantity"
                 )
         return notes
 
     def table(self) -> CalibrationTable:
-        """Return a data frame with a row per problem, sampler and quantity; prints a summary.
+        """Return a data frame with a row per problem, sampler and quantity, printed as a summary.
 
-        Quantity "all" is all quantities together. Columns: ``p_value`` of uniform ranks (all:
-        smallest after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over
-        central intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over
-        quantities), ``simulations`` that succeeded and ``failed`` ones.
+        Quantity "all" combines all quantities. Columns: ``p_value`` of uniform ranks (all: smallest
+        after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over central
+        intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over quantities),
+        ``simulations`` and ``failed``: numbers of successful and failed simulations.
         """
         from probmotion.calibration.table import CalibrationTable
 
-        places = product(self.plan.problems, self.plan.samplers)
-        return CalibrationTable.of([self._ranked(*place) for place in places], self.notes)
+        pairs = product(self.plan.problems, self.plan.samplers)
+        return CalibrationTable.of([self._ranked(*pair) for pair in pairs], self.notes)
 
     def coverage(self, problem: str, sampler: str) -> pd.DataFrame:
         """Return the coverage of credible sets by quantity and level.
 
-        Columns quantity, level, coverage, and ``lower``, ``upper``, its 95 % interval. Credible
-        sets are those of :func:`~probmotion.metrics.credible_sets.credible_level`.
+        Columns: quantity, level, coverage and its 95 % interval, lower to upper. Credible sets are
+        those of :func:`~probmotion.metrics.credible_sets.credible_level`.
         """
         from probmotion.calibration.table import coverage_frame
 
@@ -182,7 +182,7 @@ class Calibration:
         return verdict(self._ranked(problem, sampler))
 
     def plot(self, path: str | Path | None = None, problem: str | None = None) -> Path:
-        """Plot ranks and coverage, a block per sampler, of one or all problems; return the path.
+        """Plot ranks and coverage of one or all problems, one block per sampler; return the path.
 
         Raises ``ValueError`` if the problem is unknown or there are no ranks.
         """

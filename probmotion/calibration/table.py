@@ -35,10 +35,10 @@ level|, mean over quantities, about 0.3/√simulations for exact draws"""
 
 @dataclass(frozen=True, eq=False)
 class Ranked:
-    """The truth's ranks in [0, 1] by quantity, (n,), of one sampler on one problem.
+    """Ranks of the truth in [0, 1] by quantity, (n,), of one sampler on one problem.
 
-    There is a rank per successful and a failure per other simulation; ``simulations`` and
-    ``planned`` are the numbers of finished and planned ones.
+    Failed simulations have an entry in ``failures`` instead of ranks; ``simulations`` and
+    ``planned`` are the numbers of finished and planned simulations.
     """
 
     problem: str
@@ -56,11 +56,11 @@ class CalibrationTable(pd.DataFrame):
     def of(cls, ranked: Sequence[Ranked], notes: Sequence[str]) -> CalibrationTable:
         """Return the table of every sampler's ranks on every problem."""
         rows: list[tuple] = []
-        for one in ranked:
-            counts = (one.simulations - len(one.failures), len(one.failures))
-            rows += [(one.problem, one.sampler, *score, *counts) for score in _scores(one.ranks)]
+        for item in ranked:
+            counts = (item.simulations - len(item.failures), len(item.failures))
+            rows += [(item.problem, item.sampler, *score, *counts) for score in _scores(item.ranks)]
         table = cls(rows, columns=_COLUMNS)
-        table.attrs = {"verdicts": [verdict(one) for one in ranked], "notes": list(notes)}
+        table.attrs = {"verdicts": [verdict(item) for item in ranked], "notes": list(notes)}
         return table
 
     @property
@@ -108,30 +108,30 @@ def coverage_frame(ranks: Mapping[str, np.ndarray]) -> pd.DataFrame:
 def verdict(ranked: Ranked) -> str:
     """Return a one-sentence verdict on a sampler's calibration on a problem."""
     failed, ranks, finished = ranked.failures, ranked.ranks, ranked.simulations
-    worked = finished - len(failed)
+    succeeded = finished - len(failed)
     where = f"{ranked.sampler} on {ranked.problem}"
-    but = ""
+    note = ""
     if failed:
         first = failed[0].message
-        if not worked and all(failure.unsupported for failure in failed):
+        if not succeeded and all(failure.unsupported for failure in failed):
             return f"{where}: not supported, {first}"
-        but = f"; {len(failed)} of {finished} simulations failed, the first: {first}"
-    if worked < _FEWEST:
-        return f"{where}: too few simulations, {worked} of {ranked.planned} succeeded{but}"
+        note = f"; {len(failed)} of {finished} simulations failed, the first: {first}"
+    if succeeded < _FEWEST:
+        return f"{where}: too few simulations, {succeeded} of {ranked.planned} succeeded{note}"
     p_values = {name: uniformity_p_value(values) for name, values in ranks.items()}
     p = float(adjusted_p_values(np.array(list(p_values.values()))).min())
     if p >= _SIGNIFICANT:
-        result = f"no deviation found in {worked} simulations ({_probability(p)})"
+        result = f"no deviation found in {succeeded} simulations ({_probability(p)})"
     else:
-        result = f"{_deviation(ranks, p_values)} ({_probability(p)}, {worked} simulations)"
-    return f"{where}: {result}{but}"
+        result = f"{_deviation(ranks, p_values)} ({_probability(p)}, {succeeded} simulations)"
+    return f"{where}: {result}{note}"
 
 
 def _deviation(ranks: Mapping[str, np.ndarray], p_values: Mapping[str, float]) -> str:
-    """Return how ranks deviate: overconfident, underconfident or biased."""
+    """Describe the deviation of ranks: overconfident, underconfident or biased."""
     coverage = _central(ranks)
     n = len(next(iter(ranks.values())))
-    # Quantities of one motion are correlated, so the error is that of a single one.
+    # Two standard errors of a single quantity, because quantities of a motion are correlated.
     error = 2 * math.sqrt(_SHOWN * (1 - _SHOWN) / n)
     intervals = f"90 % intervals cover {100 * coverage:.0f} %"
     if coverage < _SHOWN - error:
@@ -151,7 +151,7 @@ def _central(ranks: Mapping[str, np.ndarray]) -> float:
 
 
 def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, float]]:
-    """Return quantity, p-value, 90 % coverage and coverage error, first of all together."""
+    """Return quantity, p-value, 90 % coverage and coverage error; the first row combines all."""
     if not ranks or len(next(iter(ranks.values()))) < _FEWEST:
         return [("all", math.nan, math.nan, math.nan)]
     scores = []
@@ -166,19 +166,19 @@ def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, fl
 
 def _line(sampler: str, table: pd.DataFrame) -> dict[str, str]:
     rows = table.set_index("quantity")
-    all_together = rows.loc["all"]
-    others = rows.drop(index="all")["p_value"]
+    combined = rows.loc["all"]
+    p_values = rows.drop(index="all")["p_value"]
     covered = rows["coverage_90"]
     return {
         "sampler": sampler,
-        "p": _number(float(all_together["p_value"])),
-        "worst": "-" if others.empty else str(others.idxmin()),
-        "90 % covers": _percent(float(all_together["coverage_90"])),
+        "p": _number(float(combined["p_value"])),
+        "worst": "-" if p_values.empty else str(p_values.idxmin()),
+        "90 % covers": _percent(float(combined["coverage_90"])),
         "density": _percent(float(covered.get(DENSITY, math.nan))),
         "distance": _percent(float(covered.get(DISTANCE, math.nan))),
-        "error": _number(float(all_together["coverage_error"])),
-        "simulations": f"{all_together['simulations']:.0f}",
-        "failed": f"{all_together['failed']:.0f}",
+        "error": _number(float(combined["coverage_error"])),
+        "simulations": f"{combined['simulations']:.0f}",
+        "failed": f"{combined['failed']:.0f}",
     }
 
 

@@ -1,4 +1,4 @@
-"""The command ``probmotion compare``: samplers on problems."""
+"""The command ``probmotion compare``: comparison of samplers on problems."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["Clips", "Compare"]
 
 @dataclass(frozen=True)
 class Clips:
-    """Your clips, one of which is held out and observed."""
+    """User-supplied clips; one clip is held out and observed."""
 
     clips: Annotated[tuple[str, ...], arg(metavar="FILE ...")] = ()
     """Motion files (.npz, .bvh) or quoted patterns.
-    The prior is fitted to all but one clip, which is observed."""
+    The prior is fitted to all clips except the held-out one."""
 
     observe: str = "monocular"
     """Observations of the held-out clip: monocular, occluded, sparse or none."""
@@ -50,8 +50,8 @@ class Clips:
 class Compare:
     """Run samplers on the same posteriors and print their errors.
 
-    --out stores every finished run (problem x sampler x seed); repeating an interrupted command
-    continues from there.
+    The folder --out stores every finished run (problem x sampler x seed). Run the same command
+    again to resume an interrupted comparison.
     """
 
     problems: Annotated[Positional[tuple[str, ...]], arg(metavar="[PROBLEM ...]")] = ()
@@ -70,7 +70,7 @@ class Compare:
     """Number of independent repetitions, with seeds 0, 1, …"""
 
     workers: int = 1
-    """Number of worker processes; 0 runs in this process. Draws do not depend on it."""
+    """Number of worker processes; 0 runs in this process. Draws do not depend on the number."""
 
     out: Path = Path("comparison")
     """Output folder for table.csv and all draws."""
@@ -79,18 +79,18 @@ class Compare:
     """Quick run: 40 draws and 6 s per run, 60 s limit, reduced settings; other options override."""
 
     evaluations: int | None = None
-    """Budget per run: evaluations of the density or denoiser, a gradient counting as two.
+    """Budget per run: evaluations of the density or denoiser; a gradient counts as two.
     Pilot runs choose matching settings. No budget by default."""
 
     seconds: float | None = None
-    """Budget per run in seconds of this machine; none, or 6 with --quick."""
+    """Budget per run, seconds on this machine. Default: none; 6 with --quick."""
 
     time_limit: float | None = None
-    """Time limit per run, seconds; longer runs are recorded as failed. None, or 60 with --quick."""
+    """Time limit per run, seconds; longer runs fail. Default: none; 60 with --quick."""
 
     calibrate: int = 0
     """Number of simulations for simulation-based calibration, at least 10; 0 for none.
-    Each costs as much as a run."""
+    Each simulation costs as much as a run."""
 
     report: bool = False
     """Also write report.html with the table, plots and animated draws."""
@@ -99,8 +99,8 @@ class Compare:
     """Also write skeletons_PROBLEM.png and, where quality is measured, quality_against_cost.png."""
 
     prior: str | None = None
-    """Also sample your own prior: the folder of a run of probmotion train diffusion or dvae.
-    No observations. Draws are compared with exact draws of the prior if it has any."""
+    """Also sample a user-trained prior: the folder of a run of probmotion train diffusion or dvae.
+    The prior is sampled without observations; errors require exact draws of the prior."""
 
     user_clips: OmitArgPrefixes[Clips] = field(default_factory=Clips)
 
@@ -136,10 +136,10 @@ class Compare:
         if self.evaluations is not None or self.seconds is not None:
             budget = Budget(evaluations=self.evaluations, seconds=self.seconds)
         draws = draws if self.draws is None else self.draws
-        fitting = max(n for n in (1, 2, 3, 4) if draws % n == 0)
+        divisor = max(n for n in (1, 2, 3, 4) if draws % n == 0)
         return {
             "draws": draws,
-            "chains": fitting if self.chains is None else self.chains,
+            "chains": divisor if self.chains is None else self.chains,
             "workers": self.workers,
             "out": self.out,
             "budget": budget,
@@ -162,13 +162,13 @@ class Compare:
         return calibration
 
     def _check_calibrate(self, problems: list[Problem]) -> None:
-        """Raise early what would fail after the comparison."""
+        """Validate ``calibrate`` before the comparison starts."""
         from probmotion.calibration.grid import FEWEST_SIMULATIONS as FEWEST
 
         if self.calibrate and self.calibrate < FEWEST:
             raise ValueError(f"calibrate must be at least {FEWEST}, got {self.calibrate}")
         if self.calibrate and all(problem.simulate is None for problem in problems):
-            raise ValueError("calibrate requires a problem that can be simulated")
+            raise ValueError("calibrate requires a problem that can be simulated, got none")
 
     def _samplers(self) -> dict[str, Any]:
         from probmotion.cli.settings_options import sampler_called
@@ -222,7 +222,7 @@ def _problem_of_clips(user_clips: Clips) -> Problem:
 
 
 def _problem_of_prior(source: str) -> Problem:
-    """Return the problem of sampling a user-trained prior, named by its folder."""
+    """Return the problem of sampling a user-trained prior, named after its folder."""
     from probmotion.cli.summaries import kind_of_network
     from probmotion.models.diffusion import motion_diffusion
     from probmotion.models.dvae import motion_dvae

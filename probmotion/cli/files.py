@@ -31,16 +31,16 @@ class Show:
     """
 
     file: Positional[Path]
-    """File, folder of a training run, or name of a network in the package."""
+    """File, folder of a training run, or name of a shipped network."""
 
     fps: float | None = None
-    """Frames per second of keypoints in JSON or a table."""
+    """Frame rate of keypoints in JSON or a table, frames per second."""
 
     skeleton: str | None = None
     """Layout of JSON keypoints or joints to read from a table (see probmotion list)."""
 
     figure: Path | None = None
-    """Also write a figure of the motion, or of the first draws, to this .png."""
+    """Also write a figure of the motion, or of the first draws, to this .png file."""
 
     def run(self) -> None:
         from probmotion.cli.summaries import summarise

@@ -1,7 +1,7 @@
 """Entry point of the command line: ``probmotion COMMAND [OPTIONS]``.
 
 Each command is a dataclass whose fields are its options. Commands import libraries when they run,
-so that help and errors appear at once.
+so that help and errors appear immediately.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ commands:
   show       summarise a file of motion, keypoints, draws or a network
   convert    convert a motion to another format, frame rate or skeleton
   train      train a prior, or a network for evaluating priors
-  reference  make certified reference draws of a problem
+  reference  generate certified reference draws of a problem
 
 probmotion COMMAND --help lists the options of a command."""
 
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as error:
             return _fail(str(error) or "interrupted; nothing was written", 130)
         except BrokenPipeError:
-            # The reader has closed the pipe: `probmotion list | head`.
+            # The reader has closed the pipe, as in `probmotion list | head`.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except OSError as error:

@@ -15,14 +15,14 @@ __all__ = ["Reference"]
 
 @dataclass(frozen=True)
 class Reference:
-    """Make reference draws of a problem, exactly or by two long runs that must agree.
+    """Generate reference draws of a problem, exactly or by two long runs that must agree.
 
     Writes NAME/draws.npz and NAME/certificate.json, or nothing if the runs have not converged or
-    disagree. Repeating an interrupted command continues after the last finished run.
+    disagree. Run the same command again to resume after an interruption.
     """
 
     problem: Positional[str]
-    """Name of a problem (see probmotion list), with parameters as "gait-noisy3d(noise=0.05)"."""
+    """Name of a problem (see probmotion list), such as gait or "gait-noisy3d(noise=0.05)"."""
 
     draws: int = 4000
     """Total number of draws, a multiple of 8."""
@@ -51,7 +51,7 @@ class Reference:
                 )
             reference.save(folder)
         except ReferenceRefused:
-            # Repeating the runs would give the same result.
+            # Repeating the runs would yield the same result.
             shutil.rmtree(unfinished)
             raise
         except KeyboardInterrupt as stop:
@@ -69,7 +69,7 @@ class Reference:
         certificate = reference.certificate
         print(f"{name}: wrote {reference.n} draws by {certificate['sampler']} to {folder}")
         if certificate["rhat"] is not None:
-            print(f"  R-hat {certificate['rhat']:.4f}, least ESS {certificate['ess_bulk']:.0f}")
+            print(f"  R-hat {certificate['rhat']:.4f}, minimum ESS {certificate['ess_bulk']:.0f}")
         print(f"  agreement of two runs: {_described(certificate['agreement'])}")
         if (centred := certificate["agreement_wherever_they_stand"]) is not None:
             print(f"  agreement up to translation: {_described(centred)}")

@@ -1,7 +1,7 @@
 """Command-line options for the settings of samplers, generated from their dataclasses.
 
-Numbers and words are separate options. Objects (a guidance, a proposal) are written as in
-Python: ``DPS`` or ``DPS(strength=0.5)``.
+Numbers and strings are separate options. Objects such as a guidance or a proposal are written as
+in Python: ``DPS`` or ``DPS(strength=0.5)``.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ def _option_name(sampler: str) -> str:
 
 
 def settings_of_samplers(quick: bool = False) -> type[Any]:
-    """Return a dataclass with a field per registered sampler, for quick runs if ``quick``."""
-    begin = {}
+    """Return a dataclass with a field per registered sampler; ``quick`` sets quick-run defaults."""
+    reduced = {}
     if quick:
         from probmotion.comparison.quick import quick_samplers
 
-        begin = quick_samplers()
+        reduced = quick_samplers()
     entries: dict[str, tuple[type, Any]] = {}
     for name, kind in importable_samplers().items():
-        default = partial(_same, begin[name]) if quick else kind
-        # If two names give the same identifier, the first has options.
+        default = partial(_same, reduced[name]) if quick else kind
+        # If two names yield the same identifier, only the first sampler has options.
         entries.setdefault(_option_name(name), (kind, field(default_factory=default)))
     settings = make_dataclass(
         "Settings", [(name, *entry) for name, entry in entries.items()], frozen=True
@@ -111,23 +111,23 @@ def sampler_called(name: str, settings: Any) -> Any:
     Raises
     ------
     ValueError
-        If there is no such sampler or preset, or it has no defaults.
+        If the sampler or preset is unknown, or the sampler has settings without defaults.
     """
     # Third-party samplers may have a dot in their names.
     base, _, preset = (name, "", "") if name in sampler_names() else name.partition(".")
     kind = load_sampler(base)
     if not preset:
-        given = getattr(settings, _option_name(base), None)
-        return given if type(given) is kind else default_sampler(base)
+        sampler = getattr(settings, _option_name(base), None)
+        return sampler if type(sampler) is kind else default_sampler(base)
     known = presets_of(kind)
     if preset not in known:
-        names = ", ".join(f"{base}.{one}" for one in known) or f"{base}, which has no presets"
+        names = ", ".join(f"{base}.{item}" for item in known) or f"{base}, which has no presets"
         raise ValueError(f"sampler must be {names}, got {name!r}")
     return getattr(kind, preset)()
 
 
 def objects_as_words() -> ConstructorRegistry:
-    """Return tyro's rules for settings that are one of several dataclasses."""
+    """Return the tyro registry with a rule for settings that are objects of several dataclasses."""
     from tyro.constructors import ConstructorRegistry
 
     registry = ConstructorRegistry()
@@ -165,8 +165,8 @@ def _kinds(annotation: Any) -> list[type]:
 def object_from_text(text: str, kinds: Iterable[type]) -> Any:
     """Return the object written as ``"DPS"`` or ``"DPS(strength=0.5)"``.
 
-    Only names of ``kinds`` and literals are accepted; nothing is evaluated. Anything else is a
-    ``ValueError``.
+    Only names of ``kinds`` and literals are accepted; nothing is evaluated. Raises ``ValueError``
+    for other text.
     """
     known = {kind.__name__: kind for kind in kinds}
     try:
@@ -203,7 +203,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
 
 
 def text_of_object(value: Any) -> str:
-    """Return the text that :func:`object_from_text` reads as ``value``, without defaults."""
+    """Return ``value`` as text for :func:`object_from_text`, without default settings."""
     changed = [
         f"{entry.name}={_text(getattr(value, entry.name))}"
         for entry in fields(value)

@@ -23,7 +23,7 @@ _LOSSES = ("loss", "validation_loss")
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """A file's summary in words, and n motions (n, L, J, 3) in metres to draw; n may be 0."""
+    """Text summary of a file, and n motions (n, L, J, 3), metres, for figures; n may be 0."""
 
     text: str
     skeleton: Skeleton
@@ -35,7 +35,7 @@ class Summary:
         from probmotion.plots.skeletons import draw_skeletons
 
         if not len(self.motions):
-            raise ValueError("figure requires a file with 3D motion")
+            raise ValueError("figure requires a file with 3D motion, got none")
         sided = bool(self.skeleton.mirrored_pairs)
         draw_skeletons(
             {self.label: self.motions},
@@ -54,9 +54,9 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
     Raises
     ------
     MotionFileError
-        If the file is none of these, or is damaged.
+        If the type of the file is not supported, or the file is damaged.
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     """
     if path.suffix == ".nc":
         return _of_draws(path, MotionDraws.load(path))
@@ -144,7 +144,7 @@ def _of_checkpoint(path: Path) -> Summary:
     header = _header(path)
     try:
         kind, card = header["kind"], header["settings"]
-        # A denoiser has the joints and the size of its prior.
+        # A denoiser stores joints and size in the settings of its prior.
         network = card["network"].get("prior", card["network"])
         skeleton = Skeleton(network["joint_names"], network["parents"])
         shape = ", ".join(f"{name} {value}" for name, value in network["size"].items())
@@ -180,7 +180,7 @@ def _no_checkpoint(path: Path) -> ValueError:
 
 
 def _training_data(kind: str, network: dict[str, Any]) -> list[str]:
-    """Return lines about the training data of a network."""
+    """Return lines that describe the training data of a network."""
     if kind == "motion-dvae":
         data = network["data"]
         frames = f"  trained on {data['frames']} frames of {_clips(data['clips'])}"
@@ -207,7 +207,7 @@ def _clips(names: list[str]) -> str:
 
 
 def _progress(card: dict[str, Any]) -> str:
-    """Return the length of the training and the last losses."""
+    """Return a line with training steps, batch size, time and last losses."""
     last, training = card["history"][-1] if card["history"] else {}, card["training"]
     losses = "".join(f", {key.replace('_', ' ')} {last[key]:.4f}" for key in _LOSSES if key in last)
     return (

@@ -21,23 +21,23 @@ class TrackData:
     """3D motion files (.npz, .bvh) or quoted patterns, projected to 2D with detection errors."""
 
     tracks: tuple[str, ...] = ()
-    """Files of 2D keypoints (.json, .npz, .csv), OpenPose folders, or quoted patterns.
+    """2D keypoint files (.json, .npz, .csv), OpenPose folders, or quoted patterns.
     Set --skeleton for bodies other than people."""
 
     tracks_fps: float | None = None
-    """Frames per second of keypoint files that do not contain it."""
+    """Frame rate of keypoint files without one, frames per second."""
 
     layout: str | None = None
-    """Layout of keypoints in JSON (see probmotion list) if their number is ambiguous."""
+    """Keypoint layout of JSON files (see probmotion list), if the keypoint count is ambiguous."""
 
     people: int | None = None
-    """Number of people to track in JSON without identities."""
+    """Number of people to track in JSON files without identities."""
 
     skeleton: str = "person14"
-    """Joints to learn (see probmotion list), or own for those of the track files."""
+    """Skeleton (see probmotion list); own uses the joints of the track files."""
 
     fps: float = 20.0
-    """Frame rate to train at, frames per second."""
+    """Training frame rate, frames per second."""
 
     validation: tuple[str, ...] = ()
     """Names of validation clips (files without extension); a random tenth by default."""
@@ -49,7 +49,7 @@ class TrackData:
     """Number of cameras around each 3D clip; 64 by default."""
 
     centre: Literal["frame", "sequence"] = "frame"
-    """Whether the root is at the origin in every frame or on average."""
+    """Centre the root in every frame, or its mean over the sequence."""
 
     data_seed: int = 0
     """Seed of cameras, detection errors and the random split."""
@@ -58,7 +58,7 @@ class TrackData:
 def learning_tracks(
     data: TrackData, threshold: float = 0.3, shortest: float = 1.0
 ) -> LearningTracks:
-    """Return the selected tracks, prepared and split, and print what was dropped.
+    """Prepare and split the selected tracks, and print a summary.
 
     ``threshold`` is the minimum confidence of a detection, ``shortest`` the minimum duration of a
     track in seconds.
@@ -77,10 +77,10 @@ def learning_tracks(
             raise ValueError(f"{name} requires --tracks FILE…")
     if data.tracks and data.views is not None:
         raise ValueError("views applies to 3D clips only, got tracks")
-    joints_of_files = data.skeleton == "own"
-    if joints_of_files and not data.tracks:
+    own_skeleton = data.skeleton == "own"
+    if own_skeleton and not data.tracks:
         raise ValueError("skeleton 'own' requires --tracks FILE…")
-    skeleton = None if joints_of_files else Skeleton.preset(data.skeleton)
+    skeleton = None if own_skeleton else Skeleton.preset(data.skeleton)
     if skeleton is None or data.tracks:
         prepared = read_tracks(
             data.tracks,
@@ -94,7 +94,7 @@ def learning_tracks(
             shortest=shortest,
         )
     else:
-        # Clips are named by their files, whatever name a file contains.
+        # Clips are named after their files, not by the names stored inside.
         clips = [replace(load(path), name=path.stem) for path in files_named(data.clips)]
         prepared = film_clips(
             clips or synthetic_walks(skeleton=skeleton),

@@ -1,4 +1,4 @@
-"""The command ``probmotion train``: its kinds, and those that learn from 2D tracks."""
+"""The command ``probmotion train``, and training on 2D tracks."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["TRAINABLE"]
 
 @dataclass(frozen=True)
 class _TrackTraining:
-    """Options shared by the networks that learn from 2D tracks."""
+    """Options shared by the networks trained on 2D tracks."""
 
     out: Path
     """Output folder."""
 
     threshold: float = 0.3
-    """Minimum confidence of a joint: 0.3 for people, 0.5 for horses, 0.01 with a ball."""
+    """Minimum joint confidence; use 0.3 for people, 0.5 for horses, 0.01 with a ball."""
 
     data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
@@ -47,15 +47,15 @@ class _TrackTraining:
 class TrainDiffusion(_TrackTraining):
     """Train a 2D motion diffusion model, a prior for the samplers mas, mvpc and sds.
 
-    Writes model.safetensors and losses.csv. Repeating the command continues an interrupted run;
-    more --steps extend a finished one.
+    Writes model.safetensors and losses.csv. Run the same command again to resume an interrupted
+    run; increase --steps to extend a finished one.
     """
 
     size: Literal["tiny", "small", "paper", "reference-code"] = "small"
-    """Network size; tiny trains in seconds, small in minutes on two cores, others on a GPU."""
+    """Network size; tiny trains in seconds, small in minutes on two cores; others need a GPU."""
 
     frames: int | None = None
-    """Maximum number of frames of a motion; set by the size by default."""
+    """Maximum number of frames of a motion; the default depends on the size."""
 
     def run(self) -> None:
         from probmotion.models.diffusion.settings import DiffusionSettings
@@ -79,16 +79,16 @@ class TrainDiffusion(_TrackTraining):
 
 @dataclass(frozen=True)
 class TrainEvaluator(_TrackTraining):
-    """Train the feature network of 2D motions behind FID, precision and recall.
+    """Train the feature network of 2D motions for FID, precision and recall.
 
-    Writes model.safetensors and losses.csv. Repeating the command continues an interrupted run.
+    Writes model.safetensors and losses.csv. Run the command again to resume an interrupted run.
     """
 
     size: Literal["tiny", "small", "reference-code"] = "small"
-    """Network size; tiny trains in seconds, small in minutes on two cores, others on a GPU."""
+    """Network size; tiny trains in seconds, small in minutes on two cores; others need a GPU."""
 
     frames: int | None = None
-    """Maximum number of frames of a motion; set by the size by default."""
+    """Maximum number of frames of a motion; the default depends on the size."""
 
     def run(self) -> None:
         from probmotion.models.evaluation.evaluator_training import EvaluatorTrainee
@@ -109,10 +109,10 @@ class TrainEvaluator(_TrackTraining):
 
 @dataclass(frozen=True)
 class TrainLifter(_TrackTraining):
-    """Train an unsupervised lifter of 2D poses, a baseline, after the pose flow it learns from.
+    """Train a baseline: a pose flow, then an unsupervised lifter of 2D poses that uses it.
 
-    Writes the folders flow and lifter, each with model.safetensors and losses.csv. Repeating the
-    command continues an interrupted run; more --steps extend the lifter alone.
+    Writes the folders flow and lifter, each with model.safetensors and losses.csv. Run the same
+    command again to resume an interrupted run; increase --steps to extend the lifter only.
     """
 
     size: Literal["tiny", "small"] = "small"

@@ -64,8 +64,8 @@ class Noise:
 class TrainDVAE:
     """Train a Motion-DVAE, an autoregressive prior over 3D motion, from clean clips.
 
-    Writes model.safetensors and losses.csv. Repeating the command continues an interrupted run;
-    more --steps extend a finished one.
+    Writes model.safetensors and losses.csv. Run the same command again to resume an interrupted
+    run; increase --steps to extend a finished one.
     """
 
     out: Path
@@ -75,10 +75,10 @@ class TrainDVAE:
     """Network size; tiny trains in seconds, small in minutes on two cores, paper needs a GPU."""
 
     skeleton: str = "person14"
-    """Joints to learn (see probmotion list)."""
+    """Skeleton (see probmotion list)."""
 
     fps: float = 30.0
-    """Frame rate to train at, frames per second; other clips are resampled."""
+    """Training frame rate, frames per second; other clips are resampled."""
 
     data: OmitArgPrefixes[BodyClips] = field(default_factory=BodyClips)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
@@ -110,20 +110,20 @@ class TrainDVAE:
 class TrainDenoiser:
     """Train a denoiser of 3D joints with a Motion-DVAE prior, from noisy joints alone.
 
-    Clips are only used to make noisy joints, on the prior's skeleton and frame rate. Writes
-    model.safetensors and losses.csv. Repeating the command continues an interrupted run; more
-    --steps extend a finished one.
+    Clips are only used to generate noisy joints, on the prior's skeleton and frame rate. Writes
+    model.safetensors and losses.csv. Run the same command again to resume an interrupted run;
+    increase --steps to extend a finished one.
     """
 
     out: Path
     """Output folder."""
 
     prior: str
-    """Motion-DVAE: folder or file of a run of probmotion train dvae, or a shipped network.
-    Its weights are not changed."""
+    """Motion-DVAE prior: folder or file written by probmotion train dvae, or a shipped network.
+    Its weights are frozen."""
 
     size: Size = "small"
-    """Training length for the prior's size; tiny takes seconds, small minutes, paper a GPU."""
+    """Prior size, for default settings; tiny takes seconds, small minutes; paper needs a GPU."""
 
     noise: OmitArgPrefixes[Noise] = field(default_factory=Noise)
     data: OmitArgPrefixes[BodyClips] = field(default_factory=BodyClips)
@@ -162,7 +162,7 @@ class TrainDenoiser:
 def _learning_clips(
     data: BodyClips, skeleton: Skeleton, fps: float, frames: int
 ) -> dict[str, list[Motion]]:
-    """Return the selected clips of each part with at least ``frames`` frames, and print them."""
+    """Return the selected clips of at least ``frames`` frames by part, and print their names."""
     from probmotion.data.denoising_clips import synthetic_denoising_clips
     from probmotion.data.tracks.learning import split_names, unique_files
     from probmotion.io.files import load
@@ -185,8 +185,8 @@ def _learning_clips(
             if getattr(data, name):
                 raise ValueError(f"{name} requires --clips FILE…")
         synthetic = synthetic_denoising_clips(seed=data.data_seed)
-        every = [clip for clips in synthetic.values() for clip in clips]
-        long = {clip.name: clip for clip in _long_clips(every, skeleton, fps, frames)}
+        generated = [clip for clips in synthetic.values() for clip in clips]
+        long = {clip.name: clip for clip in _long_clips(generated, skeleton, fps, frames)}
         parts = {part: [long[clip.name] for clip in clips] for part, clips in synthetic.items()}
     for part, clips in parts.items():
         count = sum(clip.frames for clip in clips)
@@ -196,7 +196,7 @@ def _learning_clips(
 
 
 def _long_clips(clips: list[Motion], skeleton: Skeleton, fps: float, frames: int) -> list[Motion]:
-    """Return retargeted and resampled clips, without those shorter than a window."""
+    """Retarget and resample clips, and drop clips shorter than ``frames``."""
     from probmotion.models.bodies.body_states import check_bones
 
     rates = Counter(clip.fps for clip in clips if clip.fps != fps)

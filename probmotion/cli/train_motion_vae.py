@@ -20,16 +20,16 @@ __all__ = ["TrainMotionVAE"]
 
 @dataclass(frozen=True)
 class TrainMotionVAE:
-    """Train a motion VAE, a prior over short 3D motions, from 2D tracks: first poses, then the VAE.
+    """Train a pose network, then a motion VAE (prior over short 3D motions), on 2D tracks.
 
-    Repeating the command continues an interrupted run; more --steps extend the VAE alone.
+    Run the same command again to resume an interrupted run; increase --steps to extend the VAE.
     """
 
     out: Path
-    """Output folder for the folders poses and vae, each with model.safetensors and losses.csv."""
+    """Output folder; its subfolders poses and vae contain model.safetensors and losses.csv."""
 
     size: Literal["tiny", "small", "paper"] = "small"
-    """Network size; tiny trains in seconds, small in 20 minutes on a core, paper needs a GPU."""
+    """Network size; tiny trains in seconds, small in 20 minutes on one core, paper needs a GPU."""
 
     frames: int | None = None
     """Number of frames of a motion; 10 by default."""
@@ -38,18 +38,18 @@ class TrainMotionVAE:
     """Weight of the KL divergence from N(0, I); 0.001 by default, as published (walk-vae: 0.01)."""
 
     threshold: float = 0.3
-    """Minimum confidence of a joint: 0.3 for people, 0.5 for horses."""
+    """Minimum joint confidence; use 0.3 for people, 0.5 for horses."""
 
     rest: Path | None = None
     """Motion file whose first frame is the rest pose, facing +Z with hanging limbs.
-    By default the mean pose, estimated from the tracks. Joint rotations are limited around it."""
+    Default: mean pose estimated from the tracks. Joint limits are relative to the rest pose."""
 
     front: str | None = None
-    """Name of a joint in front of the root, for bodies whose joints do not define the front."""
+    """Name of a joint in front of the root, for skeletons without a known front."""
 
     distance: float | None = None
-    """Distance of the cameras, metres.
-    By default 7 for projected clips, infinite (orthographic) for tracks."""
+    """Camera distance, metres.
+    Default: 7 for projected clips, infinite (orthographic) for tracks."""
 
     data: OmitArgPrefixes[TrackData] = field(default_factory=lambda: TrackData(fps=10.0))
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
@@ -76,7 +76,7 @@ class TrainMotionVAE:
         if self.data.centre != "frame":
             raise ValueError(f"centre must be 'frame', got {self.data.centre!r}")
         check_positive("fps", self.data.fps)
-        # Motions may be shorter than the usual shortest track.
+        # Short motions also fit into tracks of less than 1 s.
         shortest = min(1.0, size.frames / self.data.fps)
         tracks = learning_tracks(self.data, self.threshold, shortest)
         default = None if self.data.tracks else Filming().distance
@@ -87,10 +87,10 @@ class TrainMotionVAE:
         }
         body = self._body(tracks)
         device = self.training.device
-        first = PoseTrainee(tracks.train, tracks.validation, size, body, **shared)
+        pose_trainee = PoseTrainee(tracks.train, tracks.validation, size, body, **shared)
         if not (self.out / "vae" / STATE).exists():
-            run_training(first, poses, self.out / "poses", device)
-        teacher = first.learnt(self.out / "poses")
+            run_training(pose_trainee, poses, self.out / "poses", device)
+        teacher = pose_trainee.learnt(self.out / "poses")
         trainee = MotionVAETrainee(tracks.train, tracks.validation, size, body, teacher, **shared)
         run_training(trainee, vae, self.out / "vae", device)
 

@@ -38,17 +38,17 @@ class Steps:
     """Device; cuda uses mixed precision."""
 
     def settings(self, usual: TrainingSettings) -> TrainingSettings:
-        """Return the usual settings of a size, overridden by the given options."""
+        """Return the default settings of a size, overridden by the given options."""
         from probmotion.models.training.trainer import check_device
 
-        check_device(self.device)  # before data are prepared, which takes minutes
+        check_device(self.device)  # early, since data preparation takes minutes
         given = {k: v for k, v in asdict(self).items() if v is not None and k != "device"}
         return replace(usual, **given)
 
 
 def check_out(out: Path) -> None:
-    """Raise ``ValueError`` if the output folder is a file or below one."""
-    existing = next((place for place in (out, *out.parents) if place.exists()), out)
+    """Raise ``ValueError`` if the output folder or one of its parents is a file."""
+    existing = next((path for path in (out, *out.parents) if path.exists()), out)
     if existing.is_file():
         raise ValueError(f"out must be a folder, got {out}; {existing} is a file")
 
@@ -56,36 +56,36 @@ def check_out(out: Path) -> None:
 def check_enough_clips(names: Iterable[str]) -> None:
     """Raise ``ValueError`` if there are too few clips for a random split."""
     clips = sorted(set(names))
-    if len(clips) < 6:  # half a clip rounds to none
+    if len(clips) < 6:  # a tenth of 5 clips rounds to 0
         raise ValueError(
             f"clips must be at least 6 for a random split, got {len(clips)} ({', '.join(clips)}); "
-            "name held-out clips by --validation and --test"
+            "name held-out clips with --validation and --test"
         )
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first names, separated by commas."""
+    """Return the first 6 names as text, with "…" if there are more."""
     return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
 
 
 def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
-    """Train or continue training, and print the progress."""
+    """Train or resume training, and print the result."""
     from probmotion.models.training.checkpoints import MODEL, load_checkpoint
     from probmotion.models.training.runs import steps_taken
     from probmotion.models.training.trainer import train
 
     before = steps_taken(out, trainee.kind)
     if not before and (out / MODEL).exists():
-        load_checkpoint(out / MODEL, trainee.kind)  # never overwrite another kind of network
+        load_checkpoint(out / MODEL, trainee.kind)  # raises for another kind of network
     result = train(trainee, settings, out, device=device)
     last, saved = result.history[-1], result.saved
     ended = ""
     if last["step"] < settings.steps:
-        ended = f"; stopped early at step {last['step']:.0f}, as the validation loss no longer fell"
+        ended = f"; stopped early at step {last['step']:.0f}: the validation loss stopped falling"
     if not result.steps:
         print(f"{result.model} is finished: {before} of {settings.steps} steps{ended}")
         return
     print(
-        f"wrote {result.model}: step {saved['step']:.0f}, loss {saved['loss']:.4f}, "
-        f"validation loss {saved['validation_loss']:.4f}, {last['seconds']:.0f} s of steps{ended}"
+        f"wrote {result.model}: step {saved['step']:.0f}, loss {saved['loss']:.4f}, validation "
+        f"loss {saved['validation_loss']:.4f}, trained for {last['seconds']:.0f} s{ended}"
     )

@@ -11,14 +11,14 @@ __all__ = ["Which"]
 
 @dataclass(frozen=True)
 class Which:
-    """Recommend a sampler for a problem, with its errors and those of the alternatives.
+    """Recommend a sampler for a problem and list its error and those of the alternatives.
 
-    The measurements ship with the package and were taken once with a small budget. Use probmotion
-    compare for other problems and budgets.
+    The shipped measurements come from one comparison with a small budget. Use probmotion compare
+    for other problems and budgets.
     """
 
     problems: Positional[tuple[str, ...]] = ()
-    """Names of problems (see probmotion list); all measured ones by default."""
+    """Names of problems (see probmotion list); all measured problems by default."""
 
     def run(self) -> None:
         from probmotion.comparison import advise, measured

@@ -1,4 +1,4 @@
-"""Recommended sampler for a problem, with its error and warnings about the others."""
+"""Recommendation of a sampler for a problem, based on stored measurements."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Advice:
-    """Recommended sampler for a problem, and the others in groups, the best first.
+    """Recommended sampler for a problem, and the other samplers by group, best first.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ class Advice:
     metric : str
         Headline metric with its description.
     recommended : Standing
-        A sampler without warnings that is the best or tied with it, the cheaper one if it takes
-        less than half the time; the best if all have warnings.
+        Best of the tied samplers without warnings (of all tied samplers if all have warnings), or
+        the fastest of them if it takes less than half the time.
     tied : tuple of Standing
-        Others that are tied with the best and have no warnings.
+        Other samplers tied with the best, without warnings.
     tied_with_warnings : tuple of Standing
-        Others that are tied with the best but have warnings.
+        Other samplers tied with the best, with warnings.
     worse : tuple of Standing
         Samplers that are significantly worse.
     without_draws : dict of str
@@ -102,7 +102,7 @@ class Advice:
     without_draws: dict[str, str]
 
     def __str__(self) -> str:
-        verdict = "none is right at this cost; best" if self.recommended.warnings else "recommended"
+        verdict = "no reliable sampler; best" if self.recommended.warnings else "recommended"
         lines = [
             f"{self.problem}: {self.description}",
             f"measured with: {self.how}",
@@ -142,7 +142,7 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
     rows = measurements.rows[measurements.rows["problem"] == problem]
     metric = headline_metric(rows)
     if metric is None:
-        raise ValueError(f"problem must have a headline metric, got {problem!r} without")
+        raise ValueError(f"problem must have a headline metric, got none for {problem!r}")
     values = {
         name: row
         for (name, _), row in seed_values(rows[rows["metric"] == metric]).items()
@@ -173,14 +173,14 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
 
 
 def _recommended(on_par: Sequence[Standing]) -> Standing:
-    """Return the recommended one of tied samplers, which are sorted by their error."""
-    sound = [each for each in on_par if not each.warnings] or list(on_par)
-    cheapest = min(sound, key=lambda each: each.seconds)
-    return cheapest if cheapest.seconds < _CHEAPER * sound[0].seconds else sound[0]
+    """Return the recommended sampler among tied samplers sorted by error."""
+    reliable = [each for each in on_par if not each.warnings] or list(on_par)
+    cheapest = min(reliable, key=lambda each: each.seconds)
+    return cheapest if cheapest.seconds < _CHEAPER * reliable[0].seconds else reliable[0]
 
 
 def _error(metric: str, value: float) -> float:
-    """Return the distance of a value from the ideal one, in the order of :func:`best_of`."""
+    """Return the error of a value: its distance from the ideal value of the metric."""
     if metric != "swd_ratio":
         return value
     return abs(math.log(value)) if value > 0 else math.inf
@@ -208,7 +208,7 @@ def _standing(rows: pd.DataFrame, sampler: str, metric: str, measurements: Measu
 
 
 def _rhat_warning(rhat: pd.Series, at_most: float) -> list[str]:
-    """Return a warning if R-hat exceeds its limit at more seeds than by chance."""
+    """Return a warning if R-hat exceeds its limit at significantly many seeds."""
     above, n = int((rhat > at_most).sum()), len(rhat)
     if above and binom.sf(above - 1, n, _LEVEL) <= _LEVEL:
         where = "" if above == n else f" at {above} of {n} seeds"

@@ -32,8 +32,8 @@ def draw_comparison(
 ) -> list[Path]:
     """Write ``quality_against_cost.png`` and ``skeletons_<problem>.png``; return their paths.
 
-    The plot is omitted if no headline metric was measured. Skeletons with observations are viewed
-    at a right angle to the first camera, with the truth in grey.
+    The quality plot is omitted without a measured headline metric. Skeletons with observations are
+    viewed at a right angle to the first camera, with the truth in grey.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _draw_problem(comparison: GridResults, problem: Problem, path: Path) -> None
         path,
         azimuth=0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2,
         truth=problem.truth,
-        title=problem.name + ("" if cameras is None else ", seen from the camera's side"),
+        title=problem.name + ("" if cameras is None else ", viewed at 90° to the camera"),
     )
 
 

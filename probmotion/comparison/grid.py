@@ -71,8 +71,8 @@ def compare(
     """Run every sampler on every problem and measure its draws.
 
     The random numbers of a run depend only on its problem, sampler and seed, so the results do not
-    depend on ``workers`` or ``executor``. Each run is stored as soon as it is finished; repeating
-    the call after an interruption runs only the missing ones.
+    depend on ``workers`` or ``executor``. Each run is stored as soon as it is finished; repeat
+    the call to resume an interrupted grid.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def compare(
         Names of registered samplers with default settings, or objects; a mapping assigns other
         names. All registered samplers by default.
     draws : int
-        Number of draws per run, over all chains.
+        Number of draws per run, summed over chains.
     chains : int
         Number of chains per run.
     seeds : int
@@ -90,15 +90,15 @@ def compare(
     out : str or Path, optional
         Folder for the runs, ``table.csv`` and ``failures.json``; temporary by default.
     workers : int
-        Number of worker processes. With 0 everything runs in this process, which suits a debugger
-        but does not survive a crash of a sampler.
+        Number of worker processes. With 0 all runs use this process, which simplifies debugging,
+        but a crash of a sampler ends the grid.
     executor : concurrent.futures.Executor, optional
-        Executor to use instead of worker processes; its workers must see the folder ``out``.
+        Executor to use instead of worker processes; its workers must have access to ``out``.
     budget : Budget, optional
-        Cost that every sampler may spend on a run. Pilot runs, which cost about as much as a run,
-        choose the settings once per problem and sampler. Given settings by default.
+        Cost of a run, equal for all samplers. Pilot runs, which cost about as much as a run, choose
+        the settings once per problem and sampler. By default settings are not changed.
     time_limit : float, optional
-        Time limit of a run in seconds, without loading its problem; a longer run is recorded as
+        Time limit of a run in seconds, excluding problem loading; a longer run is recorded as
         failed. Threads of an executor are not interrupted.
     progress : bool
         Show progress bars.
@@ -108,7 +108,7 @@ def compare(
     ValueError
         If a problem or sampler is unknown, names are not unique, a number is out of range,
         ``out`` contains runs made with other settings or by another version, or another process is
-        running one of the problems there.
+        running one of the problems in ``out``.
     OSError
         If ``out`` cannot be written to; finished runs remain stored.
     KeyboardInterrupt
@@ -131,7 +131,7 @@ def compare(
         refuse_other_settings(folder, [*grid.pilots(), *grid.runs()])
         for name, source in chosen.items():
             problem = load_problem(source) if isinstance(source, str) else source
-            # The reference draws that metrics of the first seed use.
+            # Metrics of seed 0 use the same reference draws.
             seed = addressed.integer(0, "exact", name)
             try:
                 store_problem(problem, folder / "problems" / name, seed=seed)

@@ -1,7 +1,7 @@
 """Measurements of every sampler on every problem, shipped with the package.
 
-``measured.csv`` contains the rows of a table that advice needs, ``measured.json`` the
-settings, problem descriptions and reasons for missing values.
+``measured.csv`` contains the metrics that ``advise`` uses, ``measured.json`` the settings,
+problem descriptions and reasons for missing values.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ class Measured:
     rows : DataFrame
         Columns problem, sampler, seed, metric, value.
     command : str
-        Command that produced them.
+        Command that produced the measurements.
     draws, seeds : int
         Draws per run, and number of replicates.
     rhat_at_most : float
-        95 % quantile of R-hat for independent draws of this number.
+        95 % quantile of R-hat for ``draws`` independent draws.
     notes : list of str
         Notes on the budget.
     problems : dict of str
-        Descriptions by name.
+        Problem descriptions by name.
     samplers : list of str
-        Names.
+        Sampler names.
     words : dict of str
         One-word reason for missing draws, by ``problem/sampler``.
     """
@@ -73,9 +73,9 @@ class Measured:
 
 
 def save_measurements(comparison: Comparison, command: str, folder: str | Path = _FOLDER) -> None:
-    """Write the measurements of a comparison that a command produced.
+    """Write the measurements of a comparison and the command that produced it.
 
-    By default they replace the shipped ones, ``measured.csv`` and ``measured.json``.
+    By default the shipped files ``measured.csv`` and ``measured.json`` are replaced.
     """
     table = comparison.table()
     rows = table[table["metric"].isin(_STORED_METRICS)].copy()
@@ -99,7 +99,7 @@ def save_measurements(comparison: Comparison, command: str, folder: str | Path =
 
 @cache
 def measured(folder: str | Path = _FOLDER) -> Measured:
-    """Return the measurements in a folder, by default the shipped ones."""
+    """Return the measurements in a folder, by default the shipped measurements."""
     import pandas as pd
 
     settings = json.loads((Path(folder) / _SETTINGS).read_text(encoding="utf-8"))

@@ -14,10 +14,10 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "sds": {"iterations": 2000},
     "dvae": {"training_steps": 600, "training_pairs": 8000},
 }
-"""Settings by sampler that differ from the defaults."""
+"""Reduced settings by sampler; other settings have their defaults."""
 
 QUICK_DRAWS = 40
-"""Draws per run."""
+"""Number of draws per run."""
 
 QUICK_BUDGET = Budget(seconds=6.0)
 """Budget of a run."""
@@ -27,7 +27,7 @@ QUICK_LIMIT = 60.0
 
 
 def quick_samplers(names: Iterable[str] | None = None) -> dict[str, Sampler]:
-    """Return samplers with quick settings by name; all registered ones by default.
+    """Return samplers with quick settings by name; all registered samplers by default.
 
     Raises
     ------

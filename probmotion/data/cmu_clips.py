@@ -21,7 +21,7 @@ _SOURCE_FPS = 120.0
 _FRAMES = 900
 _NAME = re.compile(r"cmu_(?P<subject>\d{2,3})_(?P<trial>\d{2})", re.ASCII)
 _DATASET = "cmu-01-02-03"
-_SUBJECTS = ("01", "02", "03")  # of the data set
+_SUBJECTS = ("01", "02", "03")  # subjects of _DATASET
 _PLACE = "as folder= or in the environment variable PROBMOTION_DATA"
 
 
@@ -30,15 +30,15 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
 
     Searches the folders of :func:`~probmotion.data.downloads.data_places` for an archive
     (``cmu_02_02.npz``, or below ``cmu_single``) or the original files (``02.asf`` and
-    ``02_02.amc``, or below ``cmu-01-02-03``), of which every fourth frame is used. Both give
-    identical numbers: single precision, at most 30 seconds. Nothing is downloaded.
+    ``02_02.amc``, or below ``cmu-01-02-03``), reduced to every fourth frame. Both sources yield
+    identical single-precision positions of at most 30 seconds. Nothing is downloaded.
 
     Parameters
     ----------
     name : str
-        Subject and trial: ``"cmu_02_02"``.
+        Subject and trial, such as ``"cmu_02_02"``.
     folder : str or Path, optional
-        Folder to search instead.
+        Folder to search instead of the default folders.
 
     Returns
     -------
@@ -50,9 +50,9 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     ValueError
         If ``name`` is malformed.
     FileNotFoundError
-        If the clip is not found; the message says how to obtain it.
+        If no file of the clip exists; the message explains how to obtain it.
     MotionFileError
-        If the file is damaged, or an archive has another frame rate.
+        If the file is damaged, or the frame rate of an archive is not 30.
     """
     match = _NAME.fullmatch(name) if isinstance(name, str) else None
     if match is None:
@@ -68,15 +68,15 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
             motion = originals / f"{subject}_{trial}.amc"
             if skeleton.is_file() and motion.is_file():
                 clip = read_amc(motion, skeleton, _SOURCE_FPS)
-                # Rounded as in the archives.
+                # Single precision, as in the archives.
                 positions = clip.positions[:: round(_SOURCE_FPS / _FPS)].astype(np.float32)
                 return _first_seconds(replace(clip, positions=positions, fps=_FPS), name, motion)
     remedy = f"pass the folder with its archive {_PLACE}"
     if subject in _SUBJECTS:
         names = f'["{subject}.asf", "{subject}_{trial}.amc"]'
         remedy = (
-            f'probmotion.data.downloads.download("{_DATASET}", names={names}) fetches it, or pass '
-            f"the folder with the files {_PLACE}"
+            f'probmotion.data.downloads.download("{_DATASET}", names={names}) downloads it, or '
+            f"pass the folder with the files {_PLACE}"
         )
     raise FileNotFoundError(f"clip {name} is not in {', '.join(map(str, places))}; {remedy}")
 

@@ -1,4 +1,4 @@
-"""Clips of one person for training denoisers: recorded, split by clip, and synthetic."""
+"""Clips of one person for training denoisers, recorded or synthetic, split by clip."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
         "deepmimic_human/humanoid3d_long_walk3",
     ),
 }
-"""Clips by part: 45 of the 48 clips of one person.
+"""Clips by part of the split: 45 of the 48 clips of one person.
 
-The test clips are a climb, a walk, sword play, a dance and DeepMimic's walk, all of kinds present
-in training, and getting up from the back (``humanoid3d_getup_faceup``), which is unlike any
-training clip. Excluded are two excerpts, ``humanoid3d_walk`` and ``humanoid3d_zombie_walk``, and
+The test clips are a climb, a walk, sword play, a dance and DeepMimic's walk, which have
+similar training clips, and getting up from the back (``humanoid3d_getup_faceup``), which has none.
+Excluded are two excerpts, ``humanoid3d_walk`` and ``humanoid3d_zombie_walk``, and
 ``humanoid3d_jog``, which is shorter than a window.
 """
 
@@ -56,9 +56,9 @@ _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
     """Return the recorded clips of each part on ``person14`` at 30 frames per second.
 
-    ``folder`` must contain the clips of :data:`DENOISING_CLIPS` as ``.npz``, else a
+    ``folder`` contains the clips of :data:`DENOISING_CLIPS` as ``.npz``; a missing file raises
     ``FileNotFoundError``. A clip is split at frames marked as ``suspect`` in its file (marker
-    jumps) into segments named ``cmu_01_07-0``, …; other marks than one bool per frame raise
+    jumps) into segments named ``cmu_01_07-0``, …; ``suspect`` must be one bool per frame, else
     ``ValueError``.
     """
     return {
@@ -72,8 +72,8 @@ def synthetic_denoising_clips(
 ) -> dict[str, list[Motion]]:
     """Return synthetic people who walk, run and march, on ``person14`` at 30 frames per second.
 
-    There are ``n`` training clips of ``seconds`` s; validation and test have n / 5 each, at least
-    one per style.
+    The training part has ``n`` clips of ``seconds`` s; validation and test have n / 5 each, at
+    least one per style.
     """
     check_count("n", n)
     check_positive("seconds", seconds)

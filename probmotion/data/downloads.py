@@ -1,6 +1,6 @@
-"""Public motion data by name: downloaded on request, verified and cached.
+"""Download of public motion data by name, with verification and a cache.
 
-``registry.csv`` beside this module lists repository, commit, path, SHA-256 and size of each file.
+``registry.csv`` lists the repository, commit, path, SHA-256 and size of each file.
 The data are Carnegie Mellon University's (:data:`CMU_TERMS`); cite :data:`CMU_ACKNOWLEDGEMENT`.
 """
 
@@ -42,16 +42,16 @@ CMU_TERMS = (
 """CMU's terms as stated by the database. The data themselves may not be sold."""
 
 SALSA_TRIALS = ("01", "02", "03", "04", "05", "06", "07", "09", "10", "11")
-"""Trials of :func:`salsa_pairs`. The registry also has 12 to 15; 08 does not exist."""
+"""Trials of :func:`salsa_pairs`. The registry also lists 12 to 15; 08 does not exist."""
 
 _ADDRESS = "https://raw.githubusercontent.com"
 _FOLDER_VARIABLE = "PROBMOTION_DATA"
 _REGISTRY = Path(__file__).with_name("registry.csv")
-_TIMEOUT = 30.0  # seconds without data
+_TIMEOUT = 30.0  # seconds without a response
 
 
 class DownloadError(OSError):
-    """A file cannot be downloaded, or has another SHA-256; the message contains its address."""
+    """A file cannot be downloaded, or its SHA-256 is wrong; the message contains its URL."""
 
 
 class _Entry(NamedTuple):
@@ -78,7 +78,7 @@ def data_folder() -> Path:
 def data_places(folder: str | Path | None = None) -> list[Path]:
     """Return the folders to search for clips, in order.
 
-    These are ``folder`` alone if given; by default ``PROBMOTION_DATA`` (environment variable),
+    If ``folder`` is given, only this folder; by default ``PROBMOTION_DATA`` (environment variable),
     ``../shared/data`` beside the current directory, and the cache of :func:`download`.
     """
     if folder is not None:
@@ -97,8 +97,8 @@ def download(
 ) -> list[Path]:
     """Download files of a data set, verify their SHA-256 and return their paths.
 
-    Files that are present and intact are not downloaded again. Each file appears completely or not
-    at all. CMU's terms apply (:data:`CMU_TERMS`).
+    Existing intact files are not downloaded again. Incomplete downloads are discarded. CMU's
+    terms apply (:data:`CMU_TERMS`).
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def download(
     folder : str or Path, optional
         Parent of the data set's folder; :func:`data_folder` by default.
     base_url : str, optional
-        Address of a mirror, before ``/repository/commit/path``; GitHub's by default.
+        URL of a mirror, followed by ``/repository/commit/path``; GitHub's by default.
     progress : bool
         Whether to show a progress bar for each file.
 
@@ -118,18 +118,18 @@ def download(
     ValueError
         If the data set or a name is unknown.
     DownloadError
-        If a file cannot be downloaded or written, or has another SHA-256.
+        If a file cannot be downloaded or written, or its SHA-256 is wrong.
     """
     entries = _chosen(dataset, names)
-    place = (data_folder() if folder is None else Path(folder)) / dataset
+    target = (data_folder() if folder is None else Path(folder)) / dataset
     base = (_ADDRESS if base_url is None else base_url).rstrip("/")
-    return [_fetch(entry, place, base, progress) for entry in entries]
+    return [_fetch(entry, target, base, progress) for entry in entries]
 
 
 def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     """Return CMU's ten salsa clips of two people.
 
-    Searches ``folder``, or else the folders of :func:`data_places`, for all ten as archives
+    Searches ``folder``, by default the folders of :func:`data_places`, for all clips as archives
     (``cmu_60_61_TT.npz``, or below ``cmu_salsa_pairs``) or pairs of BVH files
     (``60_TT_scaled.bvh`` and ``61_TT_scaled.bvh``, or below ``cmu-salsa``). Nothing is downloaded.
 
@@ -141,7 +141,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     Raises
     ------
     FileNotFoundError
-        If they are not found; the message says how to obtain them.
+        If the clips are missing; the message explains how to obtain them.
     """
     places = data_places(folder)
     for place in places:
@@ -158,7 +158,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
                 return [read_salsa_bvh(lead, follow) for lead, follow in couples]
     raise FileNotFoundError(
         f"the ten salsa clips are not in {', '.join(map(str, places))}; "
-        'probmotion.data.downloads.download("cmu-salsa") fetches them, or pass their folder'
+        'probmotion.data.downloads.download("cmu-salsa") downloads them, or pass their folder'
     )
 
 
@@ -185,7 +185,7 @@ def _chosen(dataset: str, names: Sequence[str] | None) -> list[_Entry]:
     return [entries[name] for name in names]
 
 
-def _fetch(entry: _Entry, place: Path, base: str, progress: bool) -> Path:
+def _fetch(entry: _Entry, folder: Path, base: str, progress: bool) -> Path:
     """Return the path of a file, downloaded if missing."""
     import pooch
     import requests
@@ -196,26 +196,26 @@ def _fetch(entry: _Entry, place: Path, base: str, progress: bool) -> Path:
             url,
             known_hash=entry.sha256,
             fname=entry.name,
-            path=place,
+            path=folder,
             downloader=pooch.HTTPDownloader(progressbar=progress, timeout=_TIMEOUT),
         )
     except requests.RequestException as error:
         reason: int | str = type(error).__name__
-        if error.response is not None:  # pooch leaves it open
+        if error.response is not None:  # pooch does not close it
             reason = error.response.status_code
             error.response.close()
         raise DownloadError(
             f"{entry.name} cannot be downloaded from {url} ({reason}); check the network, pass "
-            f"base_url= of a mirror, or put the file into {place}"
+            f"base_url= of a mirror, or put the file into {folder}"
         ) from error
-    except ValueError as error:  # pooch raises it for a wrong hash only
+    except ValueError as error:  # raised by pooch only for a wrong hash
         raise DownloadError(
             f"{entry.name} at {url} does not have the SHA-256 {entry.sha256} of the registry; the "
             "file was discarded"
         ) from error
     except OSError as error:
         raise DownloadError(
-            f"{entry.name} from {url} cannot be written to {place} "
+            f"{entry.name} from {url} cannot be written to {folder} "
             f"({error.strerror or type(error).__name__}); choose a writable folder"
         ) from error
-    return place / entry.name
+    return folder / entry.name

@@ -34,9 +34,9 @@ def savitzky_golay(
 ) -> np.ndarray:
     """Smooth joint coordinates with local polynomials (Savitzky and Golay 1964).
 
-    Missing entries are first interpolated linearly over time (:func:`filled_between`) and weigh as
-    much as observed ones. Within half a window of an end the polynomial of the outermost window is
-    used (SciPy's ``mode="interp"``).
+    Missing entries are first interpolated linearly over time (:func:`filled_between`) and have
+    the same weight as observed entries. Within half a window of an end the polynomial of the
+    outermost window is used (SciPy's ``mode="interp"``).
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def savitzky_golay(
     ------
     ValueError
         If a joint is never observed, an observed entry is not finite, the window is longer than the
-        motion, or ``order`` is not less than the window's frames.
+        motion, or ``order`` is not less than the number of frames of the window.
     """
     check_positive("fps", fps)
     check_positive("window_seconds", window_seconds)
@@ -109,7 +109,7 @@ def kalman_smooth(
     fps : float
         Frames per second.
     acceleration : float or ndarray, (J,), optional
-        √q of all joints or of each, m/s^1.5; :func:`fit_acceleration` by default.
+        √q for all joints or for each joint, m/s^1.5; :func:`fit_acceleration` by default.
 
     Returns
     -------
@@ -161,18 +161,18 @@ def fit_acceleration(
     """Return the maximum-likelihood acceleration of each joint, (J,), m/s^1.5.
 
     Maximises :func:`log_marginal_likelihood` between 0.001 and 1000 m/s^1.5 by Brent's method on
-    the logarithm. A joint at rest gets the lower end.
+    the logarithm. The result for a joint at rest is the lower bound.
     """
     joints, confidence = np.asarray(joints), np.asarray(confidence)
     _Problem.of(joints, confidence, noise, fps, 1.0)  # validates the input
 
-    def cost(exponent: float, one: slice) -> float:
-        problem = _Problem.of(joints[:, one], confidence[:, one], noise, fps, 10.0**exponent)
+    def cost(exponent: float, joint: slice) -> float:
+        problem = _Problem.of(joints[:, joint], confidence[:, joint], noise, fps, 10.0**exponent)
         return -float(_forward(problem).log_marginal_likelihood[0])
 
     bounds = (math.log10(_LEAST), math.log10(_MOST))
     slices = [slice(joint, joint + 1) for joint in range(joints.shape[1])]
-    fits = [minimize_scalar(cost, bounds=bounds, args=(one,), method="bounded") for one in slices]
+    fits = [minimize_scalar(cost, bounds=bounds, args=(each,), method="bounded") for each in slices]
     return np.array([10.0**fit.x for fit in fits])
 
 
@@ -215,7 +215,7 @@ class _Problem(NamedTuple):
 
 
 class _Passes(NamedTuple):
-    """States after and, ``predicted``, before each update; axes share covariances."""
+    """Filtered and ``predicted`` states of each frame; axes share covariances."""
 
     mean: np.ndarray  # (L, J, 2, 3)
     covariance: np.ndarray  # (L, J, 2, 2)
@@ -240,10 +240,10 @@ def _forward(problem: _Problem) -> _Passes:
         seen = np.isfinite(variance)
         total = covariance[:, 0, 0] + variance
         innovation = problem.joints[frame] - mean[:, 0]
-        # An infinite variance has zero gain.
+        # The gain is zero for an infinite variance.
         gain = covariance[:, :, :1] / total[:, None, None]
         mean = mean + gain * innovation[:, None]
-        # Joseph form, which keeps the covariance positive definite.
+        # The Joseph form preserves positive definite covariances.
         factor = np.eye(2) - gain * np.array([1.0, 0.0])
         added = np.where(seen, variance, 0.0)[:, None, None] * (gain @ np.swapaxes(gain, -1, -2))
         covariance = factor @ covariance @ np.swapaxes(factor, -1, -2) + added

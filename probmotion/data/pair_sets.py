@@ -27,13 +27,13 @@ __all__ = [
 SALSA_HELD_OUT = ("cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11")
 """Held-out salsa clips: 3 of 10, 2658 of the 8257 dance frames."""
 
-# Fractions of the body height below the ankles and above the base of the skull, after Drillis and
+# Fractions of the body height below the ankles and above the base of the skull, from Drillis and
 # Contini (ankle .039, eyes .936, chin .870 of the height).
 _FOOT = 0.039
 _SKULL = 0.10
 _SEED_POSES = 400
 _HEIGHTS = (0.5, 3.0)  # plausible heights, m
-_FARTHEST = 5.0  # greatest distance between roots, m
+_FARTHEST = 5.0  # maximum distance between roots, m
 _MOST_APART, _FASTEST = 1.2, 7.0  # limits of dance frames, m and m/s
 _LEG = ("hip", "knee", "ankle")
 
@@ -41,19 +41,19 @@ _LEG = ("hip", "knee", "ankle")
 def dance_frames(
     motion: Motion, *, farthest: float = _MOST_APART, fastest: float = _FASTEST
 ) -> np.ndarray:
-    """Return which frames show the dance.
+    """Return a mask of the frames that show the dance.
 
-    Excluded are the opening, until the partners first come close; frames in which someone is far
-    from everybody else; and glitches, the frames on both sides of an implausibly fast step.
+    Excludes the opening, before the partners are first close together; frames with a person
+    over ``farthest`` from all others; and glitches, the frames before and after too fast a step.
 
     Parameters
     ----------
     motion : Motion
-        Two people or more.
+        Motion of at least two people.
     farthest : float
-        Greatest distance of a person's root from the nearest other root, metres.
+        Maximum distance of a person's root from the nearest other root, metres.
     fastest : float
-        Greatest speed of a joint, metres per second.
+        Maximum speed of a joint, metres per second.
 
     Returns
     -------
@@ -81,12 +81,12 @@ def ground_truth(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pose pairs evenly spaced over the dance frames of several clips.
 
-    Yin et al. (2018), section 6, take 6000 frames in this way from the salsa of the CMU database.
+    Yin et al. (2018), section 6, use 6000 such frames of the salsa clips of the CMU database.
 
     Parameters
     ----------
     motions : sequence of Motion
-        Clips of one skeleton, each with two people or more.
+        Clips of one skeleton, each of at least two people.
     n : int, optional
         Number of pose pairs; all dance frames by default.
 
@@ -100,7 +100,7 @@ def ground_truth(
     Raises
     ------
     ValueError
-        If there is no motion, skeletons differ, or there are fewer than ``n`` dance frames.
+        If ``motions`` is empty, skeletons differ, or fewer than ``n`` frames show the dance.
     """
     if not motions:
         raise ValueError("motions must contain at least one, got none")
@@ -134,7 +134,7 @@ def _evenly_spaced(n: int, total: int) -> np.ndarray:
 def hold_out(
     motions: Sequence[Motion], names: Sequence[str] = SALSA_HELD_OUT
 ) -> tuple[list[Motion], list[Motion]]:
-    """Split motions by name into training motions and held-out ones.
+    """Split motions by name into training and held-out motions.
 
     Raises
     ------
@@ -147,25 +147,25 @@ def hold_out(
     for name in names:
         if known.count(name) != 1:
             raise ValueError(
-                f"names must be names of one motion each ({', '.join(dict.fromkeys(known))}), got "
+                f"names must match one motion each ({', '.join(dict.fromkeys(known))}), got "
                 f"{name!r}, the name of {known.count(name)}"
             )
     training = [motion for motion in motions if motion.name not in names]
     held_out = [motion for motion in motions if motion.name in names]
     if not training or not held_out:
         raise ValueError(
-            f"names must hold out at least one of {len(motions)} motions and leave one, got "
+            f"names must hold out at least one and not all of the {len(motions)} motions, got "
             f"{len(held_out)} names"
         )
     return training, held_out
 
 
 def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return the standing heights of the people, from the lengths of their bones.
+    """Return the standing heights of the people, estimated from their bone lengths.
 
-    The height is the sum of shin, thigh (means of both sides), the midpoint of the hips to the
-    pelvis and the bones from there to ``head``, divided by 0.861: 3.9 % of the height are below the
-    ankles and 10 % above the base of the skull.
+    The height is the sum of shin, thigh (means of both sides), the distance from the pelvis to
+    the midpoint of the hips and the bones from pelvis to ``head``, divided by 0.861: 3.9 % of the
+    height is below the ankles and 10 % above the base of the skull.
 
     Parameters
     ----------
@@ -192,11 +192,11 @@ def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
     check_shape(name, pose, (skeleton.n_joints, 3))
     check_finite(name, pose)
     heights = person_height(pose, skeleton)
-    odd = heights[(heights < _HEIGHTS[0]) | (heights > _HEIGHTS[1])]
-    if odd.size:
+    implausible = heights[(heights < _HEIGHTS[0]) | (heights > _HEIGHTS[1])]
+    if implausible.size:
         raise ValueError(
             f"people in {name} must be {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} m tall, got "
-            f"{odd[0]:.3g}; positions are in metres"
+            f"{implausible[0]:.3g}; positions are in metres"
         )
     roots = pose[list(skeleton.roots)]
     distance = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
@@ -219,10 +219,10 @@ def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
 
 
 def choose_seed(positions: np.ndarray) -> int:
-    """Return the index of the medoid pose pair, the seed from which the others are drawn.
+    """Return the index of the medoid pose pair, for use as the seed pose.
 
-    Distances are root mean square over the joints after the best rotation and translation of the
-    pair (Kabsch), among at most 400 evenly spaced pose pairs, so that the choice is deterministic.
+    Distances are root mean square over the joints after rigid alignment (Kabsch), between at most
+    400 evenly spaced pose pairs, so that the choice is deterministic.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def choose_seed(positions: np.ndarray) -> int:
 def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the aligned rms distances of a centred pose (J, 3) to others (n, J, 3).
 
-    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), with maximum σ₁ + σ₂ ± σ₃ of the last trace.
+    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), where the trace has the maximum σ₁ + σ₂ ± σ₃.
     """
     products = pose.T @ others
     sigma = np.linalg.svd(products, compute_uv=False)

@@ -19,12 +19,12 @@ from probmotion.motion.skeleton import Skeleton
 __all__ = ["load_pairs", "pair_motion", "pair_of", "read_salsa_bvh"]
 
 # Metres per unit of the BVH files of CMU's subjects 60 (lead) and 61 (follow). The conversion used
-# one figure for both and scaled each root's path by the ratio of leg lengths; CMU's unit is
+# one character for both and scaled each root's path by the ratio of leg lengths; CMU's unit is
 # 0.0254/0.45 m, and the divisors were fitted to a metric conversion of trial 01 (rms 5 mm).
 _SALSA_SCALES = (0.0254 / 0.45 / 0.04389, 0.0254 / 0.45 / 0.04700)
-# The first frames leave the rest pose of the figure, and the last ones jump.
+# The first frames start in the rest pose of the character, and the last frames jump.
 _SALSA_START, _SALSA_END = 24, 6
-_SALSA_FPS = 60.0  # the files say 120, which is wrong
+_SALSA_FPS = 60.0  # the files incorrectly state 120
 
 
 def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
@@ -43,7 +43,7 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
     Raises
     ------
     FileNotFoundError
-        If nothing matches.
+        If no file matches.
     ValueError
         As :func:`pair_of`.
     """
@@ -58,8 +58,8 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
 def pair_of(motion: Motion) -> Motion:
     """Return a motion of two people on ``pair17``, with joints matched by canonical name.
 
-    The person with the first root becomes ``person0``. Raises ``ValueError`` if there are not two
-    roots, or a joint is missing.
+    The person with the first root becomes ``person0``. Raises ``ValueError`` unless the motion
+    has two roots and all joints.
     """
     skeleton = Skeleton.preset("pair17")
     if motion.skeleton == skeleton:
@@ -81,22 +81,22 @@ def pair_motion(first: Motion, second: Motion, name: str = "") -> Motion:
     first, second : Motion
         One person each, with the same frame rate and number of frames.
     name : str
-        Name of the result; both names by default.
+        Name of the combined motion; both names by default.
 
     Raises
     ------
     ValueError
-        If rates or lengths differ, or a motion is not one person with all joints.
+        If frame rates or lengths differ, or a motion is not one person with all joints.
     """
     if first.fps != second.fps:
         raise ValueError(
-            f"first and second must have one frame rate, got {first.fps:g} and {second.fps:g}; use "
+            f"first and second must share a frame rate, got {first.fps:g} and {second.fps:g}; use "
             f"second.resample({first.fps:g})"
         )
     if first.frames != second.frames:
         longer = "second" if second.frames > first.frames else "first"
         raise ValueError(
-            f"first and second must have as many frames, got {first.frames} and {second.frames}; "
+            f"first and second must be equally long, got {first.frames} and {second.frames}; "
             f"use {longer}.window(start, {min(first.frames, second.frames)})"
         )
     people = []
@@ -117,8 +117,8 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
 
     The files are the DAZ-friendly conversion of the CMU database, subjects 60 and 61, in the scaled
     version of :mod:`probmotion.data.downloads`. Each person is scaled about the origin (1.286 and
-    1.201 m per unit); the first 24 and last 6 frames are cut; every second frame of 60 per second
-    is used; both people are lowered until 98 % of the lowest joints are above the floor, y = 0.
+    1.201 m per unit); the first 24 and last 6 frames are cut; the rate is halved from 60 fps; the
+    2 % quantile of the lowest joint's height is moved to the floor, y = 0.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     Raises
     ------
     ValueError
-        If the names are not those of one trial, lengths differ or a file is damaged.
+        If the files belong to different trials, lengths differ or a file is damaged.
     """
     trial = _salsa_trial(Path(lead), Path(follow))
     leader, follower = (
@@ -152,7 +152,7 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
 
 
 def _salsa_trial(lead: Path, follow: Path) -> str:
-    """Return the two digits of the trial."""
+    """Return the trial number, two digits."""
     trials = []
     for argument, path, subject in (("lead", lead, "60"), ("follow", follow, "61")):
         match = re.fullmatch(rf"{subject}_(\d\d)(_scaled)?", path.stem)
@@ -163,7 +163,7 @@ def _salsa_trial(lead: Path, follow: Path) -> str:
             )
         trials.append(match[1])
     if trials[0] != trials[1]:
-        raise ValueError(f"lead and follow must be one trial, got {' and '.join(trials)}")
+        raise ValueError(f"lead and follow must belong to one trial, got {' and '.join(trials)}")
     return trials[0]
 
 

@@ -23,15 +23,15 @@ Centre = Literal["frame", "sequence"]
 class DetectorNoise:
     """Error model of a keypoint detector.
 
-    A joint is either found, with small errors and high confidence, or lost for some time, with
-    large errors and low confidence or not reported at all.
+    A joint is either detected, with small errors and high confidence, or lost for several frames,
+    with large errors and low confidence or not reported at all.
 
     Parameters
     ----------
     found : float
-        Standard deviation of a found joint, metres at the subject's distance.
+        Error of a detected joint (standard deviation), metres at the subject's distance.
     lost : float
-        Standard deviation of a lost joint, likewise.
+        Error of a lost joint (standard deviation), metres at the subject's distance.
     share : float
         Fraction of time that a joint is lost, in [0, 1).
     frames : float
@@ -69,11 +69,11 @@ class DetectorNoise:
 
     @property
     def _begin(self) -> float:
-        """Probability that a found joint is lost in the next frame."""
+        """Probability that a detected joint is lost in the next frame."""
         return self.share / (1 - self.share) / self.frames
 
     def lost_spans(self, rng: np.random.Generator, frames: int, joints: int) -> np.ndarray:
-        """Return which joints are lost, (frames, joints) bool: a Markov chain per joint."""
+        """Return a mask of lost joints, (frames, joints), sampled from a Markov chain per joint."""
         lost = np.empty((frames, joints), bool)
         lost[0] = rng.random(joints) < self.share
         for frame in range(1, frames):
@@ -105,11 +105,11 @@ class Filming:
     elevation : float
         Mean elevation of the cameras, radians; π/16 as in *MAS*.
     tilt : float
-        Greatest deviation from the mean elevation, radians.
+        Maximum deviation from the mean elevation, radians.
     distance : float
         Distance of the cameras from the subject, metres.
     perspective : bool
-        Perspective rather than orthographic cameras; images are in metres at the subject's
+        Whether cameras are perspective, not orthographic; images are in metres at the subject's
         distance.
     centre : {"frame", "sequence"}
         Whether the root is at the origin in every frame or on average.
@@ -125,8 +125,8 @@ class Filming:
         check_positive("distance", self.distance)
         if not abs(self.elevation) + self.tilt < math.pi / 2 or self.tilt < 0:
             raise ValueError(
-                f"elevation must be within tilt and pi/2 of 0, got {self.elevation} with tilt "
-                f"{self.tilt}"
+                f"elevation must be less than pi/2 - tilt in magnitude, and tilt at least 0, got "
+                f"{self.elevation} and {self.tilt}"
             )
         if self.centre not in get_args(Centre):
             raise ValueError(f"centre must be frame or sequence, got {self.centre!r}")
@@ -149,16 +149,16 @@ def project_clips(
     filming: Filming | None = None,
     noise: DetectorNoise | None = None,
 ) -> list[KeypointTrack]:
-    """Return 2D tracks of 3D clips, seen by random cameras through a noisy detector.
+    """Project 3D clips into random cameras and return noisy 2D tracks.
 
     Parameters
     ----------
     motions : sequence of Motion
         3D clips with unique names.
     views : int
-        Cameras per clip, each at a random azimuth and elevation.
+        Number of cameras per clip, each at a random azimuth and elevation.
     seed : int
-        Seed of cameras and errors; the tracks of a clip do not depend on other clips.
+        Seed of cameras and detection errors; the tracks of a clip do not depend on other clips.
     filming, noise : optional
         Camera placement, and error model of the detector.
 
@@ -171,7 +171,7 @@ def project_clips(
     Raises
     ------
     ValueError
-        If there is no clip, or names are missing or repeated.
+        If ``motions`` is empty, or names are missing or repeated.
     """
     check_count("views", views)
     if not motions:

@@ -22,11 +22,11 @@ class Cameras:
     Parameters
     ----------
     rotation : ndarray, (V, 3, 3)
-        World to camera.
+        Rotations from world to camera axes.
     translation : ndarray, (V, 3)
-        World to camera, metres.
+        Camera coordinates of the world origin, metres.
     focal : ndarray, (V,)
-        Focal length. Perspective: image units per unit slope. Orthographic: image units per metre.
+        Focal length. Perspective: image units per unit of x/z. Orthographic: image units per metre.
     centre : ndarray, (V, 2), optional
         Principal point, image units; the origin by default.
     orthographic : bool
@@ -92,10 +92,10 @@ class Cameras:
         n_views : int
             Number of cameras V.
         elevation : float
-            Radians above the horizon.
+            Elevation above the horizon, radians.
         distance : float
-            Metres from the origin, and focal length of perspective cameras: both kinds project the
-            origin's plane at one image unit per metre (MAS, appendix C).
+            Distance from the origin, metres; also the focal length of perspective cameras, so that
+            the scale at the origin is one image unit per metre (MAS, appendix C).
         start : float
             Azimuth of the first camera, radians; 0 is the +Z axis.
         perspective : bool

@@ -76,7 +76,7 @@ def quaternion_to_vector(quaternion: Array) -> Array:
 
 
 def quaternion_to_matrix(quaternion: Array) -> Array:
-    """Return the matrix of a quaternion of any length above zero: ``(…, 4) → (…, 3, 3)``."""
+    """Return the matrix of a quaternion of any nonzero length: ``(…, 4) → (…, 3, 3)``."""
     quaternion = _unit(quaternion)
     xp = array_namespace(quaternion)
     real = quaternion[..., :1, None]
@@ -158,7 +158,7 @@ def euler_to_matrix(angles: Array, order: str) -> Array:
     angles : Array, (…, 3)
         Radians, in the order of ``order``.
     order : str
-        Three of ``X``, ``Y``, ``Z`` with different neighbours: ``"ZXY"`` is ``R_z R_x R_y``, the
+        Three of ``X``, ``Y``, ``Z`` without adjacent repeats: ``"ZXY"`` is ``R_z R_x R_y``, the
         BVH channels ``Zrotation Xrotation Yrotation``.
 
     Raises
@@ -184,7 +184,7 @@ def matrix_to_euler(matrix: Array, order: str) -> Array:
     matrix : Array, (…, 3, 3)
         Rotation matrices.
     order : str
-        As for :func:`euler_to_matrix`.
+        Order of the axes, as in :func:`euler_to_matrix`.
     """
     check_shape("matrix", matrix, ("…", 3, 3))
     i, j, last = _axes(order)
@@ -234,7 +234,7 @@ def slerp(first: Array, second: Array, fraction: Array) -> Array:
     first, second : Array, (…, 3, 3)
         Rotation matrices.
     fraction : Array, (…)
-        0 at ``first``, 1 at ``second``; broadcast against the batch axes.
+        Interpolation weight: 0 at ``first``, 1 at ``second``; broadcast against the batch axes.
 
     Returns
     -------
@@ -250,7 +250,7 @@ def _axes(order: str) -> tuple[int, int, int]:
     axes = tuple("XYZ".find(letter) for letter in order.upper())
     if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
         raise ValueError(
-            "order must be three of X, Y and Z with different neighbours, such as 'ZXY', got "
+            "order must be three of X, Y and Z without adjacent repeats, such as 'ZXY', got "
             f"{order!r}"
         )
     return axes[0], axes[1], axes[2]

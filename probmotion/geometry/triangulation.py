@@ -7,8 +7,8 @@ matrix times (X, 1). With a', b', c' the first three entries of the rows,
     J = [a' − u c', b' − v c'] / c,
     JᵀJ = (a'a'ᵀ + b'b'ᵀ − u (a'c'ᵀ + c'a'ᵀ) − v (b'c'ᵀ + c'b'ᵀ) + (u² + v²) c'c'ᵀ) / c²,
 
-so the normal equations of all points are fixed matrices of the cameras times a few numbers per view
-and point. Orthographic cameras are the case c' = 0, c = 1.
+so the normal equations of all points are products of fixed camera matrices with a few numbers per
+view and point. Orthographic cameras are the case c' = 0, c = 1.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["triangulate"]
 
 _WARN_CONDITION = 1e3
-"""Condition number of the normal equations above which to warn: two views 3.6° apart."""
+"""Condition number of the normal equations above which to warn (two views 3.6° apart)."""
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Stored entries of a symmetric 3×3 matrix."""
@@ -42,7 +42,7 @@ def triangulate(
     """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for every frame and joint (MAS, section 4.2).
 
     Orthographic cameras are solved in closed form. Perspective cameras use ``iterations`` steps of
-    simplified Gauss-Newton: residual and gradient are exact, the normal matrix is that of the first
+    simplified Gauss-Newton: residual and gradient are exact, the normal matrix is from the first
     linearisation.
 
     Parameters
@@ -72,7 +72,7 @@ def triangulate(
     ------
     ValueError
         If there are fewer than two views, shapes disagree, a keypoint is not finite, the views do
-        not determine some point, or a point is behind a perspective camera. Conditions on values
+        not determine a point, or a point is behind a perspective camera. Conditions on values
         are not checked under JAX tracing.
     """
     V = cameras.n_views
@@ -186,7 +186,7 @@ def _pull(
 def _on_rays(
     xp: Any, equations: _Equations, seen: Array, weight: Array | None
 ) -> tuple[Array, Array]:
-    """Return the normal equations of the rays (a' − u c')·X = u c₄ − a₄ and its counterpart in v.
+    """Return the normal equations of the rays (a' − u c')·X = u c₄ − a₄, and likewise for v.
 
     For c' = 0 they are exact.
     """
@@ -285,7 +285,7 @@ def _report_condition(normal: np.ndarray, shape: tuple[int, ...]) -> None:
     if not condition[worst] < 0.01 / np.finfo(normal.dtype).eps:
         raise ValueError(
             f"keypoints of joint {joint} in frame {frame} do not determine a point (condition "
-            f"number {condition[worst]:.2g}); at least two non-parallel views are needed"
+            f"number {condition[worst]:.2g}); at least two non-parallel views are required"
         )
     if condition[worst] > _WARN_CONDITION:
         warnings.warn(

@@ -23,10 +23,10 @@ __all__ = ["AnnotatedPairs"]
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedPairs:
-    """L(Θ) ∝ (1/m) Σᵢ max_j exp(−d(M Θ_vᵢ, p_j)²/2σ_l²), vᵢ ~ f(v) (Yin et al. 2018, eqs. 5-9).
+    """Likelihood of pose-pairs given annotations in similar views (Yin et al. 2018, eqs. 5-9).
 
-    Compares projections of the pose-pair with annotations in similar views. The m views are drawn
-    once from ``seed``, so that the density is deterministic; :meth:`evaluate` with generators draws
+    L(Θ) ∝ (1/m) Σᵢ max_j exp(−d(M Θ_vᵢ, p_j)²/2σ_l²) with vᵢ ~ f(v). The m views are drawn once
+    from ``seed``, so that the density is deterministic; :meth:`evaluate` with generators draws
     fresh views for an unbiased estimate of the integral over views.
 
     Parameters
@@ -104,7 +104,7 @@ class AnnotatedPairs:
         Parameters
         ----------
         annotations : Annotations
-            Annotations; existing views are ignored. Those without an estimate are left out and
+            Annotations; existing views are ignored. Annotations without an estimate are omitted and
             counted in ``dropped``.
         seed_pose : ndarray, (J, 3)
             3D pose-pair with the torsos to fit, metres.
@@ -137,7 +137,7 @@ class AnnotatedPairs:
 
     @property
     def log_bound(self) -> float:
-        """Upper bound of log L, 0; lets truncated posteriors skip evaluations."""
+        """Upper bound of log L, 0; allows truncated posteriors to skip evaluations."""
         return 0.0
 
     def log_density(self, positions: Array) -> np.ndarray:
@@ -160,7 +160,7 @@ class AnnotatedPairs:
             Pose-pairs, metres.
         generators : sequence of numpy.random.Generator, optional
             One per pose-pair, to draw fresh views: exp(log L) is then an unbiased estimate, for
-            pseudo-marginal samplers (Andrieu and Roberts 2009). By default the fixed views.
+            pseudo-marginal samplers (Andrieu and Roberts 2009). Views are fixed by default.
 
         Returns
         -------

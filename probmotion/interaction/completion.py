@@ -1,7 +1,7 @@
 """Completion of occluded joints from posterior draws (Yin et al. 2018, section 6, figure 12).
 
-In 3D or in the image: the nearest draws on the visible joints, their median, and its
-deformation onto the visible joints.
+In 3D or in the image: select the draws nearest in the visible joints, take their median, and
+deform it onto the visible joints.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _FEWEST = 4  # minimum number of visible joints: a tetrahedron
 
 
 class CompletionResult(NamedTuple):
-    """A completed pair.
+    """Completed pair and the draws used.
 
-    ``positions`` (J, D), metres, with the visible joints unchanged; ``median`` (J, D) before the
-    deformation; ``indices`` (n,) of the draws of the median, nearest first.
+    ``positions`` (J, D), metres, contain the visible joints unchanged; ``median`` (J, D) is not
+    yet deformed; ``indices`` (n,) are the indices of its draws, nearest first.
     """
 
     positions: np.ndarray
@@ -64,7 +64,7 @@ def complete(
     visible : ndarray of bool, (J,)
         Mask of visible joints; at least four.
     draws : ndarray, (S, J, 3)
-        Posterior draws, metres; any position and heading.
+        Posterior draws, metres, at arbitrary positions and headings.
     skeleton : Skeleton
         Skeleton of the J joints.
     n_nearest : int
@@ -100,8 +100,8 @@ def complete_keypoints(
 ) -> CompletionResult:
     """Complete the occluded joints of a 2D pair (J, 2) from projections of draws.
 
-    As :func:`complete`, in the image (metres, x right, y up): the nearest draws are those of
-    :func:`probmotion.interaction.retrieval.retrieve`, each in its best one of ``views``.
+    Like :func:`complete`, but in the image (metres, x right, y up).
+    :func:`~probmotion.interaction.retrieval.retrieve` selects the draws and the best view of each.
     """
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
     nearest = retrieve(keypoints, draws, skeleton, views=views, visible=visible, n=n_nearest)
@@ -119,17 +119,17 @@ def nearest_annotation_completion(
 ) -> CompletionResult:
     """Complete the occluded joints of a 2D pair (J, 2) from the nearest annotation, a baseline.
 
-    The annotation is the nearest in interaction coordinates of the visible joints among those that
-    show every occluded joint, rigidly aligned in the image.
+    Selects the nearest annotation in interaction coordinates of the visible joints among
+    annotations with every occluded joint, and aligns it rigidly in the image.
 
     Parameters
     ----------
     keypoints, visible, skeleton
-        As for :func:`complete_keypoints`.
+        See :func:`complete_keypoints`.
     annotated : ndarray, (n, J, 2)
         Annotated 2D pairs, metres.
     annotated_visible : ndarray of bool, (n, J), optional
-        Mask of their annotated joints; all by default.
+        Mask of the annotated joints; all by default.
     """
     keypoints, visible = _checked("keypoints", keypoints, visible, skeleton, 2)
     annotated = np.asarray(annotated, dtype=np.float64)
@@ -162,7 +162,7 @@ def blend(
     hidden = ~visible
     difference = median[hidden, None] - median[None, visible]
     exponents = -np.sum(difference**2, axis=-1) / (2 * bandwidth**2)
-    # Subtract the maximum, so that the weights of distant joints do not underflow.
+    # Subtract the maximum so that the weights of distant joints do not all underflow.
     weights = np.exp(exponents - exponents.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     blended = target.copy()

@@ -1,4 +1,4 @@
-"""Indirect lifting: the posterior draw closest to a 2D pair (Yin et al. 2018, section 6)."""
+"""Indirect lifting: retrieval of the draws closest to a 2D pair (Yin et al. 2018, section 6)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["RetrievalResult", "retrieve", "view_grid", "views_around"]
 
-_BLOCK = 4096  # projections compared at once; has no effect on the result
+_BLOCK = 4096  # number of projections per block; does not affect the result
 
 
 class RetrievalResult(NamedTuple):
-    """The n closest draws of each 2D pair, nearest first.
+    """The n draws closest to each 2D pair, nearest first.
 
-    ``indices`` (…, n) of the draws; ``views`` (…, n, 2), the best view of each, radians;
+    ``indices`` (…, n) of the draws; ``views`` (…, n, 2), best view of each draw, radians;
     ``distances`` (…, n), metres (dimensionless for shape contexts).
     """
 
@@ -31,7 +31,7 @@ class RetrievalResult(NamedTuple):
 def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
     """Return a grid of views (φ, θ), (V, 2), radians.
 
-    φ is uniform on the circle; θ is uniform from 50° to 100°, the usual range of videos, or 90° if
+    φ is uniform on the circle; θ is uniform from 50° to 100°, the usual range in videos, or 90° if
     ``n_heights`` is 1.
     """
     check_count("n_azimuths", n_azimuths)
@@ -43,7 +43,7 @@ def view_grid(n_azimuths: int = 16, n_heights: int = 3) -> np.ndarray:
 
 
 def views_around(view: np.ndarray) -> np.ndarray:
-    """Return 15 views within 30° in φ and 15° in θ of a view (2,), radians: (15, 2)."""
+    """Return 15 views (15, 2), radians, within 30° in φ and 15° in θ of a view (2,)."""
     check_shape("view", view, (2,))
     check_finite("view", np.asarray(view))
     turns, tilts = np.radians((-30.0, -15.0, 0.0, 15.0, 30.0)), np.radians((-15.0, 0.0, 15.0))
@@ -62,7 +62,7 @@ def retrieve(
 ) -> RetrievalResult:
     """Return the n draws with the smallest distance to each 2D pair over all views.
 
-    Projections are rigidly aligned in the image. Repeated draws count once, by their first index.
+    Projections are rigidly aligned in the image. Of repeated draws, only the first is considered.
 
     Parameters
     ----------
@@ -78,9 +78,9 @@ def retrieve(
     visible : ndarray of bool, (…, J), optional
         Mask of annotated joints; all by default.
     n : int
-        Number of distinct draws.
+        Number of distinct draws to return.
     measure : str
-        As in :class:`probmotion.interaction.geometry.nearest.PairComparer`.
+        Distance measure of :class:`probmotion.interaction.geometry.nearest.PairComparer`.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     check_shape("keypoints", keypoints, ("…", skeleton.n_joints, 2))
@@ -95,15 +95,15 @@ def retrieve(
     batch = keypoints.shape[:-2]
     seen = np.ones(keypoints.shape[:-1], dtype=bool) if visible is None else np.asarray(visible)
     check_shape("visible", seen, keypoints.shape[:-1])
-    first = np.sort(np.unique(draws, axis=0, return_index=True)[1])
-    if n > len(first):
-        raise ValueError(f"n must be at most {len(first)}, the number of distinct draws, got {n}")
+    distinct = np.sort(np.unique(draws, axis=0, return_index=True)[1])
+    if n > len(distinct):
+        raise ValueError(f"n must be at most the {len(distinct)} distinct draws, got {n}")
     comparer = PairComparer(
         keypoints.reshape(-1, *keypoints.shape[-2:]),
         seen.reshape(-1, skeleton.n_joints),
         measure=measure,
     )
-    distances, best = _nearest_views(comparer, draws[first], views, skeleton)
+    distances, best = _nearest_views(comparer, draws[distinct], views, skeleton)
     order = np.argsort(distances, axis=0, kind="stable")[:n].T
     pairs = np.arange(len(order))[:, None]
     if not np.isfinite(distances[order, pairs]).all():
@@ -111,7 +111,7 @@ def retrieve(
             f"visible must share an edge with at least {n} draws, got too few visible joints"
         )
     return RetrievalResult(
-        first[order].reshape(*batch, n),
+        distinct[order].reshape(*batch, n),
         views[best[order, pairs]].reshape(*batch, n, 2),
         distances[order, pairs].reshape(*batch, n),
     )

@@ -1,4 +1,4 @@
-"""Lines of ASF and AMC files (Acclaim's formats)."""
+"""Line-by-line reader of ASF and AMC files (Acclaim formats)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from probmotion.io.errors import MotionFileError, decoded_lines, number, read_by
 __all__ = ["AcclaimText", "Line"]
 
 Line = tuple[int, list[str]]
-"""A line's number in the file, from 1, and its words."""
+"""Line number, starting at 1, and words of a line."""
 
 
 @dataclass(frozen=True)
 class AcclaimText:
-    """Nonblank lines of a text file without comments, and the number of its last line."""
+    """Nonblank lines of a text file, without comments, and its number of lines ``length``."""
 
     file: str
     lines: list[Line]
@@ -24,12 +24,12 @@ class AcclaimText:
 
     @classmethod
     def of(cls, path: Path) -> AcclaimText:
-        """Read a file."""
+        """Read the lines of a file."""
         raw = decoded_lines(read_bytes(path).rstrip(b"\r\n"))
         split = ((line, text.partition("#")[0].split()) for line, text in enumerate(raw, 1))
         text = cls(str(path), [(line, words) for line, words in split if words], len(raw))
         if not text.lines:
-            text.fail(text.length, "expected a line that begins with ':', got nothing")
+            text.fail(text.length, "expected a line starting with ':', got an empty file")
         return text
 
     def fail(self, line: int, problem: str) -> NoReturn:
@@ -37,7 +37,7 @@ class AcclaimText:
         raise MotionFileError(f"{self.file}, line {line}: {problem}")
 
     def numbers(self, line: int, name: str, words: list[str], count: int) -> list[float]:
-        """Return ``count`` finite numbers of moderate size from ``words``."""
+        """Parse ``words`` as ``count`` numbers between -1e9 and 1e9."""
         if len(words) != count:
             self.fail(line, f"{name}: expected {count} values, got {len(words)}")
         where = f"{self.file}, line {line}: {name}"

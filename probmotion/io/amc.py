@@ -1,4 +1,4 @@
-"""Reader of AMC motion files, with the ASF files of their skeletons.
+"""Reader of AMC motion files and their ASF skeletons.
 
 A bone with axes C (:mod:`probmotion.io.asf`) and channel rotation M is rotated by C M C⁻¹ relative
 to its parent; the first channel listed is applied first. The end of a bone is the end of its
@@ -31,13 +31,13 @@ def read_amc(
     Parameters
     ----------
     path : str or Path
-        The file.
+        AMC file.
     skeleton_path : str or Path, optional
-        ASF file of the skeleton. Default: the file beside it with the same name or that of the
-        subject (``02.asf`` for ``02_01.amc``).
+        ASF file of the skeleton. Default: the file in the same folder named after the motion or
+        its subject (``02.asf`` for ``02_01.amc``).
     fps : float
-        Frames per second, rarely stored in the file: 120 in most of the CMU database, 60 in some of
-        it. A different rate declared in the file is an error.
+        Frames per second, which files rarely declare: 120 for most of the CMU database, 60 for
+        some of it. If the file declares another rate, an error is raised.
 
     Returns
     -------
@@ -64,20 +64,20 @@ def read_amc(
 
 
 def _beside(path: Path) -> Path:
-    """Return the ASF file that belongs to an AMC file by name."""
+    """Return the ASF file that matches an AMC file by name."""
     stems = dict.fromkeys((path.stem, path.stem.rpartition("_")[0] or path.stem))
     candidates = [path.with_name(f"{stem}.asf") for stem in stems]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise FileNotFoundError(
-        f"there is no {' or '.join(map(str, candidates))} with the skeleton of {path}; pass "
-        "skeleton_path"
+        f"{path}: expected the skeleton {' or '.join(map(str, candidates))}, got no such "
+        "file; pass skeleton_path"
     )
 
 
 def _check_declarations(text: AcclaimText, fps: float) -> None:
-    """Refuse files of other formats, units or rates, from the lines before the first frame."""
+    """Check the format, unit and frame rate declared before the first frame."""
     declared = set()
     for line, words in text.lines:
         if not words[0].startswith(":"):
@@ -89,7 +89,7 @@ def _check_declarations(text: AcclaimText, fps: float) -> None:
         text.fail(text.length, "expected at least one frame, got the end of the file")
     for keyword in (":FULLY-SPECIFIED", ":DEGREES"):
         if keyword not in declared:
-            text.fail(line, f"expected {keyword} first, got {shortened(words[0])}")
+            text.fail(line, f"expected {keyword} before the first frame, got {shortened(words[0])}")
 
 
 def _frames(text: AcclaimText, body: AcclaimSkeleton) -> list[dict[str, list[float]]]:
@@ -105,7 +105,7 @@ def _frames(text: AcclaimText, body: AcclaimSkeleton) -> list[dict[str, list[flo
         missing = counts.keys() - frames[-1].keys() if frames else set()
         if missing:
             name = shortened(min(missing))
-            text.fail(line, f"expected all moving bones in frame {number}, got no {name}")
+            text.fail(line, f"expected all moving bones in frame {number}, got none of {name}")
 
     for line, words in text.lines:
         name = words[0]
@@ -118,7 +118,7 @@ def _frames(text: AcclaimText, body: AcclaimSkeleton) -> list[dict[str, list[flo
             number = int(name)
             frames.append({})
         elif not frames or name not in counts or name in frames[-1]:
-            wanted = "each moving bone once in a frame" if frames else "the number of a frame"
+            wanted = "each moving bone once per frame" if frames else "a frame number"
             text.fail(line, f"expected {wanted}, got {shortened(name)}")
         else:
             frames[-1][name] = text.numbers(line, shortened(name), words[1:], counts[name])
@@ -134,13 +134,13 @@ def _world_positions(body: AcclaimSkeleton, frames: list[dict[str, list[float]]]
     for joint in body.skeleton.topological_order:
         name, channels = body.skeleton.joint_names[joint], body.channels[joint]
         values = np.array([frame.get(name, ()) for frame in frames], dtype=np.float64).T
-        moved = dict(zip(channels, values, strict=True))
+        by_channel = dict(zip(channels, values, strict=True))
         C = body.axes[joint]
-        world[joint] = C @ _rotations(moved, L) @ C.T
+        world[joint] = C @ _rotations(by_channel, L) @ C.T
         parent = body.skeleton.parents[joint]
         if parent < 0:
             for axis, channel in enumerate(("TX", "TY", "TZ")):
-                positions[:, joint, axis] = body.unit * moved.get(channel, 0.0)
+                positions[:, joint, axis] = body.unit * by_channel.get(channel, 0.0)
         else:
             world[joint] = world[parent] @ world[joint]
             positions[:, joint] = positions[:, parent] + world[joint] @ body.offsets[joint]
@@ -148,9 +148,9 @@ def _world_positions(body: AcclaimSkeleton, frames: list[dict[str, list[float]]]
 
 
 def _rotations(moved: dict[str, np.ndarray], frames: int) -> np.ndarray:
-    """Return M (L, 3, 3) of the channels of one joint."""
+    """Return the channel rotations M (L, 3, 3) of one joint."""
     order = [channel[1] for channel in moved if channel.startswith("R")]
     order = [*order, *(axis for axis in "XYZ" if axis not in order)][::-1]
-    still = np.zeros(frames)
-    angles = [np.deg2rad(moved.get(f"R{axis}", still)) for axis in order]
+    zeros = np.zeros(frames)
+    angles = [np.deg2rad(moved.get(f"R{axis}", zeros)) for axis in order]
     return np.asarray(euler_to_matrix(np.stack(angles, axis=-1), "".join(order)))

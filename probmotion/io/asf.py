@@ -1,8 +1,8 @@
 """Reader of ASF skeleton files.
 
 A bone extends from its parent's end along a world direction in the rest pose and rotates about its
-own axes, which C rotates from the world's. A joint is the END of the bone of its name; ``root`` is
-the origin. Files are Y up, right-handed.
+own axes: the world axes rotated by C. A joint is the end of the bone with the same name; ``root``
+is the origin. Files are Y up, right-handed.
 
 Source: M. Meredith and S. Maddock, "Motion capture file formats explained" (2001).
 """
@@ -25,7 +25,7 @@ _INCH = 0.0254
 _ROOT = "root"
 _ROTATIONS = ("RX", "RY", "RZ")
 _TRANSLATIONS = ("TX", "TY", "TZ")
-_LENGTHS = (1e-3, 1e3)  # plausible values of the unit
+_LENGTHS = (1e-3, 1e3)  # valid range of ``length`` in ``:units``
 _ENTRIES = ("id", "name", "direction", "length", "axis", "dof", "limits", "bodymass", "cofmass")
 
 
@@ -85,7 +85,7 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
     parents = _parents(text, sections[":hierarchy"], bones)
     names = list(parents)
     indices = [-1 if name == _ROOT else names.index(parents[name]) for name in names]
-    with errors_in(path):  # a cycle
+    with errors_in(path):  # such as a cycle in the hierarchy
         skeleton = Skeleton(names, indices)
     return AcclaimSkeleton(
         skeleton,
@@ -97,7 +97,7 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
 
 
 def _sections(text: AcclaimText) -> dict[str, list[Line]]:
-    """Return the lines below each keyword that begins with a colon."""
+    """Return the lines of each section by its keyword, such as ``:units``."""
     sections: dict[str, list[Line]] = {}
     line, words = text.lines[0]
     if not words[0].startswith(":"):
@@ -106,7 +106,7 @@ def _sections(text: AcclaimText) -> dict[str, list[Line]]:
         if words[0].startswith(":"):
             keyword = words[0].lower()
             if keyword in sections:
-                text.fail(line, f"expected {shortened(words[0])} once, got it again")
+                text.fail(line, f"expected one {shortened(words[0])}, got a second")
             sections[keyword] = []
         else:
             sections[keyword].append((line, words))
@@ -142,9 +142,9 @@ def _unit(text: AcclaimText, entries: dict[str, Line]) -> float:
 
 
 def _root(text: AcclaimText, entries: dict[str, Line]) -> _Bone:
-    """Return the root, a bone of length 0 at the origin."""
+    """Return the root as a bone of length 0 at the origin."""
     for name in ("position", "orientation"):
-        # Readers disagree whether motions are relative to these.
+        # Programs disagree on whether motions are relative to these.
         line, words = entries.get(name, (0, ["0"] * 3))
         if any(text.numbers(line, name, words, 3)):
             text.fail(line, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
@@ -164,22 +164,22 @@ def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) ->
         elif keyword == "end" and begun is not None:
             for needed in ("name", "direction", "length", "axis"):
                 if needed not in entries:
-                    text.fail(line, f"expected {needed} in the bone of line {begun}")
+                    text.fail(line, f"expected {needed} in the bone of line {begun}, got end")
             name_line, names = entries["name"]
             name = " ".join(names)
             if not name or name in bones:
-                text.fail(name_line, f"name must be unique, got {shortened(name)}")
+                text.fail(name_line, f"name must be nonempty and unique, got {shortened(name)}")
             bones[name] = _bone(text, begun, entries)
             begun = None
         elif begun is None or not (keyword in _ENTRIES or keyword.startswith("(")):
             wanted = "begin" if begun is None else f"{', '.join(_ENTRIES)} or end"
             text.fail(line, f"expected {wanted}, got {shortened(words[0])}")
         elif keyword in entries:
-            text.fail(line, f"expected {keyword} once in the bone of line {begun}")
-        elif not keyword.startswith("("):  # further limits
+            text.fail(line, f"expected one {keyword} in the bone of line {begun}, got a second")
+        elif not keyword.startswith("("):  # further limits are ignored
             entries[keyword] = (line, words[1:])
     if begun is not None:
-        text.fail(lines[-1][0], f"expected end of the bone of line {begun}")
+        text.fail(lines[-1][0], f"expected end of the bone of line {begun}, got none")
 
 
 def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
@@ -187,7 +187,7 @@ def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
     line, words = entries["length"]
     (length,) = text.numbers(line, "length", words, 1)
     if length < 0:
-        text.fail(line, f"length must be 0 or more, got {length:g}")
+        text.fail(line, f"length must be at least 0, got {length:g}")
     line, words = entries["direction"]
     direction = np.array(text.numbers(line, "direction", words, 3))
     if length > 0 and abs(np.linalg.norm(direction) - 1) > 1e-3:
@@ -214,11 +214,11 @@ def _channels(
 
 
 def _parents(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> dict[str, str]:
-    """Return the parent's name of each joint, the root first with itself as parent."""
+    """Return the name of each joint's parent, root first; the root is its own parent."""
     for index, keyword in ((0, "begin"), (-1, "end")):
         line, words = lines[index] if lines else (text.length, [])
         if [word.lower() for word in words] != [keyword]:
-            text.fail(line, f"expected {keyword} around the hierarchy")
+            text.fail(line, f"expected begin and end around the hierarchy, got no {keyword}")
     parents = {_ROOT: _ROOT}
     for line, words in lines[1:-1]:
         for name in words:
@@ -230,5 +230,5 @@ def _parents(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> d
             parents[name] = words[0]
     for name, bone in bones.items():
         if name not in parents:
-            text.fail(bone.line, f"expected a parent of {shortened(name)} in the hierarchy")
+            text.fail(bone.line, f"expected {shortened(name)} in the hierarchy, got no parent")
     return parents

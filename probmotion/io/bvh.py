@@ -1,7 +1,7 @@
 """Reader of BVH motion files.
 
-The world transform of a joint is its parent's, times the translation, times the rotations of its
-channels in the order listed (the first is the outermost). A position channel replaces the offset
+The world transform of a joint is that of its parent times its translation times the rotations of
+its channels in the order listed, outermost first. A position channel replaces the offset
 along its axis, on roots and on other joints, as in Blender's importer. BVH specifies no unit or
 axes; files are Y up, right-handed, and the unit is inferred.
 """
@@ -28,7 +28,7 @@ _UNITS = {
     "centimetres": 0.01,
     "millimetres": 0.001,
 }
-# Length in metres along the bones from a foot to the opposite hand of an adult.
+# Length of the chain of bones from a foot to a hand of an adult, metres.
 _REACH = 2.4
 
 
@@ -38,20 +38,20 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     Parameters
     ----------
     path : str or Path
-        The file.
+        BVH file.
     scale : float, optional
-        Metres per unit of the file. Default: the unit among metres, centimetres, millimetres and
-        the CMU database's 1/0.45 inch that brings the longest chain of bones closest to 2.4 m, foot
-        to hand of an adult. Units other than metres issue a :class:`MotionFileWarning`.
+        Metres per unit of the file. Default: inferred among metres, centimetres, millimetres and
+        the CMU database's 1/0.45 inch, so that the longest chain of bones is closest to 2.4 m
+        (foot to hand of an adult), with a :class:`MotionFileWarning` if it is not metres.
     end_sites : bool
-        Whether to include End Sites as joints, named after their parent with ``_end``.
+        Whether to include End Sites as joints, named after their parent plus ``_end``.
 
     Returns
     -------
     motion : Motion
-        Motion in metres at the file's rate, joints in the file's order. A rounded frame time is
-        read as the integer rate. Rotations are dropped if a joint other than a root translates
-        relative to its parent.
+        Motion in metres, joints in the file's order. A frame time rounded from an integer rate is
+        read as that rate. Rotations are dropped if a joint other than a root translates relative to
+        its parent.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     positions = _world_positions(rotations, translations, skeleton)
     if scale is None:
         scale = _inferred_scale(positions, skeleton, path)
-    # Rotations and constant offsets describe the motion only if no bone translates.
+    # Rotations and constant offsets reproduce the motion only if no bone translates.
     bones = [joint for joint, _ in skeleton.bones]
     rigid = not np.ptp(translations[:, bones], axis=0).any()
     rest_offsets = translations[0].copy()
@@ -87,17 +87,17 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
 
 
 def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:
-    """Return the skeleton of ``joints``, with parents as indices into ``every``."""
+    """Return the skeleton of ``joints``, whose parents are indices into ``every``."""
     index = {id(joint): i for i, joint in enumerate(joints)}
     parents = [-1 if joint.parent < 0 else index[id(every[joint.parent])] for joint in joints]
-    taken = {joint.name for joint in joints if not joint.end_site}
+    used = {joint.name for joint in joints if not joint.end_site}
     names = []
     for joint in joints:
         name, count = joint.name, 1
-        while joint.end_site and name in taken:  # a second End Site of one joint
+        while joint.end_site and name in used:  # second End Site of a joint
             count += 1
             name = f"{joint.name}{count}"
-        taken.add(name)
+        used.add(name)
         names.append(name)
     return Skeleton(names, parents)
 
@@ -139,8 +139,8 @@ def _world_positions(
 
 
 def _inferred_scale(positions: np.ndarray, skeleton: Skeleton, path: Path) -> float:
-    """Return metres per unit from the longest chain of bones; warn unless it is 1."""
-    reach = np.zeros(skeleton.n_joints)  # from each joint to its farthest descendant
+    """Infer metres per unit from the longest chain of bones; warn unless the result is 1."""
+    reach = np.zeros(skeleton.n_joints)  # distance along bones to the farthest descendant
     longest = 0.0
     for joint in reversed(skeleton.topological_order):
         parent = skeleton.parents[joint]

@@ -19,18 +19,18 @@ from probmotion.io.errors import LARGEST, MotionFileError, decoded_lines, number
 __all__ = ["FRAME_TIMES", "BVHContent", "BVHJoint", "parse_bvh"]
 
 FRAME_TIMES = (1e-4, 1.0)
-"""Valid frame times in seconds; others are usually rates or milliseconds."""
+"""Valid range of frame times, seconds; other values are usually rates or milliseconds."""
 
 _CHANNEL = re.compile(r"([XYZ])(POSITION|ROTATION)")
 
 
 @dataclass
 class BVHJoint:
-    """``ROOT``, ``JOINT`` or ``End Site`` block.
+    """Joint of a ``ROOT``, ``JOINT`` or ``End Site`` block.
 
-    The parent is an index, -1 for a root; parents precede their children. An End Site is named
-    after its parent, such as ``Head_end``, and has no channels. Others have the axis and kind of
-    each channel in the file's order, such as ``("X", "ROTATION")``.
+    ``parent`` is an index, -1 for a root; parents precede their children. An End Site is named
+    after its parent, such as ``Head_end``, and has no channels. ``channels`` contains the axis and
+    kind of each channel in the file's order, such as ``("X", "ROTATION")``.
     """
 
     name: str
@@ -51,7 +51,7 @@ class BVHContent:
 
 
 def parse_bvh(content: bytes, file: str) -> BVHContent:
-    r"""Parse a BVH file in UTF-8 or else Latin-1; ``file`` is its name in errors.
+    r"""Parse a BVH file in UTF-8 or else Latin-1; ``file`` is its name in error messages.
 
     Lines may end in ``\\n``, ``\\r\\n`` or ``\\r``, blank lines are skipped and keywords are
     case-insensitive. A name extends to the end of the line or a brace.
@@ -75,7 +75,7 @@ class _Parser:
         motion_line = keywords.index("MOTION") + 1
         self.parse_hierarchy(motion_line)
         if motion_line > len(self.lines):
-            self.fail(len(self.lines), "expected MOTION after the hierarchy")
+            self.fail(len(self.lines), "expected MOTION after the hierarchy, got no such line")
         return BVHContent(self.joints, *self.parse_motion(motion_line))
 
     def parse_hierarchy(self, motion_line: int) -> None:
@@ -91,8 +91,8 @@ class _Parser:
         if [word.upper() for word in words] != ["HIERARCHY"]:
             self.fail(line, f"expected HIERARCHY, got {shortened(' '.join(words))}")
 
-        declared: BVHJoint | None = None  # a joint without its opening brace
-        blocks: list[BVHJoint] = []  # joints with an open brace
+        declared: BVHJoint | None = None  # joint whose opening brace is still missing
+        blocks: list[BVHJoint] = []  # joints whose brace is open
         for line, words in statements[1:]:
             keyword = words[0].upper()
             if (declared is not None) != (keyword == "{"):
@@ -121,16 +121,16 @@ class _Parser:
         if declared is not None or blocks:
             joint = declared or blocks[-1]
             name = shortened(joint.name)
-            self.fail(end, f"expected the closing brace of {name}, line {joint.line}")
+            self.fail(end, f"expected the closing brace of {name} of line {joint.line}, got none")
         if not self.joints:
-            self.fail(end, "expected ROOT in the hierarchy")
+            self.fail(end, "expected ROOT in the hierarchy, got none")
 
     def declare(self, line: int, words: list[str], blocks: list[BVHJoint]) -> BVHJoint:
         """Return the joint of a ``ROOT``, ``JOINT`` or ``End Site`` line."""
         keyword, name, parent = words[0].upper(), " ".join(words[1:]), -1
         if keyword == "ROOT" and blocks:
             outer = shortened(blocks[-1].name)
-            self.fail(line, f"expected ROOT outside braces, got it inside {outer}")
+            self.fail(line, f"expected ROOT outside braces, got one inside {outer}")
         if keyword != "ROOT":
             if not blocks:
                 self.fail(line, f"expected ROOT, got {' '.join(words[:2])[:40]} outside a joint")
@@ -142,10 +142,10 @@ class _Parser:
                 self.fail(line, f"expected End Site, got {shortened(' '.join(words))}")
             return BVHJoint(f"{blocks[-1].name}_end", parent, line, end_site=True, channels=())
         if not name:
-            self.fail(line, f"expected a name after {words[0]}")
+            self.fail(line, f"expected a name after {words[0]}, got none")
         for joint in self.joints:
             if joint.name == name and not joint.end_site:
-                got = f"{shortened(name)} as in line {joint.line}"
+                got = f"{shortened(name)} again, as in line {joint.line}"
                 self.fail(line, f"expected unique names, got {got}")
         return BVHJoint(name, parent, line)
 
@@ -165,9 +165,9 @@ class _Parser:
 
     def channels(self, line: int, words: Sequence[str]) -> tuple[tuple[str, str], ...]:
         """Return the axis and kind of each declared channel."""
-        count, given = words[0] if words else "", max(len(words) - 1, 0)
-        if count != str(given):
-            self.fail(line, f"expected {shortened(count)} channels as declared, got {given}")
+        count, n_listed = words[0] if words else "", max(len(words) - 1, 0)
+        if count != str(n_listed):
+            self.fail(line, f"expected {shortened(count)} channels as declared, got {n_listed}")
         channels: list[tuple[str, str]] = []
         for word in words[1:]:
             match = _CHANNEL.fullmatch(word.upper())
@@ -204,8 +204,8 @@ class _Parser:
     def frame_rate(self, line: int, text: str) -> float:
         """Return frames per second.
 
-        A frame time within its last printed digit (and 0.15 %) of an integer rate, such as
-        0.033333 s, is taken as that rate.
+        A frame time that equals that of an integer rate within its last printed digit (and 0.15 %),
+        such as 0.033333 s, is read as that rate.
         """
         frame_time = self.number(line, text)
         least, most = FRAME_TIMES
@@ -224,7 +224,7 @@ class _Parser:
             self.fail(frames_line, "expected at least one channel in the hierarchy, got none")
         if len(rows) != frames:
             line = rows[-1][0] if rows else len(self.lines)
-            wanted = f"{frames} lines of values as in line {frames_line}"
+            wanted = f"{frames} lines of values, as declared in line {frames_line}"
             self.fail(line, f"expected {wanted}, got {len(rows)}")
         values = np.full((frames, columns), np.nan)
         for row, (line, text) in zip(values, rows, strict=True):

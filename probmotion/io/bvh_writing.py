@@ -23,11 +23,11 @@ _TOLERANCE = 1e-6  # metres; larger than the rounding of constant bones in float
 def write_bvh(motion: Motion, path: str | Path) -> None:
     """Write a motion to a BVH file, in metres and atomically.
 
-    Rotations are the motion's own, or else fitted to its positions. If rotations and constant
-    offsets reproduce all positions to 1e-6 m, joints have rotation channels only. Otherwise every
-    joint also has position channels, which replace its offset, as in Blender. In both cases
-    positions read back to 1e-6 m with ``scale=1``. Joints are written depth first; several roots
-    become several ``ROOT`` blocks.
+    A motion without rotations is written with rotations fitted to its positions. If rotations and
+    constant offsets reproduce all positions to 1e-6 m, joints have rotation channels only.
+    Otherwise every joint also has position channels, which replace its offset, as in Blender. Both
+    files reproduce positions to 1e-6 m when read with ``scale=1``. Joints are written depth first,
+    with a ``ROOT`` block for each root.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def write_bvh(motion: Motion, path: str | Path) -> None:
         if joint in translations:
             columns.append(translations[joint])
         columns.append(angles[:, joint])
-    values = np.round(np.concatenate(columns, axis=-1), _DECIMALS) + 0.0  # no -0.00000000
+    values = np.round(np.concatenate(columns, axis=-1), _DECIMALS) + 0.0  # avoids -0.00000000
     row = " ".join([f"%.{_DECIMALS}f"] * values.shape[1])
     lines = ["HIERARCHY", *_hierarchy(skeleton, offsets, set(translations)), "MOTION"]
     lines += [f"Frames: {motion.frames}", f"Frame Time: {1 / motion.fps!r}"]
@@ -70,7 +70,7 @@ def _channels(motion: Motion) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndar
     if rotations is None or offsets is None:
         rotations, offsets = fit_rotations(skeleton, motion.positions)
     angles = np.rad2deg(matrix_to_euler(rotations, _ORDER)).round(_DECIMALS)
-    # Root offsets are 0, since programs disagree whether channels replace or add to them.
+    # Root offsets are 0, since programs disagree on whether channels replace or add to them.
     offsets = np.round(offsets, _DECIMALS)
     offsets[list(skeleton.roots)] = 0.0
     # Compare with the positions that a reader reconstructs from the rounded angles.
@@ -86,7 +86,7 @@ def _channels(motion: Motion) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndar
 
 
 def _hierarchy(skeleton: Skeleton, offsets: np.ndarray, moving: set[int]) -> list[str]:
-    """Return the lines of the joints' blocks; ``moving`` joints have position channels."""
+    """Return the lines of the hierarchy; ``moving`` joints have position channels."""
     depths: dict[int, int] = {}
     lines: list[str] = []
     open_blocks = 0

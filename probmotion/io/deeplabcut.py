@@ -4,8 +4,8 @@ The header rows are ``scorer``, ``individuals`` (for several animals), ``bodypar
 x, y and, except in manually labelled data, likelihood. The first column is the frame number or the
 image path, which newer labelled tables split into three columns. Source: DeepLabCut user guide.
 
-Empty and NaN cells are missing: NaN with confidence 0. Labelled data have confidence 1. The
-individual ``single`` contains body parts of no animal, such as the corners of a box.
+Empty and NaN cells become NaN keypoints with confidence 0. Labelled keypoints have confidence 1.
+The individual ``single`` contains points outside animals, such as the corners of a box.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ def read_deeplabcut(
     Parameters
     ----------
     path : str or Path
-        A CSV table.
+        CSV table.
     fps : float
         Frames per second of the video, which the table does not contain.
     skeleton : Skeleton or str, optional
-        Joints to return, or the name of a preset; body parts are matched by their own or canonical
-        names. Default: every body part as a root, since tables contain no links.
+        Joints to return, or the name of a preset; body parts are matched by name or canonical
+        name. Default: every body part as a root, since tables contain no links.
 
     Returns
     -------
     tracks : list of KeypointTrack
-        One per animal and video, over all frames of the table. Body parts of no animal (``single``)
+        One per animal and video, over all frames of the table. Points outside animals (``single``)
         form a separate track, which is dropped if they lack joints of ``skeleton``.
 
     Raises
@@ -107,13 +107,13 @@ def _rows(path: Path) -> Rows:
 
 
 def _header(rows: Rows, path: Path) -> tuple[int, dict[str, dict[str, Columns]], Rows]:
-    """Return the number of index columns, the columns of body parts by animal, and the body."""
+    """Return the number of index columns, the columns of body parts by animal, and the data."""
     names = [row[0].strip().lower() for _, row in rows[:4]]
     several = names[1:2] == ["individuals"]
     expected = ["scorer", *["individuals"] * several, "bodyparts", "coords"]
     if names[: len(expected)] != expected:
         raise MotionFileError(
-            f"{path}: expected the rows scorer, individuals (for several), bodyparts and coords, "
+            f"{path}: expected the rows scorer, individuals (optional), bodyparts and coords, "
             f"got {shortened(names)}"
         )
     body = rows[len(expected) :]
@@ -163,7 +163,7 @@ def _image(cells: Sequence[str], line: int, path: Path) -> tuple[str, int]:
 
 
 def _matches(joints: Skeleton, wanted: Skeleton) -> list[int | None]:
-    """Return the index of each wanted joint by its own or canonical name, None if missing."""
+    """Return the index of each wanted joint, by name or canonical name; None if missing."""
     indices: list[int | None] = []
     for name, canonical in zip(wanted.joint_names, wanted.canonical_names, strict=True):
         try:
@@ -184,9 +184,9 @@ def _values(rows: Rows, parts: list[Columns], path: Path) -> np.ndarray:
                     where = f"{path}, line {line}, column {columns[name] + 1}"
                     text = cells[columns[name]].strip()
                     entry[axis] = np.nan if text in _MISSING else number(text, where)
-            if entry[2] < 0:  # of the last column that was read
+            if entry[2] < 0:  # ``where`` is the likelihood cell
                 raise MotionFileError(
-                    f"{where}: expected a likelihood of 0 or more, got {entry[2]:g}"
+                    f"{where}: expected a likelihood of at least 0, got {entry[2]:g}"
                 )
             if not np.isnan(entry).any():
                 values[row, joint] = entry

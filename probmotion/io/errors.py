@@ -20,33 +20,33 @@ __all__ = [
 ]
 
 LARGEST = 1e9
-"""Largest magnitude of a number in a motion file."""
+"""Largest accepted magnitude of a number in a motion file."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class MotionFileError(ValueError):
-    """A file is damaged or has the wrong format; the message names the file and the line or key."""
+    """Error for a damaged file or a wrong format; the message names the file and line or key."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_on_one_line(message))
 
 
 class MotionFileWarning(UserWarning):
-    """A file was read with an assumption, which the message states."""
+    """Warning about an assumption made while reading a file."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_on_one_line(message))
 
 
 def _on_one_line(message: str) -> str:
-    """Escape unprintable characters, such as line ends in names of damaged files."""
+    """Escape unprintable characters, such as newlines in joint names of damaged files."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)
 
 
 @contextmanager
 def errors_in(where: object) -> Iterator[None]:
-    """Turn a ``ValueError`` of the block into a :class:`MotionFileError` about ``where``."""
+    """Convert a ``ValueError`` of the block to a :class:`MotionFileError` about ``where``."""
     try:
         yield
     except MotionFileError:
@@ -63,12 +63,12 @@ def read_bytes(path: Path) -> bytes:
         raise
     except OSError as error:
         raise MotionFileError(
-            f"{path} cannot be read ({error.strerror}), expected a motion file"
+            f"{path}: expected a readable motion file ({error.strerror})"
         ) from error
 
 
 def decoded_lines(content: bytes) -> list[str]:
-    """Return the lines of a text with any line ends, in UTF-8 or else Latin-1."""
+    """Return the lines of a UTF-8 or else Latin-1 text, with any line endings."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -77,7 +77,7 @@ def decoded_lines(content: bytes) -> list[str]:
 
 
 def number(word: str, where: str) -> float:
-    """Return a plain decimal number between -1e9 and 1e9; ``where`` locates it in the error."""
+    """Parse a decimal number between -1e9 and 1e9; ``where`` is its location in the error."""
     if _NUMBER.fullmatch(word) is None or abs(float(word)) > LARGEST:
         raise MotionFileError(
             f"{where}: expected a number between -1e9 and 1e9, got {shortened(word)}"

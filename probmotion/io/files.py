@@ -26,9 +26,9 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
     Parameters
     ----------
     path : str or Path
-        The file; an ``.amc`` needs its ``.asf`` skeleton beside it.
+        Motion file; an ``.amc`` requires its ``.asf`` skeleton in the same folder.
     fps : float, optional
-        Frames per second to resample to; the file's own by default.
+        Frames per second to resample to; the file's rate by default.
 
     Returns
     -------
@@ -52,9 +52,9 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
     readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": read_amc}
     if path.suffix.lower() not in readers:
         if not path.exists():
-            raise FileNotFoundError(f"there is no file {path}")
+            raise FileNotFoundError(f"path must be an existing file, got {path}")
         raise MotionFileError(
-            f"{path}: expected .bvh, .npz, or .amc beside its .asf, got {path.suffix!r}; use "
+            f"{path}: expected .bvh, .npz or .amc, got {path.suffix!r}; use "
             "read_keypoints for 2D keypoints"
         )
     motion = readers[path.suffix.lower()](path)
@@ -74,7 +74,7 @@ def save(motion: Motion, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        If the suffix is another one, or the format cannot represent the motion.
+        If the suffix is not supported, or the format cannot represent the motion.
     OSError
         If the folder is missing or not writable.
     """
@@ -101,11 +101,11 @@ def read_keypoints(
     fps : float, optional
         Frames per second; required for JSON files and tables, which do not contain it.
     skeleton : Skeleton or str, optional
-        Keypoints of a JSON file in their order (see
+        Keypoints of a JSON file in the file's order (see
         :func:`~probmotion.io.keypoint_json.read_keypoint_json`), or the joints to select from a
         table (see :func:`~probmotion.io.deeplabcut.read_deeplabcut`).
     people : int, optional
-        Number of people to follow in a JSON file without track ids.
+        Number of people to track in a JSON file without track ids.
 
     Raises
     ------
@@ -114,11 +114,11 @@ def read_keypoints(
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If ``fps`` is missing or not above 0, or ``skeleton`` or ``people`` does not apply.
+        If ``fps`` is missing or not above 0, or ``skeleton`` or ``people`` is not applicable.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
+        raise FileNotFoundError(f"path must be an existing file, got {path}")
     archive = path.suffix.lower() == ".npz"
     table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
     unused = {"people": people, "skeleton": skeleton if archive else None}
@@ -128,7 +128,7 @@ def read_keypoints(
     if archive:
         return read_keypoint_npz(path, fps)
     if fps is None:
-        raise ValueError(f"fps must be given for {path}, which does not contain a frame rate")
+        raise ValueError(f"fps must be given for {path}, which contains no frame rate, got None")
     if table:
         return read_deeplabcut(path, fps, skeleton)
     return read_keypoint_json(path, fps, skeleton, people)
@@ -155,7 +155,7 @@ def load_all(
 
 
 def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files of paths or patterns, sorted; see :func:`load_all`."""
+    """Return the files that match paths or patterns, sorted; see :func:`load_all`."""
     files: list[str] = []
     for pattern in [paths] if isinstance(paths, str | Path) else paths:
         matches = glob(str(pattern)) if has_magic(str(pattern)) else [str(pattern)]

@@ -1,7 +1,7 @@
 """Reader of keypoint tracks in the JSON formats of COCO, AlphaPose and OpenPose.
 
 =====================  ==========================================================================
-flavour                content
+format                 content
 =====================  ==========================================================================
 COCO annotations       ``{"images": […], "annotations": [{"image_id", "keypoints", …}], …}``
 COCO results,          ``[{"image_id": "12.jpg", "keypoints": [x, y, confidence, …], "idx": 1},
@@ -13,7 +13,7 @@ OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": [�
 =====================  ==========================================================================
 
 Frames are the images listed in the file (COCO annotations, OpenPose). Results list only images with
-a detection: the frame is the last number in the image's name, and tracks include all frames between
+a detection; the frame is the last number in the image's name, and tracks include all frames between
 the first and the last. Keypoints of confidence 0 are NaN. The visibility v of COCO annotations
 becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible.
 """
@@ -46,7 +46,7 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["read_keypoint_json"]
 
 _BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}
-_TWO_LAYOUTS = {25: " ('body25' and 'body25b' have as many)"}
+_TWO_LAYOUTS = {25: " ('body25' or 'body25b')"}
 
 
 def read_keypoint_json(
@@ -60,7 +60,7 @@ def read_keypoint_json(
     Parameters
     ----------
     path : str or Path
-        A JSON file, or a folder of OpenPose files, one per frame.
+        JSON file, or folder of OpenPose files, one per frame.
     fps : float
         Frames per second, which these files do not contain.
     skeleton : Skeleton or str, optional
@@ -68,7 +68,7 @@ def read_keypoint_json(
         ``categories``, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25 is
         ambiguous.
     people : int, optional
-        Number of people to follow between images in a file without track ids; see
+        Number of people to track between images in a file without track ids; see
         :func:`~probmotion.io.keypoint_linking.link_people`.
 
     Returns
@@ -80,10 +80,10 @@ def read_keypoint_json(
     Raises
     ------
     MotionFileError
-        If the file contains no such tracks or is damaged.
+        If the file contains no keypoint tracks or is damaged.
     ValueError
-        If ``fps`` is not above 0, ``skeleton`` is an unknown name, or ``people`` exceeds the number
-        in any image.
+        If ``fps`` is not above 0, ``skeleton`` is an unknown name, or ``people`` exceeds
+        the largest number in an image.
     """
     path = Path(path)
     check_positive("fps", fps)
@@ -117,7 +117,7 @@ def read_keypoint_json(
         )
     counts = sorted({len(detection.values) for detection in detections})
     if len(counts) > 1:
-        raise MotionFileError(f"{path}: expected the same keypoints of all people, got {counts}")
+        raise MotionFileError(f"{path}: expected the same number of keypoints, got {counts}")
     if people is not None:
         check_count("people", people)
         if all(detection.person is None for detection in detections):
@@ -154,7 +154,8 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
             )
         values = keypoint_values(person.get("keypoints"), where)
         if not np.isin(values[:, 2], (0, 1, 2)).all():
-            raise MotionFileError(f"{where}: expected visibilities 0, 1 or 2, got others")
+            got = shortened(values[:, 2].tolist())
+            raise MotionFileError(f"{where}: expected visibilities 0, 1 or 2, got {got}")
         values[:, 2] /= 2
         track_id = _identity(person, ("track_id", "instance_id"), where)
         detections.append(Detection(*locations[image_id], track_id, values, where))
@@ -162,7 +163,7 @@ def _annotations(content: dict[str, Any], path: Path) -> tuple[list[Detection], 
 
 
 def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
-    """Return the detections of COCO results and of AlphaPose's own list."""
+    """Return the detections of COCO results or AlphaPose's default format."""
     detections = []
     for number, person in enumerate(content):
         where = f"{path}, [{number}]"
@@ -174,14 +175,14 @@ def _results(content: list[dict[str, Any]], path: Path) -> list[Detection]:
 
 
 def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[Detection]:
-    """Return the detections of one frame of OpenPose, or of AlphaPose in the same form."""
+    """Return the detections of one frame in the OpenPose or a similar AlphaPose format."""
     key = "people" if "people" in frame else "bodies"
     detections = []
     for index, person in enumerate(_dicts(frame[key], f"{where}, {key}")):
         location = f"{where}, {key}[{index}]"
         names = ("pose_keypoints_2d", "pose_keypoints", "joints")
         keypoints = next((person[name] for name in names if name in person), None)
-        if keypoints == []:  # a face or a hand without a body
+        if keypoints == []:  # only a face or a hand
             continue
         track_id = _identity(person, ("person_id", "idx", "track_id"), location)
         values = keypoint_values(keypoints, location)
@@ -190,7 +191,7 @@ def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[
 
 
 def _folder(path: Path) -> tuple[list[Detection], Frames]:
-    """Return the detections and frames of an OpenPose folder, with evenly numbered files."""
+    """Return the detections and frames of an OpenPose folder with evenly spaced file numbers."""
     files = sorted(path.glob("*.json"), key=lambda file: natural(file.name))
     if not files:
         raise MotionFileError(f"{path}: expected OpenPose .json files, one per frame, got none")
@@ -239,7 +240,7 @@ def _all_have(items: Iterable[Any], key: str) -> bool:
 
 
 def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """Return the first of ``keys`` as text, None if it is missing or OpenPose's -1."""
+    """Return the first value among ``keys`` as text; None if missing or -1 (OpenPose)."""
     value = next((item[key] for key in keys if item.get(key) is not None), None)
     while isinstance(value, list) and len(value) == 1:
         value = value[0]
@@ -248,15 +249,15 @@ def _identity(item: dict[str, Any], keys: tuple[str, ...], where: str) -> str | 
     if value is None or value == [] or value == -1:
         return None
     if not isinstance(value, int | str):
-        raise MotionFileError(f"{where}: {keys[0]} must be a number, got {shortened(value)}")
+        raise MotionFileError(f"{where}: {keys[0]} must be int or str, got {shortened(value)}")
     return str(value)
 
 
 def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
     """Return the skeleton of the annotated COCO categories, None if they have none.
 
-    Categories with the joints of a preset use its parents. Others use a spanning tree of the file's
-    edges, since these generally form no tree.
+    Categories with the joints of a preset use its parents. Other categories use a spanning tree of
+    the file's edges, which generally contain cycles.
     """
     where = f"{path}, categories"
     used = {_identity(person, ("category_id",), where) for person in content["annotations"]}
@@ -295,7 +296,7 @@ def _named_skeleton(names: list[str], edges: list[list[int]]) -> Skeleton:
     for root in range(len(names)):
         queue = [] if root in parents else [root]
         parents.setdefault(root, -1)
-        for joint in queue:  # grows: breadth first
+        for joint in queue:  # breadth-first search; grows in the loop
             for neighbour in neighbours[joint]:
                 if neighbour not in parents:
                     parents[neighbour] = joint
@@ -310,10 +311,8 @@ def _checked_skeleton(skeleton: Skeleton | None, counts: list[int], path: Path) 
     (count,) = counts
     if skeleton is None:
         if count not in _BY_COUNT:
-            raise MotionFileError(
-                f"{path}: expected the argument skeleton to name the {count} keypoints"
-                f"{_TWO_LAYOUTS.get(count, '')}"
-            )
+            wanted = f"{count} keypoints{_TWO_LAYOUTS.get(count, '')}"
+            raise MotionFileError(f"{path}: skeleton must be given for {wanted}, got None")
         return Skeleton.preset(_BY_COUNT[count])
     if skeleton.n_joints != count:
         raise MotionFileError(

@@ -16,10 +16,10 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
     """Return the detections of ``people`` people, with track ids ``"0"``, ``"1"``, …
 
     Tracking starts at a video's first image with at least that many people, where the most
-    confident ones are numbered from left to right, and proceeds forwards and backwards. In every
-    other image, detections are assigned to people by the minimum total keypoint distance from their
-    expected positions (Hungarian method), extrapolated with constant velocity. Other detections are
-    dropped. People who swap places during occlusion may be confused.
+    confident detections are numbered from left to right, and proceeds forwards and backwards. In
+    every other image, detections are assigned to people by the minimum total keypoint distance from
+    positions extrapolated at constant velocity (Hungarian method). Other detections are dropped.
+    People who swap positions during occlusion may be confused.
     """
     videos: dict[str, dict[int, list[Detection]]] = {}
     for detection in detections:
@@ -30,25 +30,25 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
         full = [number for number in order if len(frames[number]) >= people]
         if not full:
             most = max(map(len, frames.values()))
-            raise ValueError(f"people must be at most {most}, as in one image, got {people}")
+            raise ValueError(f"people must be at most {most}, the most in any image, got {people}")
         confident = sorted(frames[full[0]], key=lambda one: -one.values[:, 2].mean())[:people]
         first = sorted(confident, key=lambda one: float(_middle(one.values)[0]))
         tracked = {full[0]: dict(enumerate(first))}
         start = order.index(full[0])
         for numbers in (order[start + 1 :], order[:start][::-1]):
-            followed: list[tuple[Detection, Detection | None]] = [(one, None) for one in first]
+            recent: list[tuple[Detection, Detection | None]] = [(one, None) for one in first]
             for number in numbers:
-                expected = [_expected(*pair, number) for pair in followed]
+                expected = [_expected(*pair, number) for pair in recent]
                 tracked[number] = _assigned(frames[number], expected)
                 for person, one in tracked[number].items():
-                    followed[person] = one, followed[person][0]
+                    recent[person] = one, recent[person][0]
         for number in order:
             linked += [replace(one, person=str(k)) for k, one in sorted(tracked[number].items())]
     return linked
 
 
 def _expected(last: Detection, before: Detection | None, frame: int) -> np.ndarray:
-    """Return a person's keypoints in ``frame``, moved at the velocity of their mean."""
+    """Return a person's keypoints in ``frame``, extrapolated at the velocity of their mean."""
     values = last.values.copy()
     if before is not None:
         step = _middle(last.values) - _middle(before.values)
@@ -58,7 +58,7 @@ def _expected(last: Detection, before: Detection | None, frame: int) -> np.ndarr
 
 
 def _assigned(detections: list[Detection], expected: list[np.ndarray]) -> dict[int, Detection]:
-    """Return the detection of each person in the image, if there is one."""
+    """Return the detections assigned to people, by the number of the person."""
     from scipy.optimize import linear_sum_assignment
 
     cost = np.array([[_distance(where, one.values) for one in detections] for where in expected])
@@ -66,7 +66,7 @@ def _assigned(detections: list[Detection], expected: list[np.ndarray]) -> dict[i
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the mean distance of common keypoints, or of the mean keypoints if there are none."""
+    """Return the mean distance of common keypoints, or of the mean keypoints if none is common."""
     both = (first[:, 2] > 0) & (second[:, 2] > 0)
     if not both.any():
         return float(np.linalg.norm(_middle(first) - _middle(second)))
@@ -74,6 +74,6 @@ def _distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _middle(values: np.ndarray) -> np.ndarray:
-    """Return the mean of the detected keypoints, (2,); 0 if there is none."""
+    """Return the mean of the detected keypoints, (2,); 0 if none is detected."""
     seen = values[:, 2] > 0
     return values[seen, :2].mean(axis=0) if seen.any() else np.zeros(2)

@@ -21,9 +21,9 @@ _LONGEST_TRACK = 500_000
 
 @dataclass(frozen=True)
 class Detection:
-    """One person in one image: x, y and confidence of each keypoint, (J, 3), as ``values``.
+    """Keypoints of one person in one image: ``values`` (J, 3) are x, y and confidence.
 
-    ``person`` is the track id, None if the file has none; ``where`` is the location for errors.
+    ``person`` is the track id, None if missing; ``where`` is the location in error messages.
     """
 
     video: str
@@ -53,7 +53,7 @@ def keypoint_values(value: Any, where: str) -> np.ndarray:
     confidence = values[:, 2]
     if not (confidence >= 0).all():
         raise MotionFileError(
-            f"{where}: expected confidence 0 or more, got {confidence[~(confidence >= 0)][0]:g}"
+            f"{where}: expected confidence of at least 0, got {confidence[~(confidence >= 0)][0]:g}"
         )
     if np.isnan(values[confidence > 0]).any():
         raise MotionFileError(f"{where}: expected numbers where confidence is above 0, got NaN")
@@ -61,9 +61,9 @@ def keypoint_values(value: Any, where: str) -> np.ndarray:
 
 
 def frame_number(image: Any, where: str) -> tuple[str, int]:
-    """Return the video and the frame of an image: ``"walk_012.png"`` → ``("walk_", 12)``.
+    """Return the video and frame number of an image: ``"walk_012.png"`` → ``("walk_", 12)``.
 
-    The frame is the last number in the image's name; the rest of it names the video.
+    The frame is the last number in the image's name; the rest is the name of the video.
     """
     if isinstance(image, int) and not isinstance(image, bool) and image >= 0:
         image = str(image)
@@ -79,7 +79,7 @@ def frame_number(image: Any, where: str) -> tuple[str, int]:
 
 
 def natural(text: str) -> tuple[tuple[str, int], ...]:
-    """Return a sort key with ``"frame10"`` after ``"frame9"``."""
+    """Return a natural sort key: ``"frame9"`` is sorted before ``"frame10"``."""
     parts = re.findall(r"([^0-9]*)([0-9]{0,19})", text)
     return tuple((word, int(number or -1)) for word, number in parts)
 
@@ -100,7 +100,7 @@ def tracks_of(
     if 0 < unnamed < len(detections):
         raise MotionFileError(
             f"{file}: expected a track id for all detections or none, got {unnamed} of "
-            f"{len(detections)} without"
+            f"{len(detections)} without one"
         )
     grouped: dict[tuple[str, str], dict[int, Detection]] = {}
     seen: dict[str, list[int]] = {}
@@ -113,7 +113,7 @@ def tracks_of(
                 got = f"person {shortened(detection.person)} twice"
             raise MotionFileError(
                 f"{detection.where}: expected unique track ids (track_id, idx or person_id), got "
-                f"{got} in frame {detection.frame}; set people to follow people without ids"
+                f"{got} in frame {detection.frame}; set people to track people without ids"
             )
         track[detection.frame] = detection
     if frames is None:

@@ -1,4 +1,4 @@
-"""Motions and keypoint tracks as ``.npz`` archives, without pickles.
+"""Reader and writer of motions and keypoint tracks in ``.npz`` archives, without pickles.
 
 Keys of a motion:
 
@@ -46,14 +46,14 @@ from probmotion.validation import check_shape
 
 __all__ = ["Archive", "read_keypoint_npz", "read_npz", "write_npz"]
 
-# Rotation from Z up to Y up: (x, y, z) becomes (x, z, -y).
+# Rotation from Z up to Y up: (x, y, z) → (x, z, -y).
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_npz(path: str | Path) -> Motion:
     """Read a motion from an ``.npz`` archive.
 
-    Several people become one skeleton with one root each and joints named ``person:joint``. Z-up
+    Several people share one skeleton, with a root for each and joints named ``person:joint``. Z-up
     worlds are rotated to Y up about the x axis. Joints without a position in any frame are dropped
     with a :class:`MotionFileWarning`.
 
@@ -86,7 +86,7 @@ def read_npz(path: str | Path) -> Motion:
 
 
 def write_npz(motion: Motion, path: str | Path) -> None:
-    """Write a motion to an ``.npz`` archive, without loss and atomically."""
+    """Write a motion to an ``.npz`` archive, losslessly and atomically."""
     skeleton = motion.skeleton
     arrays: dict[str, Any] = {
         "positions": motion.positions,
@@ -108,7 +108,7 @@ def write_npz(motion: Motion, path: str | Path) -> None:
 def read_keypoint_npz(path: str | Path, fps: float | None = None) -> list[KeypointTrack]:
     """Read the keypoint tracks of an ``.npz`` archive, one per camera.
 
-    ``fps`` replaces the file's frame rate.
+    ``fps`` overrides the file's frame rate.
 
     Raises
     ------
@@ -157,11 +157,11 @@ class Archive:
         try:
             member = io.BytesIO(self.zip.read(f"{key}.npy"))
             return np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # see __init__; pickled object arrays raise ValueError
+        except Exception as error:  # as in __init__; pickled object arrays raise ValueError
             self.fail(f"expected numbers or strings in {key} ({str(error)[:80]})", error)
 
     def numbers(self, key: str) -> np.ndarray:
-        """Return an array as float64; NaN is accepted, infinite and huge numbers are not."""
+        """Return an array as float64; NaN is accepted, magnitudes above 1e9 are not."""
         array = self.array(key)
         if array.dtype.kind not in "fiu":
             self.fail(f"{key} must contain real numbers, got {shortened(array.dtype)}")
@@ -172,14 +172,14 @@ class Archive:
         return array
 
     def points(self, key: str, shapes: str) -> np.ndarray:
-        """Return a nonempty array of three or four axes with the last size in ``shapes``."""
+        """Return a nonempty array of one of the two ``shapes``, with three or four axes."""
         array = self.numbers(key)
         if array.ndim not in (3, 4) or array.shape[-1] != int(shapes[-2]) or 0 in array.shape:
-            self.fail(f"{key} must have shape {shapes}, none of it 0, got {array.shape}")
+            self.fail(f"{key} must have nonempty shape {shapes}, got {array.shape}")
         return array
 
     def names(self, key: str, kind: str | None, count: int) -> list[str]:
-        """Return ``count`` names, by default ``person0``, ``person1``, … if a kind is given."""
+        """Return ``count`` names; with a kind, the default is ``person0``, ``person1``, …"""
         if kind is not None and key not in self.keys:
             return [f"{kind}{index}" for index in range(count)]
         array = self.array(key)

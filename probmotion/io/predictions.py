@@ -33,19 +33,19 @@ def read_predictions(
     Parameters
     ----------
     path : str or Path
-        The archive; see the module for its keys.
+        Archive with the keys of the module docstring.
     skeleton : Skeleton
-        The J joints to return, matched by their (canonical) names.
+        Skeleton of the J joints to return, matched by name or canonical name.
     frames : int, optional
-        Split every motion into windows of this length and drop the remainder; whole motions by
-        default.
+        Split every motion into windows of this length and drop the remainder; by default,
+        motions are not split.
     fps : float, optional
-        Frames per second to resample to before splitting; the file's own by default.
+        Frames per second to resample to before splitting; the file's rate by default.
 
     Returns
     -------
     ndarray, (N, L, J, 3)
-        Metres, Y up, the first root at the origin in every frame.
+        Joint positions, metres, Y up, with the first root at the origin in every frame.
 
     Raises
     ------

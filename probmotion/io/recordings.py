@@ -1,7 +1,7 @@
 """Reader of multi-camera recordings of one person, triangulated for denoising.
 
-Detections and their errors are real. The recording's own filtered 3D, computed from the same
-detections, serves for comparison; the ground truth is unknown.
+Detections and their errors are real. The ground truth is unknown; the filtered 3D joints of the
+recording, computed from the same detections, are provided for comparison.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Recording:
     joints : ndarray, (L, J, 3)
         Joints triangulated frame by frame, metres, world Y up; NaN where occluded.
     filtered : ndarray, (L, J, 3)
-        The recording's own 3D; NaN where missing.
+        Filtered joints of the recording, metres; NaN where missing.
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     fps : float
         Frames per second.
     name : str
@@ -51,9 +51,9 @@ class Recording:
 
     @property
     def seen(self) -> np.ndarray:
-        """Where joints are triangulated, (L, J).
+        """Mask of triangulated joints, (L, J).
 
-        Detection confidence is no further indicator of quality: its correlation with the distance
+        Detection confidence does not indicate their quality: its correlation with the distance
         between triangulated and filtered joints is -0.02.
         """
         return np.isfinite(self.joints).all(axis=-1)
@@ -74,10 +74,10 @@ def read_recording(
         An ``.npz`` with ``keypoints`` (V, L, J, 2), ``confidence`` (V, L, J), ``positions`` and the
         cameras' ``K``, ``R``, ``t`` and ``distortion``.
     skeleton : Skeleton, optional
-        The joints to return, ``person14`` by default; a missing pelvis or neck is the midpoint of
-        hips or shoulders.
+        Joints to return, ``person14`` by default; a missing pelvis or neck is replaced by the
+        midpoint of the hips or shoulders.
     fps : float, optional
-        Frames per second to return; None for the file's own.
+        Frames per second to resample to; None for the file's rate.
     threshold : float
         Minimum confidence of a detection.
 
@@ -86,10 +86,10 @@ def read_recording(
     MotionFileError
         If the file is damaged, or a key is missing or has an invalid shape or NaN.
     ValueError
-        If a joint of ``skeleton`` is missing, the threshold is not 0 to 1, or shapes do not fit.
+        If a joint of ``skeleton`` is missing, the threshold is out of range, or shapes disagree.
     """
     if not (isinstance(threshold, Real) and 0 <= threshold <= 1):
-        raise ValueError(f"threshold must be 0 to 1, got {threshold!r}")
+        raise ValueError(f"threshold must be between 0 and 1, got {threshold!r}")
     archive = Archive(Path(path))
     keypoints, confidence = archive.numbers("keypoints"), archive.numbers("confidence")
     check_shape("keypoints", keypoints, ("V", "L", "J", 2))
@@ -120,9 +120,9 @@ def _weights(
     if not np.isfinite(confidence).any():
         archive.fail("confidence must contain numbers, got only NaN")
     weights = np.where(confidence >= threshold, confidence, 0.0)
-    lost = np.isnan(keypoints).any(axis=-1) & (weights > 0)
-    if lost.any():
-        view, frame, joint = np.argwhere(lost)[0]
+    missing = np.isnan(keypoints).any(axis=-1) & (weights > 0)
+    if missing.any():
+        view, frame, joint = np.argwhere(missing)[0]
         archive.fail(
             f"keypoints must be finite unless their confidence is 0, got NaN at view {view}, frame "
             f"{frame}, joint {joint} with confidence {weights[view, frame, joint]:g}"
@@ -160,8 +160,8 @@ def undistorted(
 ) -> np.ndarray:
     """Return pixels (V, L, J, 2) as projected by pinhole cameras with the intrinsics of `cameras`.
 
-    A lens with intrinsics K (V, 3, 3) and coefficients k₁, k₂, p₁, p₂ (V, 4) maps slopes (x, y),
-    with r² = x² + y², to
+    A lens with intrinsics K (V, 3, 3) and coefficients k₁, k₂, p₁, p₂ (V, 4) maps normalised
+    coordinates (x, y), with r² = x² + y², to
 
         x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²), and with y and x, p₁ and p₂ exchanged,
 
@@ -171,15 +171,15 @@ def undistorted(
     focal, centre = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
     distorted = (keypoints - centre) / focal
     k1, k2, p1, p2 = distortion.T[:, :, None, None]
-    slopes = distorted
+    normalised = distorted
     for _ in range(_FIXED_POINT_STEPS):
-        x, y = slopes[..., 0], slopes[..., 1]
+        x, y = normalised[..., 0], normalised[..., 1]
         square = x**2 + y**2
         along_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
         along_y = 2 * p2 * x * y + p1 * (square + 2 * y**2)
         tangential = np.stack([along_x, along_y], axis=-1)
-        slopes = (distorted - tangential) / (1 + k1 * square + k2 * square**2)[..., None]
-    return slopes * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
+        normalised = (distorted - tangential) / (1 + k1 * square + k2 * square**2)[..., None]
+    return normalised * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
 
 
 def _converted(

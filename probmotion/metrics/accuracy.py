@@ -1,4 +1,4 @@
-"""Errors of motions against a true motion, in metres per joint and frame."""
+"""Position and acceleration errors of motions relative to the true motion."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = [
 def joint_errors(motions: Array, truth: Array) -> Array:
     """Return distances per frame and joint, ``(…, L, J, 3), (L, J, 3) → (…, L, J)``.
 
-    Their mean is G-MPJPE; after :func:`aligned_by_root` MPJPE; after
-    :func:`aligned_by_similarity` PA-MPJPE.
+    Their mean is the G-MPJPE; after :func:`aligned_by_root`, it is the MPJPE, and after
+    :func:`aligned_by_similarity`, the PA-MPJPE.
     """
     xp = array_namespace(motions, truth)
     check_shape("motions", motions, ("…", *truth.shape))
@@ -29,7 +29,7 @@ def joint_errors(motions: Array, truth: Array) -> Array:
 def mean_over(errors: Array, mask: Array | None = None) -> Array:
     """Return the mean error of each motion, ``(…, L, J) → (…)``.
 
-    Entries outside ``mask``, (L, J) bool, are ignored; an empty mask is a ``ValueError``.
+    Entries outside ``mask``, (L, J) bool, are ignored; an empty mask raises ``ValueError``.
     """
     xp = array_namespace(errors)
     if mask is None:
@@ -38,7 +38,7 @@ def mean_over(errors: Array, mask: Array | None = None) -> Array:
     weights = constant(mask, errors)
     total = float(xp.sum(weights))
     if total == 0:
-        raise ValueError("mask must select at least one joint in a frame")
+        raise ValueError("mask must select at least one joint in a frame, got none")
     return xp.sum(errors * weights, axis=(-2, -1)) / total
 
 
@@ -50,7 +50,7 @@ def aligned_by_root(motions: Array, root: int = 0) -> Array:
 def aligned_by_similarity(motions: Array, truth: Array) -> Array:
     """Return each frame aligned to the truth by a similarity, no reflection (Umeyama 1991).
 
-    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. A frame with all joints at one point is translated.
+    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. If all joints coincide, they are only translated.
     """
     xp = array_namespace(motions, truth)
     check_shape("motions", motions, ("…", *truth.shape))
@@ -62,14 +62,14 @@ def aligned_by_similarity(motions: Array, truth: Array) -> Array:
     sign = xp.linalg.det(xp.matmul(left, right))
     ones = xp.ones_like(sign)
     signs = xp.stack([ones, ones, sign], axis=-1)
-    turn = xp.matmul(left * signs[..., None, :], right)
+    rotation = xp.matmul(left * signs[..., None, :], right)
     square = xp.sum(x**2, axis=(-2, -1))
     scale = xp.sum(size * signs, axis=-1) / xp.where(square == 0, ones, square)
-    return scale[..., None, None] * xp.matmul(x, turn) + target
+    return scale[..., None, None] * xp.matmul(x, rotation) + target
 
 
 def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
-    """Return the mean distance of accelerations, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
+    """Return the mean error of the accelerations, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
     Accelerations are second differences and need at least three frames.
     """
@@ -82,12 +82,12 @@ def acceleration_ratio(motions: Array, truth: Array) -> Array:
     """Return the mean acceleration relative to the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
     Plausible values are 0.5 to 2 (paper 001, appendix H.1): lower means oversmoothed, higher
-    jittery. Raises ``ValueError`` below three frames or if the truth has no acceleration.
+    means jittery. Raises ``ValueError`` below three frames or if the truth has no acceleration.
     """
     _check_frames(motions, truth)
     size = float(_mean_bend(truth))
     if size == 0:
-        raise ValueError("truth must have a nonzero acceleration in some frame")
+        raise ValueError("truth must have a nonzero acceleration in at least one frame, got 0")
     return _mean_bend(motions) / size
 
 

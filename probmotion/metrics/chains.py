@@ -17,11 +17,11 @@ __all__ = [
 # Above this dimension, only the principal coordinates are monitored.
 _FEW = 32
 _PRINCIPAL = 10
-# Relative standard deviation below which a coordinate is constant.
+# Relative standard deviation below which a coordinate counts as constant.
 _NOTHING = 1e-9
-# Shorter chains have no ESS: it could not reveal autocorrelation.
+# Minimum draws per chain for the ESS: shorter chains cannot reveal autocorrelation.
 _TO_CORRELATE = 10
-# Simulated runs behind a quantile of R-hat.
+# Number of simulated runs from which a quantile of R-hat is computed.
 _RUNS = 100
 
 
@@ -30,12 +30,12 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
 
     ``rhat`` is the largest and ``ess_bulk`` and ``ess_tail`` are the smallest over ``values``
     (chain, draw, n), by default :func:`monitored_coordinates` (Vehtari et al. 2021, ArviZ); R-hat
-    is NaN below 4 draws per chain and ESS missing below 10. ``acceptance`` is the mean and
+    is NaN below 4 draws per chain; ESS is omitted below 10. ``acceptance`` is the mean and
     ``divergent`` the number of divergent transitions.
 
-    Walkers of an ensemble are coupled, so ``ess_bulk`` then comes from the stored
-    ``autocorrelation_time`` (missing if NaN); ensembles in different modes only show in R-hat, with
-    each ensemble as one chain.
+    Walkers of an ensemble are coupled, so ``ess_bulk`` is computed from the stored
+    ``autocorrelation_time`` (omitted if NaN). Only R-hat, with each ensemble as one chain, detects
+    ensembles in different modes.
     """
     if draws.independent:
         return {}
@@ -66,8 +66,8 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
 def principal_coordinates(values: np.ndarray) -> np.ndarray:
     """Return the leading principal coordinates over all chains, at most 10.
 
-    ``(chain, draw, n) → (chain, draw, k)``, by decreasing variance; constant ones are dropped, but
-    never the first.
+    ``(chain, draw, n) → (chain, draw, k)``, by decreasing variance; constant coordinates other than
+    the first are dropped.
     """
     flat = values.reshape(-1, values.shape[-1])
     left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
@@ -77,28 +77,28 @@ def principal_coordinates(values: np.ndarray) -> np.ndarray:
 
 
 def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
-    """Return the upper ``level`` quantile of R-hat over converged runs.
+    """Return the ``level`` quantile of R-hat over converged runs.
 
-    R-hat is the largest over as many coordinates as are monitored, in 100 simulated runs of
-    ``chains`` chains with ``draws`` (at least 4) independent draws each. For short chains the
-    quantile is far above 1.
+    R-hat is the largest over 33 coordinates, the maximum that is monitored, in 100 simulated runs
+    of ``chains`` chains with ``draws`` (at least 4) independent draws each. For short chains the
+    quantile is well above 1.
     """
     from arviz_stats.base import array_stats
 
-    greatest = []
+    maxima = []
     for run in range(_RUNS):
-        # One at a time: all at once would take gigabytes.
+        # Simulate one run at a time, since all runs would require gigabytes.
         rng = seeds.generator(seed, "rhat", run)
         values = rng.standard_normal((chains, draws, _FEW + 1))
-        greatest.append(array_stats.rhat(values, chain_axis=0, draw_axis=1).max())
-    return float(np.quantile(greatest, level))
+        maxima.append(array_stats.rhat(values, chain_axis=0, draw_axis=1).max())
+    return float(np.quantile(maxima, level))
 
 
 def monitored_coordinates(draws: MotionDraws) -> np.ndarray:
     """Return the coordinates that diagnostics monitor, (chain, draw, n).
 
-    θ (else the positions), or its 10 leading principal coordinates above 32 dimensions, because the
-    worst of a thousand looks bad even for perfect chains; plus the log density if stored.
+    θ, or the positions if θ is not stored, and the log density if stored. Above 32 dimensions, θ is
+    replaced by 10 principal coordinates, since the largest R-hat of many is always high.
     """
     data = draws.dataset
     shape = (data.sizes["chain"], data.sizes["draw"])

@@ -12,7 +12,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["coverage", "nearest_draw_distances"]
 
-# Draws per block, so that their graphs stay in a core's cache.
+# Draws per block; their graphs fit in the cache of a core.
 _BLOCK = 256
 
 
@@ -29,21 +29,21 @@ def coverage(
     ground_truth : ndarray, (G, J, 3)
         Real poses, metres.
     draws : ndarray, (S, J, 3)
-        Draws, metres; may be a memory map. Repeated poses are measured once.
+        Draws, metres; may be a memory map. Repeated poses are evaluated once.
     measure : str
-        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`, after the best rigid
-        alignment of the two poses.
+        Distance after the best rigid alignment of the two poses, one of
+        :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
     counts : sequence of int, optional
-        Numbers of leading draws, in any order, to compute coverage for in one pass.
+        Numbers of leading draws, in any order, for which to compute the coverage.
 
     Returns
     -------
     coverage : float, or ndarray (len(counts),)
-        Metres; dimensionless for shape contexts.
+        Mean distance, metres; dimensionless for shape contexts.
     """
     wanted = [len(draws)] if counts is None else list(counts)
-    least = nearest_draw_distances(ground_truth, draws, measure, wanted)
-    means = least.mean(axis=1)
+    minima = nearest_draw_distances(ground_truth, draws, measure, wanted)
+    means = minima.mean(axis=1)
     return float(means[0]) if counts is None else means
 
 
@@ -58,14 +58,14 @@ def nearest_draw_distances(
     check_shape("draws", draws, ("S", ground_truth.shape[1], 3))
     for name, values in (("ground_truth", ground_truth), ("draws", draws), ("counts", counts)):
         if len(values) == 0:
-            raise ValueError(f"{name} must not be empty, got 0 entries")
+            raise ValueError(f"{name} must have at least one entry, got 0")
     for count in counts:
         check_count("counts", count)
         if count > len(draws):
             raise ValueError(f"counts must be at most the {len(draws)} draws, got {count}")
     prepare, lower_minima = MEASURES[measure]
     truths = prepare(ground_truth)
-    least = np.full(len(ground_truth), np.inf)
+    minima = np.full(len(ground_truth), np.inf)
     seen: set[bytes] = set()
     by_count: dict[int, np.ndarray] = {}
     done = 0
@@ -74,9 +74,9 @@ def nearest_draw_distances(
             block = np.asarray(draws[start : min(start + _BLOCK, count)], dtype=np.float64)
             check_finite("draws", block)
             new = block[_first_seen(block, seen)]
-            lower_minima(*truths, *prepare(new), least)
+            lower_minima(*truths, *prepare(new), minima)
         done = count
-        by_count[count] = least.copy()
+        by_count[count] = minima.copy()
     return np.stack([by_count[count] for count in counts])
 
 

@@ -1,4 +1,4 @@
-"""Credible sets: the smallest level that contains a truth, from its rank."""
+"""Levels of the smallest credible sets that contain the truth, from its rank."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DENSITY, DISTANCE = "log density", "distance"
 
 
 def credible_level(quantity: str, ranks: np.ndarray) -> np.ndarray:
-    """Return the level of the smallest credible set that contains the truth of rank in [0, 1].
+    """Return the level of the smallest credible set that contains the truth, by rank in [0, 1].
 
     The set is the highest-density region for :data:`DENSITY` (Hermans et al. 2022, "A crisis in
     simulation-based inference?"), the ball around a random point for :data:`DISTANCE` (Lemos et al.

@@ -1,4 +1,4 @@
-"""Distances of sets of draws (n, D), flattened motions in metres, from reference draws."""
+"""Distances between draws and reference draws, flattened motions (n, D) in metres."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
     check_shape("x", x, ("n", directions.shape[-1]))
     check_shape("y", y, tuple(x.shape))
     axes = constant(directions.T, x)
-    apart = xp.sort(x @ axes, axis=0) - xp.sort(y @ axes, axis=0)
-    return xp.sqrt(xp.mean(apart**2))
+    differences = xp.sort(x @ axes, axis=0) - xp.sort(y @ axes, axis=0)
+    return xp.sqrt(xp.mean(differences**2))
 
 
 def sliced_wasserstein_ratio(
@@ -46,7 +46,7 @@ def sliced_wasserstein_ratio(
 ) -> float:
     """Return the sliced Wasserstein distance to exact draws relative to that of two exact sets.
 
-    1 means indistinguishable from exact draws.
+    A ratio of 1 means indistinguishable from exact draws.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def sliced_wasserstein_ratio(
     references : sequence of Array, each (n, D)
         At least two independent sets of exact draws; both distances are averaged over them.
     directions : ndarray, (P, D)
-        Unit vectors to project on.
+        Unit vectors onto which draws are projected.
     """
     if len(references) < 2:
         raise ValueError(f"references must have at least 2 sets, got {len(references)}")
@@ -73,11 +73,11 @@ def trace_ratio(draws: Array, reference: Array) -> Array:
 def mean_error(draws: Array, reference: Array) -> Array:
     """Return ‖mean(draws) − mean(reference)‖ / √tr Cov[reference], ``(n, D), (m, D) → ()``.
 
-    About √(1/n + 1/m) for independent exact draws.
+    It is about √(1/n + 1/m) for independent exact draws.
     """
     xp = array_namespace(draws, reference)
-    apart = xp.mean(draws, axis=0) - xp.mean(reference, axis=0)
-    return xp.sqrt(xp.sum(apart**2) / _total_variance(reference))
+    difference = xp.mean(draws, axis=0) - xp.mean(reference, axis=0)
+    return xp.sqrt(xp.sum(difference**2) / _total_variance(reference))
 
 
 def precision_recall(
@@ -85,8 +85,8 @@ def precision_recall(
 ) -> tuple[float, float]:
     """Return precision and recall of k-nearest-neighbour manifolds (Kynkäänniemi et al. 2019).
 
-    Precision is the fraction of draws within the distance to the k-th neighbour of some reference
-    draw; recall swaps the roles. Both sets, (n, D) and (m, D), need more than ``neighbours`` = k
+    Precision is the fraction of draws closer to any reference draw than its k-th neighbour, and
+    recall exchanges the roles. Both sets, (n, D) and (m, D), must have more than ``neighbours`` = k
     points.
     """
     for name, points in (("draws", draws), ("reference", reference)):
@@ -94,23 +94,23 @@ def precision_recall(
             raise ValueError(
                 f"{name} must have more than neighbours={neighbours} points, got {len(points)}"
             )
-    apart = _distances(draws, reference)
-    precision = (apart <= _radii(reference, neighbours)[None, :]).any(axis=1).mean()
-    recall = (apart <= _radii(draws, neighbours)[:, None]).any(axis=0).mean()
+    distances = _distances(draws, reference)
+    precision = (distances <= _radii(reference, neighbours)[None, :]).any(axis=1).mean()
+    recall = (distances <= _radii(draws, neighbours)[:, None]).any(axis=0).mean()
     return float(precision), float(recall)
 
 
 def _total_variance(points: Array) -> Array:
     xp = array_namespace(points)
-    apart = points - xp.mean(points, axis=0)
-    return xp.sum(apart**2) / (points.shape[0] - 1)
+    centred = points - xp.mean(points, axis=0)
+    return xp.sum(centred**2) / (points.shape[0] - 1)
 
 
 def _radii(points: np.ndarray, neighbours: int) -> np.ndarray:
     """Return the distance of each point to its k-th nearest neighbour, (n,)."""
-    apart = _distances(points, points)
-    np.fill_diagonal(apart, math.inf)
-    return np.partition(apart, neighbours - 1, axis=1)[:, neighbours - 1]
+    distances = _distances(points, points)
+    np.fill_diagonal(distances, math.inf)
+    return np.partition(distances, neighbours - 1, axis=1)[:, neighbours - 1]
 
 
 def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:

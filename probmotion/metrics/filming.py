@@ -49,15 +49,15 @@ def film_motions(
     positions : ndarray, (N, L, J, 3)
         Motions, metres.
     rng : Generator
-        Draws one azimuth per motion.
+        Random generator of the azimuths, one per motion.
     elevation : float
         Elevation of the cameras, radians.
     distance : float
-        From camera to root, metres.
+        Distance from camera to root, metres.
     angles : {"all", "side", "reference-code-side"}
         Distribution of azimuths; see :func:`random_azimuths`.
     root : int
-        Joint that the cameras follow.
+        Index of the joint at the centre of the views.
     """
     check_shape("positions", positions, ("N", "L", "J", 3))
     check_finite("positions", positions)
@@ -66,6 +66,6 @@ def film_motions(
     # Rotate the motion instead of the camera, by the negative azimuth.
     c, s = np.cos(azimuths)[:, None, None], np.sin(azimuths)[:, None, None]
     x, y, z = centred[..., 0], centred[..., 1], centred[..., 2]
-    turned = np.stack([c * x - s * z, y, s * x + c * z], axis=-1)
+    rotated = np.stack([c * x - s * z, y, s * x + c * z], axis=-1)
     camera = Cameras.around(np.zeros(1), np.array([elevation]), distance=distance, perspective=True)
-    return camera.project(turned)[:, 0]
+    return camera.project(rotated)[:, 0]

@@ -1,4 +1,4 @@
-"""Similarity of generated to real 2D motion, by an evaluator's features (MAS, section 6.3)."""
+"""Similarity of generated to real 2D motions in an evaluator's feature space (MAS, section 6.3)."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ __all__ = [
     "frechet_distance",
 ]
 
-# Recall below which a generator has collapsed (MAS, table 2).
+# Recall below which a generator counts as collapsed (MAS, table 2).
 COLLAPSED_BELOW = 0.1
 _CHAMFER_FRAMES = 10  # as published
-# Mean and standard deviation over repeats, by score.
+# Mean and standard deviation over repeats of each score.
 Scores = dict[str, tuple[float, float]]
 
 
 @runtime_checkable
 class EncodesViews(Protocol):
-    """A feature extractor of 2D motions."""
+    """Feature extractor of 2D motions."""
 
     @property
     def skeleton(self) -> Skeleton:
-        """The J joints."""
+        """Skeleton of the J joints."""
 
     @property
     def frames(self) -> int:
-        """Largest number of frames of a motion."""
+        """Maximum number of frames of a motion."""
 
     def features(self, views: np.ndarray, lengths: np.ndarray | None = None) -> np.ndarray:
         """Return features: ``(N, L, J, 2) → (N, D)``; views in metres, centred on the root."""
 
 
 def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the squared Fréchet distance of two sets' Gaussians (Heusel et al. 2017, eq. 6).
+    """Return the squared Fréchet distance of the fitted Gaussians (Heusel et al. 2017, eq. 6).
 
     ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½) of features (N, D) and (M, D). With C = RᵀR, the
     last trace is the sum of the singular values of R_a R_bᵀ, stable even for fewer motions than
@@ -68,23 +68,23 @@ def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
         if len(features) < 2:
             raise ValueError(f"{name} must have at least 2 motions, got {len(features)}")
     root_a, root_b = _covariance_root(a), _covariance_root(b)
-    shared = np.linalg.svd(root_a @ root_b.T, compute_uv=False).sum()
-    apart = ((a.mean(axis=0) - b.mean(axis=0)) ** 2).sum()
-    distance = apart + (root_a**2).sum() + (root_b**2).sum() - 2 * shared
-    # Equal sets give about ±1e-15 tr C by rounding.
+    cross = np.linalg.svd(root_a @ root_b.T, compute_uv=False).sum()
+    means = ((a.mean(axis=0) - b.mean(axis=0)) ** 2).sum()
+    distance = means + (root_a**2).sum() + (root_b**2).sum() - 2 * cross
+    # Rounding errors are about ±1e-15 tr C for equal sets.
     return max(0.0, float(distance))
 
 
 def _covariance_root(features: np.ndarray) -> np.ndarray:
     """Return R with RᵀR the covariance."""
-    apart = (features - features.mean(axis=0)) / math.sqrt(len(features) - 1)
-    return np.linalg.qr(apart).R
+    centred = (features - features.mean(axis=0)) / math.sqrt(len(features) - 1)
+    return np.linalg.qr(centred).R
 
 
 def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) -> float:
     """Return the mean distance of ``pairs`` random pairs of motions, from features (N, D), N ≥ 2.
 
-    As in the MAS authors' code (200 pairs); the paper calls it the variance.
+    Defined as in the MAS authors' code (200 pairs); the paper calls it the variance.
     """
     check_count("pairs", pairs)
     if len(features) < 2:
@@ -96,21 +96,21 @@ def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) 
 
 @dataclass(frozen=True, eq=False)
 class GenerationReference:
-    """Real 2D motion to compare generated motion with.
+    """Real 2D motions as a reference for generated motions.
 
     Parameters
     ----------
     evaluator : EncodesViews
         Feature extractor.
     held_out_features : ndarray, (M, D)
-        Features of real motions in neither training set.
+        Features of real motions outside the training sets of generator and evaluator.
     learnt_features : ndarray, (M, D), optional
         Features of the training clips. With few clips, held-out ones differ so much that no
-        generator comes close; see :meth:`of_learnt`.
+        generator scores well; see :meth:`of_learnt`.
     elevation : float
         Elevation of the cameras that view generated motions, radians.
     distance : float
-        From the cameras to the root, metres.
+        Distance from the cameras to the root, metres.
     held_out_views : ndarray, (M', L', J, 2), optional
         Held-out motions, metres, centred on the root, for the Chamfer distance.
     """
@@ -153,10 +153,10 @@ class GenerationReference:
 
         - ``fid``: Fréchet distance of features; 0 is ideal
         - ``diversity``: mean distance of two motions; ideally that of real motions
-        - ``precision``: fraction of motions on the manifold of real ones; 1 is best
-        - ``recall``: fraction of real motions on the manifold of these; 1 is best
+        - ``precision``: fraction of generated motions on the manifold of real ones; 1 is best
+        - ``recall``: fraction of real motions on the manifold of generated ones; 1 is best
 
-        Every repeat views up to ``samples`` of them from new azimuths; repeat r does not depend on
+        Every repeat films up to ``samples`` motions from new azimuths; repeat r does not depend on
         ``repeats``. The standard deviation (ddof 1) is that of one repeat and covers azimuths and
         subsets, not training or the choice of held-out motions. (The MAS authors' code prints the
         95 % interval of the mean, 1.96 standard deviations / √repeats.)
@@ -175,7 +175,7 @@ class GenerationReference:
     def chamfer(self, positions: np.ndarray, *, seed: int) -> MotionChamfer:
         """Return the Motion Chamfer Distance of one view of each motion, (N, L, J, 3) metres.
 
-        Windows have 10 frames, or all if there are fewer. Requires ``held_out_views``.
+        Windows have 10 frames, or all frames of shorter motions. Requires ``held_out_views``.
         """
         if self.held_out_views is None:
             raise ValueError("held_out_views must be given, got None")

@@ -25,7 +25,7 @@ def t_interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tup
     Parameters
     ----------
     values : sequence of float, (n,)
-        One per seed (for paired samples, the differences); n = 1 gives an infinite interval.
+        One value or paired difference per seed; the interval is infinite for n = 1.
     level : float
         Confidence level, between 0 and 1.
     """
@@ -34,15 +34,15 @@ def t_interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tup
     values = np.asarray(values, np.float64)
     check_shape("values", values, ("n",))
     if not len(values) or not np.isfinite(values).all():
-        raise ValueError(f"values must be finite and at least one, got {values.tolist()}")
+        raise ValueError(f"values must be one or more finite numbers, got {values.tolist()}")
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, got {level!r}")
     n = len(values)
     if n == 1:
         return -math.inf, math.inf
-    middle = float(values.mean())
-    reach = float(stats.t.isf((1 - level) / 2, n - 1) * values.std(ddof=1) / math.sqrt(n))
-    return middle - reach, middle + reach
+    mean = float(values.mean())
+    half_width = float(stats.t.isf((1 - level) / 2, n - 1) * values.std(ddof=1) / math.sqrt(n))
+    return mean - half_width, mean + half_width
 
 
 def best_and_tied(
@@ -56,23 +56,23 @@ def best_and_tied(
 ) -> tuple[str, set[str]]:
     """Return the best sampler and the set of samplers statistically tied with it, itself included.
 
-    The best has the lowest mean error over seeds. Another is worse if Student's interval of its
-    paired differences to the best, over common seeds, lies above 0, at Holm's levels (Holm 1979):
+    The best has the lowest mean error over seeds. A sampler is worse if Student's interval of its
+    paired differences to the best, over common seeds, is above 0, at Holm's levels (Holm 1979):
     the most significant of m at 1 − .05/m, the next at 1 − .05/(m − 1), and so on to the first that
-    includes 0. A single seed ties all. The standard deviation of differences is at least that of
-    two rounding errors of size ``step``.
+    includes 0. With one seed, all are tied. The standard deviation of differences is at least that
+    of two rounding errors of size ``step``.
 
-    The truly best sampler is among the tied with probability ≥ .95; one of several equals is alone
-    with probability ≤ .05. Because the best is chosen from the same values, the probability that
-    some of ten equals is excluded is about .1.
+    The truly best sampler is in the set with probability ≥ .95; among several equal samplers, the
+    set has only one with probability ≤ .05. Because the best is selected from the same values, the
+    probability that any of ten equal samplers is excluded is about .1.
 
     Parameters
     ----------
     values : mapping of str to sequence of float
         One value per seed for each sampler, seeds in the same order; NaN for a failed run. Samplers
-        without values or with an infinite error are excluded; one that lacks a seed is not best.
+        without values or with an infinite error are excluded; one without all seeds is not best.
     target : float or None
-        Ideal value; the error is the distance from it. None: the value is the error.
+        Ideal value; the error is the distance to it. If None, the error is the value.
     ratio : bool
         Whether the distance is abs(log(value/target)).
     lower_is_better : bool
@@ -86,14 +86,14 @@ def best_and_tied(
     n_seeds = {name: np.isfinite(row).sum() for name, row in errors.items()}
     complete = [name for name in errors if n_seeds[name] == max(n_seeds.values())]
     best = min(complete, key=lambda name: float(np.nanmean(errors[name])))
-    apart = {}
+    paired = {}
     for name, row in errors.items():
         differences = row - errors[best]
-        apart[name] = differences[np.isfinite(differences)]
-    chance = {name: _tail(apart[name], _TWO_ROUNDINGS * step) for name in set(errors) - {best}}
+        paired[name] = differences[np.isfinite(differences)]
+    p_values = {name: _tail(paired[name], _TWO_ROUNDINGS * step) for name in set(errors) - {best}}
     tied = set(errors)
-    for rank, name in enumerate(sorted(chance, key=lambda name: chance[name])):
-        if 2 * chance[name] >= (1 - level) / (len(chance) - rank):
+    for rank, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
+        if 2 * p_values[name] >= (1 - level) / (len(p_values) - rank):
             break
         tied.remove(name)
     return best, tied
@@ -127,7 +127,7 @@ def _errors(
         if np.isfinite(error).any() and not np.isinf(error).any():
             errors[name] = error
     if not errors:
-        raise ValueError("values must contain a sampler with a finite value")
+        raise ValueError("values must contain a sampler with a finite value, got none")
     return errors
 
 
@@ -138,8 +138,8 @@ def _tail(differences: np.ndarray, least_spread: float) -> float:
     n = len(differences)
     if n < 2:
         return 1.0
-    middle = float(differences.mean())
+    mean = float(differences.mean())
     spread = max(float(differences.std(ddof=1)), least_spread)
     if spread == 0:
-        return 0.0 if middle > 0 else 1.0
-    return float(stats.t.sf(middle / (spread / math.sqrt(n)), n - 1))
+        return 0.0 if mean > 0 else 1.0
+    return float(stats.t.sf(mean / (spread / math.sqrt(n)), n - 1))

@@ -1,6 +1,6 @@
 """Errors of predicted 2D keypoints (Sun et al. 2024, "Ponymation", sections 4.2.2 and 4.3).
 
-Keypoints are in any unit of the image, x right and y down.
+Keypoints are in any image unit, x right and y down.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def percentage_of_correct_keypoints(
     visible : ndarray of bool, (…, L, J), optional
         Mask of visible keypoints; all by default.
     threshold : float
-        Relative to the size; 0.1 for PCK@0.1.
+        Threshold relative to the size; 0.1 for PCK@0.1.
 
     Returns
     -------
     float
-        0 to 100, over the visible keypoints of all sequences.
+        Percentage of the visible keypoints of all sequences, 0 to 100.
     """
     seen = _check_keypoints(predicted, truth, visible)
     check_positive("threshold", threshold)
@@ -53,9 +53,9 @@ def percentage_of_correct_keypoints(
             f"{sizes.shape}"
         )
     if not (np.isfinite(sizes) & (sizes > 0)).all():
-        raise ValueError("size must be finite and above 0")
+        raise ValueError(f"size must be finite and above 0, got {size}")
     if not seen.any():
-        raise ValueError("visible must contain at least one keypoint")
+        raise ValueError("visible must contain at least one keypoint, got none")
     sizes = sizes.reshape(*sizes.shape, *[1] * (truth.ndim - 1 - sizes.ndim))
     errors = np.linalg.norm(_masked(predicted - truth, seen), axis=-1)
     return 100 * float((errors < threshold * sizes)[seen].mean())
@@ -64,7 +64,7 @@ def percentage_of_correct_keypoints(
 def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
     """Return the longer side of the bounding box of each sequence: ``(…, L, J, 2) → (…)``.
 
-    The box contains the visible keypoints of all frames; its sides must not both be 0.
+    The box contains the visible keypoints of all frames; one side must be above 0.
     """
     seen = _check_keypoints(keypoints, keypoints, visible, ("keypoints", "keypoints"))[..., None]
     low = np.where(seen, keypoints, np.inf).min(axis=(-3, -2))
@@ -99,15 +99,15 @@ def velocity_error(
     steps = _masked(np.diff(truth, axis=-3), both)
     errors = _masked(np.diff(predicted, axis=-3) - np.diff(truth, axis=-3), both)
     length = np.sqrt((steps**2).sum(axis=(-2, -1)))
-    off = np.sqrt((errors**2).sum(axis=(-2, -1)))
-    moves = length > 0
-    counted = moves.sum(axis=-1)
-    if not (counted > 0).all():
+    error_length = np.sqrt((errors**2).sum(axis=(-2, -1)))
+    moving = length > 0
+    n_moving = moving.sum(axis=-1)
+    if not (n_moving > 0).all():
         raise ValueError(
             "truth must have a moving visible keypoint in every sequence, got a static sequence"
         )
-    ratios = np.divide(off, length, out=np.zeros_like(off), where=moves)
-    return float((ratios.sum(axis=-1) / counted).mean())
+    ratios = np.divide(error_length, length, out=np.zeros_like(error_length), where=moving)
+    return float((ratios.sum(axis=-1) / n_moving).mean())
 
 
 def fit_linear_map(
@@ -121,7 +121,7 @@ def fit_linear_map(
     Parameters
     ----------
     predicted : ndarray, (…, J, 2)
-        Joints.
+        Predicted 2D joints.
     annotated : ndarray, (…, K, 2)
         Keypoints of the same frames; invisible ones may be NaN.
     visible : ndarray of bool, (…, K), optional

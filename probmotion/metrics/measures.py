@@ -1,4 +1,4 @@
-"""All metrics of one run on one problem, by name."""
+"""Metrics of a run on a problem, by name."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LIBRARIES = (
 )  # fmt: skip
 
 _DIRECTIONS = 256
-# Sets of exact draws, each as large as the run, about 4000 in all.
+# Target number of exact draws, and maximum number of sets, each as large as the run.
 _ENOUGH, _MOST_SETS = 4000, 8
 _MILLIMETRES = 1000.0
 _SQUARE_CENTIMETRES = 1e4
@@ -62,7 +62,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     Against a differentiable density in θ, ``ksd``: squared kernel Stein discrepancy; 0 is ideal,
     NaN if most draws are equal or the gradient is not finite.
 
-    Projected, against held-out real 2D motion (MAS, section 6.3), mean over random views: ``fid``,
+    In 2D, against held-out real motion (MAS, section 6.3), mean over random views: ``fid``,
     ``diversity_ratio`` (relative to real motion), ``view_precision``, ``view_recall``; from the
     side ``fid_side``, ``view_recall_side``; against the training clips ``fid_learnt``,
     ``view_recall_learnt``; ``mcd_cm2``: Motion Chamfer Distance of 10-frame windows, cm², which
@@ -84,7 +84,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     problem : Problem
         Problem that was sampled.
     draws : MotionDraws
-        The run.
+        Draws of the run.
     seed : int
         Seed of reference draws and directions, shared by all samplers.
     """
@@ -145,7 +145,7 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
     flat = _compared(problem, positions)
-    # Thin draws so that two reference sets are as large.
+    # Thin draws to the size of two available reference sets.
     most = problem.max_references
     n = len(flat) if most is None else min(len(flat), most // 2)
     thinned = flat[np.arange(n) * len(flat) // n]
@@ -156,17 +156,17 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
         "variance_ratio": float(distribution.trace_ratio(flat, exact.flat)),
         "mean_error_sd": float(distribution.mean_error(flat, exact.flat)),
     }
-    off = _off_manifold(prior, positions)
-    if off is not None and exact.off is not None:
-        values["off_manifold_ratio"] = off / exact.off
+    off_manifold = _off_manifold(prior, positions)
+    if off_manifold is not None and exact.off is not None:
+        values["off_manifold_ratio"] = off_manifold / exact.off
     log_density = _log_density(problem, positions)
     if log_density is not None and exact.log_density is not None:
         values["log_density_gap"] = log_density - exact.log_density
     proportions = _mode_proportions(prior, positions)
     if proportions:
         values |= {f"mode_proportion_{style}": p for style, p in proportions.items()}
-        apart = [abs(p - exact.mode_proportions[style]) for style, p in proportions.items()]
-        values["mode_proportions_tv"] = 0.5 * sum(apart)
+        differences = [abs(p - exact.mode_proportions[style]) for style, p in proportions.items()]
+        values["mode_proportions_tv"] = 0.5 * sum(differences)
     values["precision"], values["recall"] = distribution.precision_recall(thinned, exact.sets[0])
     values["mmd"] = maximum_mean_discrepancy(thinned, exact.sets[0])
     values["c2st"] = classifier_two_sample(thinned, exact.sets[0], seed)
@@ -202,22 +202,22 @@ def _against_real_views(
     reference: GenerationReference, positions: np.ndarray, seed: int
 ) -> dict[str, float]:
     samples = len(positions)
-    around = reference.score_motions(positions, seed=seed, samples=samples)
+    uniform = reference.score_motions(positions, seed=seed, samples=samples)
     side = reference.score_motions(positions, seed=seed, samples=samples, angles="side")
     pairs = seeds.generator(seed, "real pairs")
     real = diversity(reference.held_out_features, pairs, _REAL_PAIRS)
     values = {
-        "fid": around["fid"][0],
-        "diversity_ratio": around["diversity"][0] / real,
-        "view_precision": around["precision"][0],
-        "view_recall": around["recall"][0],
+        "fid": uniform["fid"][0],
+        "diversity_ratio": uniform["diversity"][0] / real,
+        "view_precision": uniform["precision"][0],
+        "view_recall": uniform["recall"][0],
         "fid_side": side["fid"][0],
         "view_recall_side": side["recall"][0],
     }
     if reference.learnt_features is not None:
-        again = reference.of_learnt().score_motions(positions, seed=seed, samples=samples)
-        values["fid_learnt"] = again["fid"][0]
-        values["view_recall_learnt"] = again["recall"][0]
+        learnt = reference.of_learnt().score_motions(positions, seed=seed, samples=samples)
+        values["fid_learnt"] = learnt["fid"][0]
+        values["view_recall_learnt"] = learnt["recall"][0]
     if reference.held_out_views is not None:
         values["mcd_cm2"] = _SQUARE_CENTIMETRES * reference.chamfer(positions, seed=seed).mean
     return values
@@ -277,14 +277,14 @@ def accuracy_of(
     per_draw = accuracy.mean_over(errors)
     unaligned = accuracy.joint_errors(positions, truth)
     unaligned_mean = accuracy.joint_errors(mean, truth)
-    nearest = accuracy.aligned_by_similarity(positions, truth)
+    aligned = accuracy.aligned_by_similarity(positions, truth)
     metres = {
         "mpjpe": per_draw.mean(),
         "mpjpe_mean": mean_errors.mean(),
         "mpjpe_best": per_draw.min(),
         "g_mpjpe": unaligned.mean(),
         "g_mpjpe_mean": unaligned_mean.mean(),
-        "pa_mpjpe": accuracy.joint_errors(nearest, truth).mean(),
+        "pa_mpjpe": accuracy.joint_errors(aligned, truth).mean(),
     }
     visible = visible_joints(posterior)
     if visible is not None and not visible.all() and visible.any():
@@ -311,17 +311,17 @@ def _image_errors(
     cameras = posterior.likelihood.cameras
     true = cameras.project(truth)
     try:
-        shown = cameras.project(positions)
+        projected = cameras.project(positions)
     except ValueError:
         return {"pck": math.nan, "velocity_error": math.nan}
-    true = np.broadcast_to(true, shown.shape)
+    true = np.broadcast_to(true, projected.shape)
     values = {}
     # A single joint in a single frame has no extent.
     if np.ptp(true, axis=(-3, -2)).any(axis=-1).all():
         size = keypoints.image_extent(true)
-        values["pck"] = keypoints.percentage_of_correct_keypoints(shown, true, size)
+        values["pck"] = keypoints.percentage_of_correct_keypoints(projected, true, size)
     if np.diff(true, axis=-3).any():
-        values["velocity_error"] = keypoints.velocity_error(shown, true)
+        values["velocity_error"] = keypoints.velocity_error(projected, true)
     return values
 
 
@@ -334,6 +334,6 @@ def visible_joints(posterior: MotionPosterior) -> np.ndarray | None:
 
 
 def load_libraries() -> None:
-    """Import the libraries of the metrics in advance, to exclude that from measured times."""
+    """Import the libraries of the metrics in advance, to exclude import times from run times."""
     for name in _LIBRARIES:
         import_module(name)

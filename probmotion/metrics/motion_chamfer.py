@@ -14,15 +14,15 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["MotionChamfer", "motion_chamfer_distance"]
 
-# Products are padded to this size, so that a distance does not depend on other sequences.
+# Products are padded to this size, so that rounding does not depend on the number of sequences.
 _BLOCK = 256
 
 
 class MotionChamfer(NamedTuple):
     """Both directions of a Motion Chamfer Distance, in squared keypoint units.
 
-    ``of_generated`` is the mean error of generated sequences to the nearest real one (fidelity),
-    ``of_real`` the reverse (coverage).
+    ``of_generated`` is the mean error from generated sequences to the nearest real one (fidelity),
+    ``of_real`` is the reverse (coverage).
     """
 
     of_generated: float
@@ -30,7 +30,7 @@ class MotionChamfer(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """The Motion Chamfer Distance, the mean of the two directions."""
+        """Motion Chamfer Distance: mean of the two directions."""
         return (self.of_generated + self.of_real) / 2
 
 
@@ -47,8 +47,8 @@ def motion_chamfer_distance(
 
         d(g, r) = 1/|T_r| Σ_{t ∈ T_r} 1/|V_rt| Σ_{j ∈ V_rt} ‖g_tj − r_tj‖²
 
-    with V_rt the keypoints of r visible in frame t, and T_r the frames with any. Sequences are not
-    aligned: centre and scale both sets alike.
+    with V_rt the keypoints of r visible in frame t, and T_r the frames with at least one.
+    Sequences are not aligned: centre and scale both sets in the same manner.
 
     Sequences are split into windows of ``frames`` frames. All real windows form one set; the
     distance is averaged over the window positions of the generated ones (appendix C), so that
@@ -84,11 +84,11 @@ def motion_chamfer_distance(
             )
     targets = filled.reshape(-1, frames, *filled.shape[2:])
     weights = _weights(seen.reshape(-1, frames, seen.shape[2]))
-    places = [
+    distances = [
         _chamfer(generated[:, start : start + frames], targets, weights)
         for start in range(0, generated.shape[1], frames)
     ]
-    of_generated, of_real = np.mean(places, axis=0)
+    of_generated, of_real = np.mean(distances, axis=0)
     return MotionChamfer(float(of_generated), float(of_real))
 
 
@@ -122,7 +122,7 @@ def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tu
             columns = slice(column, min(column + _BLOCK, len(real)))
             block = left @ _padded(right[columns]).T
             block = block[: rows.stop - row, : columns.stop - column] + constant[columns]
-            # Rounding may make the error of copies negative.
+            # Rounding errors may be negative for copies.
             block = np.maximum(block, 0.0)
             of_generated[rows] = np.minimum(of_generated[rows], block.min(axis=1))
             of_real[columns] = np.minimum(of_real[columns], block.min(axis=0))

@@ -1,7 +1,7 @@
 """Kernel Stein discrepancy: goodness of fit of draws to an unnormalised density.
 
-It needs only the gradient of the log density. It is local: wrong weights of well-separated modes go
-undetected.
+It requires only the gradient of the log density. It is local: it does not detect wrong weights of
+well-separated modes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _BATCH = 256
 
 
 class NoGradient(ValueError):  # noqa: N818 (a condition, not a fault)
-    """The posterior has no differentiable log density in θ; the message names the reason."""
+    """Error for a posterior without a differentiable log density in θ; states the reason."""
 
 
 def kernel_stein_discrepancy(
@@ -30,7 +30,7 @@ def kernel_stein_discrepancy(
 ) -> float:
     """Return the squared kernel Stein discrepancy of draws from a density, unbiased; 0 is ideal.
 
-    The mean over pairs of different draws of (Liu et al. 2016, eqs. 9 and 14)
+    It is the mean over pairs of different draws of (Liu et al. 2016, eqs. 9 and 14)
 
         s·s' k + s·∇'k + s'·∇k + tr ∇∇'k,    s = ∇ log p(θ), s' = ∇ log p(θ'),
 
@@ -62,9 +62,9 @@ def kernel_stein_discrepancy(
     kernel = (1 + squared) ** -0.5
     # With u = θ − θ' and f(‖u‖²) = k: ∇k = 2f'u, ∇'k = −2f'u, tr ∇∇'k = −2d f' − 4f''‖u‖².
     first, second = -0.5 * kernel**3, 0.75 * kernel**5
-    along = slope @ point.T
-    ahead = np.diag(along)[:, None] - along
-    pairs = (slope @ slope.T) * kernel - 2 * first * (ahead + ahead.T)
+    products = slope @ point.T
+    projection = np.diag(products)[:, None] - products
+    pairs = (slope @ slope.T) * kernel - 2 * first * (projection + projection.T)
     pairs -= 2 * dim * first + 4 * second * squared
     return float((pairs.sum() - np.trace(pairs)) / (n * (n - 1)))
 
@@ -77,7 +77,7 @@ def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     Raises
     ------
     NoGradient
-        If there is no log density in θ, or neither library can differentiate it.
+        If the posterior has no log density in θ, or neither library can differentiate it.
     ValueError
         If the gradient is not finite.
     """
@@ -103,9 +103,9 @@ def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
             return np.concatenate(parts)
         except NotConjugate as error:
             raise NoGradient(f"posterior has no score: {error}") from error
-        except Exception as refused:
-            # Densities may raise anything for arrays they do not support.
-            reasons.append(f"{name} met {type(refused).__name__}")
+        except Exception as cause:
+            # Densities may raise any exception for unsupported arrays.
+            reasons.append(f"{name} raised {type(cause).__name__}")
     raise NoGradient(
         f"posterior has no score: {_kind(posterior.prior)} with "
         f"{_kind(posterior.likelihood)} is not differentiable, {' and '.join(reasons)}"

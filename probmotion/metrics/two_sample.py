@@ -29,7 +29,7 @@ _ROUNDING = 1e-9
 def squared_distances(points: np.ndarray, centre: np.ndarray | None = None) -> np.ndarray:
     """Return pairwise squared distances, ``(n, D) → (n, n)``.
 
-    Precision is lost far from ``centre`` (D,), by default the mean.
+    Precision decreases away from ``centre`` (D,), by default the mean.
     """
     from sklearn.metrics import euclidean_distances
 
@@ -38,7 +38,7 @@ def squared_distances(points: np.ndarray, centre: np.ndarray | None = None) -> n
 
 
 def median_distance(points: np.ndarray) -> float:
-    """Return the median pairwise distance, ``(n, D) → ()``; ``ValueError`` if it is 0."""
+    """Return the median pairwise distance, ``(n, D) → ()``; raise ``ValueError`` if it is 0."""
     _check_set("points", points)
     return _median(squared_distances(points))
 
@@ -62,14 +62,14 @@ def maximum_mean_discrepancy(
     """
     _check_sets(draws, reference)
     n = len(draws)
-    # Centred on the reference, for precision even if draws diverge.
-    apart = squared_distances(np.concatenate([draws, reference]), reference.mean(axis=0))
+    # Centring on the reference preserves precision even if draws diverge.
+    squared = squared_distances(np.concatenate([draws, reference]), reference.mean(axis=0))
     if length_scale is None:
-        length_scale = _median(apart[n:, n:])
+        length_scale = _median(squared[n:, n:])
     check_positive("length_scale", length_scale)
     in_draws = np.zeros((n + len(reference), 1))
     in_draws[:n] = 1
-    return float(_squared_discrepancies(_kernel(apart, length_scale), in_draws)[0])
+    return float(_squared_discrepancies(_kernel(squared, length_scale), in_draws)[0])
 
 
 def discrepancy_p_value(
@@ -77,8 +77,8 @@ def discrepancy_p_value(
 ) -> float:
     """Return the permutation p-value of MMD², at least 1/(P + 1).
 
-    Valid for independent draws (Gretton et al. 2012, section 6; Phipson and Smyth 2010); those of a
-    chain give too small values.
+    Valid for independent draws (Gretton et al. 2012, section 6; Phipson and Smyth 2010); p-values
+    of Markov chains are too small.
 
     Parameters
     ----------
@@ -87,20 +87,20 @@ def discrepancy_p_value(
     seed : int
         Seed of the relabellings.
     permutations : int
-        P.
+        Number of permutations P.
     """
     check_count("permutations", permutations)
     _check_sets(draws, reference)
     n = len(draws)
-    apart = squared_distances(np.concatenate([draws, reference]))
+    squared = squared_distances(np.concatenate([draws, reference]))
     # The length scale must be invariant to relabelling.
-    kernel = _kernel(apart, _median(apart))
+    kernel = _kernel(squared, _median(squared))
     labels = np.zeros((len(kernel), 1 + permutations))
     labels[:n] = 1
     rng = seeds.generator(seed, "relabelling")
     labels[:, 1:] = rng.permuted(labels[:, 1:], axis=0)
     observed, *relabelled = _squared_discrepancies(kernel, labels)
-    # Swapping equal points changes the statistic by rounding only.
+    # Exchanging equal points changes the statistic only by rounding errors.
     as_large = np.asarray(relabelled) >= observed - _ROUNDING
     return float((1 + as_large.sum()) / (1 + permutations))
 
@@ -109,7 +109,7 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     """Return the accuracy of the classifier two-sample test (C2ST): 0.5 is ideal, 1 is worst.
 
     The 5-fold cross-validated accuracy of a support vector machine with a Gaussian kernel
-    (scikit-learn's defaults) (Lopez-Paz and Oquab 2017, section 3). For exact draws the mean is .5
+    (scikit-learn's defaults; Lopez-Paz and Oquab 2017, section 3). For exact draws the mean is .5
     and the standard deviation about 1/√(8n): .025 at n = 200.
 
     Features are the leading :func:`principal_coordinates` of both sets together, a tenth of 2n and
@@ -118,7 +118,7 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     Parameters
     ----------
     draws, reference : ndarray, both (n, D)
-        Draws to evaluate and as many exact draws, at least 5.
+        Draws to evaluate and the same number of exact draws, at least 5.
     seed : int
         Seed of the folds.
     """
@@ -141,24 +141,24 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
 def principal_coordinates(points: np.ndarray, most: int) -> np.ndarray:
     """Return standardised principal coordinates, ``(n, D) → (n, k) or (n, k + 1)``.
 
-    The ``most`` leading ones; then, if there are more dimensions, the log squared distance from
-    their subspace, which reveals errors off the manifold.
+    The k = ``most`` leading coordinates and, if the data have more dimensions, the log squared
+    distance from their subspace, which reveals errors off the manifold.
     """
     from sklearn.decomposition import PCA
 
     if (points == points[0]).all():
         raise ValueError(f"points must differ, got {len(points)} equal points")
-    apart = points - points.mean(axis=0)
-    most = min(most, *apart.shape)
-    coordinates = PCA(most, random_state=0).fit_transform(apart)
+    centred = points - points.mean(axis=0)
+    most = min(most, *centred.shape)
+    coordinates = PCA(most, random_state=0).fit_transform(centred)
     sizes = coordinates.std(axis=0)
     coordinates = coordinates[:, sizes > _ROUNDING * sizes[0]]
     features = coordinates / coordinates.std(axis=0)
-    rest = (apart**2).sum(axis=1) - (coordinates**2).sum(axis=1)
-    if (rest <= _ROUNDING * rest.max()).any() or rest.max() <= _ROUNDING * sizes[0] ** 2:
+    errors = (centred**2).sum(axis=1) - (coordinates**2).sum(axis=1)
+    if (errors <= _ROUNDING * errors.max()).any() or errors.max() <= _ROUNDING * sizes[0] ** 2:
         return features
-    rest = np.log(rest)
-    return np.column_stack([features, (rest - rest.mean()) / rest.std()])
+    errors = np.log(errors)
+    return np.column_stack([features, (errors - errors.mean()) / errors.std()])
 
 
 def _kernel(squared: np.ndarray, length_scale: float) -> np.ndarray:
@@ -182,8 +182,8 @@ def _squared_discrepancies(kernel: np.ndarray, in_draws: np.ndarray) -> np.ndarr
     to_draws = kernel @ in_draws
     within = (in_draws * to_draws).sum(axis=0)
     across = to_draws.sum(axis=0) - within
-    others = kernel.sum() - within - 2 * across
-    return within / (n * (n - 1)) + others / (m * (m - 1)) - 2 * across / (n * m)
+    within_reference = kernel.sum() - within - 2 * across
+    return within / (n * (n - 1)) + within_reference / (m * (m - 1)) - 2 * across / (n * m)
 
 
 def _check_sets(draws: np.ndarray, reference: np.ndarray) -> None:

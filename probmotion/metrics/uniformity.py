@@ -2,7 +2,7 @@
 
 Säilynoja, Bürkner & Vehtari (2022), "Graphical test for discrete uniformity and its applications in
 goodness-of-fit evaluation and multiple sample comparison", section 3. The probability of leaving a
-band is computed exactly, after Steck (1971).
+band is computed exactly, as in Steck (1971).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["adjusted_p_values", "ecdf_band", "evaluation_points", "uniformity_p_value"]
 
 _MOST_POINTS = 100
-# Tails that are equal by symmetry may differ by rounding.
+# Tails equal by symmetry may differ by rounding errors.
 _EQUAL = 1 + 1e-9
 _HALVINGS = 40
 
@@ -61,12 +61,12 @@ def ecdf_band(n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     n : int
         Number of values.
     level : float
-        Coverage probability, at least.
+        Minimum coverage probability.
 
     Returns
     -------
     lower, upper : ndarray, (m − 1,)
-        At :func:`evaluation_points`.
+        Bounds of F at the :func:`evaluation_points`.
     """
     check_count("n", n, least=2)
     if not 0 < level < 1:
@@ -101,20 +101,20 @@ def _tails(n: int) -> np.ndarray:
 
 
 def _probability_of_leaving(n: int, gamma: float) -> float:
-    """Return P(the tail is γ or less at some point) for n uniform numbers.
+    """Return P(the tail is γ or less at any point) for n uniform numbers.
 
     Counts between points are Poisson with mean n/m, conditioned on their sum n. Summing over the
-    first exit keeps small probabilities accurate.
+    first exit is accurate for small probabilities.
     """
     step, finish = _poisson(n)
-    there = np.zeros(n + 1)
-    there[0] = 1.0
-    left = 0.0
-    for stays, ends in zip(_tails(n) > _EQUAL * gamma, finish, strict=True):
-        there = np.convolve(there, step)[: n + 1]
-        left += float(there[~stays] @ ends[~stays])
-        there[~stays] = 0.0
-    return min(1.0, left)
+    inside = np.zeros(n + 1)
+    inside[0] = 1.0
+    total = 0.0
+    for allowed, remaining in zip(_tails(n) > _EQUAL * gamma, finish, strict=True):
+        inside = np.convolve(inside, step)[: n + 1]
+        total += float(inside[~allowed] @ remaining[~allowed])
+        inside[~allowed] = 0.0
+    return min(1.0, total)
 
 
 @lru_cache(maxsize=8)

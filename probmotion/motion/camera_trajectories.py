@@ -22,8 +22,8 @@ __all__ = ["CameraTrajectory", "fit_trajectory", "geman_mcclure"]
 _NEAR = 0.1
 """Depth in metres below which 1/z is replaced by its tangent."""
 _SCHEDULE = (8.0, 4.0, 2.0, 1.0)
-"""Successive multiples of the robust scale. Starting at 1, one-sided outliers trap the optimiser
-in the minimum next to the linear solution."""
+"""Successive multiples of the robust scale. At 1 only, one-sided outliers trap the
+optimiser in the minimum closest to the linear solution."""
 _SMALL = 1e-3
 """Squared angle below which series are used; the omitted terms are below 3e-14."""
 
@@ -92,7 +92,7 @@ def fit_trajectory(
         One static perspective camera.
     scale : float, optional
         c of the Geman-McClure ρ, image units; much larger errors are treated as outliers. Default:
-        focal/40, or 12.5 cm at 5 m.
+        focal/40, which is 12.5 cm at 5 m.
     smoothness_weight : float, optional
         λ, image unit²/m²: about (detection error / movement of a joint between frames)². Default:
         (focal/30 m)².
@@ -108,15 +108,15 @@ def fit_trajectory(
     ------
     ValueError
         If shapes disagree, the camera is not a single perspective one, no frame determines a
-        translation in front of the camera, a joint ends behind it, or a number is out of range.
+        translation in front of the camera, a fitted joint is behind it, or a number is invalid.
     """
     local = np.asarray(local, dtype=np.float64)
     check_shape("local", local, (track.frames, track.skeleton.n_joints, 3))
     check_finite("local", local)
     if camera.n_views != 1:
-        raise ValueError(f"camera must be one view, got {camera.n_views}")
+        raise ValueError(f"camera must have one view, got {camera.n_views}")
     if camera.orthographic:
-        raise ValueError("camera must be perspective to determine depth, got an orthographic one")
+        raise ValueError("camera must be perspective, got an orthographic one without depth")
     focal = float(camera.focal[0])
     scale = focal / 40 if scale is None else scale
     check_positive("scale", scale)
@@ -154,8 +154,8 @@ class _Objective:
 
     def points(self, translations: np.ndarray, orientations: np.ndarray) -> np.ndarray:
         """Return v in the camera's axes: ``(L, 3), (L, 3) → (L, J, 3)``."""
-        turned = self.local @ np.swapaxes(vector_to_matrix(orientations), -1, -2)
-        return turned + translations[:, None]
+        rotated = self.local @ np.swapaxes(vector_to_matrix(orientations), -1, -2)
+        return rotated + translations[:, None]
 
     def cost_and_gradient(self, parameters: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
         """Return equation 12 and its gradient, ``(6 L,) → (), (6 L,)``."""
@@ -173,7 +173,7 @@ class _Objective:
         cost += self.smoothness_weight * float((steps**2).sum())
         by_point[1:] += 2 * self.smoothness_weight * steps
         by_point[:-1] -= 2 * self.smoothness_weight * steps
-        # A change dφ moves R x by (J dφ) × R x, with the left Jacobian J of the rotation vector.
+        # A change dφ changes R x by (J dφ) × R x, with the left Jacobian J of the rotation vector.
         torque = np.cross(points - translations[:, None], by_point).sum(axis=1)
         by_orientation = (torque[:, None] @ _left_jacobian(orientations))[:, 0]
         return cost, np.concatenate([by_point.sum(axis=1), by_orientation], axis=1).ravel()
@@ -204,11 +204,11 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
 def _minimum(
     objective: _Objective, scale: float, max_iterations: int
 ) -> tuple[np.ndarray, float, int, bool]:
-    """Return (r_t, φ_t), the cost, the number of iterations and whether the last fit converged."""
+    """Return (r_t, φ_t), the cost, the iterations and whether the last optimisation converged."""
     start = _initial_translations(objective)
     parameters = np.concatenate([start, np.zeros_like(start)], axis=1).ravel()
     iterations = 0
-    # L-BFGS tolerances are absolute below 1; dividing by this unit makes them scale-free.
+    # L-BFGS tolerances are absolute below 1; the cost is divided by this unit to be scale-free.
     unit = (objective.focal / 1000) ** 2
 
     def scaled(parameters: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
@@ -232,7 +232,7 @@ def _minimum(
 def _initial_translations(objective: _Objective) -> np.ndarray:
     """Return r of each frame for φ = 0 by confidence-weighted linear least squares, (L, 3).
 
-    Each detection gives f (X + r_x) = u (Z + r_z) and its counterpart in y. Frames with fewer than
+    Each detection requires f (X + r_x) = u (Z + r_z), and likewise in y. Frames with fewer than
     two detections, or a solution behind the camera, are interpolated.
     """
     local, image, focal = objective.local, objective.detections, objective.focal
@@ -243,17 +243,17 @@ def _initial_translations(objective: _Objective) -> np.ndarray:
     right = image * local[..., 2:] - focal * local[..., :2]
     weighted = objective.confidence[..., None, None] * rows
     normal = np.einsum("ljka,ljkb->lab", weighted, rows)
-    pull = np.einsum("ljka,ljk->la", weighted, right)
+    moment = np.einsum("ljka,ljk->la", weighted, right)
     translations = np.zeros((L, 3))
-    enough = (objective.confidence > 0).sum(axis=1) >= 2
-    enough[enough] = np.linalg.cond(normal[enough]) < 1e12
-    translations[enough] = np.linalg.solve(normal[enough], pull[enough][..., None])[..., 0]
-    good = enough & ((translations[:, None] + local)[..., 2].min(axis=1) > _NEAR)
-    if not good.any():
+    usable = (objective.confidence > 0).sum(axis=1) >= 2
+    usable[usable] = np.linalg.cond(normal[usable]) < 1e12
+    translations[usable] = np.linalg.solve(normal[usable], moment[usable][..., None])[..., 0]
+    valid = usable & ((translations[:, None] + local)[..., 2].min(axis=1) > _NEAR)
+    if not valid.any():
         raise ValueError(
             f"track must determine a position in front of the camera in at least one of its {L} "
             "frames, from at least two joints of confidence above 0 in the camera's image units"
         )
-    known = np.flatnonzero(good)
+    known = np.flatnonzero(valid)
     frames = np.arange(L)
     return np.stack([np.interp(frames, known, column) for column in translations[known].T], -1)

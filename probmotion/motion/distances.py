@@ -47,7 +47,7 @@ def yaw_aligned_distances(
     root : int
         Index of the root joint.
     mirrored : bool
-        Use the depth-mirrored images of ``a``, without exchanging left and right joints.
+        Whether to invert the depth of ``a``, without exchanging left and right joints.
 
     Raises
     ------
@@ -64,8 +64,8 @@ def yaw_aligned_distances(
 def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> NearestDistances:
     """Return the mean distance from draws to the nearest real motion, and the reverse.
 
-    Draws can copy one real motion, so both directions are needed. Both decrease with the size of
-    the other set: compare samplers at equal sizes.
+    Both directions are needed, since all draws may copy one real motion. Both decrease with the
+    size of the other set: compare samplers at equal sizes.
 
     Parameters
     ----------
@@ -86,17 +86,17 @@ def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
 def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> float:
     """Return the fraction of draws that are farther from real motion than their depth mirror image.
 
-    Mirroring exchanges near and far but not joint names: knees bend backwards. Orthographic cameras
-    at elevation 0 cannot distinguish the two, which gives 0.5.
+    Mirroring inverts depth but does not exchange joint names, so knees bend backwards. Orthographic
+    cameras at elevation 0 cannot distinguish the two, so the expected fraction is 0.5.
 
     Parameters
     ----------
     draws, real, root
         As in :func:`nearest_distances`.
     """
-    straight, _ = _nearest(draws, real, root, mirrored=False)
-    images, _ = _nearest(draws, real, root, mirrored=True)
-    return float((images < straight).mean())
+    unmirrored, _ = _nearest(draws, real, root, mirrored=False)
+    mirrored, _ = _nearest(draws, real, root, mirrored=True)
+    return float((mirrored < unmirrored).mean())
 
 
 def windows(positions: np.ndarray, frames: int, stride: int = 1) -> np.ndarray:
@@ -148,27 +148,27 @@ def _pair(motions: dict[str, np.ndarray], root: int) -> tuple[_Flat, _Flat]:
     """Return two named sets of motions after checking that their shapes agree."""
     first, second = (_Flat.of(name, values, root) for name, values in motions.items())
     if first.shape != second.shape:
-        one, other = motions
+        name_a, name_b = motions
         raise ValueError(
-            f"{other} must have motions of shape {first.shape} like {one}, got {second.shape}"
+            f"{name_b} must have motions of shape {first.shape} like {name_a}, got {second.shape}"
         )
     return first, second
 
 
 def _blocks(a: _Flat, b: _Flat, mirrored: bool) -> Iterator[tuple[slice, slice, np.ndarray]]:
     """Yield blocks of the distance matrix with their rows and columns."""
-    turn = a.horizontal if mirrored else a.horizontal.conj()
-    for row in range(0, len(turn), _BLOCK):
-        rows = slice(row, min(row + _BLOCK, len(turn)))
-        level, upright = _padded(turn[rows]), _padded(a.heights[rows])
+    horizontal = a.horizontal if mirrored else a.horizontal.conj()
+    for row in range(0, len(horizontal), _BLOCK):
+        rows = slice(row, min(row + _BLOCK, len(horizontal)))
+        left, upright = _padded(horizontal[rows]), _padded(a.heights[rows])
         for column in range(0, len(b.squares), _BLOCK):
             columns = slice(column, min(column + _BLOCK, len(b.squares)))
-            inner = np.abs(level @ _padded(b.horizontal[columns]).T)
+            inner = np.abs(left @ _padded(b.horizontal[columns]).T)
             inner += upright @ _padded(b.heights[columns]).T
             inner = inner[: rows.stop - row, : columns.stop - column]
             squares = a.squares[rows, None] + b.squares[columns] - 2 * inner
-            # Rounding can make the squared distance of copies negative.
-            yield rows, columns, np.sqrt(np.maximum(squares, 0.0) / turn.shape[1])
+            # Squared distances of copies may be negative by rounding.
+            yield rows, columns, np.sqrt(np.maximum(squares, 0.0) / horizontal.shape[1])
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:

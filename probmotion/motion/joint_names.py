@@ -5,7 +5,7 @@ with the prefix ``left_`` or ``right_``, ``eye ear collar shoulder elbow wrist p
 thumb hip_joint hip knee ankle heel foot big_toe small_toe toe front_paw back_paw``. ``foot`` is
 the ball of the foot, as in SMPL, and ``toe`` its tip.
 
-Words differ between schemes. A BVH joint is named after the bone that starts there (``LeftLeg`` is
+Names are ambiguous. A BVH joint is named after the bone that starts there (``LeftLeg`` is
 a knee), an ASF joint after the bone that ends there (``ltibia`` is an ankle). ``left_foot`` is the
 ankle of a skeleton without ``left_ankle``, and the ball of the foot otherwise. All joints of a
 skeleton are therefore named together.
@@ -67,7 +67,7 @@ _ASF_SIDED = {
     "fingers": "fingers", "thumb": "thumb",
 }  # fmt: skip
 _ASF_MARKS = frozenset(side + bone for side in "lr" for bone in ("femur", "tibia", "humerus"))
-# Names of joints called ``…_end``, by the joint before them.
+# Names of joints called ``…_end``, by the parent joint.
 _END_OF = {
     "ankle": "foot", "foot": "toe", "head": "head_top", "fingers": "finger_tips",
     "thumb": "thumb_tip",
@@ -94,13 +94,13 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
     Parameters
     ----------
     names : sequence of str
-        All joint names of the skeleton. A person prefix ``person:`` is kept if there are several
-        people; a prefix common to all joints is a rig name and is dropped.
+        All joint names of the skeleton. A prefix ``person:`` is preserved if prefixes differ;
+        a prefix common to all joints is a rig name and is dropped.
 
     Returns
     -------
     tuple of str
-        Canonical names; unknown joints keep their own.
+        Canonical names; unknown names are unchanged.
     """
     people = [_person_of(name) for name in names]
     several = len(set(people)) > 1
@@ -114,7 +114,7 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _person_of(name: str) -> str:
-    """Return the ``person`` prefix of a joint name, ``""`` if there is none."""
+    """Return the ``person`` prefix of a joint name, ``""`` if missing."""
     match = _PERSON.match(_MIXAMO.sub("", name))
     return match["person"] if match else ""
 
@@ -122,7 +122,7 @@ def _person_of(name: str) -> str:
 def mirrored_name(name: str) -> str | None:
     """Return the right counterpart of a left joint's name in the same scheme, or None.
 
-    ``left_knee`` gives ``right_knee``, ``lShin`` gives ``rShin``; ``lowerback`` gives None.
+    ``left_knee`` → ``right_knee``, ``lShin`` → ``rShin``, ``lowerback`` → None.
     """
     bare = _without_person(name)
     match = _side(bare)
@@ -140,25 +140,25 @@ def _names_of_one(names: list[str]) -> list[str]:
     for index, meaning in _trunk(names).items():
         meanings[index] = (meaning,)
     result = list(names)
-    taken: set[str] = set()
-    # Unambiguous words first, then canonical ones, then by name: independent of the joint order.
+    used: set[str] = set()
+    # Unambiguous words first, then canonical names, then by name, regardless of joint order.
     for index in sorted(
         range(len(names)),
         key=lambda i: (len(meanings[i]), meanings[i][:1] != (names[i],), _word(names[i])),
     ):
-        free = [meaning for meaning in meanings[index] if meaning not in taken]
-        if free:
-            result[index] = free[0]
-            taken.add(free[0])
+        unused = [meaning for meaning in meanings[index] if meaning not in used]
+        if unused:
+            result[index] = unused[0]
+            used.add(unused[0])
     known = dict(zip(names, result, strict=True))
     for index, name in enumerate(names):
         if result[index] == name and (match := _END.match(name)):
-            alone = _meanings(match["joint"]) or (match["joint"],)
-            end = _in_side(known.get(match["joint"], alone[0]), _END_OF)
-            if end is not None and end not in taken:
+            unsided = _meanings(match["joint"]) or (match["joint"],)
+            end = _in_side(known.get(match["joint"], unsided[0]), _END_OF)
+            if end is not None and end not in used:
                 result[index] = end
-                taken.add(end)
-    if "tail" in taken:
+                used.add(end)
+    if "tail" in used:
         result = [_in_side(name, _PAW_OF) or name for name in result]
     return result
 

@@ -1,4 +1,4 @@
-"""Forward kinematics, and fitting of joint rotations to positions."""
+"""Forward kinematics and least-squares fits of joint rotations to positions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["fit_rotations", "forward_kinematics"]
 
-# Number of alternating fits of rest offsets and rotations.
+# Iterations of the alternating fit of rest offsets and rotations.
 _FITS = 3
-# Relative weight of the parent's rotation, which resolves only the undetermined twist.
+# Relative weight of the parent's rotation, which affects only the undetermined twist.
 _TIE = 1e-12
 
 
@@ -32,7 +32,7 @@ def forward_kinematics(
     Parameters
     ----------
     skeleton : Skeleton
-        J joints with R roots. Parents may come after their children.
+        J joints with R roots. Parents may follow their children.
     rotations : Array, (…, L, J, 3, 3)
         Rotation of each joint in its parent's frame.
     root_translations : Array, (…, L, R, 3)
@@ -44,14 +44,14 @@ def forward_kinematics(
     Returns
     -------
     positions : Array, (…, L, J, 3)
-        Metres.
+        Joint positions, metres.
     global_rotations : Array, (…, L, J, 3, 3)
-        From each joint's frame to the world.
+        Rotation from each joint's frame to the world.
 
     Raises
     ------
     ValueError
-        If a shape does not fit the skeleton.
+        If a shape does not match the skeleton.
     """
     check_shape("rotations", rotations, ("…", "L", skeleton.n_joints, 3, 3))
     check_shape("root_translations", root_translations, ("…", "L", len(skeleton.roots), 3))
@@ -59,19 +59,19 @@ def forward_kinematics(
     xp = array_namespace(rotations, root_translations, rest_offsets)
     levels = _levels(skeleton)
     # All joints at the same depth are computed in one step.
-    turns = [_at(xp, rotations, levels[0], -3)]
+    global_rotations = [_at(xp, rotations, levels[0], -3)]
     positions = [root_translations]
     for above, level in pairwise(levels):
         parents = [above.index(skeleton.parents[joint]) for joint in level]
-        over = _at(xp, turns[-1], parents, -3)
+        to_world = _at(xp, global_rotations[-1], parents, -3)
         offsets = _at(xp, rest_offsets, level, -2)[..., None, :, None, :]
-        positions.append(_at(xp, positions[-1], parents, -2) + xp.sum(over * offsets, axis=-1))
-        turns.append(_product(xp, over, _at(xp, rotations, level, -3)))
+        positions.append(_at(xp, positions[-1], parents, -2) + xp.sum(to_world * offsets, axis=-1))
+        global_rotations.append(_product(xp, to_world, _at(xp, rotations, level, -3)))
     order = [joint for level in levels for joint in level]
-    back = [order.index(joint) for joint in range(skeleton.n_joints)]
+    inverse = [order.index(joint) for joint in range(skeleton.n_joints)]
     return (
-        _at(xp, xp.concat(positions, axis=-2), back, -2),
-        _at(xp, xp.concat(turns, axis=-3), back, -3),
+        _at(xp, xp.concat(positions, axis=-2), inverse, -2),
+        _at(xp, xp.concat(global_rotations, axis=-3), inverse, -3),
     )
 
 
@@ -92,7 +92,7 @@ def _product(xp: Any, first: Array, second: Array) -> Array:
 
 
 def _at(xp: Any, values: Array, joints: list[int], axis: int) -> Array:
-    """Return the entries of some joints along an axis of joints."""
+    """Return the entries of ``joints`` along ``axis``."""
     where = {} if is_jax_array(values) else {"device": device(values)}
     return xp.take(values, xp.asarray(joints, **where), axis=axis)
 
@@ -104,7 +104,7 @@ def fit_rotations(
 
     With the root positions as translations, :func:`forward_kinematics` of the result reproduces the
     positions exactly if bone lengths and the angles between siblings are constant. Otherwise bones
-    have their mean length, and a joint with several children its least-squares rotation (Kabsch
+    have their mean length, and joints with several children their least-squares rotation (Kabsch
     1976). Errors do not accumulate: each bone starts at the fitted end of the previous one.
 
     Positions do not determine the twist about a bone. A joint with at most one child, or with
@@ -115,7 +115,7 @@ def fit_rotations(
     skeleton : Skeleton
         J joints.
     positions : ndarray, (L, J, 3)
-        Metres.
+        Joint positions, metres.
     rest_offsets : ndarray, (J, 3), optional
         Rest pose. By default it is fitted, close to the first frame.
 
@@ -129,7 +129,7 @@ def fit_rotations(
     Raises
     ------
     ValueError
-        If the shape does not fit, there is no frame, or a value is not finite.
+        If a shape does not match, ``positions`` is empty, or a value is not finite.
     """
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("L", skeleton.n_joints, 3))
@@ -148,18 +148,18 @@ def fit_rotations(
         offsets = np.asarray(rest_offsets, dtype=np.float64)
 
     frames = len(positions)
-    turns = np.zeros((frames, skeleton.n_joints, 3, 3))
-    rotations = np.zeros_like(turns)
-    reached = positions.copy()
+    world = np.zeros((frames, skeleton.n_joints, 3, 3))
+    rotations = np.zeros_like(world)
+    fitted = positions.copy()
     for joint in skeleton.topological_order:
         parent = skeleton.parents[joint]
-        above = np.broadcast_to(np.eye(3), (frames, 3, 3)) if parent < 0 else turns[:, parent]
+        above = np.broadcast_to(np.eye(3), (frames, 3, 3)) if parent < 0 else world[:, parent]
         if parent >= 0:
-            reached[:, joint] = reached[:, parent] + turns[:, parent] @ offsets[joint]
+            fitted[:, joint] = fitted[:, parent] + world[:, parent] @ offsets[joint]
         below = children.get(joint, [])
-        bones = positions[:, below] - reached[:, joint, None]
-        turns[:, joint] = _best_turns(offsets[below], bones, above)
-        rotations[:, joint] = np.swapaxes(above, -1, -2) @ turns[:, joint]
+        bones = positions[:, below] - fitted[:, joint, None]
+        world[:, joint] = _best_turns(offsets[below], bones, above)
+        rotations[:, joint] = np.swapaxes(above, -1, -2) @ world[:, joint]
     return rotations, offsets
 
 
@@ -167,10 +167,10 @@ def _rest_offsets(bones: np.ndarray) -> np.ndarray:
     """Return the rigid set of bones (C, 3) that best fits those of all frames (L, C, 3)."""
     lengths = np.linalg.norm(bones, axis=-1).mean(axis=0)
     rest = _of_lengths(bones[0], lengths)
-    upright = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
+    identity = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
     for _ in range(_FITS if len(lengths) > 1 else 0):
-        turns = _best_turns(rest, bones, upright)
-        rest = _of_lengths(np.einsum("lij,lci->cj", turns, bones), lengths)
+        rotations = _best_turns(rest, bones, identity)
+        rest = _of_lengths(np.einsum("lij,lci->cj", rotations, bones), lengths)
     return rest
 
 
@@ -204,18 +204,18 @@ def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.nd
 def _least_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the smallest rotations that align each ``start`` (L, 3) with ``end``."""
     lengths = np.linalg.norm(start, axis=-1), np.linalg.norm(end, axis=-1)
-    known = (lengths[0] > 0) & (lengths[1] > 0)
-    start = start / np.where(known, lengths[0], 1.0)[:, None]
-    end = end / np.where(known, lengths[1], 1.0)[:, None]
+    nonzero = (lengths[0] > 0) & (lengths[1] > 0)
+    start = start / np.where(nonzero, lengths[0], 1.0)[:, None]
+    end = end / np.where(nonzero, lengths[1], 1.0)[:, None]
     axis = np.cross(start, end)
-    # Any axis orthogonal to ``start`` serves for opposite directions.
+    # Opposite directions are rotated about any axis orthogonal to ``start``.
     parallel = np.linalg.norm(axis, axis=-1) < 1e-12
-    other = np.cross(start, np.eye(3)[np.abs(start).argmin(axis=-1)])
-    axis = np.where(parallel[:, None], other, axis)
+    fallback = np.cross(start, np.eye(3)[np.abs(start).argmin(axis=-1)])
+    axis = np.where(parallel[:, None], fallback, axis)
     axis = axis - (axis * start).sum(axis=-1, keepdims=True) * start
     norms = np.linalg.norm(axis, axis=-1, keepdims=True)
     axis = axis / np.where(norms > 0, norms, 1.0)
     cosine = (start * end).sum(axis=-1)
     sine = (np.cross(axis, start) * end).sum(axis=-1)
-    angle = np.where(known, np.arctan2(sine, cosine), 0.0)
+    angle = np.where(nonzero, np.arctan2(sine, cosine), 0.0)
     return vector_to_matrix(angle[:, None] * axis)

@@ -34,13 +34,13 @@ class Motion:
     rest_offsets : ndarray, (J, 3), optional
         Offset of each joint from its parent in the rest pose, metres; required with ``rotations``.
     name : str
-        Name of the clip in tables; readers use the file's stem.
+        Name of the clip in tables; file readers set it to the file's stem.
 
     Raises
     ------
     ValueError
-        If shapes do not fit the skeleton, a value is not finite, there is no frame, a rotation is
-        not orthonormal, or ``fps`` is not positive.
+        If shapes do not match the skeleton, a value is not finite, there are no frames, a rotation
+        is not orthonormal, or ``fps`` is not positive.
     """
 
     positions: np.ndarray
@@ -95,7 +95,7 @@ class Motion:
         return replace(self, positions=self.positions[start:stop], rotations=rotations)
 
     def resample(self, fps: float) -> Motion:
-        """Return the clip at another frame rate, with linear interpolation in time.
+        """Resample the clip to another frame rate by linear interpolation in time.
 
         Local rotations are interpolated along the geodesic; see
         :func:`~probmotion.motion.resampling.resample`.
@@ -119,11 +119,11 @@ class Motion:
     def turned(self, yaw: float) -> Motion:
         """Return the motion rotated by ``yaw`` radians about the vertical axis."""
         c, s = np.cos(yaw), np.sin(yaw)
-        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-        return replace(self, positions=self.positions @ turn.T, rotations=None, rest_offsets=None)
+        matrix = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return replace(self, positions=self.positions @ matrix.T, rotations=None, rest_offsets=None)
 
     def retarget(self, skeleton: Skeleton) -> Motion:
-        """Return the motion on another skeleton, with joints matched by their (canonical) names.
+        """Retarget the motion to another skeleton by matching joint names.
 
         Positions are unchanged. Rotations are dropped unless the skeletons are equal.
 
@@ -148,7 +148,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class KeypointTrack:
-    """Keypoints of one camera through time.
+    """2D keypoints of one camera over time.
 
     Parameters
     ----------
@@ -156,8 +156,8 @@ class KeypointTrack:
         Image coordinates, x right and y down, pixels or the camera's unit. Missing entries are NaN
         with confidence 0.
     confidence : ndarray, (L, J)
-        From 0 (missing) to 1; heatmap peaks slightly above 1 and COCO annotations up to 2 are
-        accepted.
+        Confidence from 0 (missing) to 1. Values up to 2 are accepted, for heatmap peaks slightly
+        above 1 and COCO visibility flags.
     skeleton : Skeleton
         Names and parents of the J joints.
     fps : float
@@ -168,7 +168,7 @@ class KeypointTrack:
     Raises
     ------
     ValueError
-        If shapes do not fit, a confidence is outside 0 to 2 or not finite, or a keypoint with
+        If shapes do not match, a confidence is outside 0 to 2 or not finite, or a keypoint with
         confidence above 0 is not finite.
     """
 
@@ -189,9 +189,9 @@ class KeypointTrack:
         for value in (confidence.min(), confidence.max()):
             if not 0 <= value <= _MAX_CONFIDENCE:
                 raise ValueError(f"confidence must be 0 to {_MAX_CONFIDENCE}, got {value:g}")
-        unseen = ~np.isfinite(keypoints).all(axis=-1)
-        if (unseen & (confidence > 0)).any():
-            frame, joint = np.argwhere(unseen & (confidence > 0))[0]
+        missing = ~np.isfinite(keypoints).all(axis=-1)
+        if (missing & (confidence > 0)).any():
+            frame, joint = np.argwhere(missing & (confidence > 0))[0]
             raise ValueError(
                 f"keypoints must be finite unless their confidence is 0, got NaN or infinity at "
                 f"frame {frame}, joint {joint} with confidence {confidence[frame, joint]:g}"

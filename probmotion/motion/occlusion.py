@@ -1,7 +1,7 @@
 """Retargeting and resampling of joints with occlusion.
 
-:class:`~probmotion.motion.motion.Motion` accepts no NaN; these functions follow its ``retarget``
-and ``resample`` for joints of which some are missing.
+:class:`~probmotion.motion.motion.Motion` accepts no NaN; these functions replace its
+``retarget`` and ``resample`` for arrays with missing joints.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _MIDPOINTS = {"pelvis": ("left_hip", "right_hip"), "neck": ("left_shoulder", "ri
 def joints_on_skeleton(
     joints: np.ndarray, confidence: np.ndarray, source: Skeleton, target: Skeleton
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints on another skeleton, matched by their own or else their canonical names.
+    """Retarget joints to another skeleton by their own or, failing that, canonical names.
 
-    A missing ``pelvis`` is the midpoint of the hips and a missing ``neck`` that of the shoulders.
-    With precisions w/σ² of the two joints, a midpoint has the confidence 4 w_a w_b / (w_a + w_b), 0
-    if one of them is occluded. The correlation of its error with theirs is ignored.
+    A missing ``pelvis`` is replaced by the midpoint of the hips, a missing ``neck`` by the midpoint
+    of the shoulders. With precisions w/σ² of the two joints, a midpoint has confidence
+    4 w_a w_b / (w_a + w_b), or 0 if either is occluded. Error correlations are ignored.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def joints_on_skeleton(
             missing.append(name)
     if missing:
         raise ValueError(
-            f"skeleton must contain the prior's joints, got no {', '.join(missing)} among "
+            f"skeleton must contain the prior's joints {', '.join(missing)}, got only "
             f"{', '.join(source.joint_names)}"
         )
     points, weights = zip(*matched, strict=True)
@@ -75,10 +75,10 @@ def joints_on_skeleton(
 def joints_at_rate(
     joints: np.ndarray, confidence: np.ndarray, fps: float, new_fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints at another frame rate, interpolated linearly between neighbouring frames.
+    """Resample joints to another frame rate by linear interpolation between frames.
 
-    Frames are those of :func:`~probmotion.motion.resampling.resample`. A joint is occluded if
-    either neighbour with a nonzero fraction is. For fractions 1 − a and a of frames with precisions
+    Frame times are as in :func:`~probmotion.motion.resampling.resample`. A joint is occluded if
+    it is occluded in a frame of nonzero weight. For weights 1 − a and a of frames with precisions
     w/σ², the confidence is 1 / ((1 − a)²/w₁ + a²/w₂).
 
     Parameters
@@ -102,17 +102,17 @@ def joints_at_rate(
     time = resample(clock, None, fps, new_fps)[0][:, 0, 0]
     before = np.minimum(np.floor(time + 1e-9).astype(int), frames - 1)
     after = np.minimum(before + 1, frames - 1)
-    later = np.maximum(time - before, 0.0)[:, None]
-    later = np.where(later < 1e-9, 0.0, later)
-    places = np.where(confidence[..., None] > 0, joints, 0.0)
-    parts = ((1 - later, before), (later, after))
-    mixed = sum(weight[..., None] * places[frame] for weight, frame in parts)
+    fraction = np.maximum(time - before, 0.0)[:, None]
+    fraction = np.where(fraction < 1e-9, 0.0, fraction)
+    filled = np.where(confidence[..., None] > 0, joints, 0.0)
+    terms = ((1 - fraction, before), (fraction, after))
+    interpolated = sum(weight[..., None] * filled[frame] for weight, frame in terms)
     with np.errstate(divide="ignore", invalid="ignore"):
         variance = sum(
-            np.where(weight > 0, weight**2 / confidence[frame], 0.0) for weight, frame in parts
+            np.where(weight > 0, weight**2 / confidence[frame], 0.0) for weight, frame in terms
         )
     precision = np.where(np.isfinite(variance), 1 / np.maximum(variance, 1e-300), 0.0)
-    return np.where(precision[..., None] > 0, mixed, np.nan), precision
+    return np.where(precision[..., None] > 0, interpolated, np.nan), precision
 
 
 def _midpoint(

@@ -51,7 +51,7 @@ _TREES = {
         right_ankle:right_knee neck head_top:neck left_big_toe:left_ankle
         left_small_toe:left_ankle left_heel:left_ankle right_big_toe:right_ankle
         right_small_toe:right_ankle right_heel:right_ankle""",
-    # CMU's ASF skeleton: a joint is the end of the bone of its name.
+    # CMU's ASF skeleton: each joint is the end of the bone with the same name.
     "cmu31": """
         root lhipjoint:root rhipjoint:root lowerback:root lfemur:lhipjoint ltibia:lfemur
         lfoot:ltibia ltoes:lfoot rfemur:rhipjoint rtibia:rfemur rfoot:rtibia rtoes:rfoot
@@ -66,7 +66,7 @@ _TREES = {
         right_elbow:right_shoulder left_wrist:left_elbow right_wrist:right_elbow
         left_hip:left_shoulder right_hip:right_shoulder left_knee:left_hip right_knee:right_hip
         left_ankle:left_knee right_ankle:right_knee""",
-    # Human3.6M's 17 joints; neck is between the shoulders, head the top of the head.
+    # Human3.6M's 17 joints; neck is the midpoint of the shoulders, head the top of the head.
     "h36m17": """
         pelvis right_hip:pelvis right_knee:right_hip right_ankle:right_knee left_hip:pelvis
         left_knee:left_hip left_ankle:left_knee spine:pelvis neck:spine nose:neck head:nose
@@ -100,7 +100,7 @@ _TREES = {
         right_elbow:right_shoulder right_wrist:right_elbow left_hip:pelvis left_knee:left_hip
         left_ankle:left_knee right_hip:pelvis right_knee:right_hip right_ankle:right_knee""",
     # Quadruped as in motion capture, a superset of apt36k17 without nose and eyes. tail is the base
-    # of the tail, head the joint of skull and neck, wrist the carpus, ankle the hock.
+    # of the tail, head the joint between skull and neck, wrist the carpus, ankle the hock.
     "quadruped21": """
         pelvis tail:pelvis chest:pelvis neck:chest head:neck left_shoulder:chest
         left_elbow:left_shoulder left_wrist:left_elbow left_front_paw:left_wrist
@@ -120,8 +120,8 @@ _TREES = {
 
 # Metres, thinner than real limbs: with anatomical radii (forearm 3.5 cm, trunk 10 cm) real salsa
 # pairs have a median penetration of 0.17 m, mostly between arms and their own trunk. These radii
-# were tuned so that real pairs within 1.2 m have almost none (under 3 mm in 90 % of frames) while
-# overlapping people have decimetres. The root's value is unused.
+# are tuned so that penetration is under 3 mm in 90 % of frames of real pairs within 1.2 m, but
+# several decimetres for overlapping people. The root's value is unused.
 _PERSON_RADII = {
     "pelvis": 0.05, "spine": 0.045, "chest": 0.035, "neck": 0.02, "head": 0.06,
     "shoulder": 0.025, "elbow": 0.02, "wrist": 0.01, "hip": 0.05, "knee": 0.045, "ankle": 0.03,

@@ -10,18 +10,18 @@ from probmotion.validation import check_positive
 __all__ = ["resample"]
 
 _HIGHEST_FPS = 10_000
-# Tolerance in frames at a clip's end: files round frame times (0.0083333 s), which would otherwise
-# drop the last frame.
+# Tolerance in frames at the end of a clip. Without it, frame times rounded in files (0.0083333 s)
+# would drop the last frame.
 _ROUNDING = 1e-3
 
 
 def resample(
     positions: np.ndarray, rotations: np.ndarray | None, old_fps: float, fps: float
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (L, J, 3) and rotations (L, J, 3, 3) at another frame rate.
+    """Resample positions (L, J, 3) and rotations (L, J, 3, 3) to another frame rate.
 
-    Positions are interpolated linearly and rotations along the geodesic. The first frame is kept
-    and nothing is extrapolated: the duration decreases by less than one new frame.
+    Positions are interpolated linearly and rotations along the geodesic. The first frame is
+    unchanged and nothing is extrapolated; the duration decreases by less than one new frame.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def resample(
     after = np.minimum(before + 1, last)
     fraction = time - before
     weight = fraction[:, None, None]
-    between = (1 - weight) * positions[before] + weight * positions[after]
+    resampled = (1 - weight) * positions[before] + weight * positions[after]
     if rotations is not None:
         rotations = slerp(rotations[before], rotations[after], fraction[:, None])
-    return between, rotations
+    return resampled, rotations

@@ -5,9 +5,9 @@ A camera at azimuth φ projects a bone (X, Y, Z) to
     x = X cos φ + Z sin φ,    y = Y.
 
 For uniform azimuths, E[y] is the mean of Y, and 2 E[x_a x_b] = X_a X_b + Z_a Z_b for two bones of a
-rigid body. Joint movement of the bones adds to it, mostly for a = b. Bilateral symmetry separates
-the mean pose from this: X is odd under mirroring and proportional to the width of hips and
-shoulders, Z is even.
+rigid body. Articulation adds a covariance, mostly for a = b. Bilateral symmetry separates the mean
+pose from this covariance: X is odd under mirroring and proportional to the width of hips and
+shoulders; Z is even.
 """
 
 from __future__ import annotations
@@ -22,40 +22,39 @@ from probmotion.motion.skeleton import Skeleton
 __all__ = ["estimate_rest_pose", "is_four_legged", "joint_positions"]
 
 _MAX_ITERATIONS = 5000
-"""Maximum number of principal-factor iterations; 1000 occur if one bone moves most."""
+"""Maximum number of principal-factor iterations; about 1000 are needed if one bone moves most."""
 _TOLERANCE = 1e-8
 """Relative change of the diagonal at convergence."""
 _AMBIGUOUS = 0.01
-"""Forward offset in metres below which the front is undetermined."""
+"""Forward offset in metres below which the forward direction is ambiguous."""
 _SHORT = 1e-6
 """Length in metres below which a bone has no direction."""
 _HEADS = ("nose", "head_top", "head", "neck")
 _AHEAD = (("foot", "ankle"), ("toe", "ankle"), ("big_toe", "ankle"), ("nose", "neck"))
-"""Pairs of human joints of which the first is in front of the second."""
+"""Pairs of human joints, the first in front of the second."""
 
 
 def estimate_rest_pose(
     tracks: Sequence[KeypointTrack], threshold: float = 0.3, front: str | None = None
 ) -> np.ndarray:
-    """Return the rest pose with mean bone directions, estimated from 2D tracks.
+    """Estimate the rest pose, with mean bone directions, from 2D tracks.
 
-    2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. The heights of bones
-    are means over frames; X and Z are factors of 2 E[x_a x_b] (see the module), Z from pairs of
-    different bones only. The squared length is 2 E[x²] + E[y²].
+    2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. The vertical
+    components of bones are means over frames. X and Z are factors of 2 E[x_a x_b] (see the module
+    docstring), Z from pairs of different bones only. The squared length is 2 E[x²] + E[y²].
 
     Not modelled: camera elevation, which shortens heights by its cosine (2 % at π/16); perspective;
     detection errors, which add six times the coordinate variance to the squared length; and the
-    finite number N of azimuths, about 1/√(2N) of a length.
+    finite number N of azimuths, an error of about 1/√(2N) of a length.
 
     Depth is determined up to a reflection that exchanges front and back. Knees, toes and noses of
-    people and heads of quadrupeds are in front; other bodies need ``front``. A body without
-    left-right pairs may be returned as its mirror image, with the joint farthest from the middle at
-    +X.
+    people and heads of quadrupeds define the front; other bodies require ``front``. A body without
+    left-right pairs may be returned as its mirror image, with the outermost joint at +X.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Tracks of one skeleton with one root, from random azimuths at low elevation; metres.
+        Tracks in metres of one skeleton with one root, from random azimuths at low elevation.
     threshold : float
         Minimum confidence of a joint in a frame.
     front : str, optional
@@ -70,8 +69,9 @@ def estimate_rest_pose(
     Raises
     ------
     ValueError
-        If there is no track, skeletons differ, have several roots or are not bilaterally symmetric,
-        bones are never detected or have no length or direction, or the front is undetermined.
+        If there are no tracks, skeletons differ, have several roots or are not bilaterally
+        symmetric, bones are never detected or have no length or direction, or the front is
+        ambiguous.
     """
     skeleton = _shared_skeleton(tracks)
     across, up, seen = _projected_bones(tracks, skeleton, threshold)
@@ -87,7 +87,7 @@ def estimate_rest_pose(
         parents = skeleton.parents
         trunk = [float(parents[a] == parents[b]) for a, b in skeleton.mirrored_pairs]
         x, z = _halves(gram, even, odd, np.array(trunk))
-        # Checked before averaging, which would hide a degenerate bone behind its mirror image.
+        # Check before averaging, because a degenerate bone would be averaged with its mirror image.
         _check_long(length, skeleton)
         height, length = (
             even.T @ ((even @ values) / even.sum(axis=1)) for values in (height, length)
@@ -104,7 +104,7 @@ def estimate_rest_pose(
 
 
 def joint_positions(skeleton: Skeleton, offsets: np.ndarray) -> np.ndarray:
-    """Return positions relative to the root of offsets from parents, (J, 3)."""
+    """Return joint positions relative to the root, given offsets from parents, (J, 3)."""
     positions = np.zeros_like(offsets)
     for joint in skeleton.topological_order:
         if skeleton.parents[joint] >= 0:
@@ -113,20 +113,20 @@ def joint_positions(skeleton: Skeleton, offsets: np.ndarray) -> np.ndarray:
 
 
 def is_four_legged(skeleton: Skeleton) -> bool:
-    """Return whether the joint names are those of a quadruped."""
+    """Return whether a skeleton has joint names of a quadruped."""
     return any(name == "tail" or name.endswith("_paw") for name in skeleton.canonical_names)
 
 
 def _shared_skeleton(tracks: Sequence[KeypointTrack]) -> Skeleton:
     if not tracks:
-        raise ValueError("tracks must contain at least one, got none")
+        raise ValueError("tracks must contain at least one track, got none")
     skeleton = tracks[0].skeleton
     for track in tracks:
         if track.skeleton != skeleton:
-            raise ValueError(f"tracks must have one skeleton, got other joints in {track.name!r}")
+            raise ValueError(f"tracks must share one skeleton, got another in {track.name!r}")
     if len(skeleton.roots) != 1 or not skeleton.bones:
         raise ValueError(
-            f"tracks must have a skeleton of one root with bones, got {len(skeleton.roots)} roots "
+            f"tracks must have a skeleton with one root and bones, got {len(skeleton.roots)} roots "
             f"and {len(skeleton.bones)} bones"
         )
     order = skeleton.mirrored_order
@@ -153,18 +153,18 @@ def _projected_bones(
 
 
 def _check_seen(together: np.ndarray, skeleton: Skeleton) -> None:
-    """Refuse pairs of bones without a common frame, given counts (bones, bones)."""
+    """Raise if two bones have no common frame, given counts of frames (bones, bones)."""
     if (together == 0).any():
         bones = skeleton.bones
         first, second = (skeleton.joint_names[bones[at][0]] for at in np.argwhere(together == 0)[0])
         raise ValueError(
-            "tracks must show every two bones together, got no confident frame with those to "
-            f"{first} and {second}"
+            "tracks must have a frame with confident keypoints for every two bones, got none for "
+            f"the bones to {first} and {second}"
         )
 
 
 def _check_long(sizes: np.ndarray, skeleton: Skeleton) -> None:
-    """Refuse bones of no length or direction; lengths (bones,), metres."""
+    """Raise if a bone has no length or direction, given lengths (bones,) in metres."""
     for (joint, _), size in zip(skeleton.bones, sizes, strict=True):
         if not size > _SHORT:
             raise ValueError(
@@ -174,18 +174,17 @@ def _check_long(sizes: np.ndarray, skeleton: Skeleton) -> None:
 
 
 def _sides(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bones' coefficients in even (E, bones) and odd (O, bones) combinations.
+    """Return the even (E, bones) and odd (O, bones) combinations of bones under mirroring.
 
-    A central bone is even; a left-right pair has an even sum and an odd difference, left minus
-    right.
+    Central bones and sums of left-right pairs are even; differences, left minus right, are odd.
     """
     joints = [joint for joint, _ in skeleton.bones]
-    one = {joint: np.eye(len(joints))[at] for at, joint in enumerate(joints)}
+    unit = {joint: np.eye(len(joints))[at] for at, joint in enumerate(joints)}
     pairs = skeleton.mirrored_pairs
     paired = {joint for pair in pairs for joint in pair}
-    even = [one[joint] for joint in joints if joint not in paired]
-    even += [one[left] + one[right] for left, right in pairs]
-    return np.array(even), np.array([one[left] - one[right] for left, right in pairs])
+    even = [unit[joint] for joint in joints if joint not in paired]
+    even += [unit[left] + unit[right] for left, right in pairs]
+    return np.array(even), np.array([unit[left] - unit[right] for left, right in pairs])
 
 
 def _halves(
@@ -194,14 +193,14 @@ def _halves(
     """Return X and ±Z of the bones of a symmetric body.
 
     X is proportional to the covariance with the trunk's width; a factor analysis of the odd parts
-    would also include legs in antiphase.
+    would also capture legs in antiphase.
     """
     half = odd / 2
     odds = half @ gram @ half.T
     width = trunk @ odds @ trunk
     if not width > _SHORT**2:
         raise ValueError(
-            "tracks must have hips or shoulders of nonzero width, got left and right in one place"
+            "tracks must have hips or shoulders of nonzero width, got coincident sides"
         )
     lateral = odds @ trunk / np.sqrt(width)
     mean = even / even.sum(axis=1, keepdims=True)
@@ -210,9 +209,9 @@ def _halves(
 
 
 def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
-    """Return F (n, rank) with F Fᵀ closest to the matrix off its diagonal (principal factors).
+    """Return principal factors F (n, rank): F Fᵀ fits the off-diagonal entries of ``gram``.
 
-    The diagonal, which includes movement of single bones, is an upper bound.
+    The diagonal of ``gram``, which includes movement of single bones, is an upper bound.
     """
     filled, bound = gram.copy(), np.diag(gram)
     for _ in range(_MAX_ITERATIONS):
@@ -229,45 +228,45 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
 
 def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
     """Return the rest pose rotated or reflected to face +Z."""
-    place = joint_positions(skeleton, rest)
-    ahead = _ahead(place, skeleton, front)
+    positions = joint_positions(skeleton, rest)
+    forward = _ahead(positions, skeleton, front)
     if skeleton.mirrored_pairs:
-        ahead = np.array([0.0, ahead[1]])
-    size = float(np.linalg.norm(ahead))
+        forward = np.array([0.0, forward[1]])
+    size = float(np.linalg.norm(forward))
     if size < _AMBIGUOUS:
         raise ValueError(
             f"front must be a joint in front of the root, got {front!r}; the mean pose alone does "
             "not determine front and back"
         )
     if skeleton.mirrored_pairs:
-        return rest * [1.0, 1.0, np.sign(ahead[1])]
-    x, z = ahead / size
-    turn = np.array([[z, 0.0, -x], [0.0, 1.0, 0.0], [x, 0.0, z]])
-    side = (place @ turn.T)[:, 0]
-    return rest @ turn.T * [1.0 if side[abs(side).argmax()] >= 0 else -1.0, 1.0, 1.0]
+        return rest * [1.0, 1.0, np.sign(forward[1])]
+    x, z = forward / size
+    rotation = np.array([[z, 0.0, -x], [0.0, 1.0, 0.0], [x, 0.0, z]])
+    side = (positions @ rotation.T)[:, 0]
+    return rest @ rotation.T * [1.0 if side[abs(side).argmax()] >= 0 else -1.0, 1.0, 1.0]
 
 
-def _ahead(place: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
-    """Return X and Z of a forward direction, (2,), metres; 0 if undetermined."""
-    names, flat = list(skeleton.canonical_names), place[:, [0, 2]]
+def _ahead(positions: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
+    """Return X and Z of the forward direction, (2,), metres; 0 if ambiguous."""
+    names, horizontal = list(skeleton.canonical_names), positions[:, [0, 2]]
     if front is not None:
         if front not in {*skeleton.joint_names, *names}:
             known = ", ".join(skeleton.joint_names)
             raise ValueError(f"front must be one of {known}, got {front!r}")
-        return flat[skeleton.index(front)] - flat[skeleton.roots[0]]
+        return horizontal[skeleton.index(front)] - horizontal[skeleton.roots[0]]
     if is_four_legged(skeleton):
-        heads = [flat[names.index(name)] for name in _HEADS if name in names]
-        hips = [flat[at] for at, name in enumerate(names) if name.endswith("_hip")]
-        behind = np.mean(hips, axis=0) if hips else flat[skeleton.roots[0]]
+        heads = [horizontal[names.index(name)] for name in _HEADS if name in names]
+        hips = [horizontal[at] for at, name in enumerate(names) if name.endswith("_hip")]
+        behind = np.mean(hips, axis=0) if hips else horizontal[skeleton.roots[0]]
         return heads[0] - behind if heads else np.zeros(2)
     total = np.zeros(2)
     for side in ("left_", "right_"):
         at = {name.removeprefix(side): joint for joint, name in enumerate(names)}
         if {"hip", "knee", "ankle"} <= set(at):
-            hip, knee, ankle = (place[at[name]] for name in ("hip", "knee", "ankle"))
+            hip, knee, ankle = (positions[at[name]] for name in ("hip", "knee", "ankle"))
             leg = ankle - hip
             total += (knee - hip - leg * ((knee - hip) @ leg) / (leg @ leg))[[0, 2]]
-        for one, other in _AHEAD:
-            if one in at and other in at:
-                total += flat[at[one]] - flat[at[other]]
+        for front_joint, back_joint in _AHEAD:
+            if front_joint in at and back_joint in at:
+                total += horizontal[at[front_joint]] - horizontal[at[back_joint]]
     return total

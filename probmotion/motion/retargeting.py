@@ -22,8 +22,8 @@ def matching_joints(source: Skeleton, target: Skeleton) -> list[int]:
         joint = counterpart(source, name, canonical)
         if joint is None:
             raise ValueError(
-                f"skeleton has the joint {name!r}, which has no counterpart among "
-                f"{', '.join(source.joint_names)}"
+                f"skeleton must have joints among {', '.join(source.joint_names)}, got {name!r}, "
+                "which has no counterpart"
             )
         chosen.append(joint)
     return chosen
@@ -32,20 +32,20 @@ def matching_joints(source: Skeleton, target: Skeleton) -> list[int]:
 def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
     """Return the skeleton of the joints common to all skeletons.
 
-    Joints are matched by canonical names, in the order of the first skeleton; missing parents are
-    bridged.
+    Joints are matched by canonical names and ordered as in the first skeleton; a missing
+    parent is replaced by the nearest common ancestor.
 
     Raises
     ------
     ValueError
-        If there is no skeleton or no common joint.
+        If there are no skeletons or no common joints.
     """
     skeletons = list(dict.fromkeys(skeletons))
     if not skeletons:
-        raise ValueError("skeletons must contain at least one, got none")
+        raise ValueError("skeletons must contain at least one skeleton, got none")
     if len(skeletons) == 1:
         return skeletons[0]
-    first, *others = skeletons
+    first, *rest = skeletons
     shared = [
         joint
         for joint, name in enumerate(first.canonical_names)
@@ -54,7 +54,7 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
     if not shared:
         raise ValueError(
             f"skeletons must have a joint in common, got {', '.join(first.joint_names[:5])}, … "
-            f"and {', '.join(others[-1].joint_names[:5])}, …"
+            f"and {', '.join(rest[-1].joint_names[:5])}, …"
         )
     subset = first.subset(shared)
     names = [first.canonical_names[joint] for joint in shared]
@@ -62,7 +62,7 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
 
 
 def counterpart(source: Skeleton, name: str, canonical: str) -> int | None:
-    """Return the index in ``source`` of another skeleton's joint, None if there is none."""
+    """Return the index in ``source`` of the counterpart of a joint, or ``None``."""
     canonicals = source.canonical_names
     for key, names in ((canonical, canonicals), (name, canonicals), (name, source.joint_names)):
         if names.count(key) > 1:

@@ -28,7 +28,7 @@ class Skeleton:
     parents : sequence of int
         Index of each joint's parent, -1 for a root. Parents may come after their children.
     radii : sequence of float, optional
-        Radius of each joint's bone to its parent, metres; for contact and penetration.
+        Radius of each joint's bone to its parent, metres; used for contact and penetration.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class Skeleton:
 
     @cached_property
     def topological_order(self) -> tuple[int, ...]:
-        """Joint indices in an order with parents before their children."""
+        """Joint indices, sorted so that parents precede their children."""
         order: list[int] = []
         waiting = list(reversed(self.roots))
         while waiting:
@@ -111,7 +111,7 @@ class Skeleton:
 
     @cached_property
     def mirrored_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Pairs (left, right) of joints with names that differ only in the side."""
+        """Pairs (left, right) of joints whose names differ only in the side."""
         mirrored = [mirrored_name(name) for name in self.joint_names]
         names = self.joint_names
         return tuple((j, names.index(name)) for j, name in enumerate(mirrored) if name in names)
@@ -155,7 +155,7 @@ class Skeleton:
         return tuple(chain)
 
     def subset(self, joints: Sequence[int]) -> Skeleton:
-        """Return the skeleton of ``joints``, each below its nearest ancestor among them."""
+        """Return the skeleton of ``joints``, each a child of its nearest ancestor among them."""
         chosen, parents = list(joints), []
         for joint in chosen:
             if not 0 <= joint < self.n_joints:

@@ -1,7 +1,7 @@
 """Random splits of clips into training, validation and test sets.
 
-Splits are by clip, so that windows or views of a clip are never in two sets. Names are sorted
-first, so that a split depends on the seed only and not on the order of a file listing.
+Clips are split as units, so that windows or views of a clip are never in two sets. Names are sorted
+first, so that a split does not depend on the order of a file listing.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ class Split:
 
 
 def clip_of(name: str) -> str:
-    """Return the clip of a track: its name up to the last ``/``, or all of it."""
+    """Return the clip name of a track: the part before the last ``/``, or the full name."""
     return name.rpartition("/")[0] or name
 
 
 def name_within_clip(name: str, word: str) -> str:
-    """Return a name derived from a track's that belongs to the same clip.
+    """Return a track name derived from ``name`` and ``word``, within the same clip.
 
-    ``"walk/left"`` gives ``"walk/left word"`` and ``"walk"`` gives ``"walk/word"``.
+    ``"walk/left"`` becomes ``"walk/left word"`` and ``"walk"`` becomes ``"walk/word"``.
     """
     return f"{name} {word}" if clip_of(name) != name else f"{name}/{word}"
 
@@ -41,14 +41,14 @@ def name_within_clip(name: str, word: str) -> str:
 def split_clips(
     names: Iterable[str], *, validation: float = 0.1, test: float = 0.1, seed: int
 ) -> Split:
-    """Split clips at random.
+    """Split clips at random into training, validation and test sets.
 
     Parameters
     ----------
     names : iterable of str
-        Names of clips, or of tracks (:func:`clip_of`). Order and repeats do not matter.
+        Names of clips, or of tracks (:func:`clip_of`). Order and duplicates are ignored.
     validation, test : float
-        Fractions of the clips, rounded to whole clips, above 0 and together below 1.
+        Fractions of the clips, rounded to integer counts, above 0 and together below 1.
     seed : int
         Seed of the split.
 
@@ -77,7 +77,7 @@ def split_clips(
             f"{counts[0]}, {counts[1]} and {counts[2]} from {len(clips)}"
         )
     order = seeds.generator(seed, "split").permutation(len(clips))
-    shuffled = [clips[place] for place in order]
+    shuffled = [clips[index] for index in order]
     return Split(
         train=tuple(sorted(shuffled[n_validation + n_test :])),
         validation=tuple(sorted(shuffled[n_test : n_validation + n_test])),
@@ -86,7 +86,7 @@ def split_clips(
 
 
 def tracks_of_clips(tracks: Sequence[KeypointTrack], clips: Iterable[str]) -> list[KeypointTrack]:
-    """Return the tracks of the given clips, in their order.
+    """Return the tracks of the given clips, in the order of ``tracks``.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def tracks_of_clips(tracks: Sequence[KeypointTrack], clips: Iterable[str]) -> li
     missing = sorted(wanted - {clip_of(track.name) for track in tracks})
     if missing:
         raise ValueError(
-            f"clips must have at least one of the {len(tracks)} tracks each, got none for "
+            f"clips must each have at least one of the {len(tracks)} tracks, got none for "
             f"{missing[0]!r}"
         )
     return [track for track in tracks if clip_of(track.name) in wanted]

@@ -1,4 +1,4 @@
-"""Animated skeletons in a browser, with a canvas per sampler and a common clock.
+"""Browser animations of skeletons, with a canvas per sampler and synchronised playback.
 
 The HTML is self-contained.
 """
@@ -26,14 +26,14 @@ __all__ = [
     "Animation", "animate_skeletons", "animation_html", "animation_script", "animation_style",
 ]  # fmt: skip
 
-# Width of a motion's place and least width of the page, pixels.
+# Width of a motion's cell and minimum width of the page, pixels.
 _PLACE, _CONTROLS = 180, 420
 _LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
 
 
 @dataclass(frozen=True)
 class Animation:
-    """Animated skeletons, which Jupyter shows in a frame.
+    """HTML page of animated skeletons, displayed by Jupyter in an iframe.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Animation:
     height: int
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame that isolates it from the notebook."""
+        """Return the page in an iframe, which isolates it from the notebook."""
         return (
             f'<iframe srcdoc="{html.escape(self.html)}" sandbox="allow-scripts" '
             f'title="Animated skeletons" width="{self.width}" height="{self.height}" '
@@ -65,17 +65,17 @@ def animate_skeletons(
     draws: int = 4,
     title: str = "",
 ) -> Animation:
-    """Return animated skeletons for a browser.
+    """Return an HTML animation of skeletons.
 
-    Dragging or the arrow keys turn all skeletons, the space bar stops and resumes, and the slider
-    selects a frame. The left side of the body is blue and the right red. Bodies stay in the middle
-    of their places, at the same scale.
+    Dragging or the arrow keys rotate all skeletons, the space bar pauses and resumes, and the
+    slider selects a frame. The left side of the body is blue and the right red. Bodies are centred
+    in their cells and have the same scale.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, L, J, 3)
-        Motions in metres by label, from top to bottom, all of one length. The first row sets the
-        scale; larger motions are clipped.
+        Motions in metres by label, from top to bottom, all of equal length. The first row
+        determines the scale; larger motions are clipped.
     skeleton : Skeleton
         The J joints.
     path : str or Path, optional
@@ -83,15 +83,15 @@ def animate_skeletons(
     fps : float
         Frames per second.
     draws : int
-        Number of motions per row, the first ones.
+        Number of motions per row, starting with the first.
     title : str
         Title above the skeletons.
 
     Raises
     ------
     ValueError
-        If there is no row, a row is empty or of another length, a shape does not fit the skeleton,
-        a value is not finite, ``fps`` is not positive, or the path does not end in ``.html``.
+        If there are no rows, a row is empty, lengths differ, a shape does not match the skeleton, a
+        value is not finite, ``fps`` is not positive, or the path does not end in ``.html``.
     OSError
         If the folder cannot be written to.
     """
@@ -139,12 +139,12 @@ def animation_html(
 ) -> str:
     """Return controls, canvases and data of an animation as HTML, without global names or ids.
 
-    ``captions`` are by row; ``further_cards`` are HTML cards without motions, and ``attributes``
-    label the group of canvases.
+    ``captions`` maps row labels to captions, ``further_cards`` are HTML cards without motions, and
+    ``attributes`` are HTML attributes of the group of canvases.
     """
     data = motion_numbers(shown)
     problem = shown.problem
-    # Escaped so that nothing can end the script.
+    # Escape "<", so that no text can end the script element.
     numbers = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c")
     ratio = f"{data['columns'] * data['across']:.3f} / {data['up']:.3f}"
     kind = "skeletons" if shown.frames == 1 else "animated skeletons"
@@ -154,7 +154,7 @@ def animation_html(
         description = f"{captions[label]}, on {name}, as {kind}{with_truth}."
         cards.append(
             f'<figure><canvas role="img" style="aspect-ratio: {ratio}" '
-            f'aria-label="{html.escape(description)}">This animation needs JavaScript.</canvas>'
+            f'aria-label="{html.escape(description)}">This animation requires JavaScript.</canvas>'
             f"<figcaption>{html.escape(captions[label])}</figcaption></figure>"
         )
     still, without_camera = data["frames"] == 1, problem.camera is None
@@ -184,7 +184,7 @@ def animation_script() -> str:
 
 
 def animation_style() -> str:
-    """Return the style sheet of animations, including the colours of the body's sides."""
+    """Return the style sheet of animations, including the colours of left and right."""
     return (
         f"{_text('animation.css')}:root {{ --left: {LEFT}; --right: {RIGHT}; }}\n"
         "@media screen and (prefers-color-scheme: dark) "

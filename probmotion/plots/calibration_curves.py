@@ -1,4 +1,4 @@
-"""Histograms of log densities of real poses, draws and the seed."""
+"""Histograms of log densities of real poses, draws and the seed pose."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ __all__ = ["draw_calibration"]
 def draw_calibration(
     levels: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None
 ) -> Figure:
-    """Return histograms of log densities with a panel per term of the density.
+    """Return a figure of log-density histograms, with a panel per term of the density.
 
     Parameters
     ----------
     levels : mapping of mapping of ndarray, (n,)
         Log densities in nats by kind of pose (real, draws, seed) and term of the density, the same
-        terms for every kind. A single pose is drawn as a line. Values in the lowest hundredth
-        of all, including −∞, are drawn in the lowest bin.
+        terms for every kind. A single pose is drawn as a line. Values below the 1 %
+        quantile, including −∞, are drawn in the lowest bin.
     path : str or Path, optional
         PNG file to write.
 
     Raises
     ------
     ValueError
-        If there is no kind, or the kinds have different terms.
+        If ``levels`` is empty, or the kinds have different terms.
     """
     from matplotlib.figure import Figure
 
@@ -47,11 +47,11 @@ def draw_calibration(
     for axes, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
         values = {kind: np.asarray(by_term[term]) for kind, by_term in levels.items()}
         finite = np.concatenate([level[np.isfinite(level)] for level in values.values()])
-        # Outliers would compress the rest.
+        # Low outliers would compress the histograms.
         low, high = np.quantile(finite, 0.01), finite.max()
         edges = np.linspace(low - 0.02 * (high - low) - 1e-9, high + 0.02 * (high - low) + 1e-9, 41)
-        for place, (kind, level) in enumerate(values.items()):
-            colour = CYCLE[place % len(CYCLE)]
+        for index, (kind, level) in enumerate(values.items()):
+            colour = CYCLE[index % len(CYCLE)]
             if level.size == 1:
                 axes.axvline(float(level[0]), color=colour, linewidth=2, linestyle="--", label=kind)
                 continue

@@ -1,4 +1,4 @@
-"""Coverage of real poses by draws: an embedding of both, and coverage per number of draws."""
+"""Coverage of real poses by draws: embedding, and coverage against the number of draws."""
 
 from __future__ import annotations
 
@@ -44,33 +44,33 @@ _TITLES = {
 def classical_scaling(distances: np.ndarray, dim: int = 2) -> np.ndarray:
     """Return the points of classical multidimensional scaling (Torgerson 1952).
 
-    The leading eigenvectors of the doubly centred squared distances; exact up to a rigid motion for
-    points of ``dim`` dimensions. Negative eigenvalues count as 0. The signs make the largest
-    entry of each axis positive.
+    The coordinates are scaled leading eigenvectors of the doubly centred squared distances. They
+    are exact up to a rigid motion for points in ``dim`` dimensions. Negative eigenvalues are set to
+    0, and the sign of each axis makes its largest entry positive.
 
     Parameters
     ----------
     distances : ndarray, (n, n)
         Dissimilarities; d_ij and d_ji are averaged.
     dim : int
-        Dimensions of the points.
+        Number of dimensions of the points.
 
     Returns
     -------
     points : ndarray, (n, dim)
-        Centred points, the axis of greatest variance first.
+        Centred points, with axes in order of decreasing variance.
 
     Raises
     ------
     ValueError
-        If the distances are not square, not finite, or fewer than ``dim``.
+        If ``distances`` is not square or finite, or has fewer than ``dim`` points.
     """
     check_count("dim", dim)
     distances = np.asarray(distances, dtype=np.float64)
     check_shape("distances", distances, (len(distances), len(distances)))
     check_finite("distances", distances)
     if len(distances) < dim:
-        raise ValueError(f"distances must be of at least dim={dim} points, got {len(distances)}")
+        raise ValueError(f"distances must be between at least {dim=} points, got {len(distances)}")
     squares = (0.5 * (distances + distances.T)) ** 2
     products = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
     values, vectors = np.linalg.eigh(-0.5 * products)
@@ -97,13 +97,13 @@ def draw_embedding(
     path : str or Path, optional
         PNG file to write.
     counts : mapping of str to int, optional
-        Number of draws of the prior and the posterior in each panel, by its title; one panel with
+        Number of prior draws and of posterior draws in each panel, by panel title; one panel with
         all draws by default.
 
     Raises
     ------
     ValueError
-        If shapes do not fit or a kind is unknown.
+        If shapes do not match or a kind is unknown.
     """
     from matplotlib.figure import Figure
 
@@ -129,13 +129,13 @@ def draw_embedding(
 def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure:
     """Return a figure of coverage against the number of draws (Yin et al. 2018, figure 9).
 
-    Each dissimilarity has a panel and each density a line.
+    The figure has a panel per dissimilarity and a line per density.
 
     Parameters
     ----------
     table : DataFrame
         Columns ``measure``, ``density``, ``draws`` and ``coverage``. Repeated rows, such as seeds,
-        are drawn as their mean with a bar from least to greatest.
+        are drawn as their mean with an error bar from minimum to maximum.
     path : str or Path, optional
         PNG file to write.
 
@@ -155,8 +155,8 @@ def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         rows = table[table["measure"] == measure]
-        for place, density in enumerate(densities):
-            _draw_line(axes, rows[rows["density"] == density], str(density), place)
+        for index, density in enumerate(densities):
+            _draw_line(axes, rows[rows["density"] == density], str(density), index)
         axes.set_title(_TITLES.get(measure, measure), loc="left", size=10.5, color=INK)
         _style_coverage_axes(axes)
     panels[0].set_ylabel("coverage: mean distance of a real pair\nto the nearest draw", color=INK)

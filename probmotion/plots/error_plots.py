@@ -36,16 +36,16 @@ def draw_error_decomposition(
     words: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
 ) -> Figure:
-    """Return a figure of the parts of one setting's error with a panel per metric.
+    """Return a figure of the error decomposition of one setting, with a panel per metric.
 
-    The parts are stacked from the error of exact draws at 0, positive ones upwards and negative
-    ones downwards; a black line marks their sum. Beside the stack each part is drawn with its
+    Parts are stacked above the error of exact draws at 0, positive parts upwards and negative
+    parts downwards; a black line marks their sum. Beside the stack, each part is drawn with its
     interval. Parts whose interval contains 0 are pale.
 
     Parameters
     ----------
     table : DataFrame
-        As :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table`, for one setting.
+        Table of :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table`, one setting.
     path : str or Path, optional
         PNG file to write.
     words : mapping of str to str, optional
@@ -66,7 +66,7 @@ def draw_error_decomposition(
         raise ValueError(f"table must have one setting, got {len(settings)}")
     measures = list(dict.fromkeys(table["measure"]))
     parts = [part for part in dict.fromkeys(table["part"]) if part not in (_FLOOR, _WHOLE)]
-    colours = {part: _COLOURS.get(part, CYCLE[6 + place % 2]) for place, part in enumerate(parts)}
+    colours = {part: _COLOURS.get(part, CYCLE[6 + index % 2]) for index, part in enumerate(parts)}
     figure = Figure(figsize=(0.8 + 2.75 * len(measures), 4.6), layout="constrained")
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
@@ -100,14 +100,14 @@ def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> N
 
 
 def _draw_intervals(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
-    """Draw every part and the total with their intervals, side by side."""
-    for place, (part, colour) in enumerate([*colours.items(), (_WHOLE, "black")], start=1):
+    """Draw the intervals of every part and of the total, side by side."""
+    for index, (part, colour) in enumerate([*colours.items(), (_WHOLE, "black")], start=1):
         row = rows.loc[part]
-        where = 0.25 + 0.55 * place
+        x = 0.25 + 0.55 * index
         opacity = _opacity(row)
-        axes.plot([where, where], [row["low"], row["high"]], color=colour, alpha=opacity,
+        axes.plot([x, x], [row["low"], row["high"]], color=colour, alpha=opacity,
                   linewidth=2.2, solid_capstyle="butt")  # fmt: skip
-        axes.plot(where, row["mean"], "o" if part != _WHOLE else "D", color=colour, alpha=opacity,
+        axes.plot(x, row["mean"], "o" if part != _WHOLE else "D", color=colour, alpha=opacity,
                   markersize=5.5)  # fmt: skip
 
 

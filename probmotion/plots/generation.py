@@ -1,4 +1,4 @@
-"""Metrics of generated motion, with a row per generator and a panel per metric."""
+"""Figure of generation metrics, with a row per generator and a panel per metric."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_generation"]
 
-# Marker, colour and fill.
+# Marker, colour and fill by direction of the views.
 _VIEWS = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
 
 
@@ -36,15 +36,15 @@ def draw_generation(
     *,
     logarithmic: Sequence[str] = (),
 ) -> Figure:
-    """Return a figure of metrics with error bars.
+    """Return a figure of generation metrics with error bars.
 
-    Filled markers are views from all around, open ones views from the side.
+    Filled markers denote views from all azimuths, open markers views from the side.
 
     Parameters
     ----------
     table : DataFrame
-        A row per generator with columns ``name``, the metrics and optionally ``<metric>_sd``,
-        ``<metric>_side`` and ``<metric>_side_sd``. NaN is not drawn.
+        Row per generator, with columns ``name``, the metrics and optionally ``<metric>_sd``,
+        ``<metric>_side`` and ``<metric>_side_sd``. NaN values are not drawn.
     measures : mapping of str to str
         Titles of the panels by metric.
     path : str or Path, optional
@@ -55,7 +55,7 @@ def draw_generation(
     Raises
     ------
     ValueError
-        If there is no row, or a column is missing.
+        If the table has no rows, or a column is missing.
     """
     from matplotlib.figure import Figure
 
@@ -63,17 +63,17 @@ def draw_generation(
     size = (1.6 + 2.4 * len(measures), 1.2 + 0.28 * len(table))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
-    places = np.arange(len(table))[::-1]
+    heights = np.arange(len(table))[::-1]
     for axes, (measure, title) in zip(panels, measures.items(), strict=True):
-        _draw_markers(axes, table, measure, places + 0.12, "all around")
-        _draw_markers(axes, table, f"{measure}_side", places - 0.12, "from the side")
+        _draw_markers(axes, table, measure, heights + 0.12, "all around")
+        _draw_markers(axes, table, f"{measure}_side", heights - 0.12, "from the side")
         axes.set_title(title, loc="left", size=10, color=INK)
         if measure in logarithmic:
             axes.set_xscale("log")
         else:
             axes.set_xlim(left=0)
         plain_axes(axes, grid="both")
-    panels[0].set_yticks(places, list(table["name"]))
+    panels[0].set_yticks(heights, list(table["name"]))
     legend_below(figure, 2)
     return finish_figure(figure, path)
 

@@ -1,4 +1,4 @@
-"""Placement of labels beside the markers that they name."""
+"""Placement of labels beside markers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 __all__ = ["Box", "place_labels"]
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom; or left, bottom, right, top with the vertical axis upwards."""
+"""Box (left, top, right, bottom); (left, bottom, right, top) if the vertical axis is upwards."""
 
 _AROUND = ((1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, 0), (-1, -1), (-1, 1))
 _DISTANCES = (3.0, 16.0, 30.0)
@@ -16,26 +16,26 @@ _DISTANCES = (3.0, 16.0, 30.0)
 def place_labels(
     markers: Mapping[str, Box], sizes: Mapping[str, tuple[float, float]], room: Box
 ) -> dict[str, tuple[Box, bool]]:
-    """Return the box of each label, and whether it is so far away that it needs a line.
+    """Return the box of each label and whether it needs a line to its marker.
 
-    The labels are placed in order, each where it covers the least of the markers, of earlier
-    labels and of the area outside the room.
+    Labels are placed in order, each at the position with the least overlap with markers, earlier
+    labels and the area outside ``room``.
 
-    ``sizes`` are (width, height) of the labels, and the room is the area available to them.
+    ``sizes`` are (width, height) of the labels; ``room`` is the area available to them.
     """
-    taken = list(markers.values())
+    occupied = list(markers.values())
     boxes = {}
     for name, marker in markers.items():
         width, height = sizes[name]
-        places = [
+        candidates = [
             _beside(marker, across, down, distance, width, height)
             for distance in _DISTANCES
             for across, down in _AROUND
         ]
-        covered = [_covered(place, taken, room) for place in places]
-        best = covered.index(min(covered))
-        taken.append(places[best])
-        boxes[name] = places[best], best >= len(_AROUND)
+        overlaps = [_covered(candidate, occupied, room) for candidate in candidates]
+        best = overlaps.index(min(overlaps))
+        occupied.append(candidates[best])
+        boxes[name] = candidates[best], best >= len(_AROUND)
     return boxes
 
 
@@ -45,12 +45,12 @@ def _beside(box: Box, across: int, down: int, distance: float, width: float, hei
     return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
 
-def _covered(place: Box, taken: list[Box], room: Box) -> float:
-    outside = (place[2] - place[0]) * (place[3] - place[1]) - _overlap(place, room)
-    return outside + sum(_overlap(place, other) for other in taken)
+def _covered(label: Box, taken: list[Box], room: Box) -> float:
+    outside = (label[2] - label[0]) * (label[3] - label[1]) - _overlap(label, room)
+    return outside + sum(_overlap(label, other) for other in taken)
 
 
-def _overlap(one: Box, other: Box) -> float:
-    across = min(one[2], other[2]) - max(one[0], other[0])
-    down = min(one[3], other[3]) - max(one[1], other[1])
+def _overlap(first: Box, second: Box) -> float:
+    across = min(first[2], second[2]) - max(first[0], second[0])
+    down = min(first[3], second[3]) - max(first[1], second[1])
     return max(across, 0.0) * max(down, 0.0)

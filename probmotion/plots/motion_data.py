@@ -1,4 +1,4 @@
-"""Motions encoded for animations in a browser."""
+"""Encoding of motions for browser animations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Shown", "choose_draws", "motion_numbers"]
 # Heading of bodies without observations, radians.
 _HEADING = np.pi / 2 - 0.35
 _LARGEST = np.iinfo(np.int16).max
-# Largest elevation of the view, in radians, at which a body stays in its place.
+# Largest elevation of the view, radians, at which a body is not clipped.
 _TILT = 0.3
 # Name of each side's colour in the style sheet.
 _SIDES = {"middle": "ink", "left": "left", "right": "right"}
@@ -27,10 +27,10 @@ _SIDES = {"middle": "ink", "left": "left", "right": "right"}
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Motions that an animation shows: every ``step``-th frame of rows (n, L, J, 3) in metres.
+    """Motions of an animation: every ``step``-th frame of rows (n, L, J, 3) in metres.
 
-    The first row sets the scale. With ``turned``, motions without observations and truth are turned
-    to the same heading and poses aligned with the first.
+    The first row determines the scale. With ``turned``, motions without observations and truth are
+    rotated to a common heading, and poses are aligned with the first pose.
     """
 
     problem: StoredProblem
@@ -40,20 +40,20 @@ class Shown:
 
     @property
     def frames(self) -> int:
-        """Number of frames that are shown."""
+        """Number of frames of the animation."""
         return -(-next(iter(self.rows.values())).shape[1] // self.step)
 
 
 def choose_draws(motions: np.ndarray, n: int) -> np.ndarray:
-    """Return n evenly spaced draws, as consecutive draws of a chain are similar."""
+    """Return n evenly spaced draws, because consecutive draws of a chain are correlated."""
     return motions[:: max(1, len(motions) // n)][:n]
 
 
 def motion_numbers(shown: Shown) -> dict[str, Any]:
-    """Return the data of animation.js, ready for JSON.
+    """Return the JSON-serialisable data of animation.js.
 
     With observations or a truth, all bodies of a frame are moved by the same translation, so that
-    errors of position remain visible. Otherwise each body is centred.
+    position errors remain visible. Otherwise each body is centred.
     """
     problem, step = shown.problem, shown.step
     skeleton = problem.skeleton
@@ -92,7 +92,7 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
 
 
 def _centred(rows: Mapping[str, np.ndarray], shown: Shown) -> dict[str, np.ndarray]:
-    """Return bodies in the middle of their places, turned if requested."""
+    """Return horizontally centred bodies, rotated to a common heading if requested."""
     skeleton = shown.problem.skeleton
     moved = {}
     first = next(iter(rows.values()))[0]
@@ -107,7 +107,7 @@ def _centred(rows: Mapping[str, np.ndarray], shown: Shown) -> dict[str, np.ndarr
 
 
 def _extent(motions: np.ndarray) -> dict[str, float]:
-    """Return the part of the world that a place shows, metres."""
+    """Return the visible range of coordinates, metres."""
     reach = 1.05 * float(np.quantile(np.hypot(motions[..., 0], motions[..., 2]), 0.99)) + 1e-9
     low, high = float(motions[..., 1].min()), float(motions[..., 1].max())
     return {
@@ -122,7 +122,7 @@ def _extent(motions: np.ndarray) -> dict[str, float]:
 def _camera(camera: Cameras, keypoints: np.ndarray | None, step: int) -> dict[str, Any]:
     assert camera.centre is not None
     return {
-        # Beside the camera, where depth is visible.
+        # View from beside the camera, where depth is visible.
         "azimuth": round(float(camera.azimuth[0]) + 1.0, 4),
         "keypoints": None if keypoints is None else _base64(keypoints[::step].astype("<f4")),
         "camera": {
@@ -138,7 +138,7 @@ def _camera(camera: Cameras, keypoints: np.ndarray | None, step: int) -> dict[st
 
 
 def _encoded(motion: np.ndarray) -> dict[str, Any]:
-    """Return a motion in 16-bit multiples of a unit, one millimetre unless it is too large."""
+    """Return a motion in 16-bit multiples of a unit, one millimetre unless values overflow."""
     unit = max(1, int(np.ceil(1000 * np.abs(motion).max() / _LARGEST)))
     return {"unit": unit, "numbers": _base64(np.rint(1000 * motion / unit).astype("<i2"))}
 

@@ -37,19 +37,19 @@ def draw_pairs(
 ) -> Figure:
     """Return a figure with a row of pose-pairs per entry of ``rows``, all at the same scale.
 
-    The right limbs of a character are paler than the rest.
+    Right limbs are drawn paler than the rest of a character.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, J, 3) or (n, J, 2)
-        Pose-pairs in metres by label, from top to bottom. 3D pairs stand on a ground line; 2D
-        annotations, with y up, have dashed bones and NaN for occluded joints.
+        Pose-pairs in metres by label, from top to bottom. 3D pairs are drawn on a ground
+        line; 2D annotations, with y up and NaN for occluded joints, have dashed bones.
     skeleton : Skeleton
         The J joints; each tree is a character.
     path : str or Path, optional
         PNG file to write.
     columns : int
-        Number of pose-pairs per row, the first ones.
+        Number of pose-pairs per row, starting with the first.
     azimuth, elevation : float
         Direction of the camera for 3D pairs in radians, as in :meth:`Cameras.ring`.
     title : str
@@ -58,8 +58,8 @@ def draw_pairs(
     Raises
     ------
     ValueError
-        If there is no row, a row is empty, a shape does not fit the skeleton, or a 3D pose is not
-        finite.
+        If there are no rows, a row is empty, a shape does not match the skeleton, or a 3D pose is
+        not finite.
     """
     check_count("columns", columns)
     if not rows:
@@ -73,7 +73,7 @@ def draw_pairs(
 
 
 class _Row(NamedTuple):
-    """Label, 2D poses (n, J, 2) in metres with y up, and whether they are projected 3D poses."""
+    """Row of 2D poses (n, J, 2), in metres with y up; ``is_3d`` marks projected 3D poses."""
 
     label: str
     poses: np.ndarray
@@ -143,13 +143,13 @@ def _draw_pair(axes: Axes, pose: np.ndarray, skeleton: Skeleton, is_3d: bool) ->
         low = axes.get_ylim()[0]
         axes.plot(axes.get_xlim(), [low, low], color=GREY, linewidth=1.2, solid_capstyle="butt")
     right = {joint for _, joint in skeleton.mirrored_pairs}
-    for place, root in enumerate(skeleton.roots):
+    for index, root in enumerate(skeleton.roots):
         bones = [
             (joint, parent)
             for joint, parent in skeleton.bones
             if root in skeleton.ancestors(joint) and np.isfinite(pose[[joint, parent]]).all()
         ]
-        colour = _CHARACTERS[place % len(_CHARACTERS)]
+        colour = _CHARACTERS[index % len(_CHARACTERS)]
         style: dict[str, Any] = {"capstyle": "round", "linewidths": 1.5, "colors": colour}
         style["linestyles"] = "solid" if is_3d else (0, (1.6, 1.6))
         for paler, alpha in ((True, 0.5), (False, 1.0)):

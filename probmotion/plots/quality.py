@@ -31,20 +31,20 @@ Style = tuple[str, str]
 def plot_quality_against_cost(table: pd.DataFrame, path: str | Path | None = None) -> Figure:
     """Return a figure of the headline metric against seconds on logarithmic axes.
 
-    A point is the mean over seeds, with bars from the least to the greatest seed. Samplers without
-    a point are listed above the panel with the reason.
+    A point is the mean over seeds, with error bars from minimum to maximum. Samplers without a
+    point are listed above the panel with the reason.
 
     Parameters
     ----------
     table : DataFrame
-        Columns problem, sampler, seed, metric, value, as :meth:`Comparison.table` returns.
+        Columns problem, sampler, seed, metric, value, as returned by :meth:`Comparison.table`.
     path : str or Path, optional
         PNG file to write.
 
     Raises
     ------
     ValueError
-        If no sampler has positive values of both.
+        If no sampler has a positive headline metric and positive seconds.
     """
     from matplotlib.figure import Figure
 
@@ -57,7 +57,7 @@ def plot_quality_against_cost(table: pd.DataFrame, path: str | Path | None = Non
     if quality is None or not any(points.values()):
         raise ValueError("table must have a sampler with a headline metric and seconds, got none")
     samplers = table.attrs.get("samplers") or [str(n) for n in dict.fromkeys(table["sampler"])]
-    styles = {name: style_of(place) for place, name in enumerate(samplers)}
+    styles = {name: style_of(index) for index, name in enumerate(samplers)}
     columns = min(len(problems), 3)
     lines = -(-len(problems) // columns)
     figure = Figure(figsize=(0.5 + 4.2 * columns, 0.2 + 3.9 * lines), layout="constrained")
@@ -94,7 +94,7 @@ def quality_points(rows: pd.DataFrame, quality: str) -> dict[str, Point]:
 
 
 def _missing(table: pd.DataFrame, problem: str, points: Mapping[str, Point]) -> list[str]:
-    """Return the samplers without a point with the reason."""
+    """Return a line per sampler without a point, with the reason."""
     words = table.attrs.get("words", {})
     rows = table[table["problem"] == problem]
     lines = []
@@ -123,28 +123,28 @@ def _draw_panel(
     spans = [np.concatenate(values) for values in zip(*points.values(), strict=True)]
     axes.set(xscale="log", yscale="log")
     axes.set_xlim(_set_ticks(axes.xaxis, spans[0]))
-    # A minimal range, so that small differences do not look large.
+    # Enforce a minimum range, so that small differences do not look large.
     axes.set_ylim(_set_ticks(axes.yaxis, np.append(spans[1], [0.9, 2.0])))
 
 
 def _set_ticks(axis: Any, values: np.ndarray) -> tuple[float, float]:
-    """Set ticks at round numbers; return limits that leave room for labels."""
+    """Set ticks at round numbers; return limits with a margin for labels."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     low, high = np.log10(values.min()), np.log10(values.max())
     margin = max(0.14 * (high - low), 0.12)
     decades = high - low + 2 * margin
-    between = (
+    multiples = (
         (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 1 else (1.0, 1.5, 2.0, 3.0, 5.0)
     )
-    axis.set_major_locator(LogLocator(subs=between, numticks=99))
+    axis.set_major_locator(LogLocator(subs=multiples, numticks=99))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     return 10 ** (low - margin), 10 ** (high + margin)
 
 
 def _label_points(axes: Axes, points: Mapping[str, Point], styles: Mapping[str, Style]) -> None:
-    """Write the name of each point beside it."""
+    """Write the sampler's name beside each point."""
     from matplotlib.patheffects import withStroke
 
     markers = {name: _marker_box(axes, point) for name, point in points.items()}
@@ -156,9 +156,9 @@ def _label_points(axes: Axes, points: Mapping[str, Point], styles: Mapping[str, 
         texts[name], sizes[name] = text, (extent.width, extent.height)
     room = (axes.bbox.x0, axes.bbox.y0, axes.bbox.x1, axes.bbox.y1)
     to_data = axes.transData.inverted()
-    for name, (box, far) in place_labels(markers, sizes, room).items():
+    for name, (box, needs_line) in place_labels(markers, sizes, room).items():
         texts[name].set_position(tuple(to_data.transform(_middle(box))))
-        if far:
+        if needs_line:
             x, y = _middle(markers[name])
             nearest = min(max(x, box[0]), box[2]), min(max(y, box[1]), box[3])
             axes.plot(*to_data.transform([(x, y), nearest]).T, color=GREY, linewidth=0.8, zorder=1)

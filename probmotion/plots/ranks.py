@@ -34,7 +34,7 @@ _WIDTH, _HEADER, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
 def draw_ranks(
     blocks: Mapping[str, Mapping[str, np.ndarray]], path: str | Path | None = None
 ) -> Figure:
-    """Return a figure of simulated truths' ranks with a block per sampler.
+    """Return a figure of the ranks of simulated truths, with a block per sampler.
 
     A block has a histogram per quantity, the difference F(z) − z between the empirical and the
     uniform distribution function, and the coverage of credible sets against their level. The grey
@@ -45,15 +45,15 @@ def draw_ranks(
     Parameters
     ----------
     blocks : mapping of mapping of ndarray, (n,)
-        Ranks in [0, 1], one per simulation and at least two, by title of the block, such as the
-        sampler's verdict, and by quantity.
+        Ranks in [0, 1], one per simulation (at least two), by title of the block (e.g. the
+        sampler's verdict) and by quantity.
     path : str or Path, optional
         PNG file to write.
 
     Raises
     ------
     ValueError
-        If there is no block, a block has no quantity, or ranks have another shape.
+        If there are no blocks, a block has no quantities, or ranks are not one-dimensional.
     """
     from matplotlib.figure import Figure
 
@@ -70,7 +70,7 @@ def draw_ranks(
         header + _PANEL * max(2, -(-len(ranks) // _ACROSS)) + _FOOT
         for header, ranks in zip(headers, blocks.values(), strict=True)
     ]
-    # The time of a constrained layout grows with the square of the number of panels.
+    # A constrained layout would take time quadratic in the number of panels.
     figure = Figure(figsize=(_WIDTH, sum(heights)))
     parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
     for part, title, header, height, ranks in zip(
@@ -80,11 +80,11 @@ def draw_ranks(
             title, size=12, color=INK, weight="bold", x=0.01, ha="left", va="top",
             y=1 - 0.3 * _LINE / height,
         )  # fmt: skip
-        place = {"top": 1 - header / height, "bottom": _FOOT / height}
+        margins = {"top": 1 - header / height, "bottom": _FOOT / height}
         left, middle, right = part.subfigures(1, 3, width_ratios=[1.9, 1, 1])
-        colours = {name: CYCLE[at % len(CYCLE)] for at, name in enumerate(ranks)}
-        _draw_histograms(left, ranks, colours, {"left": 0.065, "right": 0.985, **place})
-        wide = {"left": 0.13, "right": 0.97, **place}
+        colours = {name: CYCLE[index % len(CYCLE)] for index, name in enumerate(ranks)}
+        _draw_histograms(left, ranks, colours, {"left": 0.065, "right": 0.985, **margins})
+        wide = {"left": 0.13, "right": 0.97, **margins}
         _draw_difference(middle.subplots(gridspec_kw=wide), ranks, colours)
         _draw_coverage(right.subplots(gridspec_kw=wide), ranks, colours)
     return finish_figure(figure, path)
@@ -157,7 +157,7 @@ def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping
 
 
 def _draw_band(axes: Axes, n: int, less: float) -> None:
-    """Draw the band of uniform ranks' distribution function minus ``less`` times the level."""
+    """Draw the band of the distribution function of uniform ranks minus ``less`` × level."""
     points = evaluation_points(n)
     lower, upper = ecdf_band(n, _LEVEL)
     shift = less * points

@@ -1,4 +1,4 @@
-"""Filmstrips of skeletons, with a row of draws per sampler at one scale."""
+"""Filmstrips of skeletons, with a row of draws per sampler at a common scale."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ def draw_skeletons(
     """Return a figure with a row of filmstrips per entry of ``rows``.
 
     A strip shows ``moments`` frames of one motion side by side, the left side of the body in blue
-    and the right in red. All strips have the same scale and are clipped.
+    and the right in red. All strips have the same scale; larger motions are clipped.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, L, J, 3)
-        Motions in metres by label, from top to bottom. The first row sets the scale.
+        Motions in metres by label, from top to bottom. The first row determines the scale.
     skeleton : Skeleton
         The J joints.
     path : str or Path, optional
         PNG file to write.
     draws : int
-        Number of motions per row, the first ones.
+        Number of motions per row, starting with the first.
     moments : int
         Number of evenly spaced frames per motion.
     azimuth, elevation : float
         Direction of the camera in radians, as in :meth:`Cameras.ring`.
     heading : float, optional
-        Turn every motion about the vertical to this mean heading, in radians from +Z towards +X.
+        Mean heading, in radians from +Z towards +X, to which motions are rotated; none by default.
     truth : ndarray, (L, J, 3), optional
         Motion drawn in grey behind every strip, at its position relative to the motion.
     title : str
@@ -62,8 +62,8 @@ def draw_skeletons(
     Raises
     ------
     ValueError
-        If there is no row, a shape does not fit the skeleton, a value is not finite, or
-        ``heading`` is given for a skeleton without named sides.
+        If there are no rows, a shape does not match the skeleton, a value is not finite, or
+        ``heading`` is given for a skeleton without left-right pairs.
     """
     check_count("moments", moments)
     shown = checked_rows(rows, skeleton, draws)
@@ -73,8 +73,8 @@ def draw_skeletons(
         }
     camera = Cameras.around(np.array([azimuth]), np.array([elevation]))
     strips = {label: _project(camera, motions, moments) for label, motions in shown.items()}
-    behind = None if truth is None else _project(camera, np.asarray(truth)[None], moments)[0]
-    return finish_figure(_compose(strips, skeleton, behind, title), path)
+    truth_strip = None if truth is None else _project(camera, np.asarray(truth)[None], moments)[0]
+    return finish_figure(_compose(strips, skeleton, truth_strip, title), path)
 
 
 def checked_rows(
@@ -98,9 +98,9 @@ def checked_rows(
 
 
 def face_heading(motions: np.ndarray, skeleton: Skeleton, heading: float) -> np.ndarray:
-    """Turn each motion, (n, L, J, 3), about the vertical to a mean heading in radians."""
+    """Rotate each motion, (n, L, J, 3), about the vertical to a mean heading in radians."""
     if not skeleton.mirrored_pairs:
-        raise ValueError("heading must be None for a skeleton without left-right pairs")
+        raise ValueError(f"heading must be None without left-right pairs, got {heading:g}")
     left, right = np.array(skeleton.mirrored_pairs).T
     across = (motions[:, :, left] - motions[:, :, right]).mean(axis=(1, 2))
     # The left side of a body facing +Z is at +X.
@@ -134,7 +134,7 @@ def _compose(
     slot, low, high = _extent(strips, truth)
     strip_width = max(2.35, 7.0 / columns)
     strip_height = strip_width * (high - low) / (slot * moments)
-    # A letter of this size is about .09 inches wide.
+    # A character of this size is about 0.09 inches wide.
     label_width, top_margin = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
     width = label_width + columns * (strip_width + 0.1)
     height = top_margin + len(strips) * (strip_height + 0.08) + 0.05
@@ -209,7 +209,7 @@ def _bones(frames: np.ndarray, bones: Sequence[tuple[int, int]]) -> list:
 
 
 def _write_key(figure: Figure, title: str, with_truth: bool, width: float, height: float) -> None:
-    """Write the title and, from the right, the meaning of each colour."""
+    """Write the title and, right-aligned, the legend of the colours."""
     top = 1 - 0.1 / height
     figure.text(0.12 / width, top, title, va="top", size=12, color=INK)
     entries = [("left side", LEFT), ("right side", RIGHT)]

@@ -1,4 +1,4 @@
-"""Colours, markers and axes shared by all figures, and writing of figures.
+"""Colours, markers and axes shared by all figures, and saving of figures as PNG.
 
 The palette is that of Okabe and Ito (2008), distinguishable with colour-vision deficiency, with
 lighter colours darkened for text on white.
@@ -37,7 +37,7 @@ _DOTS_PER_INCH = 150
 
 
 def style_of(place: int) -> tuple[str, str]:
-    """Return colour and marker of the sampler at a place in the order; 90 places differ."""
+    """Return the colour and marker of the sampler at index ``place``; 90 are distinct."""
     return CYCLE[place % len(CYCLE)], _MARKERS[place % len(_MARKERS)]
 
 
@@ -47,7 +47,7 @@ def plain_axes(
     size: float = 8.5,
     grid: Literal["both", "x", "y"] | None = None,
 ) -> None:
-    """Hide some spines, style the ticks and draw a grid along the given axes."""
+    """Hide the given spines, style the ticks and draw a grid along the given axes."""
     for name in hidden:
         axes.spines[name].set_visible(False)
     axes.tick_params(which="both", color=GREY, labelcolor=INK, labelsize=size)
@@ -57,7 +57,7 @@ def plain_axes(
 
 
 def check_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
-    """Raise ``ValueError`` unless a table has a row and all columns."""
+    """Raise ``ValueError`` unless a table has rows and all columns."""
     missing = [name for name in columns if name not in table]
     if missing or len(table) == 0:
         problem = f"no columns {', '.join(missing)}" if missing else "no row"
@@ -65,14 +65,14 @@ def check_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
 
 
 def legend_below(figure: Figure, ncols: int, axes: Axes | None = None, **options: Any) -> None:
-    """Add the legend of some axes, by default the first, below the figure."""
+    """Add a legend of ``axes``, by default the first of the figure, below the figure."""
     handles, labels = (axes or figure.axes[0]).get_legend_handles_labels()
     options |= {"loc": "outside lower center", "frameon": False, "labelcolor": INK}
     figure.legend(handles, labels, ncols=ncols, **options)
 
 
 def finish_figure(figure: Figure, path: str | Path | None) -> Figure:
-    """Write a figure as PNG if a path is given, and return it; if writing fails, no file remains.
+    """Save a figure as PNG if a path is given, and return it; no file is written on failure.
 
     Raises
     ------

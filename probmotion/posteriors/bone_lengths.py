@@ -1,4 +1,4 @@
-"""Bone lengths from noisy joints: the β of *Motion-DVAE*."""
+"""Estimation of bone lengths from noisy joints: β of *Motion-DVAE*."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["bone_lengths"]
 
-# Simulated bones per median, at least; its standard error is then a fifth of that of 300 frames.
+# Minimum number of simulated bones per median, for a fifth of the standard error of 300 frames.
 _SIMULATED = 8000
 _HALVINGS = 16  # bisection steps, to a hundredth of a millimetre
 
@@ -24,7 +24,7 @@ def bone_lengths(
     degrees_of_freedom: float | None = None,
     typical: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the length of every bone over a recording (Motion-DVAE, supplements B and C).
+    """Estimate the length of every bone over a recording (Motion-DVAE, supplements B and C).
 
     The average length of noisy bones is biased upwards. A bone b between joints of confidence w
     and w' is observed as d = b + n, where each coordinate of n has variance v = σ² (1/w + 1/w'),
@@ -36,16 +36,16 @@ def bone_lengths(
     simulated bones, with the observed directions and each frame's noise, have the median length
     of the recording.
 
-    A bone is observed in frames where both of its joints are. A bone without an estimate (never
-    observed, or shorter than the noise explains) takes the length of its mirror image, else its
-    ``typical`` length.
+    A bone is observed in frames where both of its joints are observed. A bone without an estimate
+    (never observed, or not distinguishable from noise) is assigned the length of its mirror image
+    or, failing that, its ``typical`` length.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
         Metres. Entries with confidence 0 are ignored and may be NaN.
     confidence : ndarray, (L, J), or None
-        Multiplies the precision; 0 marks an occluded joint. ``None``: 1 everywhere.
+        Multiplier of the precision; 0 marks an occluded joint, ``None`` is 1 everywhere.
     skeleton : Skeleton
         Skeleton of the joints.
     noise : float
@@ -97,12 +97,12 @@ def _from_mean_square(bones: np.ndarray, precisions: np.ndarray) -> float:
 
 
 def _from_median(bones: np.ndarray, precisions: np.ndarray, degrees_of_freedom: float) -> float:
-    """Return ℓ at which simulated bones have the observed median length, NaN if there is none."""
+    """Return ℓ at which simulated bones have the observed median length; NaN without a solution."""
     observed = np.linalg.norm(bones, axis=1)
     target = float(np.median(observed))
     copies = -(-_SIMULATED // len(bones))
     rng = seeds.generator(0, "bone lengths")
-    # The same errors for every ℓ, so that the median is monotone.
+    # Use the same errors for every ℓ, so that the median is monotone.
     unit = rng.standard_t(degrees_of_freedom, (copies, *bones.shape, 2))
     errors = (unit / np.sqrt(precisions)[:, None, :]).sum(axis=-1)
     directions = bones / np.maximum(observed, 1e-12)[:, None]
@@ -122,7 +122,7 @@ def _from_median(bones: np.ndarray, precisions: np.ndarray, degrees_of_freedom: 
 
 
 def _completed(estimates: np.ndarray, skeleton: Skeleton, typical: np.ndarray | None) -> np.ndarray:
-    """Return the lengths with NaN replaced by mirrored or typical ones."""
+    """Return the lengths with NaN replaced by mirrored or typical lengths."""
     lengths = estimates.copy()
     lengths[list(skeleton.roots)] = 0.0
     order = skeleton.mirrored_order
@@ -136,8 +136,8 @@ def _completed(estimates: np.ndarray, skeleton: Skeleton, typical: np.ndarray | 
         if typical is None:
             names = skeleton.joint_names
             raise ValueError(
-                f"joints must show the bone from {names[parent]} to {names[joint]}, or its "
-                "mirror image, above the noise; pass typical lengths"
+                f"joints must determine the length of the bone from {names[parent]} to "
+                f"{names[joint]} or its mirror image, got no estimate; pass typical lengths"
             )
         lengths[joint] = typical[joint]
     return lengths

@@ -35,7 +35,7 @@ class MotionDraws:
     dataset : xarray.Dataset
         ``positions`` (chain, draw, frame, joint, axis), metres; optionally ``theta`` (chain, draw,
         coordinate), ``log_density`` (chain, draw), statistics per draw (chain, draw) or chain
-        (chain), and ``state_*``, the sampler state needed to continue. Attributes: skeleton, fps,
+        (chain), and ``state_*``, the sampler state for continuation. Attributes: skeleton, fps,
         sampler, settings, seed, versions, seconds and evaluation counts.
     """
 
@@ -62,7 +62,7 @@ class MotionDraws:
         Parameters
         ----------
         sampler : Sampler
-            A dataclass with a ``name``; its fields become the settings.
+            Dataclass with a ``name``; its fields are stored as the settings.
         positions : ndarray, (chains, draws, L, J, 3)
             Metres.
         seed, seconds
@@ -74,12 +74,12 @@ class MotionDraws:
         statistics : mapping of ndarray, optional
             Arrays over (chain,) or (chain, draw): ``acceptance``, ``divergent``, …
         counts : mapping of int, optional
-            Evaluations of ``denoiser``, ``density`` and ``gradient``, each of one motion (2D
-            denoiser: one view of one motion).
+            Numbers of evaluations of ``denoiser``, ``density`` and ``gradient``, each of one motion
+            (2D denoiser: of one view).
         state : mapping of ndarray, optional
-            Sampler state needed to continue.
+            Sampler state from which the run can be continued.
         independent : bool
-            Whether draws are independent by construction; chain diagnostics then do not apply.
+            Whether draws are independent by construction, so that chain diagnostics do not apply.
         """
         skeleton = posterior.skeleton
         positions = np.asarray(positions, dtype=np.float64)
@@ -130,12 +130,12 @@ class MotionDraws:
 
     @property
     def positions(self) -> xr.DataArray:
-        """The motions, (chain, draw, frame, joint, axis), metres."""
+        """Joint positions of the draws, (chain, draw, frame, joint, axis), metres."""
         return self.dataset["positions"]
 
     @property
     def skeleton(self) -> Skeleton:
-        """The skeleton of every draw."""
+        """Skeleton of the draws."""
         names = [str(name) for name in self.dataset["joint"].values]
         parents = np.atleast_1d(self.dataset.attrs["parents"]).tolist()
         radii = self.dataset.attrs.get("radii")
@@ -148,23 +148,23 @@ class MotionDraws:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the run."""
+        """Wall-clock time of the run, seconds."""
         return float(self.dataset.attrs["seconds"])
 
     @property
     def independent(self) -> bool:
-        """Whether the draws are independent by construction, not the states of a chain."""
+        """Whether the draws are independent by construction, not states of a Markov chain."""
         return bool(self.dataset.attrs["independent"])
 
     @property
     def counts(self) -> dict[str, int]:
-        """Evaluations by kind: ``denoiser``, ``density``, ``gradient``."""
+        """Number of evaluations by kind: ``denoiser``, ``density``, ``gradient``."""
         counts = _with_prefix("evaluations_", self.dataset.attrs)
         return {name: int(count) for name, count in counts.items()}
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Sampler state needed to continue; empty for independent draws."""
+        """Sampler state from which the run can be continued; empty for independent draws."""
         state = _with_prefix("state_", self.dataset.data_vars)
         return {name: values.values for name, values in state.items()}
 
@@ -179,7 +179,7 @@ class MotionDraws:
         return self._motion(positions, f"{chain}-{draw}")
 
     def playback(self, chain: int = 0) -> Motion:
-        """Return a chain's draws concatenated into one motion, to animate how the chain moves."""
+        """Return a chain's draws concatenated into one motion, for animation."""
         chains = self.positions.sizes["chain"]
         if not 0 <= chain < chains:
             raise ValueError(f"chain must be between 0 and {chains - 1}, got {chain!r}")
@@ -191,7 +191,7 @@ class MotionDraws:
         return Motion(positions, self.skeleton, self.fps, name=name)
 
     def motions(self) -> Iterator[Motion]:
-        """Yield every draw, chain by chain."""
+        """Yield every draw as a motion, chain by chain."""
         for chain in range(self.dataset.sizes["chain"]):
             for draw in range(self.dataset.sizes["draw"]):
                 yield self.motion(draw, chain)
@@ -220,18 +220,18 @@ class MotionDraws:
         """Write the draws atomically as netCDF; ``path`` must end in ``.nc``."""
         if Path(path).suffix != ".nc":
             raise ValueError(f"path must end in .nc, got {str(path)!r}")
-        # netCDF's integers have 32 bits; seeds and counts may need more.
-        wide = {
+        # NetCDF integers have 32 bits, which seeds and counts may exceed.
+        large = {
             str(name): str(value)
             for name, value in self.dataset.attrs.items()
             if isinstance(value, int) and not -(2**31) <= value < 2**31
         }
         with written_whole(Path(path)) as unfinished:
-            self.dataset.assign_attrs(wide).to_netcdf(unfinished, engine="scipy")
+            self.dataset.assign_attrs(large).to_netcdf(unfinished, engine="scipy")
 
     @classmethod
     def load(cls, path: str | Path) -> MotionDraws:
-        """Read draws written by :meth:`save`; raise ``ValueError`` if the file is not one."""
+        """Read draws written by :meth:`save`; raise ``ValueError`` if the file is invalid."""
         try:
             with xr.open_dataset(path, engine="scipy") as opened:
                 dataset = opened.load()
@@ -247,7 +247,7 @@ class MotionDraws:
 
 
 def _with_prefix(prefix: str, entries: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return the entries whose name begins with ``prefix``, without it."""
+    """Return the entries with names that begin with ``prefix``, without the prefix."""
     names = [str(name) for name in entries if str(name).startswith(prefix)]
     return {name.removeprefix(prefix): entries[name] for name in names}
 

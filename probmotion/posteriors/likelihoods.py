@@ -29,11 +29,11 @@ class LinearObservation(NamedTuple):
     Attributes
     ----------
     axes : ndarray, (V, M, 3)
-        A: M rows per view.
+        Matrices A, with M rows per view.
     target : ndarray, (V, L, J, M)
         y minus the projection of the origin; 0 where occluded.
     precision : ndarray, (V, L, J)
-        1 / variance of each of the M numbers; 0 where occluded.
+        1 / variance of each of the M entries; 0 where occluded.
     """
 
     axes: np.ndarray
@@ -50,7 +50,7 @@ class EntryNoise:
     noise : float
         Standard deviation (Student-t: scale) of an entry of confidence 1.
     confidence : ndarray
-        Multiplies the precision, one number per observed joint; 0 marks an occluded one.
+        Multiplier of the precision of each joint; 0 marks an occluded joint.
     degrees_of_freedom : float or None
         Degrees of freedom of Student-t noise; ``None`` for Gaussian noise.
     """
@@ -110,7 +110,7 @@ class EntryNoise:
 
 
 class _Entries:
-    """Properties and shapes of observed entries."""
+    """Mixin with the shape and the noise of the observed entries."""
 
     noise: float
     confidence: np.ndarray | None
@@ -128,7 +128,7 @@ class _Entries:
         return self.entries.confidence.shape[-1]
 
     def _set_entries(self, name: str, shape: tuple[int | str, ...]) -> None:
-        """Check the observed array ``name`` and set it, its confidence and its noise."""
+        """Validate the observed array ``name``; store it, its confidence and its noise."""
         observed = np.asarray(getattr(self, name), dtype=np.float64)
         check_shape(name, observed, shape)
         entries = entry_noise(
@@ -142,7 +142,7 @@ class _Entries:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints2D(_Entries):
-    """Noisy keypoints of one motion in V known cameras.
+    """Likelihood of noisy keypoints of one motion in V known cameras.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class Keypoints2D(_Entries):
     noise : float
         Standard deviation of a keypoint of confidence 1, image units.
     confidence : ndarray, (V, L, J), optional
-        Multiplies the precision; 0 marks an occluded entry; 1 everywhere by default.
+        Multiplier of the precision, 1 by default; 0 marks an occluded entry.
     degrees_of_freedom : float, optional
         Degrees of freedom of Student-t noise; Gaussian by default.
     skeleton : Skeleton, optional
@@ -185,15 +185,15 @@ class Keypoints2D(_Entries):
         hidden: np.ndarray | None = None,
         degrees_of_freedom: float | None = None,
     ) -> Keypoints2D:
-        """Return simulated noisy detections of ``motion`` in ``cameras``.
+        """Return the likelihood of simulated noisy detections of ``motion``.
 
         ``hidden``, bool, (L, J) or (V, L, J), marks occluded entries; ``noise`` and
-        ``degrees_of_freedom`` are those of the class.
+        ``degrees_of_freedom`` are as for the class.
         """
         shape = (cameras.n_views, *motion.positions.shape[:2])
         confidence = _confidence_of(hidden, shape)
-        origin, of = np.zeros((*shape, 2)), (motion.skeleton, motion.fps)
-        blank = cls(origin, cameras, noise, confidence, degrees_of_freedom, *of)
+        zeros, source = np.zeros((*shape, 2)), (motion.skeleton, motion.fps)
+        blank = cls(zeros, cameras, noise, confidence, degrees_of_freedom, *source)
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
     @classmethod
@@ -226,7 +226,7 @@ class Keypoints2D(_Entries):
 
 @dataclass(frozen=True, eq=False)
 class Joints3D(_Entries):
-    """Noisy 3D joints of one motion.
+    """Likelihood of noisy 3D joints of one motion.
 
     Parameters
     ----------
@@ -261,10 +261,10 @@ class Joints3D(_Entries):
         hidden: np.ndarray | None = None,
         degrees_of_freedom: float | None = None,
     ) -> Joints3D:
-        """Return simulated noisy joints of ``motion``; ``hidden`` (L, J) marks occluded ones."""
+        """Return the likelihood of simulated noisy joints; ``hidden`` (L, J) marks occlusion."""
         shape = motion.positions.shape[:2]
-        origin, of = np.zeros((*shape, 3)), (motion.skeleton, motion.fps)
-        blank = cls(origin, noise, _confidence_of(hidden, shape), degrees_of_freedom, *of)
+        zeros, source = np.zeros((*shape, 3)), (motion.skeleton, motion.fps)
+        blank = cls(zeros, noise, _confidence_of(hidden, shape), degrees_of_freedom, *source)
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
     def log_density(self, positions: Array) -> Array:
@@ -291,9 +291,9 @@ def entry_noise(
 ) -> EntryNoise:
     """Return the noise of entries of ``shape``; confidence 1 by default."""
     check_positive("noise", noise)
-    shown = np.ones(shape) if confidence is None else np.asarray(confidence, dtype=np.float64)
-    check_shape("confidence", shown, shape)
-    return EntryNoise(float(noise), shown, degrees_of_freedom)
+    confidences = np.ones(shape) if confidence is None else np.asarray(confidence, dtype=np.float64)
+    check_shape("confidence", confidences, shape)
+    return EntryNoise(float(noise), confidences, degrees_of_freedom)
 
 
 def _confidence_of(hidden: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:

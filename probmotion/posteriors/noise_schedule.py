@@ -18,7 +18,7 @@ _OFFSET = 0.008  # prevents β_t from vanishing at small t
 
 
 class PosteriorStep(NamedTuple):
-    """q(x_s | x_t, x₀) = N(``clean`` x₀ + ``noisy`` x_t, ``deviation``² I)."""
+    """DDPM posterior q(x_s | x_t, x₀) = N(``clean`` x₀ + ``noisy`` x_t, ``deviation``² I)."""
 
     clean: float
     noisy: float
@@ -27,14 +27,14 @@ class PosteriorStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NoiseSchedule:
-    """Signal levels ᾱ_0 = 1 > ᾱ_1 > … > ᾱ_T > 0.
+    """Noise schedule with signal levels ᾱ_0 = 1 > ᾱ_1 > … > ᾱ_T > 0.
 
     Parameters
     ----------
     alpha_bar : ndarray, (T + 1,)
         ᾱ_t, the fraction of the signal's variance at each level.
     times : ndarray, (T + 1,), optional
-        Index of each level in the schedule that a network was trained with; 0..T by default.
+        Index of each level in the network's training schedule; 0..T by default.
     """
 
     alpha_bar: np.ndarray
@@ -90,11 +90,11 @@ class NoiseSchedule:
         """
         if not 1 <= t <= self.steps:
             raise ValueError(f"t must be between 1 and {self.steps}, got {t}")
-        now, after = self.alpha_bar[t], self.alpha_bar[t - 1]
-        alpha = now / after
+        bar_t, bar_s = self.alpha_bar[t], self.alpha_bar[t - 1]
+        alpha = bar_t / bar_s
         beta = 1 - alpha
         return PosteriorStep(
-            clean=float(np.sqrt(after) * beta / (1 - now)),
-            noisy=float(np.sqrt(alpha) * (1 - after) / (1 - now)),
-            deviation=float(np.sqrt(beta * (1 - after) / (1 - now))),
+            clean=float(np.sqrt(bar_s) * beta / (1 - bar_t)),
+            noisy=float(np.sqrt(alpha) * (1 - bar_s) / (1 - bar_t)),
+            deviation=float(np.sqrt(beta * (1 - bar_s) / (1 - bar_t))),
         )

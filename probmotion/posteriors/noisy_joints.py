@@ -17,13 +17,13 @@ __all__ = ["noisy_joints"]
 
 # Mean cosine with an axis above which a body counts as aligned with it.
 _UPRIGHT = 0.8
-# Plausible longest chain of bones, metres: a three-year-old has 0.5 from pelvis to ankle, an adult
-# 1.15 from pelvis to wrist.
+# Plausible lengths of the longest chain of bones, metres; pelvis to ankle is 0.5 for a
+# three-year-old, pelvis to wrist 1.15 for an adult.
 _SIZES = (0.5, 3.0)
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "kilometres": 1000.0}
-# Quantile of the lowest joints' height, robust to noise, and its largest distance from the floor.
+# Quantile of the lowest joints' height, robust to noise, and its maximum distance from the floor.
 _LOW, _FAR = 0.05, 0.5
-# Relative: files round frame times (0.0333 s), but 29.97 and 30 frames per second differ.
+# Relative tolerance: accepts rounded frame times (0.03333 s), but separates 29.97 and 30 fps.
 _SAME_RATE = 5e-4
 
 
@@ -39,10 +39,10 @@ def noisy_joints(
     resample: bool = False,
     longest_gap: int | None = None,
 ) -> Joints3D:
-    """Return the likelihood of recorded joints, on the prior's skeleton and frame rate.
+    """Return the likelihood of recorded joints, with the prior's skeleton and frame rate.
 
-    NaN joints count as occluded. Joints are never moved, rescaled or filled in, and only resampled
-    on request. If the prior has a floor (a Motion-DVAE: Y = 0), the recording must share it.
+    NaN joints count as occluded. Joints are never translated or rescaled, and only resampled on
+    request. If the prior has a floor (Motion-DVAE: Y = 0), the recording's must be at that height.
 
     Parameters
     ----------
@@ -54,18 +54,18 @@ def noisy_joints(
     fps : float
         Frames per second.
     prior : MotionPrior
-        Provides the target ``skeleton``, ``fps`` and ``frames``; the recording may be longer.
+        Prior with the target ``skeleton``, ``fps`` and ``frames``; the recording may be longer.
     noise : float
         Standard deviation (Student-t: scale) of a coordinate of confidence 1, metres.
     confidence : ndarray, (L, J), optional
-        Multiplies the precision; 0 marks an occluded joint; 1 by default.
+        Multiplier of the precision, 1 by default; 0 marks an occluded joint.
     degrees_of_freedom : float, optional
         Degrees of freedom of Student-t noise; Gaussian by default.
     resample : bool
         Resample to the prior's frame rate with :func:`~probmotion.motion.occlusion.joints_at_rate`.
     longest_gap : int, optional
-        Every run of fully occluded frames, at the prior's rate, must be shorter than this; by
-        default the window of the prior's networks, else its ``frames``.
+        Number of consecutive fully occluded frames that is rejected, at the prior's rate; by
+        default the window of the prior's networks or, without networks, its ``frames``.
 
     Warns
     -----
@@ -76,7 +76,7 @@ def noisy_joints(
     ------
     ValueError
         If a joint is infinite or partly NaN, all joints are occluded for ``longest_gap`` frames,
-        the frame rate differs without ``resample``, the skeleton lacks a joint of the prior's, or
+        the frame rate differs without ``resample``, the skeleton lacks a joint of the prior, or
         an argument is invalid.
     """
     for name, value, kind in (("skeleton", skeleton, Skeleton), ("prior", prior, MotionPrior)):
@@ -105,7 +105,7 @@ def noisy_joints(
     if _plausible_size(joints, weight, prior.skeleton):
         if noise > 1:
             warnings.warn(
-                f"noise is {noise:g} m, more than a body is wide; is it in metres?", stacklevel=2
+                f"noise is {noise:g} m, larger than a body; is it in metres?", stacklevel=2
             )
         floor = getattr(prior, "floor", None)
         if floor is not None:
@@ -130,21 +130,21 @@ def _observed(joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _check_frames(confidence: np.ndarray, longest_gap: int) -> None:
-    """Warn of fully occluded frames; raise if there are ``longest_gap`` in a row."""
+    """Warn about fully occluded frames; raise if ``longest_gap`` of them are consecutive."""
     occluded = ~(confidence > 0).any(axis=1)
     if occluded.all():
-        raise ValueError("joints must be observed in some frame, got every frame occluded")
+        raise ValueError("joints must be observed in at least one frame, got none")
     edges = np.flatnonzero(np.diff(occluded, prepend=False, append=False)).reshape(-1, 2)
     for start, stop in edges.tolist():
         if stop - start >= longest_gap:
             raise ValueError(
-                f"joints must include an observed one in any {longest_gap} consecutive frames, got "
-                f"none in the {stop - start} frames from frame {start}"
+                f"joints must be observed once in any {longest_gap} consecutive frames, got none "
+                f"in the {stop - start} frames from frame {start}"
             )
     if occluded.any():
         warnings.warn(
             f"all joints are occluded in {occluded.sum()} of {len(confidence)} frames; only the "
-            "prior informs them",
+            "prior constrains them",
             stacklevel=3,
         )
 
@@ -168,7 +168,7 @@ def _plausible_size(joints: np.ndarray, confidence: np.ndarray, skeleton: Skelet
 
 
 def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float) -> None:
-    """Warn if the lowest joints (feet, or knees if those are occluded) are far from the floor."""
+    """Warn if the lowest joints (feet, or knees if feet are occluded) are far from the floor."""
     heights = np.where(confidence > 0, joints[..., 1], np.inf).min(axis=1)
     lowest = np.quantile(heights[np.isfinite(heights)], _LOW)
     if abs(lowest - floor) > _FAR:
@@ -180,7 +180,7 @@ def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float) -> No
 
 
 def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> None:
-    """Warn if the body is aligned with another axis than Y throughout."""
+    """Warn if the body is aligned with an axis other than +Y in all frames."""
     names = skeleton.canonical_names
     if not {"neck", "left_ankle", "right_ankle"} <= set(names):
         return
@@ -190,10 +190,10 @@ def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleto
         return
     bodies = joints[seen, neck] - joints[seen][:, ankles].mean(axis=1)
     size = np.linalg.norm(bodies, axis=-1, keepdims=True)
-    along = (bodies / np.where(size > 0, size, 1.0)).mean(axis=0)
-    axis = int(np.abs(along).argmax())
-    if abs(along[axis]) > _UPRIGHT and not (axis == 1 and along[1] > 0):
-        sign = "" if along[axis] > 0 else "-"
+    direction = (bodies / np.where(size > 0, size, 1.0)).mean(axis=0)
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) > _UPRIGHT and not (axis == 1 and direction[1] > 0):
+        sign = "" if direction[axis] > 0 else "-"
         warnings.warn(
             f"the body is aligned with {sign}{'XYZ'[axis]}, but Y must be up; is it lying down?",
             stacklevel=3,

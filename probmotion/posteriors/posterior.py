@@ -26,7 +26,7 @@ __all__ = ["MotionPosterior"]
 
 @dataclass(frozen=True, eq=False)
 class MotionPosterior:
-    """p(X | y) ∝ p(X) p(y | X); without a likelihood, the prior.
+    """Posterior p(X | y) ∝ p(X) p(y | X), or the prior if there is no likelihood.
 
     Parameters
     ----------
@@ -58,10 +58,10 @@ class MotionPosterior:
                 "likelihood must have log_density(positions) and simulate(rng, positions), got "
                 f"{type(self.likelihood).__name__}"
             )
-        for name, want in (("frames", self.frames), ("n_joints", self.skeleton.n_joints)):
-            got = getattr(self.likelihood, name, want)
-            if got != want:
-                raise ValueError(f"likelihood must have the prior's {name}, {want}, got {got}")
+        for name, expected in (("frames", self.frames), ("n_joints", self.skeleton.n_joints)):
+            got = getattr(self.likelihood, name, expected)
+            if got != expected:
+                raise ValueError(f"likelihood must have the prior's {name}, {expected}, got {got}")
         seen = getattr(self.likelihood, "skeleton", None)
         if seen is not None and seen.canonical_names != self.skeleton.canonical_names:
             raise ValueError(
@@ -111,7 +111,7 @@ class MotionPosterior:
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ) + log p(y | θ), unnormalised: ``(…, dim) → (…)``.
 
-        Accepts the arrays that prior and likelihood accept (NumPy, torch, JAX). With NumPy, the
+        Accepts the array types of prior and likelihood (NumPy, torch, JAX). With NumPy, the
         likelihood is only evaluated where the prior's density is positive.
         """
         check_shape("theta", theta, ("…", self.dim))
@@ -119,7 +119,7 @@ class MotionPosterior:
             raise ValueError(f"prior must have a log density, got {type(self.prior).__name__}")
         log_prior = self.prior.log_density(theta)
         if not isinstance(log_prior, np.ndarray | np.floating):
-            # Masks are not possible under automatic differentiation or a compiler.
+            # Boolean masks fail under automatic differentiation and compilation.
             return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
         if self.likelihood is None:
             return self._shaped(np.asarray(log_prior), self._log_measure(theta))
@@ -139,14 +139,14 @@ class MotionPosterior:
         theta : ndarray, (n, dim)
             Coordinates.
         generators : sequence of numpy.random.Generator, optional
-            One per point, each drawing new views: the density is then an unbiased estimate, which
-            must not be truncated.
+            One generator per point, from which views are drawn. The density is then an unbiased
+            estimate, which must not be truncated.
 
         Returns
         -------
         log_density : ndarray, (n,)
         closest : ndarray of int, (n, m)
-            Argument of :meth:`speeds`; 0 where the likelihood is not evaluated.
+            Closest annotations, for :meth:`speeds`; 0 where the likelihood is not evaluated.
         """
         likelihood = self.likelihood
         if not isinstance(likelihood, ComparesViews):
@@ -161,13 +161,13 @@ class MotionPosterior:
         log_prior = to_numpy(self.prior.log_density(theta))
 
         def compare(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            own = None if generators is None else [generators[i] for i in np.flatnonzero(mask)]
-            return likelihood.evaluate(to_numpy(self.prior.motion(theta[mask])), own)
+            selected = None if generators is None else [generators[i] for i in np.flatnonzero(mask)]
+            return likelihood.evaluate(to_numpy(self.prior.motion(theta[mask])), selected)
 
         return self._with_observations(theta, log_prior, compare)
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
-        """Return extra statistics of draws by name, from θ (…, dim) and log density (…)."""
+        """Return additional statistics of draws by name, given θ (…, dim) and log density (…)."""
         return {}
 
     def speeds(self, closest: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ class MotionPosterior:
             self.prior, HasCoordinateSpeeds
         ):
             raise ValueError(
-                "speeds need a prior with coordinate speeds and an annotated likelihood, got "
+                "prior and likelihood must be HasCoordinateSpeeds and ComparesViews, got "
                 f"{type(self.prior).__name__} and {type(self.likelihood).__name__}"
             )
         return self.prior.coordinate_speeds(self.likelihood.joint_speeds(closest))
@@ -203,7 +203,7 @@ class MotionPosterior:
         closest[mask] = masked
         return self._shaped(log_density, log_measure), closest
 
-    # Overridden by TruncatedPosterior.
+    # Methods overridden by TruncatedPosterior.
 
     def _log_measure(self, theta: np.ndarray) -> np.ndarray:
         """Return the log density of the base measure."""
@@ -238,7 +238,7 @@ class MotionPosterior:
         """Return one motion per θ, ``(n, dim) → (n, L, J, 3)``.
 
         Variables that the prior marginalises are drawn given θ and the observations; ``rng`` is
-        unused if there are none.
+        unused without such variables.
         """
         check_shape("theta", theta, ("n", self.dim))
         if isinstance(self.prior, Marginalises):

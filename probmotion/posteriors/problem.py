@@ -26,18 +26,18 @@ __all__ = ["Problem", "simulated"]
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A posterior to compare samplers on.
+    """Test problem for the comparison of samplers.
 
     Parameters
     ----------
     name : str
-        Name in tables.
+        Name of the problem in tables.
     description : str
-        One sentence.
+        Description of the problem in one sentence.
     posterior : MotionPosterior
-        The target.
+        Target of the samplers.
     truth : ndarray, (L, J, 3), optional
-        True motion behind the observations, metres.
+        True motion that generated the observations, metres.
     held_out : ndarray, (G, L, J, 3), optional
         Held-out real motions that draws should cover, metres.
     generation : GenerationReference, optional
@@ -48,8 +48,8 @@ class Problem:
         Motion to which draws and reference draws are rigidly aligned before comparison, for
         posteriors invariant to translation and rotation.
     simulate : callable, optional
-        ``simulate(k)`` returns the problem with a truth drawn from the prior and observations of
-        it, both seeded by k; see :func:`simulated`.
+        ``simulate(k)`` returns the problem with a truth drawn from the prior and simulated
+        observations, both seeded by k; see :func:`simulated`.
 
     Raises
     ------
@@ -83,7 +83,7 @@ class Problem:
 
     @property
     def exact(self) -> ExactPosterior | None:
-        """Closed-form posterior, if there is one."""
+        """Closed-form posterior; ``None`` if unavailable."""
         prior = self.posterior.prior
         if self.posterior.truncated or not isinstance(prior, HasExactPosterior):
             return None
@@ -102,7 +102,7 @@ class Problem:
 
     @property
     def has_reference(self) -> bool:
-        """Whether there are reference draws, exact or stored."""
+        """Whether reference draws, exact or stored, are available."""
         return self.stored is not None or self.exact_source is not None
 
     @property
@@ -113,8 +113,8 @@ class Problem:
     def reference(self, seed: int, n: int) -> np.ndarray:
         """Return n independent reference draws, (n, L, J, 3), metres.
 
-        Exact draws if available, else stored ones chosen without replacement; raise ``ValueError``
-        if there are fewer than n.
+        Exact draws if available, else stored draws chosen without replacement. Raises
+        ``ValueError`` if fewer than n draws are available.
         """
         check_count("n", n)
         source, rng = self.exact_source, seeds.generator(seed, "reference")
@@ -127,8 +127,8 @@ class Problem:
         if self.stored is not None:
             return self.stored.choose(rng, n)
         raise ValueError(
-            f"problem {self.name} must have reference draws, but has neither an exact posterior "
-            "nor stored draws; make them with probmotion reference"
+            f"problem {self.name} must have reference draws, got neither an exact posterior nor "
+            "stored draws; create them with probmotion reference"
         )
 
     def log_density_of(self, positions: np.ndarray) -> np.ndarray | None:
@@ -140,7 +140,7 @@ class Problem:
 
 
 def simulated(problem: Problem) -> Problem:
-    """Return the problem with ``simulate``, which draws truths from its prior.
+    """Return the problem with a ``simulate`` function that draws truths from its prior.
 
     The prior must be :class:`~probmotion.posteriors.protocols.Samplable`.
     """

@@ -1,7 +1,7 @@
 """Protocols of priors, likelihoods and inference networks.
 
-A sampler lists the protocols it requires; a prior implements those it supports. Diffusion uses
-normalised units: metres divided by the prior's ``scale``.
+Samplers list their required protocols; priors implement their supported protocols. Diffusion
+uses normalised units: metres divided by the prior's ``scale``.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ __all__ = [
 
 
 class NotConjugate(ValueError):  # noqa: N818 (a condition, not a fault)
-    """The posterior has no closed form; the message names the reason."""
+    """Error for a posterior without closed form; the message is the reason."""
 
 
 @runtime_checkable
 class Likelihood(Protocol):
-    """log p(y | X) for one observed y."""
+    """Likelihood p(y | X) of one observed y."""
 
     def log_density(self, positions: Array) -> Array:
         """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
@@ -66,7 +66,7 @@ class ComparesViews(Protocol):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return log L and the closest annotations: ``(…, L, J, 3) → (…), (…, m)``.
 
-        With generators, one per pose, log L is that of randomly drawn views.
+        With generators, one per pose, log L is evaluated on randomly drawn views.
         """
 
     def joint_speeds(self, closest: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ class MotionPrior(Protocol):
 
 @runtime_checkable
 class Samplable(Protocol):
-    """Independent draws from the prior."""
+    """A prior with independent draws."""
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n motions, (n, L, J, 3), metres."""
@@ -107,7 +107,7 @@ class Samplable(Protocol):
 
 @runtime_checkable
 class HasLogDensity(Protocol):
-    """Log density in θ, normalised if possible, and initial points of chains.
+    """A prior with a log density in θ, normalised if possible, and initial points of chains.
 
     A prior or likelihood without a gradient sets ``differentiable = False``.
     """
@@ -116,7 +116,7 @@ class HasLogDensity(Protocol):
         """Return log p(θ): ``(…, dim) → (…)``."""
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n initial points, (n, dim): draws from the prior unless it `HasSeeds`."""
+        """Return n initial points, (n, dim): seeds of a `HasSeeds` prior, else draws."""
 
 
 @runtime_checkable
@@ -129,7 +129,7 @@ class HasSeeds(Protocol):
 
 @runtime_checkable
 class HasCoordinateSpeeds(Protocol):
-    """Conversion of joint speeds in an image to steps of θ."""
+    """A prior that converts joint speeds in an image to steps of θ."""
 
     def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
         """Return each coordinate's mean squared step: ``(…, J, 2) → (…, dim)``.
@@ -150,7 +150,7 @@ class ChecksObservations(Protocol):
 class Marginalises(Protocol):
     """A prior that marginalises variables not in θ (a style, a yaw, small noise).
 
-    Its likelihood is not a function of a single motion, and a motion at θ is a draw.
+    Its likelihood depends on a distribution of motions, and ``complete`` draws a motion given θ.
     """
 
     def log_likelihood(self, theta: Array, likelihood: Likelihood) -> Array:
@@ -182,12 +182,12 @@ class HasManifold(Protocol):
     """A prior concentrated around a manifold."""
 
     def off_manifold(self, positions: np.ndarray) -> np.ndarray:
-        """Return the variance off the manifold over its expectation: ``(n, L, J, 3) → (n,)``."""
+        """Return the ratio of off-manifold variance to its expectation: ``(n, L, J, 3) → (n,)``."""
 
 
 @runtime_checkable
 class Denoises2D(Protocol):
-    """Posterior mean of clean 2D views given noisy ones."""
+    """2D denoiser: posterior mean of clean views given noisy views."""
 
     @property
     def scale(self) -> float:
@@ -209,7 +209,7 @@ class Denoises2D(Protocol):
 
 @runtime_checkable
 class Denoises3D(Protocol):
-    """Posterior mean of the clean motion given a noisy one."""
+    """3D denoiser: posterior mean of the clean motion given a noisy motion."""
 
     @property
     def scale(self) -> float:
@@ -221,7 +221,7 @@ class Denoises3D(Protocol):
 
 @runtime_checkable
 class DenoisesCoordinates(HasLogDensity, Protocol):
-    """Posterior mean of θ given a noisy θ, √ᾱ θ_t for θ ~ N(0, I), and a log density in θ."""
+    """Denoiser of θ: posterior mean given θ_t, √ᾱ θ_t if θ ~ N(0, I), and a log density in θ."""
 
     def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
         """Return E[θ | θ_t], θ_t = √ᾱ θ + √(1−ᾱ) ε: ``(…, dim) → (…, dim)``.
@@ -270,13 +270,13 @@ class MotionInference(Protocol):
         """Return a one-draw estimate of the negative ELBO, summed over windows: a tensor."""
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return draws (n, L, J, 3), metres, and their θ (n, dim) if there is one.
+        """Return draws (n, L, J, 3), metres, and their θ (n, dim) if available.
 
         The i-th draw uses only the i-th rows of the arrays that ``streams`` returns.
         """
 
     def predict(self, rng: np.random.Generator, *, average: bool) -> np.ndarray:
-        """Return the predicted motion (L, J, 3), metres: the average, or that of q's means."""
+        """Return the predicted motion (L, J, 3), metres: average motion, or motion at q's means."""
 
 
 @runtime_checkable
@@ -284,7 +284,7 @@ class InferenceNetwork(Protocol):
     """Networks trained to infer a prior's motions from observations."""
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Whether the network supports this kind of observations."""
+        """Return whether the network supports this kind of observations."""
 
     def on(
         self,
@@ -294,7 +294,7 @@ class InferenceNetwork(Protocol):
         degrees_of_freedom: float | None,
         overlap: int,
     ) -> MotionInference:
-        """Return the inference of one recording; ``prior`` may have its length and body."""
+        """Return the inference of one recording; ``prior`` may be adapted to the recording."""
 
 
 @runtime_checkable
@@ -308,7 +308,7 @@ class HasInferenceNetwork(Protocol):
 
 @runtime_checkable
 class HasExactPosterior(Protocol):
-    """Closed-form posterior for conjugate likelihoods."""
+    """A prior with a closed-form posterior for conjugate likelihoods."""
 
     def exact_posterior(self, likelihood: Likelihood | None) -> ExactPosterior:
         """Return p(X | y); raise `NotConjugate` unless y is linear in X with Gaussian noise."""

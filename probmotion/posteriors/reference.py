@@ -1,8 +1,8 @@
 """Reference draws of long runs, stored with a certificate.
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
-``certificate.json``. Its fingerprint is the posterior's log density at some draws or, if only θ has
-a density, at initial points; unlike the bits of a fitted prior, it is reproducible across machines.
+``certificate.json``. Its fingerprint is the posterior's log density at the first draws or, if only
+θ has a density, at initial points; it is reproducible across machines, unlike a hash of the prior.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class StoredReference:
     Parameters
     ----------
     positions : ndarray, (n, L, J, 3)
-        The draws, nearly independent, metres.
+        Nearly independent draws, metres.
     certificate : mapping
         ``problem``, ``draws``, ``exact``, ``sampler``, ``settings``, ``rhat``, ``ess_bulk``,
         ``ess_tail``, ``agreement`` of two independent runs (``agreement_wherever_they_stand``:
@@ -62,7 +62,7 @@ class StoredReference:
         check_finite("positions", self.positions)
         missing = [name for name in _NEEDED if name not in self.certificate]
         if missing:
-            raise ValueError(f"certificate must have {', '.join(_NEEDED)}; missing {missing}")
+            raise ValueError(f"certificate must have {', '.join(_NEEDED)}, got none of {missing}")
         if self.certificate["draws"] != self.n:
             raise ValueError(
                 f"certificate must be of the {self.n} stored draws, got {self.certificate['draws']}"
@@ -74,12 +74,12 @@ class StoredReference:
         return len(self.positions)
 
     def choose(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n of the draws, without replacement, (n, L, J, 3), metres, float64."""
+        """Return n draws chosen without replacement, (n, L, J, 3), metres, float64."""
         if n > self.n:
             name = self.certificate["problem"]
             raise ValueError(
                 f"n must be at most the {self.n} stored reference draws of {name}, got {n}; "
-                f"make more with: probmotion reference '{name}' --draws {n}"
+                f"create more with: probmotion reference '{name}' --draws {n}"
             )
         return self.positions[rng.permutation(self.n)[:n]].astype(np.float64)
 
@@ -91,12 +91,12 @@ class StoredReference:
             expected = fingerprint_of(posterior, self.positions)
         if expected is None or not _same(expected, stored):
             raise ValueError(
-                f"certificate must have {name}'s fingerprint {expected}, got {stored}; make the "
-                f"reference with: probmotion reference '{name}'"
+                f"certificate must have {name}'s fingerprint {expected}, got {stored}; create "
+                f"the reference with: probmotion reference '{name}'"
             )
 
     def save(self, folder: str | Path) -> Path:
-        """Write both files into ``folder``, or raise ``OSError`` and keep an earlier reference."""
+        """Write both files into ``folder``; an ``OSError`` preserves an earlier reference."""
         folder = Path(folder)
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
@@ -134,15 +134,15 @@ class StoredReference:
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:
-    """Return the numbers that identify a reference's posterior.
+    """Return the fingerprint of a reference's posterior.
 
-    They are the log density at the first draws; without a density of positions, the log density at
-    four initial θ and the mean distance of their joints from the origin, metres. The truncation
-    levels are appended if there are any.
+    The fingerprint is the log density at the first draws or, without a density of positions, the
+    log density at four initial θ and the mean distance of their joints from the origin, metres. The
+    levels of a truncated posterior are appended.
     """
     prior = posterior.prior
     if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):
-        # Evaluated at the points as stored, in float32.
+        # Evaluate at the positions as stored, in float32.
         stored = np.asarray(positions[:_PROBES], dtype=np.float32).astype(np.float64)
         numbers = [log_density_at(posterior, stored)]
     else:

@@ -1,4 +1,4 @@
-"""Sampler protocol, the registry of samplers, and compatibility checks."""
+"""Sampler protocol, sampler registry and compatibility checks."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ __all__ = [
 
 @runtime_checkable
 class Sampler(Protocol):
-    """A frozen dataclass of settings that draws from a posterior.
+    """Sampler of a posterior: a frozen dataclass of settings.
 
     ``requires`` lists the protocols of :mod:`probmotion.posteriors.protocols` that the prior must
-    implement; a union ``A | B`` requires either.
+    implement; a union ``A | B`` requires A or B.
     """
 
     name: ClassVar[str]
@@ -56,11 +56,11 @@ class Sampler(Protocol):
         """Return ``chains`` × ``draws`` draws."""
 
 
-class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
-    """A sampler does not support a posterior.
+class UnsupportedPosterior(ValueError):  # noqa: N818 (public name)
+    """Error for a posterior that a sampler does not support.
 
-    ``reason`` is the rest of a sentence that begins with the sampler's name, ``word`` the reason in
-    one word, for tables, and ``others`` the names of suitable samplers.
+    ``reason`` completes a sentence that begins with the sampler's name, ``word`` is a one-word
+    reason for tables, and ``others`` are the names of suitable samplers.
     """
 
     def __init__(self, sampler: str, reason: str, word: str, others: Iterable[str] = ()) -> None:
@@ -70,9 +70,9 @@ class UnsupportedPosterior(ValueError):  # noqa: N818 (the name is the design's)
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C stopped a sampler; ``draws`` are the finished draws, equally many per chain.
+    """Interruption of a sampler by Ctrl-C; ``draws`` are the finished draws, as many per chain.
 
-    A chain sampler continues with ``sampler.sample(posterior, …, initial=interrupted.draws)``.
+    Continue a chain sampler with ``sampler.sample(posterior, …, initial=interrupted.draws)``.
     """
 
     def __init__(self, draws: MotionDraws) -> None:
@@ -82,20 +82,20 @@ class Interrupted(KeyboardInterrupt):
 
 
 def missing(sampler: type[Any] | Sampler, posterior: MotionPosterior) -> list[type | UnionType]:
-    """Return the protocols that ``sampler`` requires and the posterior's prior lacks."""
+    """Return the protocols that ``sampler`` requires but the prior does not implement."""
     return [needed for needed in sampler.requires if not isinstance(posterior.prior, needed)]
 
 
 def require(sampler: Sampler, posterior: MotionPosterior) -> None:
-    """Raise :class:`UnsupportedPosterior` if the prior lacks a protocol the sampler requires.
+    """Raise :class:`UnsupportedPosterior` if the prior lacks a required protocol.
 
-    A prior may name substitutes by protocol in a mapping ``stand_ins``, appended to the message.
+    A prior's optional mapping ``stand_ins``, from protocol names to hints, extends the message.
     """
     protocols = missing(sampler, posterior)
     if protocols:
-        names = [[one.__name__ for one in get_args(needed) or (needed,)] for needed in protocols]
+        names = [[kind.__name__ for kind in get_args(needed) or (needed,)] for needed in protocols]
         stand_ins = getattr(posterior.prior, "stand_ins", {})
-        hints = [f"; {stand_ins[one]}" for union in names for one in union if one in stand_ins]
+        hints = [f"; {stand_ins[kind]}" for union in names for kind in union if kind in stand_ins]
         raise UnsupportedPosterior(
             sampler.name,
             f"needs a prior with {' and '.join(map(' or '.join, names))}, got "
@@ -140,7 +140,7 @@ def importable_samplers() -> dict[str, type[Any]]:
 
 
 def _imported(errors: dict[str, ValueError]) -> dict[str, type[Any]]:
-    """Return the importable samplers; add the others' errors to ``errors``."""
+    """Return the importable samplers; add import errors by name to ``errors``."""
     samplers = {}
     for name in sampler_names():
         try:
@@ -152,7 +152,7 @@ def _imported(errors: dict[str, ValueError]) -> dict[str, type[Any]]:
 
 @cache
 def _registered() -> dict[str, EntryPoint]:
-    """Return the entry points by name; the library's own take precedence."""
+    """Return the entry points by name; those of probmotion take precedence."""
     registered: dict[str, EntryPoint] = {}
     points = entry_points(group="probmotion.samplers")
     for point in sorted(points, key=lambda point: _package_of(point) != "the package probmotion"):
@@ -160,7 +160,7 @@ def _registered() -> dict[str, EntryPoint]:
         if first.value != point.value:
             warnings.warn(
                 f"sampler {point.name!r} of {_package_of(point)} is skipped: "
-                f"{_package_of(first)} has one of that name",
+                f"{_package_of(first)} registers the same name",
                 stacklevel=3,
             )
     return registered
@@ -183,7 +183,7 @@ def load_sampler(name: str) -> type[Any]:
     point = known[name]
     try:
         return point.load()
-    except Exception as error:  # third-party packages may raise anything
+    except Exception as error:  # third-party packages may raise any exception
         raise ValueError(
             f"sampler {name!r} of {_package_of(point)} must be importable from {point.value!r}, "
             f"got {_in_a_line(error)}"

@@ -18,19 +18,19 @@ _NEAR = 1.0  # distance to the floor, nats, below which a draw is flagged
 
 @dataclass(frozen=True, eq=False)
 class TruncatedPosterior(MotionPosterior):
-    """f* = 0 where f < f₀/c, c f₀ where f > c f₀, else f, with f₀ = f(seed) (eq. 11).
+    """Density f*: 0 where f < f₀/c, c f₀ where f > c f₀, else f, with f₀ = f(seed) (eq. 11).
 
     f is the density relative to the prior's ``log_measure``, if it has one. The likelihood is not
-    evaluated where its upper bound cannot lift f above the floor.
+    evaluated where its upper bound cannot raise f above f₀/c.
 
     Parameters
     ----------
     prior, likelihood
         As in :class:`~probmotion.MotionPosterior`.
     seed : ndarray, (dim,), optional
-        θ of f₀; 0 by default.
+        θ at which f₀ is evaluated; 0 by default.
     limit : float
-        c, above 1; infinity disables the truncation.
+        Truncation ratio c, above 1; infinity disables the truncation.
     """
 
     seed: np.ndarray | None = None
@@ -59,12 +59,12 @@ class TruncatedPosterior(MotionPosterior):
 
     @property
     def log_floor(self) -> float:
-        """log f₀/c."""
+        """Lower truncation level log f₀/c."""
         return self.log_seed - math.log(self.limit)
 
     @property
     def log_cap(self) -> float:
-        """log c f₀."""
+        """Upper truncation level log c f₀."""
         return self.log_seed + math.log(self.limit)
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
@@ -94,7 +94,7 @@ class TruncatedPosterior(MotionPosterior):
 
 
 def limit_for_dimension(dim: int) -> float:
-    """Return a limit c that keeps the typical set of a Gaussian in ``dim`` dimensions.
+    """Return a limit c that includes the typical set of a Gaussian in ``dim`` dimensions.
 
     log f is dim/2 nats below the mode on average, with standard deviation √(dim/2); log c is the
     mean plus three standard deviations.

@@ -37,7 +37,7 @@ def problem_names() -> list[str]:
 
 
 def available_problems() -> tuple[list[str], dict[str, str]]:
-    """Return the names of loadable problems, and error messages by name of those without data."""
+    """Return the names of loadable problems, and the error message of each other problem."""
     missing = {}
     for name in problem_names():
         try:
@@ -68,10 +68,10 @@ def load_problem(name: str, **scale: Any) -> Problem:
     Raises
     ------
     ValueError
-        If the problem or a parameter is unknown, or the stored reference draws belong to another
+        If the problem or a parameter is unknown, or the stored reference draws are of another
         posterior.
     FileNotFoundError
-        If its data are missing; the message says how to get them.
+        If its data are missing; the message explains how to obtain them.
     """
     return _load(*_resolve(name, scale))
 
@@ -106,7 +106,7 @@ def _parse(words: str) -> dict[str, Any]:
         call = ast.parse(f"f({words})", mode="eval").body
         assert isinstance(call, ast.Call)
         assert not call.args
-        return {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
+        return {str(item.arg): ast.literal_eval(item.value) for item in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise ValueError(
             f"parameters must be given as in (frames=20, noise=0.05), got ({words})"
@@ -123,7 +123,7 @@ def _load(name: str, scale: Scale) -> Problem:
 
 @cache
 def _load_without_reference(name: str, scale: Scale) -> Problem:
-    # One thread makes problems bit-identical in every process of a comparison.
+    # A single thread makes problems bit-identical across processes of a comparison.
     with one_thread():
         if name not in _GAITS:
             return _OTHERS[name][1]()

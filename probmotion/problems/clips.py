@@ -1,4 +1,4 @@
-"""Problems made from motion clips: one clip is held out, a prior is fitted to the others."""
+"""Recovery of a held-out motion clip with a prior fitted to other clips."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def clips_problem(
     rank : int
         Latent dimensions per style.
     styles : int
-        Number of styles, determined by clustering.
+        Number of styles into which the windows are clustered.
     observe : str
         Observations of the held-out window: a name of
         :data:`~probmotion.problems.observations.OBSERVATIONS`; ``"none"`` for generation.
@@ -73,17 +73,17 @@ def clips_problem(
     check_positive("noise", noise)
     if len(motions) < 2:
         raise ValueError(
-            "motions must contain at least 2 clips, one to hold out and others to fit the prior, "
+            "motions must contain at least 2 clips, one to hold out and the rest to fit the prior, "
             f"got {len(motions)}"
         )
     _check_distinct(motions)
     index = _index(motions, held_out)
     with one_thread():
         clips = _harmonised(motions, fps)
-        unseen = clips.pop(index)
-        if unseen.frames < frames:
-            raise ValueError(f"held_out must be a clip of at least frames={frames}, got {unseen}")
-        truth = unseen.window((unseen.frames - frames) // 2, frames).centred()
+        target = clips.pop(index)
+        if target.frames < frames:
+            raise ValueError(f"held_out must be a clip of at least frames={frames}, got {target}")
+        truth = target.window((target.frames - frames) // 2, frames).centred()
         likelihood = observations.observe(truth, observe, noise, seed)
         long = [clip for clip in clips if clip.frames >= frames]
         if not long:
@@ -102,7 +102,7 @@ def clips_problem(
         )
     problem = Problem(
         name,
-        _description(long, len(clips) - len(long), unseen, frames, observe, noise),
+        _description(long, len(clips) - len(long), target, frames, observe, noise),
         MotionPosterior(prior, likelihood),
         None if likelihood is None else truth.positions,
     )

@@ -1,4 +1,4 @@
-"""Posteriors as priors with exact denoisers, the reference for guidance."""
+"""Conditioned priors with exact denoisers, a reference for guidance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Conditions(Protocol):
 
 
 def conditioned(posterior: MotionPosterior) -> MotionPosterior:
-    """Return the same distribution with the observations absorbed into the prior.
+    """Return the same posterior, with a prior conditioned on the observations.
 
     Raises ``ValueError`` if there are observations and the prior is neither a Gaussian mixture nor
     has ``given``; ``NotConjugate`` if a mixture's likelihood is not linear in the positions with

@@ -59,19 +59,19 @@ def denoising_problem(
     Parameters
     ----------
     truth : Motion
-        The motion, with the prior's skeleton and frame rate, metres; of any length.
+        Motion of any length with the prior's skeleton and frame rate, metres.
     prior : MotionDVAE
-        The prior, adapted to the length of the truth and the observed bone lengths.
+        Prior; adapted to the number of frames of ``truth`` and the observed bone lengths.
     noise : float
-        Standard deviation (Student-t: scale) of a coordinate, metres.
+        Standard deviation (scale of Student-t noise) per coordinate, metres.
     degrees_of_freedom : float, optional
-        Of Student-t noise; Gaussian by default.
+        Degrees of freedom of Student-t noise; Gaussian noise by default.
     hidden : ndarray of bool, (L, J), optional
         Occluded joints.
     seed : int
         Seed of the noise.
     name, description : str
-        Name in tables, and a sentence.
+        Name and description of the problem in tables.
     """
     likelihood = Joints3D.observe(
         truth, noise, seed, hidden=hidden, degrees_of_freedom=degrees_of_freedom
@@ -82,10 +82,10 @@ def denoising_problem(
 
 
 def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
-    """Estimate a body from noisy joints; returns rest offsets (J, 3), metres.
+    """Return the body estimated from noisy joints, as rest offsets (J, 3), metres.
 
-    Bone lengths are those observed. Bone directions at joints with several children, such as hips,
-    come from Kalman-smoothed joints; if a joint is never visible, they are the prior's.
+    Bone lengths are estimated from the observations, and bone directions at joints with several
+    children from Kalman-smoothed joints. If a joint is never visible, the prior's are used.
     """
     from probmotion.data.joint_filters import kalman_smooth
 
@@ -111,7 +111,7 @@ def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
 def gaussian_noise(likelihood: Joints3D) -> float:
     """Return an equivalent Gaussian noise scale for smoothers, metres.
 
-    Student-t noise gives its standard deviation, or three times its scale if that is infinite.
+    For Student-t noise: its standard deviation, or three times its scale if ν ≤ 2.25.
     """
     freedom = likelihood.entries.degrees_of_freedom
     if freedom is None:
@@ -122,8 +122,8 @@ def gaussian_noise(likelihood: Joints3D) -> float:
 def limb_occlusions(motion: Motion, *, cut_off: bool = False) -> np.ndarray:
     """Return the mask of occluded joints (L, J): right arm, then left leg.
 
-    Each is occluded for a third of the time, between the first and last sixth. With ``cut_off``
-    each is occluded for a whole half, up to the first or last frame.
+    Each limb is occluded for a third of the frames, between the first and last sixth. With
+    ``cut_off``, the arm is occluded in the first half of the frames and the leg in the second half.
     """
     hidden = np.zeros(motion.positions.shape[:2], dtype=bool)
     first, middle, last = (motion.frames * sixth // 6 for sixth in (1, 3, 5))
@@ -147,7 +147,7 @@ def _problem(
     prior = body_prior()
     clip = cmu_clip(_CLIP).retarget(prior.skeleton)
     truth = clip.window((clip.frames - prior.frames) // 2, prior.frames)
-    # Move the clip to the origin, as its position carries no information.
+    # Centre the clip on the origin; its position carries no information.
     ground = truth.positions[:, prior.skeleton.roots[0]].mean(axis=0) * [1.0, 0.0, 1.0]
     truth = Motion(truth.positions - ground, truth.skeleton, truth.fps, name=name)
     return denoising_problem(

@@ -1,15 +1,15 @@
-"""Problems on procedural gaits with an exact prior, and with observations of a draw from it.
+"""Problems with an exact prior on procedural gaits and observations of a prior draw.
 
-Truths are draws from the prior, so the posterior is calibrated. Parameters, of which
-:data:`GAIT_PROBLEMS` lists those of each problem:
+Truths are drawn from the prior, so exact posterior draws are calibrated. :data:`GAIT_PROBLEMS`
+defines the defaults of the parameters:
 
-- ``frames``: L
-- ``components``: of the mixture, styles × azimuths; numbers up to that of the styles select as many
-  styles, without azimuths
-- ``joints``: observed joints, those closest to the root
-- ``noise``: standard deviation (Student-t: scale) of the observations, metres
-- ``hidden``: proportion of the frames, the middle ones, with the longest limb occluded
-- ``seed``: of the truth and its observations
+- ``frames``: number of frames L
+- ``components``: number of mixture components, styles × azimuths; values up to the number of styles
+  select that many styles and a single azimuth
+- ``joints``: number of observed joints, counted from the root
+- ``noise``: standard deviation (scale of Student-t noise) of the observations, metres
+- ``hidden``: proportion of frames, around the middle frame, with the longest limb occluded
+- ``seed``: seed of the truth and its observations
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ Observed = Literal["nothing", "keypoints", "one frame", "joints"]
 class GaitProblem:
     """Factory of a gait problem with the default parameters ``defaults``.
 
-    ``observes``: 2D keypoints of one camera in all frames or the middle one, or 3D joints with
-    Student-t noise of 3 degrees of freedom.
+    ``observes`` selects no observations, 2D keypoints from one camera in all frames or the middle
+    frame, or 3D joints with Student-t noise (3 degrees of freedom).
     """
 
     name: str
@@ -64,7 +64,7 @@ class GaitProblem:
     defaults: Mapping[str, Any]
 
     def __call__(self, name: str | None = None, **scale: Any) -> Problem:
-        """Return the problem, called ``name``, with some parameters changed."""
+        """Return the problem, renamed to ``name``, with the parameters in ``scale`` changed."""
         parameters = {**self.defaults, **scale}
         check_count("frames", parameters["frames"], least=2)
         coordinates: Coordinates = "positions" if self.observes == "joints" else "latent"
@@ -182,4 +182,4 @@ GAIT_OUTLIER_PROBLEMS: Mapping[str, GaitProblem] = _problems(
         {"frames": 10, **_DENSE, "noise": 0.03},
     ),
 )
-"""Factories of the problems with outliers, by name; their reference is a long run."""
+"""Factories of the problems with outliers, by name; the reference is a long Gibbs run."""

@@ -1,4 +1,4 @@
-"""Simulated keypoint observations of a true motion, by name."""
+"""Simulated 2D keypoints of a motion, with named occlusion patterns."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _SPARSE_JOINTS = 6
 
 
 def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | None:
-    """Return noisy keypoints of ``motion`` in one orthographic camera 15° above the horizon.
+    """Return noisy keypoints of ``motion`` from an orthographic camera at 15° elevation.
 
-    ``how`` is a name of :data:`OBSERVATIONS`, else a ``ValueError``; ``noise`` is a standard
-    deviation in metres, with one image unit per metre.
+    ``how`` is a key of :data:`OBSERVATIONS`; ``noise`` is the standard deviation in metres, with
+    one image unit per metre. Return ``None`` if ``how`` is ``"none"``.
     """
     if how not in OBSERVATIONS:
         raise ValueError(f"observe must be one of {', '.join(OBSERVATIONS)}, got {how!r}")
@@ -43,17 +43,17 @@ def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | 
 def one_camera_keypoints(
     motion: Motion, noise: float, seed: int, hidden: np.ndarray
 ) -> Keypoints2D:
-    """Return noisy keypoints as :func:`observe` does, with ``hidden`` (L, J) joints occluded."""
+    """Return noisy keypoints from the camera of :func:`observe`; ``hidden`` (L, J): occluded."""
     camera = Cameras.ring(1, elevation=_ELEVATION)
     return Keypoints2D.observe(motion, camera, noise, seed, hidden=hidden)
 
 
 def limb_occlusion(motion: Motion, fraction: float = 0.5) -> np.ndarray:
-    """Return a mask (L, J) of the longest limb in the middle ``fraction`` of the frames."""
+    """Return the mask (L, J) of the longest limb in the middle ``fraction`` of the frames."""
     if not 0 <= fraction <= 1:
         raise ValueError(f"hidden must be between 0 and 1, got {fraction!r}")
     hidden = _no_occlusion(motion)
-    # Whole frames, rounded down; the constant absorbs rounding errors.
+    # Round down to full frames; the constant absorbs floating-point error.
     start = int((1 - fraction) / 2 * motion.frames + 1e-9)
     stop = start + int(fraction * motion.frames + 1e-9)
     hidden[start:stop, _longest_limb(motion.skeleton)] = True
@@ -87,7 +87,7 @@ def _all_but_central_joints(motion: Motion) -> np.ndarray:
 
 
 def _longest_limb(skeleton: Skeleton) -> list[int]:
-    """Return the longest chain of joints from a leaf to below the nearest branching."""
+    """Return the longest chain of joints from a leaf up to a branching joint or root, exclusive."""
     children = np.bincount([p for p in skeleton.parents if p >= 0], minlength=skeleton.n_joints)
     limbs = []
     for leaf in np.flatnonzero(children == 0):
@@ -106,7 +106,7 @@ OBSERVATIONS: Mapping[str, Callable[[Motion], np.ndarray] | None] = {
     "occluded": limb_occlusion,
     "sparse": _all_but_central_joints,
 }
-"""Masks of occluded joints (L, J), by name.
+"""Functions that return the mask of occluded joints (L, J), by name.
 
 ``none``: no observations, the posterior is the prior; ``monocular``: all joints visible;
 ``occluded``: longest limb occluded in the middle half of the frames; ``sparse``: only the six

@@ -20,16 +20,16 @@ __all__ = ["BUDGET", "animation", "shown_problems"]
 _MOST = 4
 _MOST_POSES = 6
 BUDGET = 9_000_000
-"""Largest size of motions and images in bytes, before base64 adds a third."""
+"""Maximum size of motions and images in bytes, before base64 encoding."""
 _HELD_OUT = "held-out poses"
 _REFERENCE = "reference draws"
 
 
 def shown_problems(comparison: GridResults, budget: int = BUDGET) -> dict[str, Shown]:
-    """Return the motions to show for each problem, at most 4 draws of each sampler.
+    """Return the motions to show for each problem, at most 4 draws or 6 poses of each sampler.
 
-    Draws, and then frames, are left out until they fit the budget in bytes. Problems without draws
-    and references are left out.
+    Draws, then frames, are omitted until their size is within the budget in bytes. Problems without
+    motions are omitted.
     """
     problems = {}
     for name in comparison.plan.problems:
@@ -81,8 +81,8 @@ def _shown(comparison: GridResults, name: str) -> Shown | None:
 def animation(name: str, shown: Shown, place: int, missing: Mapping[str, str]) -> str:
     """Return the animation of one problem as HTML.
 
-    ``place`` is the number of the problem in the report, for its ids; ``missing`` contains the
-    reason for missing draws by sampler, as HTML.
+    ``place`` is the index of the problem in the report, used in HTML ids; ``missing`` maps samplers
+    without draws to the reason, as HTML.
     """
     cards = [
         f"<figure><figcaption>{escape(sampler)}: no draws, {why}</figcaption></figure>"
@@ -106,7 +106,7 @@ def _counted(label: str, n: int, problem: StoredProblem) -> str:
 
 
 def _description(shown: Shown) -> str:
-    """Return sentences on the observations and on omitted parts."""
+    """Return a description of the observations and of omitted content."""
     problem = shown.problem
     parts = []
     for observed, words in ((problem.keypoints, "keypoints"), (problem.joints, "noisy 3D joints")):
@@ -115,18 +115,18 @@ def _description(shown: Shown) -> str:
         visible = np.isfinite(observed[..., 0])
         frames = np.flatnonzero(visible.any(axis=1))
         text = (
-            f"There are observations of {int(visible.sum())} {words} in {len(frames)} of "
+            f"The observations are {int(visible.sum())} {words} in {len(frames)} of "
             f"{len(visible)} frames"
         )
         if len(frames) == 1:
             text += f", all in frame {frames[0] // shown.step + 1}"
         parts.append(text + ".")
     if problem.keypoints is not None:
-        parts.append("The initial view is beside the first camera, where depth is visible.")
+        parts.append("The initial view is rotated from the first camera to show depth.")
     if problem.has_observations and problem.keypoints is None and problem.joints is None:
-        parts.append("The observations are not drawn.")
+        parts.append("The observations are not shown.")
     if problem.reference is None and problem.held_out is None:
-        parts.append("There are no reference draws.")
+        parts.append("Reference draws are not available.")
     if shown.step > 1:
         parts.append(f"Every {shown.step}th frame is shown to limit the size of the report.")
     return " ".join(parts)

@@ -15,7 +15,7 @@ __all__ = ["contents", "facts", "note_ids", "notes", "reading_guide"]
 
 
 def facts(comparison: GridResults) -> str:
-    """Return problems, samplers, sizes and versions as an HTML list."""
+    """Return problems, samplers, numbers of draws and library versions as an HTML list."""
     plan = comparison.plan
     failed = len(comparison.failures)
     total = len(plan.problems) * len(plan.samplers) * plan.seeds
@@ -25,12 +25,12 @@ def facts(comparison: GridResults) -> str:
         "draws": f"{plan.draws} per sampler, on {plan.chains} chain{'s' * (plan.chains != 1)}",
         "seeds": f"{plan.seeds}; numbers are mean ± standard deviation"
         if plan.seeds > 1
-        else "1; the spread is unknown",
+        else "1; without standard deviations",
         "runs": f"{len(comparison.results)} of {total} finished, {failed} of them without draws",
         "versions": _versions(comparison),
     }
     listed = "".join(
-        f"<dt>{name}</dt><dd>{escape(words)}</dd>" for name, words in entries.items() if words
+        f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in entries.items() if text
     )
     return f'<dl class="facts">{listed}</dl>'
 
@@ -47,10 +47,10 @@ def _versions(comparison: GridResults) -> str:
 
 def contents(comparison: GridResults, with_calibration: bool) -> str:
     """Return links to all sections as HTML."""
-    links = [(f"problem-{place}", name) for place, name in enumerate(comparison.plan.problems)]
+    links = [(f"problem-{i}", name) for i, name in enumerate(comparison.plan.problems)]
     links += [("calibration", "calibration")] if with_calibration else []
     links.append(("notes", "notes"))
-    items = "".join(f'<li><a href="#{where}">{escape(name)}</a></li>' for where, name in links)
+    items = "".join(f'<li><a href="#{anchor}">{escape(name)}</a></li>' for anchor, name in links)
     return f'<nav aria-label="Sections"><ul>{items}</ul></nav>'
 
 
@@ -68,35 +68,34 @@ def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
 <details open><summary>How to read this report</summary>
 {legends}
 <p>{highlights}</p>
-<p>Click a column heading to sort by it, in ascending and then in descending order. –: not
-applicable or not measured. A word in place of numbers links to the note with the reason.</p>
+<p>Click a column heading to sort by it, in ascending, then in descending order. –: not
+applicable or not measured. Words instead of numbers link to the note with the reason.</p>
 <p id="keys">All skeletons of a problem move and turn together. Drag them, or click on them and use
-the keys: <kbd>space</kbd> plays and stops, the arrow keys turn, <kbd>,</kbd> and <kbd>.</kbd> go
-one frame back and forth, <kbd>Home</kbd> and <kbd>End</kbd> go to the first and the last frame,
-<kbd>c</kbd> switches the camera's view on and off.</p>
+the keys: <kbd>space</kbd> plays and stops, the arrow keys turn, <kbd>,</kbd> and <kbd>.</kbd> step
+one frame back or forward, <kbd>Home</kbd> and <kbd>End</kbd> jump to the first or last frame,
+<kbd>c</kbd> switches the camera view on or off.</p>
 </details>"""
 
 
 def note_ids(comparison: GridResults) -> dict[tuple[str, str], str]:
-    """Return the id of the note on each failure by problem and sampler."""
+    """Return the HTML ids of the notes on failures, by problem and sampler."""
     sentences = comparison.notes
     ids: dict[tuple[str, str], str] = {}
     for result in comparison.failures:
         assert result.failure is not None
-        beginning = f"{result.sampler} on {result.problem}: {result.failure.message}"
-        for place, sentence in enumerate(sentences):
-            if sentence.startswith(beginning):
-                ids.setdefault((result.problem, result.sampler), f"note-{place}")
+        prefix = f"{result.sampler} on {result.problem}: {result.failure.message}"
+        for i, sentence in enumerate(sentences):
+            if sentence.startswith(prefix):
+                ids.setdefault((result.problem, result.sampler), f"note-{i}")
     return ids
 
 
 def notes(comparison: GridResults) -> str:
     """Return the notes as HTML."""
     items = "".join(
-        f'<li id="note-{place}">{escape(sentence)}</li>'
-        for place, sentence in enumerate(comparison.notes)
+        f'<li id="note-{i}">{escape(sentence)}</li>' for i, sentence in enumerate(comparison.notes)
     )
-    listed = f'<ul class="notes">{items}</ul>' if items else "<p>There are none.</p>"
+    listed = f'<ul class="notes">{items}</ul>' if items else "<p>No notes.</p>"
     return f"""\
 <section id="notes" aria-labelledby="notes-name">
 <header><h2 id="notes-name">Notes</h2></header>

@@ -37,9 +37,9 @@ _ON_DARK = (
     "#FFFFFF", "#5BB3E8", "#F58A4B", "#2FC79B", "#E39BC2", "#DDA92E", "#9CD0F5", "#C2A27E",
     "#A8A8A8",
 )  # fmt: skip
-"""Colours of CYCLE on a dark background."""
+"""Variants of the colours in CYCLE for dark backgrounds."""
 _LEAST = BUDGET // 9
-"""Bytes reserved for motions beside large figures."""
+"""Minimum budget for motions in bytes, whatever the size of the figures."""
 
 
 def write_report(
@@ -50,7 +50,7 @@ def write_report(
     Parameters
     ----------
     comparison : GridResults
-        Results; unfinished runs are left out.
+        Results; unfinished runs are omitted.
     path : str or Path
         HTML file to write.
     calibration : Calibration, optional
@@ -61,7 +61,7 @@ def write_report(
     ValueError
         If the path does not end in ``.html``.
     OSError
-        If the folder cannot be written to.
+        If the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
@@ -84,8 +84,8 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
         for name in plan.problems
     }
     sections = [
-        _section(comparison, table, name, place, shown.get(name), outcomes[name], plots[name])
-        for place, name in enumerate(plan.problems)
+        _section(comparison, table, name, i, shown.get(name), outcomes[name], plots[name])
+        for i, name in enumerate(plan.problems)
     ]
     if calibration is not None:
         sections.append(_calibration(calibration, ranks))
@@ -93,7 +93,7 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     title = " on ".join(
         f"{n} {kind}{'s' * (n != 1)}" for n, kind in zip(count, ("sampler", "problem"), strict=True)
     )
-    # The page loads nothing from elsewhere.
+    # Block external resources.
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
     policy += "script-src 'unsafe-inline'"
     return f"""\
@@ -135,7 +135,7 @@ def _section(
     outcomes: Mapping[str, Outcome],
     plot: bytes,
 ) -> str:
-    draws = '<p class="quiet">There are no draws.</p>'
+    draws = '<p class="quiet">No draws are available.</p>'
     if shown is not None:
         missing = {
             sampler: outcome.link()
@@ -157,7 +157,7 @@ def _section(
 def _outcome(
     comparison: GridResults, problem: str, sampler: str, ids: Mapping[tuple[str, str], str]
 ) -> Outcome:
-    """Return why a sampler has missing draws; runs without a result are unfinished."""
+    """Return the reasons for missing draws; runs without a result count as unfinished."""
     seeds = comparison.plan.seeds
     results = [r for r in comparison.results if (r.problem, r.sampler) == (problem, sampler)]
     failures = [result.failure for result in results if result.failure is not None]
@@ -193,7 +193,7 @@ def _png(plot: Callable[[Path], object]) -> bytes:
         path = Path(folder) / "figure.png"
         plot(path)
         with Image.open(path) as image:
-            # A palette needs a third of the bytes, without visible change of lines and bars.
+            # A palette reduces the size to a third without visibly changing lines and bars.
             small = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     encoded = io.BytesIO()
     small.save(encoded, "png")
@@ -209,11 +209,11 @@ def _image(png: bytes, description: str, kind: str = "plot") -> str:
 
 
 def _calibration(calibration: Calibration, figure: bytes) -> str:
-    """Return the figure, if there is one, and the table of a calibration as HTML."""
+    """Return the figure, if any, and the table of a calibration as HTML."""
     description = "Rank histograms and expected coverage; the numbers follow as text."
     shown = _image(figure, description, "plot calibration")
     if not figure:
-        shown = "<p>No sampler has ranks; the table states the reasons.</p>"
+        shown = "<p>No sampler has ranks; the table contains the reasons.</p>"
     return f"""\
 <section id="calibration" aria-labelledby="calibration-name">
 <header><h2 id="calibration-name">Calibration</h2></header>
@@ -228,12 +228,10 @@ sampler the rank of a truth among the draws is uniform, and credible sets have n
 def _sampler_colours() -> str:
     """Return the colours of samplers as CSS, for light and dark backgrounds."""
     light, dark = (
-        "".join(f"--sampler-{place}: {colour}; " for place, colour in enumerate(cycle))
+        "".join(f"--sampler-{i}: {colour}; " for i, colour in enumerate(cycle))
         for cycle in (CYCLE, _ON_DARK)
     )
-    classes = "".join(
-        f".sampler-{place} {{ fill: var(--sampler-{place}); }}\n" for place in range(len(CYCLE))
-    )
+    classes = "".join(f".sampler-{i} {{ fill: var(--sampler-{i}); }}\n" for i in range(len(CYCLE)))
     return (
         f":root {{ {light}}}\n"
         f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}\n{classes}"

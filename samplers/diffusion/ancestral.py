@@ -1,7 +1,7 @@
 """DDPM ancestral sampling (Ho et al. 2020, algorithm 2).
 
-From noise at level T to a clean motion: at every level the clean motion is estimated, and the next
-state is drawn from the DDPM posterior around the estimate.
+Sampling starts from noise at level T. At every level the denoiser estimates the clean motion, and
+the next state is drawn from the DDPM posterior given the estimate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = [
 
 
 class State(Protocol):
-    """Representation of a noisy motion in the loop, one motion or several views."""
+    """Representation of a noisy motion during sampling, as a 3D motion or as several views."""
 
     schedule: NoiseSchedule
     counts: dict[str, int]
@@ -47,14 +47,14 @@ class Denoiser(Protocol):
     counts: dict[str, int]
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
-        """Return the estimate of the clean motion from the state at ᾱ, of the same shape."""
+        """Return the estimate of the clean motion from ``x_t`` at ᾱ, of the same shape."""
 
 
 @dataclass
 class MotionState:
-    """One noisy motion per draw, (B, L, J, 3), or (B, L, J, 2) in 2D; ``shape`` is without B.
+    """State of one noisy motion per draw, (B, L, J, 3) or (B, L, J, 2); ``shape`` excludes B.
 
-    ``guide`` corrects the estimate of the clean motion for the observations. ``noise_factor`` maps
+    ``guide`` conditions the estimate of the clean motion on the observations. ``noise_factor`` maps
     σ to a matrix F, (3, 3), for noise F ε, or to ``None`` for the identity.
     """
 
@@ -88,7 +88,7 @@ class MotionState:
 
 
 Corrector = Callable[[State, NormalStreams, np.ndarray, int], np.ndarray]
-"""(state, streams, x_t, t) → another state at the same level t."""
+"""Function (state, streams, x_t, t) → corrected state at level t."""
 
 
 def ancestral(
@@ -138,7 +138,7 @@ def sigma(schedule: NoiseSchedule, t: int) -> float:
 
 
 class NoiseLevels:
-    """Base of frozen dataclasses with these settings of the noise levels."""
+    """Base of frozen dataclasses with settings of the noise schedule."""
 
     steps: int
     trained_steps: int | None
@@ -147,12 +147,12 @@ class NoiseLevels:
 
     def __post_init__(self) -> None:
         check_count("batch", self.batch)
-        # The schedule checks the other settings.
+        # Creating the schedule validates the other settings.
         check_count("steps", self.schedule.steps)
 
     @property
     def schedule(self) -> NoiseSchedule:
-        """The noise levels: ``steps`` of a schedule of ``trained_steps`` levels."""
+        """Noise schedule with ``steps`` of the ``trained_steps`` levels."""
         if self.trained_steps is None:
             return NoiseSchedule.cosine(self.steps, power=self.schedule_power)
         trained = NoiseSchedule.cosine(self.trained_steps, power=self.schedule_power)
@@ -160,7 +160,7 @@ class NoiseLevels:
 
 
 class AncestralSampler(NoiseLevels, IndependentSampler):
-    """Base of the ancestral samplers of 3D motions."""
+    """Base class of ancestral samplers of 3D motions."""
 
     draws_from = staticmethod(can_guide)
     effort: ClassVar[tuple[str, ...]] = ("steps",)

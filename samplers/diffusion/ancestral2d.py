@@ -1,4 +1,4 @@
-"""Ancestral sampling of a single view."""
+"""Ancestral sampling of a single view with a 2D denoiser."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ __all__ = ["Ancestral2D"]
 class Ancestral2D(NoiseLevels):
     """DDPM ancestral sampling of one view with a 2D denoiser: the upper bound in table 2 of MAS.
 
-    It returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
+    Returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
 
     Parameters
     ----------
     steps : int
         Number of denoising steps T.
     trained_steps : int, optional
-        Steps of the schedule that the T levels are taken from; ``steps`` by default.
+        Number of levels of the schedule from which T are selected; ``steps`` by default.
     schedule_power : int
         Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
     batch : int
@@ -66,26 +66,26 @@ class Ancestral2D(NoiseLevels):
         Parameters
         ----------
         posterior : MotionPosterior
-            A prior without observations.
+            Posterior without observations.
         draws : int
-            Number of draws; does not affect a draw.
+            Number of draws; does not affect individual draws.
         seed : int
             Seed of the noise.
         camera : Cameras, optional
-            The view, for exact denoisers; networks ignore it. By default orthographic with
-            elevation π/16.
+            View for exact denoisers; networks ignore it. Orthographic with elevation π/16 by
+            default.
         progress : bool
             Show a progress bar.
 
         Returns
         -------
         ndarray, (draws, L, J, 2)
-            Metres, x right and y down.
+            2D motions in metres, x right and y down.
 
         Raises
         ------
         UnsupportedPosterior
-            If the prior has no 2D denoiser, or there are observations.
+            If the prior has no 2D denoiser or the posterior has observations.
         ValueError
             If ``camera`` has several views.
         """
@@ -107,7 +107,7 @@ class Ancestral2D(NoiseLevels):
         state = MotionState(_ViewDenoiser(prior, view), self.schedule, shape)
         bars = progress_bar(self.steps * -(-draws // self.batch), self.name, progress)
         done: list[np.ndarray] = []
-        # Multithreaded products round differently for different batch sizes.
+        # Rounding of multithreaded matrix products depends on the batch size.
         with threadpool_limits(1, user_api="blas"), bars as bar:
             for batch in batches([(0, draw) for draw in range(draws)], self.batch):
                 streams = NormalStreams.of_draws(seed, list(batch))
@@ -116,7 +116,7 @@ class Ancestral2D(NoiseLevels):
 
 
 class _ViewDenoiser:
-    """E[x₀ | x_t] of one view."""
+    """Denoiser E[x₀ | x_t] of one view."""
 
     def __init__(self, prior: Denoises2D, camera: Cameras) -> None:
         self.prior = prior

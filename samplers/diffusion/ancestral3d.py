@@ -18,15 +18,15 @@ __all__ = ["Ancestral3D"]
 class Ancestral3D(AncestralSampler):
     """DDPM ancestral sampling (Ho et al. 2020, algorithm 2) with a 3D denoiser.
 
-    The difference from `mas` with the same number of steps is the error of conditioning on single
-    views.
+    The difference from `mas` with the same number of steps is the error due to conditioning on
+    single views.
 
     Parameters
     ----------
     steps : int
         Number of denoising steps T.
     trained_steps : int, optional
-        Steps of the schedule that the T levels are taken from; ``steps`` by default.
+        Number of levels of the schedule from which T are selected; ``steps`` by default.
     schedule_power : int
         Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
     guidance : AnyGuidance

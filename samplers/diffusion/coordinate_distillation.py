@@ -5,7 +5,7 @@ Let θ_t = √ᾱ θ + √(1−ᾱ) ε and ε_φ = (θ_t − √ᾱ E[θ | θ_t]
     w(t) (ε_φ − ε) − g(t) ∇ log p(y | θ),    g(t) = w(t) √(ᾱ(1−ᾱ)).
 
 By Tweedie's formula E_ε[ε_φ − ε] = −√(1−ᾱ) E_ε[∇ log p_t(θ_t)], which for θ ~ N(0, I) is
-√(ᾱ(1−ᾱ)) θ = −√(ᾱ(1−ᾱ)) ∇ log p(θ). With this g(t) prior and likelihood have the same weight at
+√(ᾱ(1−ᾱ)) θ = −√(ᾱ(1−ᾱ)) ∇ log p(θ). With this g(t), prior and likelihood have the same weight at
 every level, so the iterates converge to a mode of the posterior.
 """
 
@@ -44,17 +44,17 @@ def coordinate_distillation_gradient(
     prior: DenoisesCoordinates, theta: np.ndarray, noise: np.ndarray, alpha_bar: float
 ) -> np.ndarray:
     """Return ε_φ(θ_t) − ε, (…, dim), for θ_t = √ᾱ θ + √(1−ᾱ) ε = √ᾱ E[θ | θ_t] + √(1−ᾱ) ε_φ."""
-    signal, spread = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
-    noisy = signal * theta + spread * noise
+    signal, noise_scale = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
+    noisy = signal * theta + noise_scale * noise
     clean = to_numpy(prior.denoise_coordinates(noisy, alpha_bar))
-    return (noisy - signal * clean) / spread - noise
+    return (noisy - signal * clean) / noise_scale - noise
 
 
 def _likelihood_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     """Return ∇ log p(y | θ), ``(n, dim) → (n, dim)``."""
     import torch
 
-    # A copy, because Adam changes θ in place.
+    # Copy θ because Adam updates it in place.
     point = torch.tensor(theta, requires_grad=True)
     try:
         value = posterior.log_likelihood(point)

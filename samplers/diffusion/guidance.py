@@ -1,7 +1,7 @@
-"""Guidance of denoisers by observations.
+"""Guidance of denoisers by linear Gaussian observations.
 
-Linear Gaussian observations y = A X + noise of precision W, in normalised units. A guidance maps
-the estimate D of E[X₀ | X_t] to an estimate of E[X₀ | X_t, y].
+Observations are y = A X + noise with precision W, in normalised units. Guidance maps the estimate D
+of E[X₀ | X_t] to an estimate of E[X₀ | X_t, y].
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
 
 
 def can_guide(posterior: MotionPosterior) -> bool:
-    """Return whether the likelihood is linear Gaussian, or there are no observations."""
+    """Return whether the posterior has no observations or a linear Gaussian likelihood."""
     try:
         return posterior.likelihood is None or bool(_linear(posterior))
     except NotConjugate:
@@ -45,10 +45,10 @@ def _linear(posterior: MotionPosterior) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 @dataclass(frozen=True, eq=False)
 class LinearObservations:
-    """Linear Gaussian observations y_v = A_v X + noise of precision W, in normalised units.
+    """Linear Gaussian observations y_v = A_v X + noise with precision W, in normalised units.
 
-    ``axes`` are A_v, (V, M, 3); ``target`` is y, (V, L, J, M); ``precision`` is W, (V, L, J), and 0
-    for missing entries.
+    ``axes`` are A_v, (V, M, 3); ``target`` is y, (V, L, J, M); ``precision`` is W, (V, L, J), 0 for
+    missing entries.
     """
 
     axes: np.ndarray
@@ -91,7 +91,7 @@ class LinearObservations:
 
 @dataclass(frozen=True)
 class MomentMatched:
-    """Moment matching: X₀ | X_t ~ N(D, C) conditioned on y, C from the denoiser's Jacobian.
+    """Moment matching: N(D, C) conditioned on y, with C from the denoiser's Jacobian.
 
         D + C Aᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D)
 
@@ -101,8 +101,8 @@ class MomentMatched:
     Parameters
     ----------
     steps : int
-        Maximum conjugate-gradient steps, one product with C each. The Jacobian of a learnt
-        denoiser is only approximately a covariance; a draw stops earlier where this shows.
+        Maximum number of conjugate-gradient steps, with one product with C each. A draw stops
+        earlier if C is detectably not a covariance, as may occur with learnt denoisers.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -112,19 +112,19 @@ class MomentMatched:
         check_count("steps", self.steps)
 
     def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
-        """Return the guide of one run."""
+        """Return the guide for one run."""
         root = np.sqrt(observations.precision)[..., None]
 
         def guide(
             x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
         ) -> np.ndarray:
             def spread(entries: np.ndarray) -> np.ndarray:
-                """C Aᵀ W^½ u."""
-                pulled = observations.adjoint(root * entries)
-                return denoiser.covariance_product(x_t, alpha_bar, pulled)
+                """Return C Aᵀ W^½ u."""
+                adjoint = observations.adjoint(root * entries)
+                return denoiser.covariance_product(x_t, alpha_bar, adjoint)
 
             def whiten(motions: np.ndarray) -> np.ndarray:
-                """W^½ A X."""
+                """Return W^½ A X."""
                 return root * observations.observe(motions)
 
             residual = root * (observations.target - observations.observe(clean))
@@ -159,7 +159,7 @@ class DPS:
         check_positive("step_size", self.step_size)
 
     def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
-        """Return the guide of one run."""
+        """Return the guide for one run."""
         confidence = observations.confidence[..., None]
         half = symmetric_power(denoiser.gram, 0.5)
         inverse_half = symmetric_power(denoiser.gram, -0.5)
@@ -169,11 +169,11 @@ class DPS:
         ) -> np.ndarray:
             residual = observations.target - observations.observe(clean)
             length = np.sqrt((confidence * residual**2).sum(axis=(1, 2, 3, 4), keepdims=True))
-            pulled = observations.adjoint(confidence * residual / np.maximum(length, 1e-300))
+            adjoint = observations.adjoint(confidence * residual / np.maximum(length, 1e-300))
             # ∇‖y − A D‖ = −Jᵀ Aᵀ (y − A D)/‖y − A D‖ with J = √ᾱ/(1−ᾱ) M^(-½) C M^(½).
-            product = denoiser.covariance_product(x_t, alpha_bar, pulled @ inverse_half)
+            product = denoiser.covariance_product(x_t, alpha_bar, adjoint @ inverse_half)
             gradient = -(np.sqrt(alpha_bar) / (1 - alpha_bar)) * (product @ half)
-            # The estimate has weight step.clean in x_{t−1}, which is to move by −ζ ∇.
+            # The estimate has weight step.clean in x_{t−1}, which must change by −ζ ∇.
             return clean - (self.step_size / step.clean) * gradient
 
         return guide
@@ -183,14 +183,14 @@ class DPS:
 class Replacement:
     """Replacement of the observed coordinates of the estimate by the observations.
 
-    As in motion editing (Tevet et al. 2023, section 4.3). Observations are treated as exact;
-    inconsistent ones are averaged by precision.
+    Used in motion editing (Tevet et al. 2023, section 4.3). Observations are treated as exact;
+    inconsistent observations are averaged, weighted by precision.
     """
 
     kind: str = field(default="replacement", init=False)
 
     def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
-        """Return the guide of one run."""
+        """Return the guide for one run."""
         confidence = observations.confidence
         inverse = np.linalg.pinv(observations.information(confidence), hermitian=True)
         return _least_squares(observations, confidence, inverse)
@@ -198,7 +198,7 @@ class Replacement:
 
 @dataclass(frozen=True)
 class WeightedTriangulation:
-    """Observations as additional views in the triangulation M⁻¹ Σ P_vᵀ x̂_v.
+    """Triangulation M⁻¹ Σ P_vᵀ x̂_v with the observations as additional views.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ class WeightedTriangulation:
         check_positive("weight", self.weight)
 
     def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
-        """Return the guide of one run."""
+        """Return the guide for one run."""
         weight = self.weight * observations.confidence
         inverse = np.linalg.inv(denoiser.gram + observations.information(weight))
         return _least_squares(observations, weight, inverse)
@@ -239,10 +239,10 @@ AnyGuidance = MomentMatched | DPS | Replacement | WeightedTriangulation
 def guide_towards(
     sampler: Sampler, posterior: MotionPosterior, guidance: AnyGuidance, denoiser: StateDenoiser
 ) -> Guide | None:
-    """Return the guide of a posterior; ``None`` without observations.
+    """Return the guide for a posterior, or ``None`` without observations.
 
     Raises :class:`UnsupportedPosterior` if the likelihood is not linear Gaussian, or the guidance
-    needs the covariance of the denoiser and the prior does not provide it.
+    requires the covariance of the denoiser and the prior does not provide it.
     """
     if posterior.likelihood is None:
         return None
@@ -266,12 +266,12 @@ def conjugate_gradients(
 ) -> np.ndarray:
     """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``, (B, …).
 
-    Rows of the first axis are independent systems. A row stops when it has converged, or when its
-    matrix turns out not to be the identity plus a covariance (:func:`_of_covariance`).
-    Each step evaluates ``spread`` once.
+    Entries of the first axis are independent systems. A system stops on convergence, or when its
+    matrix is not the identity plus a covariance (:func:`_of_covariance`). Each step evaluates
+    ``spread`` once.
     """
     size = _products(residual, residual)
-    enough = 1e-28 * size
+    tolerance = 1e-28 * size
     active = np.ones(len(residual), dtype=bool)
     direction, before = residual, (np.zeros_like(residual), np.zeros(len(residual)))
     solution: np.ndarray | None = None
@@ -279,7 +279,7 @@ def conjugate_gradients(
         moved = spread(direction)
         image = direction + whiten(moved)
         curvature = _products(direction, image)
-        active &= (size > enough) & _of_covariance(direction, image, curvature, *before)
+        active &= (size > tolerance) & _of_covariance(direction, image, curvature, *before)
         length = np.where(active, size / np.where(active, curvature, 1.0), 0.0)
         part = moved * _rows(length, moved)
         solution = part if solution is None else solution + part
@@ -304,16 +304,16 @@ def _of_covariance(
     before: np.ndarray,
     curvature_before: np.ndarray,
 ) -> np.ndarray:
-    """Return for which rows the matrix A = I + K is consistent with a covariance K, (B,).
+    """Return whether A = I + K is consistent with a covariance K, for every system, (B,).
 
     If K is positive semidefinite, d · A d ≥ |d|²; if it is symmetric, the previous direction is
     conjugate, d′ · A d = 0. Otherwise conjugate gradients may diverge.
     """
     square = _products(direction, direction)
     rounding = _ROUNDING * np.sqrt(square * _products(image, image))
-    crossed = np.abs(_products(before, image))
-    beside = _CONJUGATE * np.sqrt(np.maximum(curvature_before * curvature, 0.0))
-    return (curvature >= square - rounding) & (crossed <= beside)
+    conjugacy_error = np.abs(_products(before, image))
+    tolerance = _CONJUGATE * np.sqrt(np.maximum(curvature_before * curvature, 0.0))
+    return (curvature >= square - rounding) & (conjugacy_error <= tolerance)
 
 
 def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:

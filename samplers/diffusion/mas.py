@@ -1,7 +1,7 @@
 """Multi-view ancestral sampling (MAS, algorithm 1).
 
-A 2D denoiser is applied to V views of one 3D motion. After every step the V estimates are
-triangulated to one 3D motion, which is projected back.
+A 2D denoiser is applied to V views of one 3D motion. At every step the V estimates are triangulated
+to one 3D motion, which is reprojected to the views.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ __all__ = ["MultiViewAncestral", "MultiViewTrace"]
 class MultiViewAncestral(AncestralSampler):
     """Multi-view ancestral sampling (MAS, algorithm 1) with a 2D denoiser.
 
-    With orthographic views and shared noise the V noisy views are projections of one noisy 3D
-    motion, which then is the state of the sampler.
+    With orthographic views and shared noise, the V noisy views are projections of one noisy 3D
+    motion, which is the state of the sampler.
 
     Parameters
     ----------
     steps : int
         Number of denoising steps T.
     n_views : int
-        Number of views V, evenly spaced in azimuth; two are 120° apart.
+        Number of views V, evenly spaced in azimuth; 120° apart if V = 2.
     elevation : float
         Elevation of all views, radians.
     perspective : bool
@@ -47,15 +47,15 @@ class MultiViewAncestral(AncestralSampler):
     distance : float
         Distance of perspective views from the origin, metres.
     shared_noise : bool
-        Project one 3D noise into all views instead of drawing independent noise per view.
+        Project one 3D noise array to all views instead of drawing independent noise per view.
     view_weights : tuple of float, optional
         Weights of the views in the triangulation; 1 by default.
     trained_steps : int, optional
-        Steps of the schedule that the T levels are taken from; ``steps`` by default.
+        Number of levels of the schedule from which T are selected; ``steps`` by default.
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the authors' code.
     stop_level : int
-        Last level, whose estimate is returned; 2 in the authors' code.
+        Last noise level; its estimate is returned. 2 in the authors' code.
     variance_for_deviation : bool
         Multiply the noise by the variance of the DDPM posterior, as printed in line 8 of
         algorithm 1, instead of its standard deviation.
@@ -66,8 +66,8 @@ class MultiViewAncestral(AncestralSampler):
 
     Notes
     -----
-    Line 8 of algorithm 1 also swaps the factors of x_t and of the reprojected estimate; here they
-    are those of Ho et al. (2020, equation 7).
+    Line 8 of algorithm 1 also swaps the factors of x_t and of the reprojected estimate; this
+    implementation uses the factors of Ho et al. (2020, equation 7).
     """
 
     name: ClassVar[str] = "mas"
@@ -105,22 +105,22 @@ class MultiViewAncestral(AncestralSampler):
     def reference_code(cls) -> MultiViewAncestral:
         """Return the settings of the authors' released code.
 
-        Its triangulation by an optimiser that stops before convergence is not reproduced.
+        The early-stopped optimiser in its triangulation is not reproduced.
         """
         return cls(n_views=7, perspective=True, schedule_power=4, stop_level=2)
 
     @property
     def cameras(self) -> Cameras:
-        """The V views."""
+        """Cameras of the V views."""
         return views_around(
             self.n_views, self.elevation, distance=self.distance, perspective=self.perspective
         )
 
     def trace(self, posterior: MotionPosterior, *, draws: int, seed: int = 0) -> MultiViewTrace:
-        """Return the estimates and noises of the draws of :meth:`sample` in its first chain."""
+        """Return the estimates and noise of all draws in the first chain of :meth:`sample`."""
         require(self, posterior)
         if not self.shared_noise:
-            raise ValueError("shared_noise must be True to project the noise to a new view")
+            raise ValueError("shared_noise must be True to compute new views, got False")
         state = self._state(posterior)
         watched: list[Any] = []
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
@@ -157,7 +157,7 @@ class MultiViewAncestral(AncestralSampler):
 
 @dataclass(frozen=True, eq=False)
 class MultiViewTrace:
-    """Estimates and noises of a run of MAS, from which new views are computed (appendix D).
+    """Estimates and noise of a MAS run, used to compute new views (appendix D).
 
     Parameters
     ----------
@@ -184,17 +184,17 @@ class MultiViewTrace:
         cameras : Cameras
             New views.
         level : int
-            Between T, pure noise, and 0, the clean motion.
+            Noise level between T (pure noise) and 0 (clean motion).
 
         Returns
         -------
         ndarray, (B, V, L, J, 2)
-            Normalised units.
+            2D motions in normalised units.
 
         Raises
         ------
         ValueError
-            If the run did not reach the level.
+            If the run does not include the level.
         """
         sampler, schedule = self.sampler, self.sampler.schedule
         if level not in [0, *range(sampler.stop_level, schedule.steps + 1)]:

@@ -1,16 +1,16 @@
 """Multi-view predictor-corrector sampling.
 
-MAS combines the estimates of single views, so views that disagree about the mode leave the state
-off the manifold. Here Langevin steps at every level bring the views into agreement:
+MAS averages the estimates of single views, so the state is off-manifold if views favour different
+modes. Langevin steps at every level make the views consistent:
 
     D(X, t) = M⁻¹ Σ_v P_vᵀ E[x₀ | P_v X, t],   M = Σ_v P_vᵀ P_v,   Λ = V M⁻¹,   σ = √((1−ᾱ)/ᾱ)
     predictor  X ← DDPM posterior step with D(X, t), noise ~ N(0, Λ^γ(σ))
     corrector  X ← X + ε (√ᾱ D(X) − X) + √(2ε(1−ᾱ)) ξ,   ξ ~ N(0, Λ^γ(σ))
 
 √ᾱ D(X) − X = (1−ᾱ) M⁻¹ ∇ Σ_v log p_v(P_v X), so for γ = 1 the corrector is Langevin dynamics
-preconditioned by Λ with stationary density Π_v p_v(P_v X)^(1/V), the pool of the noisy 2D
-marginals. With γ > 0 an isotropic Gaussian is no longer sampled exactly. Hence γ = ½ at high noise,
-where the views choose a mode, and 0 below.
+preconditioned by Λ with stationary density Π_v p_v(P_v X)^(1/V), the logarithmic pool of the noisy
+2D marginals. With γ > 0, sampling is not exact for an isotropic Gaussian. Hence γ = ½ at high
+noise, where the mode is determined, and γ = 0 at low noise.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ class MultiViewPredictorCorrector(AncestralSampler):
     Parameters
     ----------
     steps : int
-        Number of levels T.
+        Number of noise levels T.
     corrector_steps : int
         Number of corrector steps per level.
     corrector_size : float
         Step size ε of the corrector, in (0, 1].
     n_views : int
-        Number of orthographic views V, evenly spaced in azimuth; two are 120° apart.
+        Number of orthographic views V, evenly spaced in azimuth; 120° apart if V = 2.
     elevation : float
-        Elevation of all views, radians. At 0 a motion and its mirror image are indistinguishable.
+        Elevation of all views, radians. At 0, a motion and its mirror image are indistinguishable.
     gamma : float
-        γ at high noise, at least 0.
+        Exponent γ at high noise, at least 0.
     gamma_from : float
         Noise level σ below which γ is 0.
     corrected_from : float
-        Noise level σ below which there are no corrector steps.
+        Noise level σ below which corrector steps are skipped.
     trained_steps : int, optional
-        Steps of the schedule that the T levels are taken from; ``steps`` by default.
+        Number of levels of the schedule from which T are selected; ``steps`` by default.
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the code of MAS.
     guidance : AnyGuidance
@@ -101,7 +101,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:
-        """Return settings with a smaller error at three times the default cost."""
+        """Return a sampler with a smaller error at three times the default cost."""
         return cls(steps=100, corrector_steps=2, corrector_size=0.4)
 
     def gamma_at(self, level: float) -> float:
@@ -122,11 +122,11 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     def _noise_factor(self, views: Views) -> Callable[[float], np.ndarray | None]:
         """Return σ → Λ^(γ(σ)/2), or ``None`` for the identity."""
-        spread = views.n_views * np.linalg.inv(views.gram)
+        covariance = views.n_views * np.linalg.inv(views.gram)
 
         @cache
         def power(gamma: float) -> np.ndarray | None:
-            return symmetric_power(spread, gamma / 2) if gamma else None
+            return symmetric_power(covariance, gamma / 2) if gamma else None
 
         return lambda level: power(self.gamma_at(level))
 
@@ -137,6 +137,6 @@ class MultiViewPredictorCorrector(AncestralSampler):
         size, alpha_bar = self.corrector_size, float(state.schedule.alpha_bar[t])
         for _ in range(self.corrector_steps):
             drift = math.sqrt(alpha_bar) * state.estimate(x, t) - x
-            kick = math.sqrt(2 * size * (1 - alpha_bar)) * state.noise(streams, t)
-            x = x + size * drift + kick
+            noise = math.sqrt(2 * size * (1 - alpha_bar)) * state.noise(streams, t)
+            x = x + size * drift + noise
         return x

@@ -1,7 +1,7 @@
-"""Score distillation sampling (SDS), the adaptation of DreamFusion in MAS.
+"""Score distillation sampling (SDS) as adapted from DreamFusion in MAS.
 
-The motion is optimised: project it to a random view, add noise, estimate the noise with the 2D
-denoiser, and descend w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
+Every iteration projects the motion to a random view, adds noise, estimates the noise with the 2D
+denoiser, and descends w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
 """
 
 from __future__ import annotations
@@ -34,36 +34,36 @@ Weighting = Literal["constant", "variance", "residual"]
 
 @dataclass(frozen=True)
 class ScoreDistillation(IndependentSampler):
-    """Score distillation sampling with a 2D denoiser, or a denoiser of the prior's coordinates.
+    """Score distillation sampling with a denoiser of 2D motions or of prior coordinates.
 
-    SDS seeks modes: its draws are overconfident, with a spread far below that of the posterior.
-    Draws have independent starts and noises, but all draws of a run share the level t and the
-    views of an iteration. Priors without a 2D denoiser are optimised in their coordinates, with or
-    without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`); the counts
-    then include likelihood gradients and final log densities.
+    SDS is mode-seeking: its draws are overconfident, with a spread far below that of the posterior.
+    Draws have independent starting points and noise, but all draws of a run share the level t and
+    the views of an iteration. Priors without a 2D denoiser are optimised in their coordinates, with
+    or without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`); the
+    counts then include likelihood gradients and final log densities.
 
     Parameters
     ----------
     iterations : int
-        Gradient steps per draw.
+        Number of gradient steps per draw.
     n_views : int
-        Views per iteration, at different random azimuths; 2D denoisers only.
+        Number of views per iteration, at distinct random azimuths; 2D denoisers only.
     elevation : float
         Elevation of all views, radians; 2D denoisers only.
     azimuths : int
-        Number of evenly spaced azimuths to choose from; 2D denoisers only.
+        Number of evenly spaced candidate azimuths; 2D denoisers only.
     arc : float
         Range of the azimuths from 0, radians; the full circle by default. 2D denoisers only.
     shared_noise : bool
-        Project one 3D noise into the views of an iteration instead of drawing independent noise;
+        Project one 3D noise array to the views of an iteration instead of independent noise;
         2D denoisers only.
     levels : {"uniform", "annealed"}
-        t ~ U{1..T−1}, or t decreasing from T − 1 to 1 over the iterations.
+        Noise level t ~ U{1..T−1}, or decreasing from T − 1 to 1 over the iterations.
     weighting : {"constant", "variance", "residual"}
-        w(t): 1; 1 − ᾱ_t (DreamFusion); or √(1−ᾱ_t)/√ᾱ_t, for which the gradient is the residual
+        w(t): 1, 1 − ᾱ_t (DreamFusion) or √(1−ᾱ_t)/√ᾱ_t, for which the gradient is the residual
         p(X) − x̂₀, as in the loss of MAS (appendix B).
     learning_rate : float
-        Learning rate of Adam, in normalised units, or in units of θ.
+        Learning rate of Adam, in normalised units or units of θ.
     steps : int
         Number of levels T of the cosine schedule.
     schedule_power : int
@@ -106,18 +106,18 @@ class ScoreDistillation(IndependentSampler):
     def reference_code(cls) -> ScoreDistillation:
         """Return the settings of the released code of MAS.
 
-        Its azimuths are uniform on [0, 1) radians, a sixth of the circle.
+        Azimuths are uniform on [0, 1) radians, a sixth of the circle.
         """
         return cls(iterations=1000, weighting="residual", arc=1.0, schedule_power=4)
 
     @property
     def schedule(self) -> NoiseSchedule:
-        """The noise levels."""
+        """Cosine noise schedule with ``steps`` levels."""
         return NoiseSchedule.cosine(self.steps, power=self.schedule_power)
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether there are no observations, or the coordinates are optimised."""
+        """Return whether the posterior has no observations or its coordinates are optimised."""
         return posterior.likelihood is None or not isinstance(posterior.prior, Denoises2D)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
@@ -175,7 +175,7 @@ class ScoreDistillation(IndependentSampler):
         return Batches(draw, self.batch, self.iterations, counts=counts, thetas=thetas)
 
     def weight(self, alpha_bar: float) -> float:
-        """Return w(t)."""
+        """Return the weight w(t)."""
         if self.weighting == "constant":
             return 1.0
         if self.weighting == "variance":
@@ -214,9 +214,9 @@ def score_distillation_gradient(
 ) -> np.ndarray:
     """Return Σ_v (ε_φ(x_t) − ε) ∂p/∂X for x_t = √ᾱ p(X) + √(1−ᾱ) ε = √ᾱ x̂₀ + √(1−ᾱ) ε_φ.
 
-    Motions X are (B, L, J, 3), in normalised units, and noises ε are (B, V, L, J, 2).
+    Motions X have shape (B, L, J, 3), in normalised units, and noise ε (B, V, L, J, 2).
     """
-    signal, spread = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
-    noisy = signal * views.project(motions) + spread * noise
+    signal, noise_scale = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
+    noisy = signal * views.project(motions) + noise_scale * noise
     clean = prior.denoise(noisy, alpha_bar, views.cameras)
-    return views.scatter((noisy - signal * clean) / spread - noise)
+    return views.scatter((noisy - signal * clean) / noise_scale - noise)

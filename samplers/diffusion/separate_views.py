@@ -19,9 +19,9 @@ __all__ = ["SeparateViews"]
 
 @dataclass
 class SeparateViews:
-    """V noisy views per draw, (B, V, L, J, 2), normalised units; ``shape`` is (L, J, 3).
+    """State of V noisy views per draw, (B, V, L, J, 2), normalised; ``shape`` is (L, J, 3).
 
-    ``views`` are the orthographic counterparts of ``cameras``, to which shared noise is projected.
+    Shared noise is projected to ``views``, the orthographic counterparts of ``cameras``.
     """
 
     prior: Denoises2D
@@ -34,7 +34,7 @@ class SeparateViews:
     _last: np.ndarray | None = None
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
-        """Return unit noise in every view; the first level starts a new batch."""
+        """Return unit noise in every view; level T starts a new batch."""
         if t == self.schedule.steps:
             self._last = None
         if self.shared_noise:

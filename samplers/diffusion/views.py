@@ -1,4 +1,4 @@
-"""Orthographic views of a motion, and 3D denoisers built from 2D ones.
+"""Orthographic views of a motion and 3D denoisers built from 2D denoisers.
 
 P_v are the image axes of the cameras, w_v the weights of the views and M = Σ_v w_v P_vᵀ P_v. All
 motions are in normalised units.
@@ -31,7 +31,7 @@ class Views:
     Parameters
     ----------
     cameras : Cameras
-        The V cameras; perspective ones are replaced by orthographic ones that agree at the origin.
+        The V cameras; perspective cameras are approximated by orthographic ones at the origin.
     weights : sequence of float, optional
         Weights w_v; 1 by default.
     """

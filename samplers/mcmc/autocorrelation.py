@@ -13,7 +13,7 @@ _WINDOW = 5
 def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation time of every coordinate.
 
-    Sokal's estimate (1989, with the automatic window of his equation C.2), averaged over walkers.
+    Sokal's estimator (1989) with the automatic window of equation C.2, averaged over walkers.
 
     Parameters
     ----------
@@ -23,13 +23,12 @@ def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, (dim,)
-        In iterations: 1 for independent iterations, NaN for a coordinate that never moved.
+        Time in iterations; 1 for independent iterations, NaN for a constant coordinate.
 
     Notes
     -----
-    Unlike in emcee, all walkers are centred at their common mean. With a mean per walker the slow
-    part of short runs is lost: the estimate is 5 times too small for a run of 2 autocorrelation
-    times.
+    Unlike in emcee, all walkers are centred at their common mean. With one mean per walker, the
+    estimate is biased for short runs: 5 times too small for a run of 2 autocorrelation times.
     """
     n = len(trace)
     centred = trace - trace.mean(axis=(0, 1))

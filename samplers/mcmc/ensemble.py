@@ -21,30 +21,30 @@ from probmotion.validation import check_count
 __all__ = ["Ensemble"]
 
 _LEAST_TIMES = 3
-"""Minimum length of a run, in autocorrelation times, for which their estimate is used."""
+"""Minimum run length, in autocorrelation times, for a reliable estimate of that time."""
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The stretch move (Goodman and Weare 2010) of emcee (Foreman-Mackey et al. 2013).
+    """Ensemble sampler with stretch moves (Goodman and Weare 2010) of emcee.
 
-    A chain is one ensemble; its draws are all walkers of the first recorded iteration, then of the
-    next. Walkers of an ensemble depend on each other, so R-hat and ESS of a chain are not valid;
-    the draws have an autocorrelation time instead.
+    A chain is one ensemble; its draws are all walkers of each recorded iteration in turn. Walkers
+    of an ensemble depend on each other, so R-hat and ESS of a chain are not valid; the
+    autocorrelation time is reported instead. See Foreman-Mackey et al. (2013) for emcee.
 
     Parameters
     ----------
     walkers : int, optional
-        Walkers per ensemble, at least 2 dim; 4 dim by default.
+        Number of walkers per ensemble, at least 2 dim; 4 dim by default.
     warmup : int
         Iterations before the first draw.
     thin : int
         Iterations per recorded iteration.
     largest_dim : int
-        Maximum dimension of the posterior. In high dimension the stretch move mixes poorly without
-        showing it in the draws (Huijser et al. 2015).
+        Maximum dimension of the posterior. In high dimensions the stretch move mixes poorly, which
+        diagnostics may not detect (Huijser et al. 2015).
     candidates : int
-        Prior draws per ensemble, among which its walkers are resampled by likelihood.
+        Number of prior draws per ensemble; starting points are resampled from them by likelihood.
     """
 
     name: ClassVar[str] = "ensemble"
@@ -75,7 +75,7 @@ class Ensemble:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``draws`` walker states of each of ``chains`` ensembles.
+        """Return ``draws`` walker states from each of ``chains`` ensembles.
 
         ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
         shape (chains, walkers, dim).
@@ -85,7 +85,7 @@ class Ensemble:
         UnsupportedPosterior
             If the posterior has no density or too many dimensions.
         ValueError
-            If there are fewer than 2 dim walkers.
+            If the number of walkers is below 2 dim.
         Interrupted
             On Ctrl-C, with the finished draws.
         """
@@ -156,7 +156,7 @@ class Ensemble:
 
 
 class _State(NamedTuple):
-    """Ensembles after an iteration, of which the last ``unused`` walkers are the next draws."""
+    """Ensembles after an iteration; the last ``unused`` walkers are the next draws."""
 
     coordinates: np.ndarray
     log_density: np.ndarray
@@ -183,7 +183,7 @@ class _State(NamedTuple):
 
 
 class _Run:
-    """emcee samplers of all ensembles, and their recorded iterations."""
+    """emcee samplers and recorded iterations of all ensembles."""
 
     def __init__(self, density: Density, start: _State, thin: int) -> None:
         import emcee
@@ -210,10 +210,10 @@ class _Run:
         self.first_coordinates: list[list[np.ndarray]] = []
 
     def record(self) -> None:
-        """Advance every ensemble by ``thin`` iterations and record the last; interruptible."""
+        """Advance every ensemble by ``thin`` iterations and record the last iteration."""
         for iteration in range(self.thin):
             states = [next(chain) for chain in self.chains]
-            # emcee changes its arrays in place.
+            # emcee modifies its arrays in place.
             self.first_coordinates.append([state.coords[:, 0].copy() for state in states])
             if iteration % self._stride == 0:
                 self.trace.append([state.coords.copy() for state in states])
@@ -240,10 +240,10 @@ class _Run:
     def statistics(self) -> dict[str, np.ndarray]:
         """Return the acceptance rate and autocorrelation time of every ensemble.
 
-        The time is that of the slowest coordinate in recorded iterations, at least 1. Runs shorter
-        than three times their estimate get the number of recorded iterations instead: they count
-        as one iteration, whose walkers are independent under the target (Goodman and Weare 2010).
-        It is NaN, and there is no acceptance rate, after fewer than four iterations.
+        The time is the maximum over coordinates, in recorded iterations, at least 1. If the run is
+        shorter than three times the estimate, it is at least the number of recorded iterations: the
+        run counts as one iteration, with walkers independent under the target (Goodman and Weare
+        2010). With fewer than four trace entries, it is NaN and the acceptance rate is omitted.
         """
         if len(self.trace) < 4:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
@@ -263,9 +263,9 @@ class _Run:
 
 
 def _words(state: Any) -> np.ndarray:
-    """Return a RandomState's state as signed 32-bit words, for netCDF.
+    """Return the state of a RandomState as signed 32-bit words, for netCDF.
 
-    The cached normal number is omitted, since the stretch move of emcee draws none.
+    The cached normal variate is omitted; the stretch move of emcee uses none.
     """
     _, key, position, *_ = state
     return np.append(key.view(np.int32), np.int32(position))

@@ -23,20 +23,20 @@ __all__ = ["MetropolisHastings"]
 
 @dataclass(frozen=True)
 class MetropolisHastings:
-    """Metropolis-Hastings (Metropolis et al. 1953, Hastings 1970), all chains vectorised.
+    """Metropolis-Hastings (Metropolis et al. 1953, Hastings 1970), vectorised over chains.
 
     Parameters
     ----------
     proposal : Proposal
         Proposal distribution.
     warmup : int
-        Steps before the first draw, in which the proposal adapts.
+        Number of adaptation steps before the first draw.
     thin : int
-        Steps per draw.
+        Number of steps per draw.
     candidates : int
-        Prior draws per chain, among which its start is resampled by likelihood.
+        Number of prior draws per chain; the starting point is resampled from them by likelihood.
     pseudo_marginal : bool
-        Estimate the likelihood of every proposal from freshly drawn views and store the estimate
+        Estimate the likelihood of every proposal from random views and store the estimate
         with the state, so that chains target the integral over views (Andrieu and Roberts 2009).
         By default the views of the likelihood are fixed.
     """
@@ -70,7 +70,7 @@ class MetropolisHastings:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``draws`` states of each of ``chains`` chains, ``thin`` steps apart.
+        """Return ``draws`` states from each of ``chains`` chains, ``thin`` steps apart.
 
         ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
         shape (chains, dim).
@@ -78,7 +78,7 @@ class MetropolisHastings:
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no density, or the settings need views and it has none.
+            If the posterior has no density, or no views although the settings require them.
         Interrupted
             On Ctrl-C, with the finished draws.
         """
@@ -150,7 +150,7 @@ class MetropolisHastings:
 
 
 _Draw = tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]
-"""θ, log density and mean acceptance of all chains, and the state to continue from."""
+"""θ, log density and mean acceptance of all chains, and the resumable state."""
 
 
 @dataclass
@@ -195,12 +195,12 @@ class _Walk:
         return self.sampler.proposal
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the arrays that :meth:`resume` needs."""
+        """Return the arrays required by :meth:`resume`."""
         adaptation = self.proposal.settled(self.adaptation)
         return {
             "theta": self.theta,
             "log_density": self.log_density,
-            # netCDF cannot store an array without columns.
+            # netCDF cannot store arrays with zero columns.
             **({"guide": self.guide} if self.proposal.guided else {}),
             # A deterministic value identifies the posterior; an estimate does not.
             **({"fixed": self.density(self.theta)} if self.sampler.pseudo_marginal else {}),
@@ -210,20 +210,20 @@ class _Walk:
         }
 
     def warm_up(self, steps: int, tick: Callable[[], Any]) -> None:
-        """Take steps and adapt the proposal."""
+        """Advance all chains and adapt the proposal after each step."""
         for _ in range(steps):
             acceptance = self._step()
             self.adaptation = self.proposal.learn(self.adaptation, self.theta, acceptance)
             tick()
 
     def advance(self, steps: int) -> _Draw:
-        """Take the steps to the next draw."""
+        """Advance all chains by ``steps`` and return the next draw."""
         acceptance = np.mean([self._step() for _ in range(steps)], axis=0)
         self.draws += 1
         return self.theta, self.log_density, acceptance, self.state()
 
     def _step(self) -> np.ndarray:
-        """Take one step; return its probability of acceptance, (chains,)."""
+        """Advance all chains by one step and return the acceptance probabilities, (chains,)."""
         proposed = self.proposal.propose(self.generators, self.theta, self.guide, self.adaptation)
         log_density, guide = self.density.evaluate(proposed, *self._evaluation())
         log_ratio = self.proposal.log_ratio(
@@ -231,8 +231,8 @@ class _Walk:
         )
         log_acceptance = np.minimum(0.0, log_density - self.log_density + log_ratio)
         # −log U is standard exponential for U uniform on (0, 1].
-        level = np.array([rng.standard_exponential() for rng in self.generators])
-        accepted = -level < log_acceptance
+        threshold = np.array([rng.standard_exponential() for rng in self.generators])
+        accepted = -threshold < log_acceptance
         self.theta = np.where(accepted[:, None], proposed, self.theta)
         self.log_density = np.where(accepted, log_density, self.log_density)
         self.guide = np.where(accepted[:, None], guide, self.guide)

@@ -1,4 +1,4 @@
-"""The No-U-Turn sampler of NumPyro."""
+"""No-U-Turn sampler of NumPyro."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ __all__ = ["NUTS"]
 
 @dataclass(frozen=True)
 class NUTS:
-    """The No-U-Turn sampler (Hoffman and Gelman 2014) of NumPyro (Phan et al. 2019).
+    """No-U-Turn sampler (Hoffman and Gelman 2014) of NumPyro (Phan et al. 2019).
 
     Parameters
     ----------
     warmup : int
-        Iterations before the first draw, which adapt the step size and the diagonal mass matrix.
+        Iterations of step-size and diagonal mass-matrix adaptation before the first draw.
     target_acceptance : float
-        Target mean acceptance of the step size adaptation.
+        Target mean acceptance probability of step-size adaptation.
     max_tree_depth : int
-        Maximum doublings of a trajectory, which has at most 2^max_tree_depth − 1 steps.
+        Maximum number of trajectory doublings (at most 2^max_tree_depth − 1 steps).
     thin : int
-        Iterations per draw. For each draw ``acceptance`` is their mean, ``divergent`` is whether
-        any diverged, and ``steps`` is their sum.
+        Number of iterations per draw. ``acceptance`` of a draw is their mean acceptance,
+        ``divergent`` whether any diverged, and ``steps`` their total number of leapfrog steps.
     candidates : int
-        Prior draws per chain, among which its start is resampled by likelihood.
+        Number of prior draws per chain; the starting point is resampled from them by likelihood.
 
     Notes
     -----
-    Chains run one after the other in float64, so that a chain is bit-identical for any number of
-    chains. Compilation takes some seconds per posterior and ``warmup``, which ``seconds`` of the
-    draws excludes.
+    Chains run sequentially in float64, so that a chain is bit-identical for any number of chains.
+    Compilation takes several seconds for each posterior and ``warmup``; ``seconds`` of the draws
+    excludes it.
     """
 
     name: ClassVar[str] = "nuts"
@@ -81,7 +81,7 @@ class NUTS:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``draws`` states of each of ``chains`` chains.
+        """Return ``draws`` states from each of ``chains`` chains.
 
         ``initial`` is an earlier run to continue without warm-up, or starting points, an array of
         shape (chains, dim).
@@ -115,8 +115,8 @@ class NUTS:
                 points = starting_points(
                     posterior, kernel.log_likelihoods, initial, shape, seed, self.candidates
                 )
-                chosen = initial is None and posterior.likelihood is not None
-                densities = chains * self.candidates if chosen and self.candidates > 1 else 0
+                resampled = initial is None and posterior.likelihood is not None
+                densities = chains * self.candidates if resampled and self.candidates > 1 else 0
             else:
                 points = earlier["theta"]
             run = _Run(self, kernel, points, earlier, seed, densities)
@@ -150,7 +150,7 @@ class NUTS:
 
 @dataclass
 class _Run:
-    """Chains of one call, and the draws that all of them have finished."""
+    """Chains of one call to :meth:`NUTS.sample`, and the draws finished in all chains."""
 
     sampler: NUTS
     kernel: NutsKernel
@@ -165,11 +165,11 @@ class _Run:
 
     @property
     def first(self) -> int:
-        """Number of the first draw in its chain."""
+        """Index of the first draw in its chain."""
         return 0 if self.earlier is None else int(self.earlier["draws"])
 
     def sample(self, draws: int, progress: bool) -> None:
-        """Warm up new chains, then draw from all chains in turn, chunk by chunk."""
+        """Warm up new chains, then draw from all chains in alternating chunks."""
         chains, thin = len(self.points), self.sampler.thin
         warmup = self.sampler.warmup if self.earlier is None else 0
         with progress_bar(chains * (warmup + draws * thin), self.sampler.name, progress) as bar:
@@ -191,7 +191,7 @@ class _Run:
                 self.finished += n
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state after the last finished draw, to continue from."""
+        """Return the resumable state after the last finished draw."""
         leaves = [self.kernel.leaves(state) for state in self.chains]
         stacked = {f"leaf_{i}": np.stack(rows) for i, rows in enumerate(zip(*leaves, strict=True))}
         theta = np.stack([np.asarray(state.z) for state in self.chains])
@@ -214,5 +214,5 @@ class _Run:
 
 
 def _chunks(draws: int, thin: int) -> list[int]:
-    most = max(1, CHUNK // thin)
-    return [min(most, draws - start) for start in range(0, draws, most)]
+    size = max(1, CHUNK // thin)
+    return [min(size, draws - start) for start in range(0, draws, size)]

@@ -19,14 +19,14 @@ __all__ = ["CHUNK", "NutsKernel", "compiled"]
 
 
 CHUNK = 50
-"""Maximum draws, and maximum iterations unless a single draw takes more, per compiled call."""
+"""Maximum number of draws per compiled call; also of iterations, unless ``thin`` is larger."""
 
 
 @lru_cache(maxsize=8)
 def compiled(
     posterior: MotionPosterior, warmup: int, target_acceptance: float, max_tree_depth: int
 ) -> NutsKernel:
-    """Return the compiled kernel, cached for other seeds and restarts."""
+    """Return the compiled kernel, cached across seeds and continued runs."""
     return NutsKernel(posterior, warmup, target_acceptance, max_tree_depth)
 
 
@@ -47,11 +47,11 @@ class NutsKernel:
             target_accept_prob=target_acceptance,
             max_tree_depth=max_tree_depth,
         )
-        # Evaluated once per chain, so not compiled.
+        # Not compiled, because it is evaluated once per chain.
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
         self.log_likelihood = jax.jit(to_jax(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
-        # Compile all functions now, so that timed runs do not.
+        # Compile all functions now to exclude compilation from measured run times.
         theta = posterior.initial(seeds.generator(0, "compile"), 1)[0]
         if posterior.likelihood is not None:
             self.log_likelihoods(theta[None])
@@ -75,11 +75,11 @@ class NutsKernel:
         return np.array([float(self.log_likelihood(point)) for point in theta])
 
     def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
-        """Return the state with given :meth:`leaves`; evaluates nothing."""
+        """Return the state with the given :meth:`leaves`, without evaluating the density."""
         import jax
 
-        like = self._init(jax.random.key(0), theta, 0.0, np.zeros_like(theta))
-        shapes, structure = jax.tree.flatten(like)
+        template = self._init(jax.random.key(0), theta, 0.0, np.zeros_like(theta))
+        shapes, structure = jax.tree.flatten(template)
         restored = []
         for leaf, shape in zip(leaves, shapes, strict=True):
             if jax.dtypes.issubdtype(shape.dtype, jax.dtypes.prng_key):
@@ -120,9 +120,9 @@ class NutsKernel:
 
         def draw(i: Any, carry: tuple[Any, dict[str, Any]]) -> Any:
             state, rows = carry
-            none = (jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int64))
+            zeros = (jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int64))
             state, accepted, divergent, steps = jax.lax.fori_loop(
-                0, thin, iteration, (state, *none)
+                0, thin, iteration, (state, *zeros)
             )
             values = {
                 "theta": state.z,
@@ -155,7 +155,7 @@ def _bridge(posterior: MotionPosterior) -> Callable[[Callable[[Any], Any]], Call
         jax.eval_shape(jax.grad(posterior.log_density), point)
     except NotConjugate as error:
         raise not_conjugate("nuts", error) from error
-    except Exception as refused:
+    except Exception as jax_error:
         # A density that does not accept JAX arrays may raise any exception. Try torch.
         try:
             theta = posterior.initial(seeds.generator(0, "probe"), 1)[0]
@@ -164,8 +164,8 @@ def _bridge(posterior: MotionPosterior) -> Callable[[Callable[[Any], Any]], Call
             raise UnsupportedPosterior(
                 "nuts",
                 "needs a log density that JAX or torch can differentiate, but JAX raised "
-                f"{type(refused).__name__}: {str(refused).splitlines()[0]}",
+                f"{type(jax_error).__name__}: {str(jax_error).splitlines()[0]}",
                 word="gradient",
-            ) from refused
+            ) from jax_error
         return jax_from_torch
     return lambda function: function

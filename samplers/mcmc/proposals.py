@@ -55,14 +55,14 @@ class Proposal(Protocol):
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
     ) -> ProposalState:
-        """Return the state after a warm-up step to ``theta`` with ``acceptance``, (chains,)."""
+        """Return the state adapted to ``theta`` and ``acceptance``, (chains,), during warm-up."""
 
     def settled(self, state: ProposalState) -> ProposalState:
-        """Return the part of the state that is needed after warm-up."""
+        """Return the state required after warm-up, without adaptation statistics."""
 
 
 class _Symmetric:
-    """Base of symmetric proposals."""
+    """Base class of symmetric proposals."""
 
     guided: ClassVar[bool] = False
 
@@ -79,7 +79,7 @@ class _Symmetric:
 
 
 class _AdaptiveScale:
-    """Base of proposals whose only adaptive state is their scale s."""
+    """Base class of proposals that adapt only their scale s."""
 
     scale: float
     target: float | None
@@ -97,7 +97,7 @@ class _AdaptiveScale:
     def learn(
         self, state: ProposalState, theta: np.ndarray, acceptance: np.ndarray
     ) -> ProposalState:
-        """Return the state with s adapted towards the target acceptance."""
+        """Return the state with s adapted towards the target acceptance rate."""
         if self.target is None:
             return state
         steps = state["steps"] + 1
@@ -111,14 +111,14 @@ class _AdaptiveScale:
 
 @dataclass(frozen=True)
 class Isotropic(_AdaptiveScale, _Symmetric):
-    """θ' = θ + s ε, ε ~ N(0, I): random walk (Metropolis et al. 1953).
+    """Random-walk proposal θ' = θ + s ε, ε ~ N(0, I) (Metropolis et al. 1953).
 
     Parameters
     ----------
     scale : float
-        Initial s, in units of θ.
+        Initial scale s, in units of θ.
     target : float or None
-        Target acceptance of the adaptation of s; ``None`` disables it.
+        Target acceptance rate for adapting s; ``None`` disables adaptation.
     """
 
     kind: str = field(default="isotropic", init=False)
@@ -134,19 +134,19 @@ class Isotropic(_AdaptiveScale, _Symmetric):
 
 @dataclass(frozen=True)
 class AdaptiveCovariance(_Symmetric):
-    """θ' = θ + s C ε, C Cᵀ the covariance of the chain's warm-up (Haario et al. 2001).
+    """Random-walk proposal θ' = θ + s C ε, C Cᵀ the warm-up covariance (Haario et al. 2001).
 
-    The warm-up is divided into windows of 50, 100, 200, … steps. At the end of each, C is set to
-    the root of the regularised covariance of its points and s to 2.38/√dim (Gelman et al. 1996).
-    Within windows s is adapted towards the target acceptance (Andrieu and Thoms 2008,
-    algorithm 4).
+    Warm-up is divided into windows of 50, 100, 200, … steps. At the end of each window, C is set to
+    the Cholesky factor of the regularised covariance of its states and s to 2.38/√dim (Gelman et
+    al. 1996). Within windows, s is adapted towards the target acceptance rate (Andrieu and Thoms
+    2008, algorithm 4).
 
     Parameters
     ----------
     scale : float
-        s during the first window, where C = I, in units of θ.
+        Scale s in the first window, where C = I, in units of θ.
     target : float
-        Target acceptance.
+        Target acceptance rate.
     """
 
     kind: str = field(default="adaptive-covariance", init=False)
@@ -209,7 +209,7 @@ class AdaptiveCovariance(_Symmetric):
 
 @dataclass(frozen=True)
 class VelocityBiased(_AdaptiveScale):
-    """θ' ~ N(θ, s² diag(σ₀² + b V(θ))): longer steps along fast coordinates (Yin et al. 2018).
+    """Proposal N(θ, s² diag(σ₀² + b V(θ))), wider along fast coordinates (Yin et al. 2018).
 
     V(θ), the guide, is the mean squared speed of each coordinate in the annotations closest to θ
     (eq. 12, with b = 1). It depends on θ, so the proposal is not symmetric.
@@ -217,13 +217,13 @@ class VelocityBiased(_AdaptiveScale):
     Parameters
     ----------
     scale : float
-        Initial s.
+        Initial scale s.
     base : float
-        σ₀, in units of θ.
+        Proposal scale σ₀ at zero speed, in units of θ.
     bias : float
-        b, weight of the speeds.
+        Weight b of the mean squared speeds.
     target : float or None
-        Target acceptance of the adaptation of s; ``None`` disables it.
+        Target acceptance rate for adapting s; ``None`` disables adaptation.
     """
 
     guided: ClassVar[bool] = True
@@ -254,7 +254,7 @@ class VelocityBiased(_AdaptiveScale):
         state: ProposalState,
     ) -> np.ndarray:
         """Return log N(θ; θ', σ²(θ')) − log N(θ'; θ, σ²(θ))."""
-        forward, backward = (self._variances(some, state) for some in (guide, proposed_guide))
+        forward, backward = (self._variances(g, state) for g in (guide, proposed_guide))
         square = (proposed - theta) ** 2
         terms = np.log(forward / backward) + square / forward - square / backward
         return 0.5 * terms.sum(axis=1)
@@ -271,7 +271,7 @@ def _shrunk(scatter: np.ndarray, n: float) -> np.ndarray:
     """Return a positive definite covariance from n points, regularised as in Stan."""
     dim = scatter.shape[-1]
     variance = np.trace(scatter, axis1=-2, axis2=-1) / (n * dim)
-    # The minimum applies to chains that have not moved.
+    # The lower bound applies to chains that have not moved.
     floor = np.maximum(1e-3 * variance, 1e-12)
     return (scatter + 5 * floor[:, None, None] * np.eye(dim)) / (n + 5)
 

@@ -1,7 +1,7 @@
 """Amortised inference with a conditional VAE trained on simulated pairs.
 
-A network learns p(X | y) from pairs simulated from the prior and the likelihood. Draws given the
-actual observations take one forward pass.
+A network learns p(X | y) from pairs simulated from the prior and the likelihood. Sampling from
+the posterior requires one forward pass of the network.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["AmortisedPosterior", "AmortisedSettings"]
 
-# Number of pairs from which the coordinates are computed.
+# Number of pairs used to compute the principal coordinates.
 _FIRST = 12_000
-# Fraction of held-out pairs, for the covariance of the decoder.
+# Fraction of pairs held out to estimate the covariance of the decoder.
 _HELD_OUT = 0.1
 _WARMUP = 100
 # Initial weight of KL(r ‖ p), and the fraction of steps in which it increases to 1.
@@ -42,18 +42,18 @@ _FIRST_WEIGHT, _ANNEALED = 0.05, 0.3
 
 @dataclass(frozen=True)
 class AmortisedSettings:
-    """Size of the network and length of its training.
+    """Network sizes and training settings of amortised inference.
 
     Parameters
     ----------
     steps : int
-        Gradient steps.
+        Number of gradient steps.
     batch : int
-        Pairs per step.
+        Number of pairs per step.
     pairs : int
-        Simulated pairs.
+        Number of simulated pairs.
     coordinates : int
-        Maximum number of principal coordinates of motions, and of observations.
+        Maximum number of principal coordinates of motions and of observations, each.
     latent, components, experts, hidden : int
         Sizes of the network (:class:`ConditionalVAE`).
     learning_rate : float
@@ -89,10 +89,10 @@ class AmortisedSettings:
 
 @dataclass(frozen=True, eq=False)
 class AmortisedPosterior:
-    """Approximation of p(X | y) at the observations y of one posterior.
+    """Amortised approximation of p(X | y) at the observations y of one posterior.
 
-    ``network`` is in double precision, so that draws do not depend on their batch. ``root`` is the
-    root of the decoder's covariance S, (C, C), and ``observed`` are the observations, (L, M).
+    ``network`` is in double precision, so that draws do not depend on the batch size. ``root`` is a
+    square root of the decoder's covariance S, (C, C), and ``observed`` the observations, (L, M).
     """
 
     network: ConditionalVAE
@@ -133,7 +133,7 @@ class AmortisedPosterior:
             condition = torch.from_numpy(y)
             mixture = self.network.prior(condition[:1])
             log_weight, means, log_scales = (part[0].numpy() for part in mixture)
-            # Without the last sum, which may round to less than 1.
+            # Omit the last sum, which may round to less than 1.
             cumulative = np.cumsum(np.exp(log_weight))[:-1]
             k = np.searchsorted(cumulative, uniform, side="right")
             z = torch.from_numpy(means[k] + np.exp(log_scales[k]) * z_noise)
@@ -145,18 +145,18 @@ class AmortisedPosterior:
 def _coordinates(
     posterior: MotionPosterior, settings: AmortisedSettings, seed: int
 ) -> tuple[MotionCoordinates, PrincipalCoordinates, torch.Tensor, torch.Tensor]:
-    """Return the coordinates of motions and observations, and x and y of all pairs."""
+    """Return the coordinate systems of motions and observations, and x and y of all pairs."""
     chunks = simulate_pairs(posterior, seed, settings.pairs)
-    chunks_of_first: list[SimulatedPairs] = []
-    while sum(len(pairs.positions) for pairs in chunks_of_first) < min(_FIRST, settings.pairs):
-        chunks_of_first.append(next(chunks))
+    first_chunks: list[SimulatedPairs] = []
+    while sum(len(pairs.positions) for pairs in first_chunks) < min(_FIRST, settings.pairs):
+        first_chunks.append(next(chunks))
     first = SimulatedPairs(
-        np.concatenate([pairs.positions for pairs in chunks_of_first]),
-        np.concatenate([pairs.observed for pairs in chunks_of_first]),
+        np.concatenate([pairs.positions for pairs in first_chunks]),
+        np.concatenate([pairs.observed for pairs in first_chunks]),
     )
-    most = settings.coordinates
-    observations = PrincipalCoordinates.of(first.observed, most)
-    motions = MotionCoordinates.learn(first, observations.coordinates(first.observed), most)
+    limit = settings.coordinates
+    observations = PrincipalCoordinates.of(first.observed, limit)
+    motions = MotionCoordinates.learn(first, observations.coordinates(first.observed), limit)
     x, y = [], []
     for pairs in chain([first], chunks):
         y.append(observations.coordinates(pairs.observed))
@@ -186,7 +186,7 @@ def _train(
             if not math.isfinite(loss.item()):
                 raise ValueError(
                     f"training on simulated pairs diverged at step {step} with learning_rate "
-                    f"{settings.learning_rate:g}; use a smaller one"
+                    f"{settings.learning_rate:g}; use a smaller value"
                 )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -198,7 +198,7 @@ def _train(
 def _decoder_root(
     network: ConditionalVAE, x: torch.Tensor, y: torch.Tensor, seed: int
 ) -> np.ndarray:
-    """Return the root of S, the covariance of the residuals of held-out pairs, (C, C)."""
+    """Return a square root of S, the residual covariance of held-out pairs, (C, C)."""
     rng = seeds.torch_generator(seed, "misfits")
     noise = torch.randn(len(x), network.latent, generator=rng, dtype=x.dtype)
     misfits = network.misfits(x, y, noise).numpy()

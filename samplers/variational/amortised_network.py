@@ -1,9 +1,9 @@
-"""Conditional VAE of motions given observations, both in principal coordinates.
+"""Conditional VAE of motions given observations, in principal coordinates.
 
     p(x, z | y) = p(z | y) N(x; μ(z, y), S),   r(z | x, y) = N(z; a(x, y), b(x, y)²)
 
-x are the coordinates of a motion and y those of its observations. p(z | y) is a mixture of
-Gaussians, one or more per mode; μ is a mixture of linear maps plus a bounded network. Training
+x and y are the coordinates of a motion and of its observations. p(z | y) is a Gaussian mixture with
+one or more components per mode; μ is a mixture of linear maps plus a neural network. Training
 maximises E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015).
 """
 
@@ -14,12 +14,12 @@ from torch import nn
 
 __all__ = ["ConditionalVAE"]
 
-# Bounds of log scales, for stability of the first training steps.
+# Bounds of log scales, for stability early in training.
 _LEAST, _MOST = -7.0, 2.0
 
 
 class ConditionalVAE(nn.Module):
-    """Encoder, prior and decoder.
+    """Conditional VAE with a Gaussian-mixture prior.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class ConditionalVAE(nn.Module):
     latent : int
         Dimension of z.
     components : int
-        Number K of Gaussians in p(z | y).
+        Number K of mixture components of p(z | y).
     experts : int
         Number of linear maps in μ.
     hidden : int
@@ -69,7 +69,7 @@ class ConditionalVAE(nn.Module):
     ) -> torch.Tensor:
         """Return −E[log N(x; μ, S)] + ``weight`` · KL(r ‖ p) up to a constant, averaged over pairs.
 
-        S is diagonal, and both expectations use the single z = a + b · ``noise``.
+        S is diagonal; both expectations are estimated from one sample z = a + b · ``noise``.
         """
         mean, log_scale = self.encode(x, y)
         z = mean + log_scale.exp() * noise
@@ -86,7 +86,7 @@ class ConditionalVAE(nn.Module):
 
 
 class _MixtureOfGaussians(nn.Module):
-    """p(z | y) = Σ_k π_k(y) N(m_k + m(y), (s_k s(y))²)."""
+    """Gaussian mixture p(z | y) = Σ_k π_k(y) N(m_k + m(y), (s_k s(y))²)."""
 
     def __init__(self, observed: int, latent: int, components: int, hidden: int) -> None:
         super().__init__()
@@ -123,7 +123,7 @@ class _MixtureOfGaussians(nn.Module):
 
 
 class _MixtureOfLinearMaps(nn.Module):
-    """f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v), with g and h from one network."""
+    """Mixture of linear maps f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v); g and h share a network."""
 
     def __init__(self, inputs: int, outputs: int, experts: int, hidden: int) -> None:
         super().__init__()

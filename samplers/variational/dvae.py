@@ -37,43 +37,43 @@ __all__ = ["DVAEInference"]
 
 Mode = Literal["regression", "optimization"]
 
-# Maximum gradient norm: far from the training data initial losses reach thousands of nats, and
-# such a step would dominate the moments of Adam.
+# Maximum gradient norm. Out of distribution, initial losses reach thousands of nats, and unclipped
+# gradients would dominate the moments of Adam.
 _CLIP = 30.0
 
 
 @dataclass(frozen=True)
 class DVAEInference(IndependentSampler):
-    """Variational inference with networks that map observations to motions (Motion-DVAE, B to E).
+    """Variational inference with inference networks (Motion-DVAE, appendices B to E).
 
-    Uses ``network`` or the inference network of the prior; without observations, draws are those
-    of a prior with such a network. Otherwise a network is trained first on pairs simulated from
-    the prior and likelihood (:mod:`~probmotion.samplers.variational.amortised`), without
-    optimisation. Draws have θ and log densities if the motion fits into one window of the network.
+    Uses ``network`` or the inference network of the prior; without observations, a prior with an
+    inference network is sampled directly. Otherwise a network is first trained on pairs simulated
+    from the prior and likelihood (:mod:`~probmotion.samplers.variational.amortised`) and used
+    unchanged. Draws have θ and log densities if the motion fits into one window of the network.
 
     Parameters
     ----------
     network : InferenceNetwork, optional
-        Inference network; that of the prior by default.
+        Inference network; the network of the prior by default.
     mode : {"regression", "optimization"}
-        Use the network as it is, or optimise it for these observations first.
+        Use the network unchanged, or optimise it for the observations.
     iterations : int
-        Optimisation steps; 50 to 200 as published.
+        Number of optimisation steps; 50 to 200 as published.
     learning_rate : float
         Initial learning rate of Adam, with half-cosine decay to 0. The default was chosen on the
         validation clips of ``body-dvae``.
     degrees_of_freedom : float, optional
-        λ of the assumed noise, ``inf`` for Gaussian; that of the likelihood by default. Small
-        values are robust to outliers.
+        Degrees of freedom λ of the assumed Student-t noise, ``inf`` for Gaussian; from the
+        likelihood by default. Small values are robust to outliers.
     initial_entropy : bool
-        Include the entropy of the first pose and its prior in the bound. The paper omits them
-        (C.2.2), which improves the fit but makes the first frames overconfident.
+        Include the entropy and the prior of the first pose in the bound. The paper omits them
+        (appendix C.2.2), which improves the fit but makes the first frames overconfident.
     latent_weight : float
         Weight of the motion prior in the optimisation; 0 for the ablation "no prior".
     overlap : int
         Number of frames shared by consecutive windows of a long motion, less than a window.
     training_steps, training_pairs : int
-        Gradient steps and simulated pairs, if a network is trained.
+        Numbers of gradient steps and simulated pairs if a network is trained.
     batch : int
         Maximum batch size; does not affect the draws.
     """
@@ -112,7 +112,7 @@ class DVAEInference(IndependentSampler):
 
     @classmethod
     def paper(cls) -> DVAEInference:
-        """Return the published optimisation: robust noise, no entropy of the first pose."""
+        """Return the published settings: robust noise, no entropy of the first pose."""
         return cls(
             mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
         )
@@ -153,7 +153,7 @@ class DVAEInference(IndependentSampler):
         average: bool = True,
         progress: bool = True,
     ) -> Motion:
-        """Return a point estimate: the average of observed and decoded joints (D, equation 11).
+        """Return a point estimate: mean observed and decoded joints (appendix D, equation 11).
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class DVAEInference(IndependentSampler):
         seed : int
             Seed of the draws to average.
         average : bool
-            Average draws; otherwise decode the means once (the ablation "NN output").
+            Average the draws; otherwise decode the means (the ablation "NN output").
 
         Raises
         ------
@@ -193,7 +193,7 @@ class DVAEInference(IndependentSampler):
         prior = posterior.prior
         if posterior.likelihood is None and isinstance(prior, HasInferenceNetwork):
             assert isinstance(prior, Samplable)
-            # NormalStreams have the methods of a generator, with one stream per draw.
+            # NormalStreams has the methods of a generator, with one stream per draw.
             return lambda streams: prior.sample(streams, len(streams.generators))  # type: ignore[arg-type]
         network = self._network_of(posterior)
         if network is None:
@@ -234,7 +234,7 @@ class DVAEInference(IndependentSampler):
         counts: dict[str, int],
         progress: bool,
     ) -> MotionInference:
-        """Return the inference for the observations, optimised if that is the mode."""
+        """Return the inference for the observations, optimised in mode "optimization"."""
         inference = network.on(
             posterior.prior,
             posterior.likelihood,
@@ -244,24 +244,24 @@ class DVAEInference(IndependentSampler):
         if self.mode == "regression":
             return inference
         losses = self._optimised(inference, seed, counts, progress)
-        # The loss is noisy; a rise of one nat per coordinate is more than that.
-        chance = 3 * posterior.frames * posterior.skeleton.n_joints
-        if not all(map(math.isfinite, losses)) or losses[-1] > losses[0] + chance:
+        # An increase of one nat per coordinate exceeds the noise of the loss.
+        tolerance = 3 * posterior.frames * posterior.skeleton.n_joints
+        if not all(map(math.isfinite, losses)) or losses[-1] > losses[0] + tolerance:
             raise ValueError(
                 f"optimisation diverged with learning_rate {self.learning_rate:g} from loss "
-                f"{losses[0]:g} to {losses[-1]:g}; use a smaller one"
+                f"{losses[0]:g} to {losses[-1]:g}; use a smaller value"
             )
         return inference
 
     def _optimised(
         self, inference: MotionInference, seed: int, counts: dict[str, int], progress: bool
     ) -> list[float]:
-        """Optimise; return all losses, and the final one with the random numbers of the first."""
+        """Optimise and return all losses; the last loss uses the random numbers of the first."""
         import torch
 
         parameters = inference.parameters()
         adam = torch.optim.Adam(parameters, lr=self.learning_rate)
-        rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.iterations)
+        scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.iterations)
         losses: list[float] = []
         with progress_bar(self.iterations, f"{self.name} fit", progress) as bar:
             for iteration in [*range(self.iterations), 0]:
@@ -277,7 +277,7 @@ class DVAEInference(IndependentSampler):
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(parameters, _CLIP)
                 adam.step()
-                rates.step()
+                scheduler.step()
                 counts["gradient"] += 1
                 bar.update(1)
         return losses

@@ -192,7 +192,7 @@ def test_show_finds_a_network_by_folder_or_name(tmp_path, capsys, monkeypatch, f
         printed = capsys.readouterr().out
         assert printed.startswith(f"{file}: a motion-diffusion of ")
         assert "14 joints, rooted at pelvis" in printed
-    assert fails("show", "walk3d") == "there is no file walk3d"
+    assert fails("show", "walk3d") == "path must be an existing file, got walk3d"
 
 
 def test_show_reads_deeplabcut_tables(tmp_path, capsys, fails):

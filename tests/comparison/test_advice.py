@@ -110,8 +110,8 @@ def test_samplers_with_warnings_are_recommended_only_without_alternative():
     text = " ".join(str(result).split())
     assert "with warnings: good 0.997 ± 0.025 in 6 s (chains disagree: R-hat 2)" in text
     alone = advise("p", measurements(good=GOOD, bad=BAD, more=doubtful))
-    assert "none is right at this cost; best: good 0.997" in str(alone)
-    assert "none is right at this cost; best: bad 2.05" in str(advise("p", measurements(bad=BAD)))
+    assert "no reliable sampler; best: good 0.997" in str(alone)
+    assert "no reliable sampler; best: bad 2.05" in str(advise("p", measurements(bad=BAD)))
 
 
 def test_a_single_sampler_is_recommended():

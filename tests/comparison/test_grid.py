@@ -52,7 +52,7 @@ def test_draws_are_stored_by_problem_sampler_and_seed(grid):
     zero, one = (grid.draws("generation", "exact", seed) for seed in (0, 1))
     assert zero.positions.shape == (2, 10, 4, 3, 3)
     assert (zero.flat() != one.flat()).all()
-    with pytest.raises(ValueError, match="there is no run of problem 'generation', sampler 'mas'"):
+    with pytest.raises(ValueError, match="must exist, got problem 'generation', sampler 'mas'"):
         grid.draws("generation", "mas")
     with pytest.raises(ValueError, match="wide has no draws of monocular: prior-draws takes no"):
         grid.draws("monocular", "wide")
@@ -186,7 +186,7 @@ def test_failures_of_an_executor_are_recorded():
     assert failures == {
         "refused": "TypeError: refused cannot be sent",
         "forgotten": "FileNotFoundError: generation/forgotten/0 ended without a result in out; "
-        "workers must see the folder out",
+        "workers must have access to out",
         "failed": "OSError: the cluster is gone",
         "right": "None",
     }
@@ -241,7 +241,7 @@ def test_invalid_arguments_raise_before_anything_runs(
 
 
 def test_loading_another_folder_raises(tmp_path):
-    message = r"one that compare\(\) wrote, .* without comparison\.json"
+    message = r"must be written by compare\(\), .* without comparison\.json"
     with pytest.raises(ValueError, match=message):
         Comparison.load(tmp_path)
     (tmp_path / "comparison.json").write_text("{")

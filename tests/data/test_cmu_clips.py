@@ -79,7 +79,7 @@ def test_folders_are_searched_in_order(nowhere):
 
 
 def test_missing_clip_names_folders_and_remedy(nowhere):
-    fetched = r'download\("cmu-01-02-03", names=\["02.asf", "02_02.amc"\]\) fetches it, or pass'
+    fetched = r'download\("cmu-01-02-03", names=\["02.asf", "02_02.amc"\]\) downloads it, or pass'
     for name, remedy in (
         ("cmu_02_02", fetched),
         ("cmu_131_02", "pass the folder with its"),

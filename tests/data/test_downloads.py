@@ -149,7 +149,7 @@ def put_archives(folder, frames):
 
 
 def test_folders_are_searched_in_order(nowhere):
-    with pytest.raises(FileNotFoundError, match=r'downloads\.download\("cmu-salsa"\) fetches'):
+    with pytest.raises(FileNotFoundError, match=r'downloads\.download\("cmu-salsa"\) downloads'):
         salsa_pairs()
     places = ("shared/data/cmu_salsa_pairs", "cache", "cache/cmu_salsa_pairs")
     for frames, place in enumerate(places):

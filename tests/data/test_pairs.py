@@ -76,7 +76,7 @@ def test_salsa_bvh_files_equal_the_archive(real_data, salsa, tmp_path):
     np.testing.assert_allclose(read.positions, salsa[8].positions, rtol=0, atol=2e-7)
     with pytest.raises(ValueError, match="lead must be named 60_TT_scaled"):
         read_salsa_bvh(follow, lead)
-    with pytest.raises(ValueError, match="lead and follow must be one trial, got 10 and 11"):
+    with pytest.raises(ValueError, match="lead and follow must belong to one trial, got 10 and 11"):
         read_salsa_bvh(lead, tmp_path / "61_11_scaled.bvh")
     with pytest.raises(FileNotFoundError):
         read_salsa_bvh(lead, tmp_path / "61_10_scaled.bvh")

@@ -164,7 +164,7 @@ def test_repeated_poses_count_once_by_their_first_index():
     result = retrieve(projection(9, 3), repeated, n=3)
     assert result.indices[0] == 2
     assert sorted(result.indices) == [0, 2, 5]
-    with pytest.raises(ValueError, match="n must be at most 3, the number of distinct draws"):
+    with pytest.raises(ValueError, match="n must be at most the 3 distinct draws, got"):
         retrieve(projection(9, 3), repeated, n=4)
 
 

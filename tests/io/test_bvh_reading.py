@@ -177,8 +177,8 @@ def test_scale_overrides_the_inferred_unit(tmp_path):
 
 NUMBER, ROW = "expected a number between", "0 1 0 90 0 0 0 0 90"
 DEFECTS = [
-    ("Frames: 2", "Frames: 3", "expected 3 lines of values as in line 17, got 2", 20),
-    ("Frames: 2", "Frames: 1", "expected 1 lines of values as in line 17, got 2", 20),
+    ("Frames: 2", "Frames: 3", "expected 3 lines of values, as declared in line 17, got 2", 20),
+    ("Frames: 2", "Frames: 1", "expected 1 lines of values, as declared in line 17, got 2", 20),
     ("Frames: 2", "Frames: 0", "Frames must be an integer of at least 1, got '0'", 17),
     ("Frames: 2\n", "", "expected 'Frames: …', got", 17),
     ("Frame Time: 0.0333333\n", "", "expected 'Frame Time: …', got", 18),
@@ -199,13 +199,13 @@ DEFECTS = [
     ("OFFSET 0 -0.5 0", "CHANNELS 0", "inside an End Site, got CHANNELS", 12),
     ("OFFSET 0 -0.5 0", "JOINT x", "inside an End Site, got JOINT", 12),
     ("End Site", "End", "expected End Site, got 'End'", 10),
-    ("JOINT Knee", "ROOT Knee", "expected ROOT outside braces, got it inside 'Hips'", 6),
+    ("JOINT Knee", "ROOT Knee", "expected ROOT outside braces, got one inside 'Hips'", 6),
     ("JOINT Knee", "JOINT", "expected a name after JOINT", 6),
-    ("JOINT Knee", "JOINT Hips", "expected unique names, got 'Hips' as in line 2", 6),
+    ("JOINT Knee", "JOINT Hips", "expected unique names, got 'Hips' again, as in line 2", 6),
     ("JOINT Knee", "LIMB Knee", "a brace or MOTION, got 'LIMB'", 6),
     ("ROOT Hips", "JOINT Hips", "expected ROOT, got JOINT Hips outside a joint", 2),
     ("ROOT Hips\n{", "ROOT Hips", "expected '{', got 'OFFSET'", 3),
-    ("}\nMOTION", "MOTION", "expected the closing brace of 'Hips', line 2", 15),
+    ("}\nMOTION", "MOTION", "expected the closing brace of 'Hips' of line 2", 15),
     ("}\nMOTION", "}\n}\nMOTION", "got '}' without an open brace", 16),
     ("HIERARCHY\n", "", "expected HIERARCHY, got 'ROOT Hips'", 1),
     ("MOTION\n", "", "a brace or MOTION, got 'Frames:'", 16),
@@ -236,7 +236,7 @@ def test_foreign_files_are_refused(tmp_path):
         (tmp_path / "none.bvh", FileNotFoundError, "none.bvh"),
         (tmp_path / "none.txt", FileNotFoundError, "none.txt"),
         (written(tmp_path, MINIMAL, "clip.txt"), MotionFileError, r"got '\.txt'"),
-        (tmp_path / "folder.bvh", MotionFileError, "cannot be read"),
+        (tmp_path / "folder.bvh", MotionFileError, "expected a readable motion file"),
     ):
         with pytest.raises(error, match=message):
             load(path)

@@ -57,7 +57,7 @@ def test_people_are_followed_in_files_without_ids(tmp_path):
     assert np.allclose(np.diff(second.keypoints[:, 0, 0]), -1)
     for people, message in (
         (None, "two people without track ids in frame 0"),
-        (3, "people must be at most 2, as in one image, got 3"),
+        (3, "people must be at most 2, the most in any image, got 3"),
         (0, "people must be an integer of at least 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -91,7 +91,7 @@ def test_joints_in_fewer_than_two_views_are_nan():
 
 @pytest.mark.parametrize("threshold", [np.nan, -0.1, 1.5, "half"])
 def test_invalid_thresholds_are_refused(tmp_path, threshold):
-    with pytest.raises(ValueError, match="threshold must be 0 to 1, got"):
+    with pytest.raises(ValueError, match="threshold must be between 0 and 1, got"):
         read_recording(tmp_path / "made.npz", threshold=threshold)
 
 

@@ -104,8 +104,8 @@ def test_infinite_errors_are_neither_best_nor_tied():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: t_interval([]), r"values must be finite and at least one, got \[\]"),
-        (lambda: t_interval([1.0, math.nan]), "values must be finite and at least one"),
+        (lambda: t_interval([]), r"values must be one or more finite numbers, got \[\]"),
+        (lambda: t_interval([1.0, math.nan]), "values must be one or more finite numbers"),
         (lambda: t_interval([1.0, 2.0], 1.0), "level must be between 0 and 1, got 1.0"),
         (lambda: t_interval([[1.0, 2.0]]), r"values must have shape \(n\), got \(1, 2\)"),
         (lambda: best_and_tied({"a": [1.0], "b": [1.0, 2.0]}, target=None), "got a 1, b 2"),

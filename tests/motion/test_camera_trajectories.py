@@ -198,7 +198,7 @@ def test_gradient_agrees_with_finite_differences(rng, size):
         ({"local": np.zeros((L, J, 2))}, r"local must have shape \(40, 9, 3\), got \(40, 9, 2\)"),
         ({"local": np.full((L, J, 3), np.inf)}, "local must be finite, got 1080 values"),
         ({"camera": Cameras.ring(1)}, "camera must be perspective"),
-        ({"camera": Cameras.ring(2, perspective=True)}, "camera must be one view, got 2"),
+        ({"camera": Cameras.ring(2, perspective=True)}, "camera must have one view, got 2"),
         ({"scale": 0.0}, "scale must be a finite number above 0, got 0.0"),
         ({"smoothness_weight": 0.0}, "smoothness_weight must be a finite number above 0, got 0.0"),
         ({"max_iterations": 0}, "max_iterations must be an integer of at least 1, got 0"),

@@ -179,14 +179,14 @@ def unit_tracks(names, parents):
 @pytest.mark.parametrize(
     ("tracks", "message"),
     [
-        (list, "tracks must contain at least one, got none"),
-        (lambda: [*degenerate(), *unit_tracks(["a", "b"], [-1, 0])], "tracks must have one skel"),
+        (list, "tracks must contain at least one track, got none"),
+        (lambda: [*degenerate(), *unit_tracks(["a", "b"], [-1, 0])], "tracks must share one skel"),
         (lambda: unit_tracks(["a", "b"], [-1, 0]), "front must be a joint in front of the root"),
-        (lambda: unit_tracks(["a", "b"], [-1, -1]), "one root with bones, got 2 roots and 0"),
-        (lambda: unit_tracks(["a"], [-1]), "one root with bones, got 1 roots and 0 bones"),
+        (lambda: unit_tracks(["a", "b"], [-1, -1]), "one root and bones, got 2 roots and 0"),
+        (lambda: unit_tracks(["a"], [-1]), "one root and bones, got 1 roots and 0 bones"),
         (lambda: unit_tracks(["a", "left_b", "right_b", "c"], [-1, 0, 3, 0]), "bilaterally symm"),
-        (lambda: without("left", "left"), "no confident frame with those to .*left_wrist"),
-        (lambda: without("left", "right"), "with those to left_wrist and right_wrist"),
+        (lambda: without("left", "left"), "got none for the bones to .*left_wrist"),
+        (lambda: without("left", "right"), "the bones to left_wrist and right_wrist"),
         # A degenerate bone is not replaced by its counterpart.
         (lambda: degenerate("right_wrist"), "mean direction .* the bone to right_wrist"),
         (lambda: degenerate("left_wrist"), "mean direction .* the bone to left_wrist"),

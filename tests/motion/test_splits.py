@@ -43,7 +43,7 @@ def test_tracks_of_clips_preserves_order():
     assert {track.name for part in parts for track in part} == set(VIEWS)
     names = [track.name for track in parts[0]]
     assert names == [name for name in VIEWS if clip_of(name) in split.train]
-    with pytest.raises(ValueError, match="at least one of the 120 tracks each, got none for 'se"):
+    with pytest.raises(ValueError, match="at least one of the 120 tracks, got none for 'se"):
         tracks_of_clips(tracks, ["set/run"])
 
 

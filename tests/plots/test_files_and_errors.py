@@ -75,7 +75,7 @@ TWO_SETTINGS = pd.concat([ERRORS, ERRORS.assign(setting="V = 12")])
         (draw_calibration, ({},), "levels must contain at least one kind of pose, got none"),
         (draw_calibration, (LEVELS | {"draws": {"b": [1]}},), r"must have the terms \['prior'\], "),
         (classical_scaling, (np.zeros((3, 4)),), r"distances must have shape \(3, 3\), got \(3,"),
-        (classical_scaling, (np.zeros((1, 1)),), "must be of at least dim=2 points, got 1"),
+        (classical_scaling, (np.zeros((1, 1)),), "must be between at least dim=2 points, got 1"),
         (draw_embedding, (POINTS, ["truth", *KINDS[1:]]), "kinds must be real, prior, .*got truth"),
         (draw_embedding, (POINTS, KINDS[1:]), r"kinds must have shape \(25\), got \(24,\)"),
         (draw_coverage, (COVERAGE.drop(columns="coverage"),), "got no columns coverage"),

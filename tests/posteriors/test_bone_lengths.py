@@ -90,7 +90,7 @@ def test_bones_without_estimate_need_typical_lengths(joints):
     motion, lengths = body()
     confidence = np.ones((60, 14))
     confidence[:, [PERSON.index(name) for name in joints]] = 0
-    with pytest.raises(ValueError, match=f"to {joints[0]}, or its mirror image"):
+    with pytest.raises(ValueError, match=f"to {joints[0]} or its mirror image"):
         bone_lengths(motion.positions, confidence, PERSON, 0.001)
     typical = np.full(14, 0.21)
     estimated = bone_lengths(motion.positions, confidence, PERSON, 1e-9, typical=typical)

@@ -89,7 +89,7 @@ def lifted(height):
         (walk() * 39.37, {}, "is 47.* long, implausible in metres; are these inches"),
         (walk() / 1e3, {}, "is 0.00121.* long, implausible in metres; are these kilometres"),
         (walk() / 1e6, {}, "implausible in metres$"),
-        (walk(), {"noise": 30.0}, "^noise is 30 m, more than .* is it in metres"),
+        (walk(), {"noise": 30.0}, "^noise is 30 m, larger than .* is it in metres"),
         (walk()[..., [0, 2, 1]], {}, "aligned with Z, but Y must be up"),
         (walk()[..., [1, 0, 2]], {}, "aligned with X, but Y must be up"),
         (walk() * [1, -1, 1], {}, "aligned with -Y, but Y must be up"),
@@ -158,7 +158,7 @@ def invalid(value, axes):
         ({"joints": np.zeros((40, 3, 3))}, "joints must have shape"),
         ({"joints": np.zeros((0, 14, 3))}, "joints must have at least one frame"),
         ({"joints": np.ones((40, 14, 3))}, "joints must be distinct"),
-        ({"joints": np.full((10, 14, 3), np.nan)}, "got every frame occluded"),
+        ({"joints": np.full((10, 14, 3), np.nan)}, "in at least one frame, got none"),
         (
             {"joints": invalid(np.nan, [1])},
             r"NaN in only some .* at frame 6, joint 2 \(left_should",

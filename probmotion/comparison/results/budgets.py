@@ -1,10 +1,10 @@
-"""Equal budgets: the settings with which each sampler spends the same cost on a problem.
+"""Equal budgets: sampler settings of equal cost on a problem.
 
-A sampler class lists in ``effort`` the settings that its cost grows with: the first is tuned, the
+A sampler class lists the settings that determine its cost in ``effort``: the first is tuned, the
 others are scaled in proportion, and ``least_effort`` is the smallest useful value of the first.
 Pilot runs, each with 2 to 8 times the effort of the previous one, measure the cost, which is linear
-in the effort for all samplers here but NUTS. With a budget of seconds the first pilot runs twice,
-so that compilation does not count, and pilots that do not lie on a line are repeated.
+in the effort for all samplers of this package except NUTS. With a budget in seconds the first pilot
+runs twice, to exclude compilation, and pilots with nonlinear costs are repeated.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["Budget", "affordable", "effort_of"]
 
-# Cost of an evaluation other than 1: a gradient includes the value, which costs about as much.
+# Costs other than 1: a gradient also computes the value, at about the same cost.
 _WEIGHTS = {"gradient": 2}
-# Pilots stop once they have spent this fraction of the budget; each aims slightly beyond it.
+# Pilots stop above the first fraction of the budget; the second is their target cost.
 _ENOUGH, _TARGET = 0.25, 0.3
-# Smallest and largest growth of the effort between pilots.
+# Minimum and maximum growth factor of the effort between pilots.
 _GROWTH = 2, 8
-# If the cost has not grown at this multiple of the given effort, the effort costs nothing.
+# The effort costs nothing if the cost has not increased at this multiple of the given effort.
 _MULTIPLE = 64
 # Relative noise of seconds; evaluation counts have none.
 _NOISE = 0.1
-# Largest relative deviation of the last pilot from the line through the two before it.
+# Maximum relative deviation of the last pilot from the line through the previous two.
 _DEVIATION = 0.15
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Cost that every sampler may spend on a run, either in evaluations or in seconds.
+    """Cost of a run, equal for all samplers, either in evaluations or in seconds.
 
     Parameters
     ----------
     evaluations : int, optional
-        Evaluations of the denoiser, its covariance, the density (1 each) and gradients (2 each),
-        each for one motion, or one view of it for a 2D denoiser. A training step of a network
+        Number of evaluations of the denoiser, its covariance, the density (1 each) and gradients
+        (2 each), for one motion, or for one view with a 2D denoiser. A training step of a network
         counts as one gradient.
     seconds : float, optional
         Wall-clock time on the machine that runs the grid.
@@ -71,7 +71,7 @@ class Budget:
 
     @property
     def amount(self) -> float:
-        """The budget in its own unit."""
+        """Number of evaluations or seconds."""
         given = self.seconds if self.evaluations is None else self.evaluations
         assert given is not None
         return float(given)
@@ -95,7 +95,7 @@ class Budget:
 
 
 def effort_of(sampler: Sampler) -> tuple[str, ...]:
-    """Return the settings that a sampler's cost grows with, the tuned one first."""
+    """Return the settings that determine a sampler's cost, the tuned one first."""
     named: Any = getattr(sampler, "effort", ())
     return (named,) if isinstance(named, str) else tuple(named)
 
@@ -103,7 +103,7 @@ def effort_of(sampler: Sampler) -> tuple[str, ...]:
 def affordable(
     budget: Budget, sampler: Sampler, pilot: Callable[[Sampler], float]
 ) -> dict[str, int]:
-    """Return the settings with which a sampler spends a budget; empty if it has no effort setting.
+    """Return the settings at which a sampler uses a budget; empty without an effort setting.
 
     The effort is the largest whose cost, extrapolated from the last two pilots, is within the
     budget.
@@ -120,7 +120,7 @@ def affordable(
     Raises
     ------
     UnsupportedPosterior
-        If the least effort exceeds the budget; its word is ``budget``.
+        If the least effort exceeds the budget (failure word ``budget``).
     """
     if not effort_of(sampler):
         return {}
@@ -134,34 +134,34 @@ def affordable(
         settings = ", ".join(f"{name}={n}" for name, n in _settings(sampler, effort).items())
         raise UnsupportedPosterior(
             sampler.name,
-            f"needs {budget.words(costs[0][1])} with {settings}, and the budget "
+            f"needs {budget.words(costs[0][1])} with {settings}; the budget "
             f"is {budget.words(budget.amount)}",
             word="budget",
         )
     noise = _NOISE if budget.evaluations is None else 0.0
-    enough, target = (share * (budget.amount - costs[0][1]) for share in (_ENOUGH, _TARGET))
+    enough, target = (part * (budget.amount - costs[0][1]) for part in (_ENOUGH, _TARGET))
     while costs[-1][1] - costs[0][1] <= enough:
-        next_one = _next_effort(costs, costs[0][1] + target)
-        effort = _within_range(sampler, costs[-1][0], next_one)
+        proposed = _next_effort(costs, costs[0][1] + target)
+        effort = _within_range(sampler, costs[-1][0], proposed)
         if effort == costs[-1][0]:
             break
         if effort > _MULTIPLE * given and costs[-1][1] <= (1 + noise) * costs[-2][1]:
             return {}
         costs.append((effort, pilot(_with(sampler, effort))))
     if budget.seconds is not None:
-        for place in range(-3, 0):
+        for index in range(-3, 0):
             if _is_nonlinear(costs) and sum(seconds for _, seconds in costs) < budget.amount:
-                effort, seconds = costs[place]
-                costs[place] = effort, min(seconds, pilot(_with(sampler, effort)))
+                effort, seconds = costs[index]
+                costs[index] = effort, min(seconds, pilot(_with(sampler, effort)))
     return _settings(sampler, _within_range(sampler, costs[0][0], _solve(costs, budget.amount)))
 
 
 def _next_effort(costs: list[tuple[int, float]], target: float) -> int:
-    """Return the effort of the next pilot, towards the target cost with bounded growth."""
+    """Return the effort of the next pilot for a target cost, with bounded growth."""
     least, most = _GROWTH
     effort, spent = costs[-1]
     if len(costs) == 1 and spent > 0:
-        # The fixed cost is unknown, so assume there is none.
+        # The fixed cost is unknown and assumed to be zero.
         growth = target / spent
     elif len(costs) > 1 and spent > costs[-2][1]:
         growth = _solve(costs, target) / effort
@@ -171,23 +171,23 @@ def _next_effort(costs: list[tuple[int, float]], target: float) -> int:
 
 
 def _is_nonlinear(costs: list[tuple[int, float]]) -> bool:
-    """Whether the last pilot is off the line through the two before it."""
+    """Whether the last pilot deviates from the line through the previous two."""
     if len(costs) < 3:
         return False
-    (low, cheap), (middle, dearer), (high, dear) = costs[-3:]
-    predicted = dearer + (dearer - cheap) * (high - middle) / (middle - low)
-    return abs(dear - predicted) > _DEVIATION * dear
+    (x0, y0), (x1, y1), (x2, y2) = costs[-3:]
+    predicted = y1 + (y1 - y0) * (x2 - x1) / (x1 - x0)
+    return abs(y2 - predicted) > _DEVIATION * y2
 
 
 def _solve(costs: list[tuple[int, float]], amount: float) -> int:
     """Return the effort at which the line through the last two pilots reaches an amount."""
     if len(costs) == 1:
         return costs[0][0]
-    (low, cheap), (high, dear) = costs[-2:]
-    if dear <= cheap:
-        return high
-    solution = low + (amount - cheap) * (high - low) / (dear - cheap)
-    # Rounding must not miss a whole number.
+    (x0, y0), (x1, y1) = costs[-2:]
+    if y1 <= y0:
+        return x1
+    solution = x0 + (amount - y0) * (x1 - x0) / (y1 - y0)
+    # The tolerance prevents rounding errors just below an integer.
     return max(costs[0][0], int(solution + 1e-9 * abs(solution)))
 
 

@@ -9,7 +9,7 @@ from probmotion.posteriors.sampling import UnsupportedPosterior
 
 __all__ = ["Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied"]
 
-# How libraries report exhausted memory other than by MemoryError.
+# Out-of-memory errors of libraries, besides MemoryError.
 _MEMORY_KINDS = ("OutOfMemoryError",)
 _MEMORY_SIGNS = ("RESOURCE_EXHAUSTED", "can't allocate memory", "Unable to allocate")
 _NAN_SIGN = "NaN or infinite"
@@ -35,7 +35,7 @@ class TimeLimitExceeded(RuntimeError):  # noqa: N818
 
 
 class WorkerDied(RuntimeError):  # noqa: N818
-    """The worker process of a run ended; ``killed`` if by SIGKILL, as when memory runs out."""
+    """The worker process of a run died; ``killed`` if by SIGKILL, often for lack of memory."""
 
     def __init__(self, killed: bool) -> None:
         super().__init__("a worker process died during this run, possibly out of memory")
@@ -53,7 +53,7 @@ class Failure:
         :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` such as ``budget``, or the
         class of the error.
     message : str
-        One sentence.
+        Error message on one line.
     unsupported : bool
         Whether the sampler does not support the problem. Other failures are retried.
     traceback : str
@@ -70,7 +70,7 @@ class Failure:
 
     @classmethod
     def of(cls, error: BaseException) -> Failure:
-        """Return the failure that an error caused."""
+        """Return the failure for an error."""
         message = " ".join(str(error).split()) or type(error).__name__
         trace = "".join(traceback.format_exception(error))
         unsupported = isinstance(error, UnsupportedPosterior)

@@ -45,22 +45,22 @@ def fingerprint(value: Any) -> str:
     """Return a hexadecimal digest of ``value``.
 
     - Numbers, strings, arrays, lists, mappings: their contents.
-    - Dataclasses: their ``init`` fields, so that caches do not count.
+    - Dataclasses: their ``init`` fields, which excludes caches.
     - Classes, modules and C functions: their names.
     - Python functions: name, compiled code, defaults and closure; bound methods also their object.
     - Networks: layers and weights.
     - Other objects: their attributes, or their pickled state if they have none.
     - Classes and functions of a script or notebook: also the code of their methods and the
       functions, classes, numbers, strings and arrays of the module that they read. Lists and
-      mappings are left out, since functions may fill them.
-    - Anything of an installed package: also the version of the package.
+      mappings are excluded, since functions may modify them.
+    - Objects of installed packages: also the version of the package.
 
-    Fingerprints of functions depend on the Python version, which compiles them.
+    Fingerprints of functions depend on the Python version, because they include bytecode.
 
     Raises
     ------
     ValueError
-        If an object has no content to identify it by.
+        If the content of an object cannot be determined.
     """
     digest = hashlib.sha256()
     _add(digest, value, ())
@@ -112,7 +112,7 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
                 parts += [field.name, getattr(value, field.name)]
     elif getattr(value, "__dict__", None):
         attributes = vars(value).items()
-        # Cached properties follow from the other attributes.
+        # Cached properties are determined by the other attributes.
         parts.append({name: part for name, part in attributes if not _is_cached(kind, name)})
     elif not _is_stateless(kind):
         parts += _as_pickled(value)
@@ -126,7 +126,7 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
 def _is_named(value: Any) -> bool:
     if isinstance(value, type | ModuleType | FunctionType | MethodType):
         return True
-    # Callable objects of Python classes may carry a function's name, but are identified by their
+    # Callable objects of Python classes may have a function's name, but are identified by their
     # attributes.
     if not callable(value) or isinstance(type(value).__call__, FunctionType):
         return False
@@ -186,7 +186,7 @@ def _as_pickled(value: Any) -> list[Any]:
 
 
 def _version_of(module: str | None) -> str:
-    """Return the version of a module's package unless results record it anyway."""
+    """Return the version of a module's package; empty if results record it separately."""
     package = (module or "").partition(".")[0]
     recorded = package in sys.stdlib_module_names or package in _RECORDED_PACKAGES
     return "" if recorded or is_user_code(module) else _installed_version(package)
@@ -203,5 +203,5 @@ def _is_cached(kind: type, name: str) -> bool:
 
 
 def _is_stateless(kind: type) -> bool:
-    """Whether a Python class has objects without state, which its name identifies."""
+    """Whether instances of a Python class have no state, so that its name identifies them."""
     return kind.__module__ != "builtins" and hasattr(kind, "__dict__") and bool(kind.__dictoffset__)

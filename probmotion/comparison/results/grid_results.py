@@ -35,9 +35,9 @@ class GridResults:
     folder : Path
         Folder of the grid.
     plan : Plan
-        The grid; unfinished runs are left out.
+        Plan of the grid; unfinished runs are omitted.
     temporary : bool
-        Remove the folder together with this object.
+        Whether to delete the folder together with this object.
     """
 
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
@@ -90,16 +90,16 @@ class GridResults:
             where = f"{result.sampler} on {result.problem}"
             seeds.setdefault(f"{where}: {result.failure.message}", []).append(result.seed)
         for sentence, failed in seeds.items():
-            # The table then averages over fewer seeds.
-            some = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
-            notes.append(sentence + (some if len(failed) < self.plan.seeds else ""))
+            # The table averages over the other seeds.
+            failed_seeds = f" (seeds {', '.join(map(str, failed))} of {self.plan.seeds})"
+            notes.append(sentence + (failed_seeds if len(failed) < self.plan.seeds else ""))
         return notes
 
     def table(self) -> ComparisonTable:
         """Return the tidy data frame with columns problem, sampler, seed, metric, value.
 
         A run without draws has a single metric, ``unsupported`` or ``failed``, equal to 1.
-        Printing shows mean ± standard deviation over seeds in a block per problem.
+        It prints as mean ± standard deviation over seeds, with one block per problem.
         """
         from probmotion.comparison.results.table import ComparisonTable
 
@@ -128,7 +128,7 @@ class GridResults:
         Raises
         ------
         ValueError
-            If there is no such run or it failed.
+            If the run does not exist or failed.
         """
         for result in self.results:
             if (result.problem, result.sampler, result.seed) == (problem, sampler, seed):
@@ -138,13 +138,13 @@ class GridResults:
                     )
                 return read_draws(self.plan.run_folder(self.folder, problem, sampler, seed))
         raise ValueError(
-            f"there is no run of problem {problem!r}, sampler {sampler!r}, seed {seed!r}; "
+            f"the run must exist, got problem {problem!r}, sampler {sampler!r}, seed {seed!r}; "
             f"problem must be one of {', '.join(self.plan.problems)}, sampler one of "
             f"{', '.join(self.plan.samplers)}, and seed below {self.plan.seeds}"
         )
 
     def write(self, folder: str | Path) -> None:
-        """Write ``table.csv`` and ``failures.json``; copy the runs if ``folder`` is another one."""
+        """Write ``table.csv`` and ``failures.json``; copy the runs to another folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if folder.resolve() != self.folder.resolve():

@@ -49,7 +49,7 @@ _RULES: Mapping[str, Mapping[str, Any]] = {
     "view_recall_learnt": _MORE,
 }
 _LESS_PREFIXES, _LESS_SUFFIXES = ("coverage_", "fid"), ("_mm", "_cm2")
-# Number of sets of draws in the denominator of a proportion, which changes in steps.
+# Metrics that are proportions, with the number of sets of draws in their denominator.
 _PROPORTIONS = {"precision": 1, "recall": 1, "mode_proportions_tv": 1, "c2st": 2}
 _DISTANCES_TO_TRUTH = ("acceleration_error", "velocity_error", "pck")
 
@@ -82,8 +82,8 @@ def best_of(
     fewer than two samplers or two seeds; and for distances of single draws to the truth if there
     are references, because overconfident draws are closer to the truth.
 
-    ``values`` are by sampler and seed, ``measured`` contains all metrics of the problem, and
-    ``draws`` is the number of draws behind each value.
+    ``values`` contains values over seeds by sampler, ``measured`` all metrics of the problem;
+    ``draws`` is the number of draws per value.
     """
     rule = _RULES.get(metric)
     if rule is None and (metric.startswith(_LESS_PREFIXES) or metric.endswith(_LESS_SUFFIXES)):
@@ -91,7 +91,7 @@ def best_of(
     if rule is None or ("swd_ratio" in measured and _is_distance_to_truth(metric)):
         return None, set()
     rows = {name: row.reindex(list(seeds)).to_numpy(float) for name, row in values.items()}
-    # Infinite values and ratios of 0 are infinitely wrong.
+    # Infinite values and ratios of 0 exclude a sampler.
     errors = {
         name: row
         for name, row in rows.items()

@@ -14,7 +14,7 @@ from probmotion.problems.catalogue import load_problem, problem_names
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
 
 _NAME = re.compile(r"\w[\w.,=+() -]*")
-# Longest name of a folder in bytes, less the affixes of its temporary name.
+# Maximum length of a folder name in bytes, without the affixes of temporary names.
 _LONGEST = 200
 
 AnyProblem = str | Problem | MotionPosterior
@@ -22,7 +22,7 @@ AnySampler = str | Sampler
 
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
-    """Return problems by their names in the table; registered ones by their full names."""
+    """Return problems by table name; registered problems have their full names."""
     named: dict[str, str | Problem] = {}
     for label, given in _labelled(problems, AnyProblem):
         if isinstance(given, str):
@@ -43,19 +43,19 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
 
 
 def _registered_name(problem: Problem) -> str | None:
-    """Return the name of a registered problem, which each worker process then makes once."""
+    """Return the name of a registered problem, for loading in workers, or None."""
     name = problem.name
     if name.partition("(")[0] not in problem_names():
         return None
     try:
         return name if load_problem(name) is problem else None
     except (ValueError, FileNotFoundError):
-        # A user's problem with a similar name, such as "gait(mine)".
+        # A user-supplied problem with a similar name, such as "gait(mine)".
         return None
 
 
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
-    """Return samplers by their names in the table; all registered ones for None."""
+    """Return samplers by table name; all registered samplers for None."""
     named: dict[str, Sampler] = {}
     for label, given in _labelled(
         list(importable_samplers()) if samplers is None else samplers, AnySampler

@@ -1,4 +1,4 @@
-"""Plan of a grid: its problems, samplers and sizes, stored in its folder."""
+"""Plan of a grid: problems, samplers and numbers of draws, chains and seeds."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Plan:
     Parameters
     ----------
     problems : dict of str
-        Descriptions by name.
+        Problem descriptions by name.
     samplers : dict of dict
-        By name, the settings that differ from the defaults.
+        Settings that differ from the defaults, by sampler name.
     draws, chains, seeds : int
         As given to :func:`~probmotion.comparison.compare`.
     notes : tuple of str
@@ -59,7 +59,7 @@ class Plan:
         budget: Budget | None = None,
         per: str = "run",
     ) -> Plan:
-        """Return the plan of a grid; ``per`` names the unit that the budget applies to."""
+        """Return the plan of a grid; ``per`` is the unit of the budget in notes."""
         loaded = {
             name: load_problem(source) if isinstance(source, str) else source
             for name, source in problems.items()
@@ -75,7 +75,7 @@ class Plan:
         )
 
     def runs(self) -> Iterator[tuple[str, str, int]]:
-        """Yield (problem, sampler, seed), all samplers of one problem and seed in a row."""
+        """Yield (problem, sampler, seed) in the order problem, seed, sampler."""
         for problem in self.problems:
             for seed in range(self.seeds):
                 for sampler in self.samplers:
@@ -103,7 +103,7 @@ class Plan:
             return cls(**stored | {name: tuple(stored[name]) for name in ("notes", "references")})
         except OSError as error:
             raise ValueError(
-                f"folder must be one that compare() wrote, got {str(folder)!r} without {_PLAN}"
+                f"folder must be written by compare(), got {str(folder)!r} without {_PLAN}"
             ) from error
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
@@ -118,8 +118,8 @@ class Plan:
         version = stored.get("format", 1) if isinstance(stored, dict) else _FORMAT
         if version != _FORMAT:
             raise ValueError(
-                f"out is {folder}, which another version of probmotion wrote (format {version}, "
-                f"not {_FORMAT}); use another folder"
+                f"out must be written by this version of probmotion (format {_FORMAT}), got "
+                f"{folder} of format {version}; use another folder"
             )
 
 

@@ -22,7 +22,7 @@ DRAWS, RESULT = "draws.nc", "run.json"
 class RunResult:
     """Result of a finished run.
 
-    ``budget`` contains the budget in words, the chosen settings and the amount used;
+    ``budget`` contains the budget as text, the chosen settings and the amount used;
     ``draws_bytes`` is the size of the draws file.
     """
 
@@ -37,7 +37,7 @@ class RunResult:
 
 
 def read_result(folder: Path) -> RunResult | None:
-    """Return the result in a run's folder, or None if there is none or it is damaged."""
+    """Return the result in a run's folder, or None if it is missing or damaged."""
     try:
         stored = json.loads((folder / RESULT).read_text(encoding="utf-8"))
         failure = stored.pop("failure")
@@ -58,7 +58,7 @@ def read_draws(folder: Path) -> MotionDraws:
 
 
 def used_of_budget(results: Iterable[RunResult]) -> list[str]:
-    """Return the smallest and largest amount of the budget that each sampler used, in words."""
+    """Return the minimum and maximum cost of each sampler's runs, as text."""
     used: dict[str, list[float]] = {}
     for result in results:
         if result.budget is not None and result.budget["used"] is not None:

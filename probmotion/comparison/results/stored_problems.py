@@ -24,7 +24,7 @@ _CAMERA = ("rotation", "translation", "focal", "centre", "orthographic")
 
 @dataclass(frozen=True, eq=False)
 class StoredProblem:
-    """The parts of a problem that figures and the report show.
+    """Data of a problem for the figures and the report.
 
     Parameters
     ----------
@@ -66,8 +66,8 @@ class StoredProblem:
         camera = keypoints = joints = held_out = None
         if isinstance(likelihood, Keypoints2D):
             camera = likelihood.cameras.view(0)
-            seen = likelihood.entries.visible[0]
-            keypoints = np.where(seen[..., None], likelihood.keypoints[0], np.nan)
+            visible = likelihood.entries.visible[0]
+            keypoints = np.where(visible[..., None], likelihood.keypoints[0], np.nan)
         elif isinstance(likelihood, Joints3D):
             joints = np.where(likelihood.entries.visible[..., None], likelihood.joints, np.nan)
         if problem.held_out is not None:
@@ -114,7 +114,7 @@ def store_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: in
 
 
 def read_stored(folder: str | Path) -> StoredProblem | None:
-    """Return the problem that :func:`store_problem` wrote into ``folder``, or None.
+    """Read the stored problem in ``folder``; return None if there is none.
 
     Raises
     ------

@@ -105,7 +105,7 @@ _GENERATION_LEGEND = """\
 FID: Fréchet distance between features of random views and held-out real views; it decreases with
 the number of draws; diversity ratio: mean distance of two motions, divided by that of real motions
 (ideal: 1); side: from π/4 to 3π/4 beside the first view; training: against the training clips,
-which a few held-out clips need not resemble; MCD: Motion Chamfer Distance to held-out views in
+since few held-out clips may differ from them; MCD: Motion Chamfer Distance to held-out views in
 windows of 10 frames (cm²); it also decreases with the number of draws."""
 _LEGENDS = (
     ({"swd_ratio"}, _REFERENCES_LEGEND),
@@ -115,13 +115,13 @@ _LEGENDS = (
     ({"fid"}, _GENERATION_LEGEND),
 )
 _NARROWEST = 10
-"""Width in letters to which column headings are wrapped at least."""
+"""Minimum width of wrapped column headings, characters."""
 
 
 class ComparisonTable(pd.DataFrame):
     """Data frame with columns problem, sampler, seed, metric, value; prints mean ± sd over seeds.
 
-    ``attrs`` contain problem descriptions, the words for runs without draws, and notes.
+    ``attrs`` contains problem descriptions, reasons for missing draws, and notes.
     Slices are plain data frames.
     """
 
@@ -147,7 +147,7 @@ class ComparisonTable(pd.DataFrame):
         parts += self.legends()
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
-        return "\n\n".join(parts) if parts else "no run is finished"
+        return "\n\n".join(parts) if parts else "no finished runs"
 
     def legends(self) -> list[str]:
         """Return explanations of the metrics in the table."""
@@ -203,7 +203,7 @@ class ComparisonTable(pd.DataFrame):
 
 
 def mean_and_sd(values: pd.Series | None) -> str:
-    """Return mean ± standard deviation of values with significant digits; empty for None."""
+    """Return mean ± standard deviation, rounded to significant digits; empty for None."""
     if values is None:
         return ""
     mean, sd = float(values.mean()), float(values.std())
@@ -213,7 +213,7 @@ def mean_and_sd(values: pd.Series | None) -> str:
     mean, sd = mean / size, sd / size
     if len(values) == 1 or not math.isfinite(sd):
         return f"{mean:.{_decimals(mean, 3)}f}{letter}"
-    # Two digits of the standard deviation, and the mean to the same place.
+    # Two digits of the standard deviation, and as many decimal places of the mean.
     places = _decimals(sd, 2) if sd > 0 else _decimals(mean, 3)
     return f"{mean:.{places}f} ± {sd:.{places}f}{letter}"
 
@@ -226,14 +226,14 @@ def _unit(value: float) -> tuple[float, str]:
 
 
 def _decimals(value: float, digits: int) -> int:
-    """Return the decimal places that show the given number of digits, at most three."""
+    """Return the number of decimal places for some significant digits, at most three."""
     if value == 0 or (float(value).is_integer() and abs(value) >= 100):
         return 0
     return min(3, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
 def _aligned(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Return aligned columns; headings but the first are wrapped to the width of their column."""
+    """Return aligned columns; all headings except the first are wrapped to the column width."""
     headings = [[header[0]]]
     for heading, *column in zip(header[1:], *(row[1:] for row in body), strict=True):
         width = max(_NARROWEST, *map(len, column))

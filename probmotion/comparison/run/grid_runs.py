@@ -1,6 +1,6 @@
 """Runs of a grid: one sampler on one problem with one seed, stored in a folder.
 
-The folder is filled under a temporary name and renamed, so that it is never incomplete.
+A folder is written under a temporary name and then renamed, so that it is always complete.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _FARTHEST = 1e100
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GridRun(GridTask):
-    """One sampler on one problem with one seed; ``path`` is the folder of draws and result.
+    """Run of one sampler on one problem with one seed; ``path`` is the folder of its result.
 
-    With a budget, ``settings`` were chosen by the pilot, or ``pilot_failure`` is its failure.
+    With a budget, ``settings`` or ``pilot_failure`` is the result of the pilot.
     """
 
     stores_draws: ClassVar[bool] = True
@@ -162,7 +162,7 @@ class GridRun(GridTask):
             shutil.rmtree(unfinished, ignore_errors=True)
             raise ResultNotWritten(error.strerror or str(error)) from error
         except Exception as error:
-            # The sampler returned draws that cannot be saved.
+            # The draws of the sampler cannot be saved.
             shutil.rmtree(unfinished, ignore_errors=True)
             if draws is None:
                 raise
@@ -170,18 +170,18 @@ class GridRun(GridTask):
 
 
 def forget_unfinished(folder: Path, problems: Iterable[str]) -> None:
-    """Remove the incomplete files and folders that a killed process left in a grid's folder."""
+    """Remove incomplete files and folders of killed processes from a grid's folder."""
     for problem in problems:
-        for place in (folder / "runs" / problem).glob("*/"):
-            _remove_unfinished(place, "*")
+        for runs in (folder / "runs" / problem).glob("*/"):
+            _remove_unfinished(runs, "*")
         for kind in ("pilots", "problems"):
             forget_killed(folder / kind / problem)
     forget_killed(folder)
 
 
-def _remove_unfinished(place: Path, seed: str) -> None:
-    for left in place.glob(f"{_UNFINISHED}{seed}-*"):
-        shutil.rmtree(left, ignore_errors=True)
+def _remove_unfinished(folder: Path, seed: str) -> None:
+    for path in folder.glob(f"{_UNFINISHED}{seed}-*"):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _without_nan(stored: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Tasks of a grid, one sampler on one problem, and the pilots that choose settings for a budget."""
+"""Tasks of a grid: one sampler on one problem; pilots choose the settings for a budget."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["GridTask", "Pilot", "PilotResult"]
 
 @dataclass(frozen=True)
 class PilotResult:
-    """Settings with which a sampler spends a budget, or the failure of the pilot.
+    """Settings chosen for a budget, or the failure of the pilot.
 
     ``settings`` are empty if the sampler has no effort setting.
     """
@@ -37,10 +37,10 @@ class PilotResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GridTask:
-    """One sampler on one problem; ``problem`` and ``sampler`` select the random numbers.
+    """Task of one sampler on one problem; ``problem`` and ``sampler`` seed the random numbers.
 
-    ``path`` is the file or folder of the result, ``source`` the problem or the registered name to
-    load it by in a worker, and ``limit`` the time limit in seconds after loading.
+    ``path`` is the file or folder of the result, ``source`` the problem or its registered name, for
+    loading in a worker, and ``limit`` the time limit in seconds after loading.
     """
 
     path: Path
@@ -64,7 +64,7 @@ class GridTask:
         return result is not None and result.fingerprint == self.fingerprint
 
     def finished(self) -> bool:
-        """Whether a result for the same inputs is stored that need not be retried."""
+        """Whether a result for the same inputs is stored and needs no retry."""
         result = self.result()
         if result is None or not self.has_result():
             return False
@@ -88,7 +88,7 @@ class GridTask:
         return load_problem(self.source) if isinstance(self.source, str) else self.source
 
     def prepare(self) -> None:
-        """Load everything that the time limit does not cover."""
+        """Load the problem before the time limit starts."""
         self.load()
 
     def sample(
@@ -103,7 +103,7 @@ class GridTask:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pilot(GridTask):
-    """Pilot of a sampler on a problem, which chooses the settings of runs with all seeds."""
+    """Pilot of a sampler on a problem; chooses the settings for all seeds."""
 
     def __str__(self) -> str:
         return f"{self.problem}/{self.sampler}"

@@ -13,7 +13,7 @@ __all__ = ["locked"]
 def locked(folder: Path, problems: Iterable[str]) -> Iterator[None]:
     """Lock the problems of a folder during the block.
 
-    Grids of different problems may share a folder, as the jobs of an array do. The operating
+    Grids of different problems may share a folder, for example in a job array. The operating
     system releases the locks when the process ends, even if it is killed.
 
     Raises
@@ -27,19 +27,19 @@ def locked(folder: Path, problems: Iterable[str]) -> Iterator[None]:
 
     with ExitStack() as stack:
         for problem in problems:
-            place = folder / "runs" / problem
-            place.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(place / ".lock", blocking=False, fallback_to_soft=False)
+            path = folder / "runs" / problem
+            path.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(path / ".lock", blocking=False, fallback_to_soft=False)
             try:
                 stack.enter_context(lock)
             except Timeout as error:
                 raise ValueError(
-                    f"out is {folder}, where another process is running {problem}; wait for it to "
-                    "end or use another folder"
+                    f"out must not be in use, got {folder}, where another process is running "
+                    f"{problem}; wait for it to end or use another folder"
                 ) from error
             except OSError as error:
                 raise OSError(
-                    f"out is {str(folder)!r}, where files cannot be locked: "
+                    f"out must support file locks, got {str(folder)!r}: "
                     f"{error.strerror or error}; use a folder on another file system"
                 ) from error
         yield

@@ -16,10 +16,10 @@ _STATUS, _RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class PeakMemory:
-    """Peak memory of the block of :func:`watched_memory`."""
+    """Peak memory of a block, set by :func:`watched_memory`."""
 
     mebibytes: float | None = None
-    """Increase over the memory in use before, including newly loaded libraries; None if unknown."""
+    """Increase over the memory before the block, including new libraries; None if unknown."""
 
 
 @contextmanager
@@ -27,8 +27,8 @@ def watched_memory() -> Iterator[PeakMemory]:
     """Measure the peak memory of a block on Linux in the main thread.
 
     Freed memory is first returned to the system so that reusing it counts. Memory that cannot be
-    returned is missed when the block reuses it: free lists of Python, partly used pages, pools of
-    libraries such as torch's on a GPU, and the whole heap without glibc.
+    returned is not counted when the block reuses it: free lists of Python, partly used pages,
+    pools of libraries such as torch's on a GPU, and the entire heap without glibc.
     """
     peak = PeakMemory()
     before = _begin() if threading.current_thread() is threading.main_thread() else None

@@ -1,7 +1,7 @@
-"""Worker processes, whose crashes fail only their own task.
+"""Worker processes for tasks; the crash of a process fails only its current task.
 
-They are spawned without importing the caller's script or notebook. Its classes and functions are
-sent by value, so that a script needs no ``if __name__ == "__main__"``.
+Processes are spawned without importing the caller's script or notebook. Its classes and functions
+are sent by value, so that a script needs no ``if __name__ == "__main__"``.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ __all__ = ["Done", "run_in_processes"]
 
 
 Done = Callable[[Any, BaseException | None], None]
-"""Called for every task that ended, with the error if it could not store it itself."""
+"""Callback for every ended task, with the error unless the task has stored it."""
 
-# Processes are started with settings that affect all threads of this one.
+# Starting a process changes settings of all threads of this process.
 _START_LOCK = threading.Lock()
 _READY, _STARTED = b"ready", b"started"
-# Factor and seconds beyond the limit after which a task in compiled code is killed.
+# A task in compiled code is killed after this factor times the limit plus these seconds.
 _GRACE = 1.2, 1.0
 
 
@@ -46,18 +46,18 @@ class _Worker:
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs,), daemon=False)
+        self.connection, child_end = context.Pipe()
+        self.process = context.Process(target=_work, args=(child_end,), daemon=False)
         with _START_LOCK, _ignoring_ctrl_c(), _without_main():
             self.process.start()
-        theirs.close()
+        child_end.close()
         self.ready = False
         self.known: set[int] = set()
         self.task: GridTask | None = None
         self.until: float | None = None
 
     def send(self, task: GridTask) -> None:
-        """Send a task; each problem is sent once, so that its caches serve all of its tasks."""
+        """Send a task; each problem is sent once, so that its tasks share its caches."""
         key = id(task.source)  # unique while tasks refer to the problem
         problem = None if key in self.known else cloudpickle.dumps(task.source)
         # multiprocessing's pickler would share the memory of tensors and send classes by name.
@@ -98,7 +98,7 @@ def run_in_processes(tasks: Sequence[GridTask], workers: int, done: Done) -> Non
     """
     if multiprocessing.current_process().daemon:
         raise ValueError(
-            f"workers must be 0 in a daemonic process, which may have no children, got {workers}"
+            f"workers must be 0 in a daemonic process, which cannot start processes, got {workers}"
         )
     waiting = deque(tasks)
     pool: list[_Worker] = []
@@ -122,7 +122,7 @@ def _hand_out(pool: list[_Worker], waiting: deque[GridTask], done: Done) -> None
             try:
                 worker.send(task)
             except OSError:
-                # It died between two tasks; _listen removes it.
+                # The worker died between two tasks; _listen removes it.
                 waiting.appendleft(task)
                 break
             except Exception as error:
@@ -155,8 +155,8 @@ def _handle(pool: list[_Worker], worker: _Worker, done: Done) -> None:
         worker.ready = True
     elif message == _STARTED:
         if worker.task is not None and worker.task.limit is not None:
-            factor, more = _GRACE
-            worker.until = time.monotonic() + factor * worker.task.limit + more
+            factor, extra = _GRACE
+            worker.until = time.monotonic() + factor * worker.task.limit + extra
     elif message is not None:
         done(worker.take_task(), pickle.loads(message))
     elif not worker.ready:
@@ -188,11 +188,11 @@ def _work(connection: Connection) -> None:
             if isinstance(packed := problems[key], bytes):
                 problems[key] = pickle.loads(packed)
             task = replace(task, source=problems[key])
-            with suppress(Exception):  # run() raises it again
+            with suppress(Exception):  # run() raises the error again
                 task.prepare()
             connection.send_bytes(_STARTED)
             task.run(False)
-        # Workers ignore Ctrl-C, so a KeyboardInterrupt comes from the sampler.
+        # Workers ignore Ctrl-C, so the sampler raised a KeyboardInterrupt.
         except (Exception, KeyboardInterrupt) as caught:
             error = caught
         connection.send_bytes(_pickled(error))
@@ -209,11 +209,11 @@ def _pickled(error: BaseException | None) -> bytes:
 
 @contextmanager
 def _ignoring_ctrl_c() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C even while loading."""
+    """Let processes started in the block ignore Ctrl-C, even while they load."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # The tracker unblocks Ctrl-C when it starts, so it is started first.
+    # Start the resource tracker first, because its start unblocks Ctrl-C.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -224,7 +224,7 @@ def _ignoring_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """Start processes that do not run the caller's script."""
+    """Prevent processes started in the block from running the caller's script."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -234,13 +234,13 @@ def _without_main() -> Iterator[None]:
 
 
 def _begin_worker() -> None:
-    """Ignore Ctrl-C and exit when the parent does."""
+    """Ignore Ctrl-C and exit when the parent exits."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    def follow() -> None:
+    def exit_with_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()

@@ -1,4 +1,4 @@
-"""All tasks of a grid: its runs and, with a budget, the pilots before them."""
+"""Tasks of a grid: its runs and, with a budget, the preceding pilots."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def check_grid_options(
 
 @dataclass(eq=False)
 class Grid:
-    """Tasks of a comparison, whose results are stored in ``folder``.
+    """Tasks of a comparison with results in ``folder``.
 
     ``budget`` applies to each run, ``limit`` (seconds) to each task.
     """
@@ -76,7 +76,7 @@ class Grid:
         ]
 
     def runs(self) -> list[GridRun]:
-        """Return the runs in the plan's order, with the settings of the pilots so far."""
+        """Return the runs in the plan's order, with the settings of the finished pilots."""
         return [self._grid_run(*address) for address in self.plan.runs()]
 
     def _pilot(self, problem: str, sampler: str) -> Pilot:
@@ -144,14 +144,14 @@ def run_grid(
         At Ctrl-C. Both messages state how many runs are finished and stored.
     """
     forget_unfinished(grid.folder, grid.problems)
-    where = (workers, executor, progress)
+    options = (workers, executor, progress)
     try:
         with _reporting_finished(grid):
             pilots = [pilot for pilot in grid.pilots() if not pilot.finished()]
-            run_tasks(pilots, *where, label="pilots")
-            run_tasks([run for run in grid.runs() if not run.finished()], *where, label=label)
+            run_tasks(pilots, *options, label="pilots")
+            run_tasks([run for run in grid.runs() if not run.finished()], *options, label=label)
     finally:
-        # Workers killed while writing; those of an executor may still be writing.
+        # Killed workers may leave incomplete files; those of an executor may still be writing.
         if executor is None:
             forget_unfinished(grid.folder, grid.problems)
 
@@ -162,21 +162,21 @@ def refuse_other_settings(folder: Path, tasks: Iterable[GridTask]) -> None:
         runs = [task for task in conflicting if isinstance(task, GridRun)]
         what = f"{len(runs)} finished runs" if runs else f"{len(conflicting)} pilots of a budget"
         raise ValueError(
-            f"out is {folder}, which contains {what} made with other settings, observations or "
-            f"library versions, the first {(runs or conflicting)[0]}; use another folder"
+            f"out must be a new folder, got {folder}, which contains {what} made with other "
+            f"settings, observations or library versions, the first {(runs or conflicting)[0]}"
         )
 
 
 @contextmanager
 def _reporting_finished(grid: Grid) -> Iterator[None]:
-    """Add the number of finished runs to the message of an interruption or a full disk."""
+    """Add the number of finished runs to the message of an interruption or write error."""
     try:
         yield
     except (KeyboardInterrupt, ResultNotWritten) as stop:
         runs = grid.runs()
         finished = (
             f"{sum(run.finished() for run in runs)} of {len(runs)} runs finished and stored in "
-            f"{grid.folder}; repeat the command with this folder to continue"
+            f"{grid.folder}; run the command again with this folder to resume"
         )
         if isinstance(stop, ResultNotWritten):
             raise OSError(f"cannot write to out, {stop}, with {finished}") from stop

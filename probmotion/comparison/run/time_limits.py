@@ -15,7 +15,7 @@ __all__ = ["time_limit"]
 
 
 class _Alarm(BaseException):
-    """Not an ``Exception``, so that samplers do not catch it."""
+    """Interruption of a block; not an ``Exception``, so that samplers do not catch it."""
 
 
 @contextmanager
@@ -23,7 +23,7 @@ def time_limit(seconds: float | None) -> Iterator[None]:
     """Raise :class:`TimeLimitExceeded` if the block takes longer than ``seconds``.
 
     In the main thread of a system with interval timers the block is interrupted, between two
-    Python instructions; elsewhere the error is raised at its end. None means no limit.
+    Python instructions; elsewhere the error is raised at the end of the block. None means no limit.
     """
     if seconds is None:
         yield
@@ -53,7 +53,7 @@ def _alarm(seconds: float) -> Iterator[None]:
     inside = True
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        # The signal may arrive just after the block.
+        # The signal may arrive just after the end of the block.
         if inside:
             raise _Alarm
 
@@ -65,6 +65,6 @@ def _alarm(seconds: float) -> Iterator[None]:
     finally:
         inside = False
         # Resume a timer of the caller.
-        left = max(remaining - (time.monotonic() - start), 1e-6) if remaining else 0.0
+        rest = max(remaining - (time.monotonic() - start), 1e-6) if remaining else 0.0
         signal.signal(signal.SIGALRM, before)
-        signal.setitimer(signal.ITIMER_REAL, left, interval)
+        signal.setitimer(signal.ITIMER_REAL, rest, interval)

@@ -20,15 +20,15 @@ def run_tasks(
 ) -> None:
     """Run every task, which stores its own result or failure, with a labelled progress bar.
 
-    Tasks run on the executor if there is one, otherwise in ``workers`` processes, or with 0 in this
-    process.
+    Tasks run on the executor if given, otherwise in ``workers`` processes, or in this process if
+    ``workers`` is 0.
 
     Raises
     ------
     KeyboardInterrupt
         At Ctrl-C.
     ResultNotWritten
-        If a result cannot be written, as on a full disk.
+        If a result cannot be written, for example on a full disk.
     """
     if not tasks:
         return
@@ -39,7 +39,7 @@ def run_tasks(
                 raise error
             if error is None and not task.has_result():
                 error = FileNotFoundError(
-                    f"{task} ended without a result in out; workers must see the folder out"
+                    f"{task} ended without a result in out; workers must have access to out"
                 )
             if error is not None:
                 task.fail(error)
@@ -67,7 +67,7 @@ def _run_on(executor: Executor, tasks: Sequence[GridTask], done: Done) -> None:
         for task in tasks:
             try:
                 running[executor.submit(_run_task, task)] = task
-            except Exception as error:  # such as a task that cannot be pickled
+            except Exception as error:  # for example, the task cannot be pickled
                 done(task, error)
         for future in running:
             future.add_done_callback(ended.put)

@@ -41,9 +41,9 @@ def animal_clips(
 ) -> dict[str, list[Motion]]:
     """Return animal clips in the parts "train", "validation" and "test", at 30 fps.
 
-    ``n``, ``seconds`` and ``seed`` are the number of synthetic training clips, their length and
-    seed; validation and test have n / 5 each, at least 2. With ``folder`` the dog's cycles
-    (:func:`dog_clips`) are added.
+    ``n``, ``seconds`` and ``seed`` are the number of synthetic training clips, their duration and
+    seed; validation and test have n / 5 each, at least 2. With ``folder``, recorded dog clips
+    (:func:`dog_clips`) are included.
     """
     check_count("n", n)
     frames = _frames(seconds)
@@ -60,9 +60,9 @@ def animal_clips(
 def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Motion]]:
     """Return the dog's cycles of each part, repeated for ``seconds``, at 30 fps.
 
-    ``folder`` must contain the cycles of :data:`DOG_CLIPS` (0.4 to 0.7 s) as ``.npz``, else a
-    ``FileNotFoundError``. Raises ``ValueError`` if a file is not a cycle (``loop`` other than
-    "wrap") or has another frame rate.
+    ``folder`` contains the cycles of :data:`DOG_CLIPS` (0.4 to 0.7 s) as ``.npz``; a missing file
+    raises ``FileNotFoundError``; a file that is not a cycle (``loop`` other than "wrap") or has
+    another frame rate raises ``ValueError``.
     """
     frames = _frames(seconds)
     return {
@@ -76,7 +76,7 @@ def synthetic_animals(
 ) -> list[Motion]:
     """Return ``n`` procedural quadrupeds of ``frames`` frames at ``fps`` frames per second.
 
-    They walk and trot in turn, named ``quadruped-walk-0``, …. Trunk and paws follow
+    Clips of walk and trot alternate, named ``quadruped-walk-0``, …. Trunk and paws follow
     :mod:`probmotion.data.synthetic.gaits`; the legs have a dog's proportions. A clip depends only
     on its number and ``seed``.
     """
@@ -92,7 +92,7 @@ def _frames(seconds: float) -> int:
 def _dog_clip(path: Path, frames: int) -> Motion:
     if not path.is_file():
         name = f"{path.parent.name}/{path.name}"
-        raise FileNotFoundError(f"folder must contain {name}, got no such file")
+        raise FileNotFoundError(f"folder must contain {name}, got none")
     with np.load(path) as archive:
         loop = str(archive["loop"]) if "loop" in archive else "none"
     cycle = load(path)
@@ -104,13 +104,13 @@ def _dog_clip(path: Path, frames: int) -> Motion:
     clip = repeated_cycle(cycle.retarget(ANIMAL_SKELETON), frames)
     trunk = clip.positions[0, ANIMAL_SKELETON.index("neck")] - clip.positions[0, 0]
     clip = clip.turned(-float(np.arctan2(trunk[0], trunk[2])))
-    begin = clip.positions[0, 0] * [1.0, 0.0, 1.0]
-    return replace(clip, positions=clip.positions - begin)
+    start = clip.positions[0, 0] * [1.0, 0.0, 1.0]
+    return replace(clip, positions=clip.positions - start)
 
 
 # Proportions of the recorded dog, metres. Legs are slightly longer than those of the gaits, so that
-# they never straighten. The angle of carpus or hock, degrees at zero and full extension, grows with
-# the extension of the leg, which makes its inverse kinematics unique.
+# they are never fully straight. The angle of carpus or hock, degrees at zero and full extension,
+# increases with the extension of the leg, so that its inverse kinematics are unique.
 _TRUNK_FRACTION = 0.2375 / (0.2375 + 0.2813)
 _TAIL = np.array([0.0, -0.04, -0.077])
 _LEG_LENGTH = 0.60
@@ -156,9 +156,9 @@ def _leg(
     bend: tuple[float, float],
     side: float,
 ) -> tuple[np.ndarray, ...]:
-    """Return the four joints of a leg, (L, 3) each; the first bend is behind for ``side`` 1.
+    """Return the four joints of a leg, (L, 3) each; the first joint bends backwards for ``side`` 1.
 
-    The extension of the leg sets the lower angle; the two bones around it then act as one bone.
+    The extension of the leg determines the lower angle, so that two bones act as a single one.
     """
     upper, middle, lower = bones
     stretch = np.linalg.norm(paw - top, axis=-1) / bones.sum()
@@ -166,13 +166,13 @@ def _leg(
     reach = np.sqrt(middle**2 + lower**2 - 2 * middle * lower * np.cos(angle))
 
     def between(start: np.ndarray, first: float, second: float, side: float) -> np.ndarray:
-        """Return the point at two distances from start and paw, in the plane normal to left."""
+        """Return the point at given distances from start and paw, in the plane normal to left."""
         line = paw - start
         distance = np.linalg.norm(line, axis=-1)
         along = (first**2 - second**2 + distance**2) / (2 * distance)
-        aside = np.sqrt(first**2 - along**2) * side
+        across = np.sqrt(first**2 - along**2) * side
         axis = line / distance[:, None]
-        return start + along[:, None] * axis + aside[:, None] * np.cross(left, axis)
+        return start + along[:, None] * axis + across[:, None] * np.cross(left, axis)
 
     knee = between(top, upper, reach, side)
     return top, knee, between(knee, middle, lower, -side), paw

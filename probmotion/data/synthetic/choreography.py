@@ -1,4 +1,4 @@
-"""Choreography of procedural couple dances: figures of eight beats and the path of each partner."""
+"""Choreography of procedural couple dances: eight-beat figures and the path of each partner."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 __all__ = ["HOLDS", "Dance", "Figure", "draw_dance", "level", "rise"]
 
 _FIGURE = 8  # beats
-# Least and greatest distance between the partners' roots, metres.
+# Minimum and maximum distance between the partners' roots, metres.
 HOLDS = {"open": (0.60, 0.78), "closed": (0.46, 0.56), "one hand": (0.62, 0.85)}
-_TURN_DISTANCE = 0.5
+_TURN_DISTANCE = 0.5  # metres
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of eight beats: hold, distance (m), displacement (m) and turns."""
+    """Eight-beat figure of a dance: hold, distance (m), displacement (m) and turns."""
 
     hold: str
     distance: float
     forward: float
     aside: float
-    turns: int  # person0 or person1 turns under the arm; 2: nobody
+    turns: int  # index of the person who turns under the arm; 2: neither
     way: float  # sense of rotation, -1 or 1
 
 
 @dataclass(frozen=True)
 class Dance:
-    """Style of one dance; every method is a smooth function of time (n,), seconds.
+    """Parameters of one dance; methods are smooth functions of the time (n,), seconds.
 
     Angles in radians, ``beat`` in seconds, ``start`` in beats, ``turning`` in rad/s, ``sway`` and
-    ``hands`` (raised height) in metres; ``bend`` is the hip height as a fraction of straight legs.
+    ``hands`` (height offset) in metres; ``bend`` is the hip height as a fraction of straight legs.
     """
 
     figures: tuple[Figure, ...]
@@ -48,7 +48,7 @@ class Dance:
     waves: np.ndarray  # (channels, 3, 2): sine and cosine of three slow frequencies
 
     def beats(self, time: np.ndarray) -> np.ndarray:
-        """Return the beats since the first figure began."""
+        """Return the number of beats since the start of the first figure."""
         return self.start + time / self.beat
 
     def wander(self, channel: int, time: np.ndarray) -> np.ndarray:
@@ -59,21 +59,21 @@ class Dance:
 
     def weights(self, time: np.ndarray) -> np.ndarray:
         """Return the weight of each figure, (figures, n); transitions last 1.5 beats."""
-        begin = _FIGURE * np.arange(len(self.figures))[:, None]
-        begun = rise((self.beats(time) - begin + 0.75) / 1.5)
-        return begun - np.vstack([begun[1:], np.zeros_like(begun[:1])])
+        starts = _FIGURE * np.arange(len(self.figures))[:, None]
+        started = rise((self.beats(time) - starts + 0.75) / 1.5)
+        return started - np.vstack([started[1:], np.zeros_like(started[:1])])
 
     def raised(self, time: np.ndarray, person: int) -> np.ndarray:
-        """Return how far the hands are raised, 0 to 1, for a turn of ``person``."""
+        """Return the raising of the hands for turns of ``person``, from 0 to 1."""
         turns = self._turns(time, person)
         lifts = (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in turns)
         return sum(lifts, np.zeros_like(time))
 
     def turned(self, time: np.ndarray, person: int) -> np.ndarray:
         """Return the angle by which ``person`` has turned under the raised hands."""
-        ways = [2 * np.pi * figure.way for figure in self.figures if figure.turns == person]
-        turns = zip(ways, self._turns(time, person), strict=True)
-        return sum((way * rise((x - 1.9) / 4.2) for way, x in turns), np.zeros_like(time))
+        angles = [2 * np.pi * figure.way for figure in self.figures if figure.turns == person]
+        turns = zip(angles, self._turns(time, person), strict=True)
+        return sum((angle * rise((x - 1.9) / 4.2) for angle, x in turns), np.zeros_like(time))
 
     def _turns(self, time: np.ndarray, person: int) -> list[np.ndarray]:
         beats = self.beats(time)
@@ -82,9 +82,9 @@ class Dance:
     def place(self, time: np.ndarray, person: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the ground position (n, 3) of a person's root, y = 0, and the yaw (n,)."""
         weights = self.weights(time)
-        begin = _FIGURE * np.arange(len(self.figures))[:, None]
-        inside = np.clip(self.beats(time) - begin, 0, _FIGURE)
-        excursion = np.sin(np.pi * inside / _FIGURE * 2) * np.sin(np.pi * inside / _FIGURE) ** 2
+        starts = _FIGURE * np.arange(len(self.figures))[:, None]
+        elapsed = np.clip(self.beats(time) - starts, 0, _FIGURE)
+        excursion = np.sin(np.pi * elapsed / _FIGURE * 2) * np.sin(np.pi * elapsed / _FIGURE) ** 2
         forward = np.array([figure.forward for figure in self.figures]) @ excursion
         aside = np.array([figure.aside for figure in self.figures]) @ excursion
         distance = np.array([figure.distance for figure in self.figures]) @ weights
@@ -95,7 +95,7 @@ class Dance:
         x, z = self.wander(1, time), self.wander(2, time)
         centre = 0.15 * np.stack([x, np.zeros_like(time), z], axis=-1)
         centre += forward[:, None] * facing + aside[:, None] * level(heading + np.pi / 2)
-        # Partners are offset to their left and sway over the standing foot.
+        # Partners are offset to their left and sway over the supporting foot.
         closed = np.array([figure.hold == "closed" for figure in self.figures]) @ weights
         left = 0.05 * closed + self.sway * np.sin(np.pi * self.beats(time))
         yaw = heading + np.pi * person
@@ -107,7 +107,7 @@ class Dance:
 def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
     """Return a random dance longer than ``duration`` seconds.
 
-    A longer dance from the same generator begins with the same figures.
+    A longer dance from an equally seeded generator starts with the same figures.
     """
     beat = rng.uniform(0.44, 0.56)
     style = {
@@ -122,7 +122,7 @@ def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
     bend = rng.uniform(0.955, 0.975, size=2)
     lean = rng.normal((0.03, 0.0), 0.03)
     waves = rng.normal(size=(11, 3, 2))
-    # One extra figure on either side: foot placement looks back and ahead.
+    # One extra figure on either side: foot placement uses earlier and later positions.
     figures = tuple(_draw_figure(rng) for _ in range(int(duration / beat / _FIGURE) + 4))
     return Dance(figures, beat, heights=heights, bend=bend, lean=lean, waves=waves, **style)
 
@@ -132,12 +132,12 @@ def _draw_figure(rng: np.random.Generator) -> Figure:
     holds = [hold for hold in HOLDS if turns == 2 or hold != "closed"]
     hold = holds[rng.integers(len(holds))]
     forward, aside = rng.uniform(-1, 1, size=2) * (0.25, 0.2) * (turns == 2)
-    way = float(rng.choice([-1.0, 1.0]))
-    return Figure(hold, rng.uniform(*HOLDS[hold]), forward, aside, turns, way)
+    sense = float(rng.choice([-1.0, 1.0]))
+    return Figure(hold, rng.uniform(*HOLDS[hold]), forward, aside, turns, sense)
 
 
 def level(yaw: np.ndarray) -> np.ndarray:
-    """Return horizontal unit vectors (n, 3), from +Z towards +X."""
+    """Return horizontal unit vectors (n, 3) at the angle ``yaw`` from +Z towards +X."""
     return np.stack([np.sin(yaw), np.zeros_like(yaw), np.cos(yaw)], axis=-1)
 
 

@@ -17,9 +17,9 @@ __all__ = ["repeated_cycle"]
 def repeated_cycle(cycle: Motion, frames: int) -> Motion:
     """Return a periodic motion of ``frames`` frames, repeated from one cycle.
 
-    The last frame of a cycle is the first of the next one, translated and rotated about the
-    vertical as the root moved over the cycle. The remaining mismatch of the pose is distributed
-    evenly over the cycle by rotating rigid groups of bones, which preserves bone lengths. Raises
+    The last frame of a cycle is the first of the next one, transformed by the cycle's translation
+    and its rotation about the vertical. The remaining mismatch of the pose is distributed evenly
+    over the cycle by rotating rigid groups of bones, which preserves bone lengths. Raises
     ``ValueError`` if the cycle has fewer than 3 frames or several roots.
     """
     check_count("frames", frames)
@@ -33,15 +33,15 @@ def repeated_cycle(cycle: Motion, frames: int) -> Motion:
     offsets = _closed(cycle, vector_to_matrix(turn))
     steps = np.diff(cycle.positions[:, root], axis=0)
     steps[:, 1] -= steps[:, 1].mean()
-    number, frame = np.divmod(np.arange(frames), period)
-    turns = vector_to_matrix(number[:, None] * turn)
+    repetition, frame = np.divmod(np.arange(frames), period)
+    turns = vector_to_matrix(repetition[:, None] * turn)
     travel = np.einsum("lij,lj->li", turns, steps[frame])
     path = cycle.positions[0, root] + np.cumsum(travel, axis=0) - travel
-    along = np.einsum("lij,lkj->lki", turns, offsets[frame])
+    rotated = np.einsum("lij,lkj->lki", turns, offsets[frame])
     positions = np.empty((frames, cycle.skeleton.n_joints, 3))
     for joint in cycle.skeleton.topological_order:
         parent = cycle.skeleton.parents[joint]
-        positions[:, joint] = path if parent < 0 else positions[:, parent] + along[:, joint]
+        positions[:, joint] = path if parent < 0 else positions[:, parent] + rotated[:, joint]
     return replace(cycle, positions=positions, rotations=None, rest_offsets=None)
 
 
@@ -54,20 +54,20 @@ def _turn_about_vertical(first: np.ndarray, last: np.ndarray, root: int) -> np.n
 
 
 def _closed(cycle: Motion, turn: np.ndarray) -> np.ndarray:
-    """Return the joint offsets (L, J, 3) such that the last equals the rotated first."""
+    """Return joint offsets (L, J, 3), corrected so that the last equals the rotated first."""
     skeleton, positions = cycle.skeleton, cycle.positions
     parents = np.array(skeleton.parents)
     offsets = positions - positions[:, np.maximum(parents, 0)]
     elapsed = np.arange(cycle.frames)[:, None] / (cycle.frames - 1)
     for group in _rigid_groups(skeleton):
-        missing = _rotation_between(offsets[-1, group], offsets[0, group] @ turn.T)
-        even = vector_to_matrix(elapsed * missing)
-        offsets[:, group] = np.einsum("lij,lkj->lki", even, offsets[:, group])
+        correction = _rotation_between(offsets[-1, group], offsets[0, group] @ turn.T)
+        gradual = vector_to_matrix(elapsed * correction)
+        offsets[:, group] = np.einsum("lij,lkj->lki", gradual, offsets[:, group])
     return offsets
 
 
 def _rigid_groups(skeleton: Skeleton) -> list[list[int]]:
-    """Return the joints grouped by parent; the trunk is apart from other children of the root."""
+    """Return the joints grouped by parent; the trunk is a separate group at the root."""
     root = skeleton.roots[0]
     groups: dict[tuple[int, bool], list[int]] = {}
     for joint, parent in skeleton.bones:
@@ -77,14 +77,14 @@ def _rigid_groups(skeleton: Skeleton) -> list[list[int]]:
     return list(groups.values())
 
 
-def _rotation_between(some: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation vector (3,) that best aligns vectors (n, 3) with others (n, 3)."""
-    if len(some) == 1:
+def _rotation_between(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the rotation vector (3,) that best aligns ``source`` with ``target``, (n, 3)."""
+    if len(source) == 1:
         # Shortest rotation: a single bone does not determine the twist.
-        axis = np.cross(some[0], others[0])
+        axis = np.cross(source[0], target[0])
         sine = np.linalg.norm(axis)
-        angle = np.arctan2(sine, some[0] @ others[0])
+        angle = np.arctan2(sine, source[0] @ target[0])
         return axis * (angle / sine if sine > 0 else 0.0)
-    left, _, right = np.linalg.svd(others.T @ some)
+    left, _, right = np.linalg.svd(target.T @ source)
     left[:, 2] *= np.linalg.det(left @ right)
     return matrix_to_vector(left @ right)

@@ -1,8 +1,8 @@
 """Procedural couple dances: steps, turns under raised arms and changes of hold.
 
-A dance is a sequence of figures of eight beats. Position, heading and distance of the couple are
-smooth functions of time; feet are planted beat by beat below the future hips; hands follow the
-hold. Bones have constant lengths, and elbows and knees bend anatomically.
+A dance is a sequence of eight-beat figures. Position, heading and distance of the couple are
+smooth functions of time. Each step plants a foot below the hip at mid-stance; the hold determines
+the hands. Bones have constant lengths, and elbows and knees bend anatomically.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def synthetic_dances(
     """Return ``n`` dances of ``frames`` frames at ``fps`` frames per second, on ``pair17``.
 
     Dances are named ``dance-0``, …; ``person0`` leads and is about 1.7 m tall, ``person1`` about
-    1.6 m. Rhythm, figures, holds, steps, turns and posture depend only on ``seed`` and the dance's
-    number.
+    1.6 m. Rhythm, figures, holds, steps, turns and posture depend only on ``seed`` and the index of
+    the dance.
     """
     check_count("n", n)
     check_count("frames", frames)
@@ -63,22 +63,22 @@ def synthetic_dances(
 
 
 def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
-    """Return a person's joints without arms, and the chest's orientation."""
+    """Return the joints of a person's trunk and legs, and the chest's orientation."""
     height, beats = dance.heights[person], dance.beats(time)
     mirror = 1.0 - 2.0 * person  # the follower mirrors the leader
     root, yaw = dance.place(time, person)
     roll = mirror * 2.0 * dance.sway * np.sin(np.pi * beats)
     lean = dance.lean[person] + 0.04 * dance.wander(5 + person, time)
     twist = mirror * dance.twist * np.cos(np.pi * beats)
-    still = np.zeros_like(time)
+    zero = np.zeros_like(time)
     pelvis = _frame(yaw - 0.5 * twist, lean, roll)
-    spine = _frame(yaw, lean, still)
+    spine = _frame(yaw, lean, zero)
     chest = _frame(yaw + 0.5 * twist, lean + 0.02, -0.5 * roll)
     nod = 0.12 * dance.wander(7 + person, time)
-    gaze = _frame(yaw + 0.2 * dance.wander(9 + person, time), lean + nod, still)
-    stand = _ANKLE + sum(_LEG) * dance.bend[person] - _HIP[1]
+    gaze = _frame(yaw + 0.2 * dance.wander(9 + person, time), lean + nod, zero)
+    hip_height = _ANKLE + sum(_LEG) * dance.bend[person] - _HIP[1]
     bob = 0.008 * np.cos(2 * np.pi * beats)
-    joints = {"pelvis": root + _UP * (height * stand + bob)[:, None], "frame": chest}
+    joints = {"pelvis": root + _UP * (height * hip_height + bob)[:, None], "frame": chest}
     for name, parent, frame, offset in (
         ("spine", "pelvis", pelvis, _SPINE),
         ("chest", "spine", spine, _CHEST),
@@ -100,20 +100,20 @@ def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
 def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarray:
     """Return the target of an ankle, (L, 3): planted or swinging to the next position."""
     height = dance.heights[person]
-    odd = float((sign > 0) == (person == 0))  # feet alternate beats
+    odd = float((sign > 0) == (person == 0))  # the feet step on alternate beats
     beats = dance.beats(time)
     stepped = 2 * np.floor((beats - odd) / 2) + odd
-    done = rise((beats - stepped) / _SWING)
-    spots = []
+    progress = rise((beats - stepped) / _SWING)
+    footholds = []
     for step in (stepped - 2, stepped):
         # Below the hip at mid-stance.
         middle = (step + 1 + _SWING / 2 - dance.start) * dance.beat
         root, yaw = dance.place(middle, person)
-        spots.append(root + (sign * (_HIP[0] + 0.01) * height) * level(yaw + np.pi / 2))
-    move = spots[1] - spots[0]
+        footholds.append(root + (sign * (_HIP[0] + 0.01) * height) * level(yaw + np.pi / 2))
+    move = footholds[1] - footholds[0]
     lift = np.minimum(0.03 + 0.15 * np.linalg.norm(move, axis=-1), 0.1)
-    ankle = spots[0] + done[:, None] * move
-    return ankle + _UP * (_ANKLE * height + lift * np.sin(np.pi * done) ** 2)[:, None]
+    ankle = footholds[0] + progress[:, None] * move
+    return ankle + _UP * (_ANKLE * height + lift * np.sin(np.pi * progress) ** 2)[:, None]
 
 
 def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
@@ -152,30 +152,30 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
 
 
 def _grip(lead: Joints, follow: Joints, person: int, side: str, higher: float) -> np.ndarray:
-    """Return where hands meet in an open hold: below the middle of the shoulders."""
+    """Return the position of joined hands in an open hold, below the shoulders' midpoint."""
     opposite = "right" if side == "left" else "left"
-    of_lead, of_follow = (side, opposite) if person == 0 else (opposite, side)
-    between = (lead[f"{of_lead}_shoulder"] + follow[f"{of_follow}_shoulder"]) / 2
-    return between - _UP * (0.28 - higher)
+    lead_side, follow_side = (side, opposite) if person == 0 else (opposite, side)
+    middle = (lead[f"{lead_side}_shoulder"] + follow[f"{follow_side}_shoulder"]) / 2
+    return middle - _UP * (0.28 - higher)
 
 
 def _on_partner(partner: Joints, person: int) -> np.ndarray:
-    """Return where the free hand rests in a closed hold, on the partner."""
+    """Return the position of the free hand on the partner in a closed hold."""
     if person == 0:
         return partner["chest"] + _rotated(partner["frame"], (0.17, -0.02, 0.0))
     return partner["right_shoulder"] + _rotated(partner["frame"], (-0.03, -0.03, 0.05))
 
 
 def _above(turner: Joints, partner: Joints, height: float) -> np.ndarray:
-    """Return where raised hands meet: above the turning head, towards the partner."""
+    """Return the position of raised hands: above the turning head, towards the partner."""
     towards = (partner["chest"] - turner["chest"]) * [1.0, 0.0, 1.0]
     above = turner["chest"] * [1.0, 0.0, 1.0] + 0.3 * towards
     return above + _UP * 1.01 * height
 
 
-def _elbow_direction(frame: np.ndarray, sign: float, way: np.ndarray) -> np.ndarray:
-    """Return the direction of an elbow: back when the arm hangs, forward when raised."""
-    along = way / np.linalg.norm(way, axis=-1, keepdims=True)
+def _elbow_direction(frame: np.ndarray, sign: float, extent: np.ndarray) -> np.ndarray:
+    """Return the direction of an elbow: backwards when the arm hangs, forwards when raised."""
+    along = extent / np.linalg.norm(extent, axis=-1, keepdims=True)
     raised = rise((along * frame[..., 1]).sum(axis=-1) / 0.8)[:, None]
     low, high = _rotated(frame, (0.35 * sign, -1.0, -0.5)), _rotated(frame, (0.6 * sign, -0.2, 0.8))
     return (1 - raised) * low + raised * high
@@ -194,24 +194,24 @@ def _rotated(frames: np.ndarray, offset: Sequence[float] | np.ndarray) -> np.nda
 def bent_limb(
     start: np.ndarray, target: np.ndarray, lengths: tuple[float, float], pole: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middle joint and the end of a limb that reaches from ``start`` for ``target``.
+    """Return the middle joint and the end of a two-bone limb from ``start`` towards ``target``.
 
     Points are (…, 3), metres. The upper and the lower bone have exactly the given ``lengths``;
     ``pole`` is the direction of the elbow or knee, whose component along the limb is ignored. The
-    end lies on the line to the target; targets out of reach are approached smoothly.
+    end lies on the line to the target; its distance is limited smoothly for unreachable targets.
     """
     upper, lower = lengths
-    farthest = _STRAIGHTEST * (upper + lower)
-    nearest = np.sqrt(upper**2 + lower**2 - 2 * upper * lower * _FOLD)
-    way = target - start
-    distance = np.linalg.norm(way, axis=-1, keepdims=True)
-    along = way / np.maximum(distance, 1e-9)
-    reach = farthest - _soft_positive(farthest - distance)
-    reach = nearest + _soft_positive(reach - nearest)
-    aside = pole - (pole * along).sum(axis=-1, keepdims=True) * along
-    aside = aside / np.maximum(np.linalg.norm(aside, axis=-1, keepdims=True), 1e-9)
+    longest = _STRAIGHTEST * (upper + lower)
+    shortest = np.sqrt(upper**2 + lower**2 - 2 * upper * lower * _FOLD)
+    offset = target - start
+    distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+    along = offset / np.maximum(distance, 1e-9)
+    reach = longest - _soft_positive(longest - distance)
+    reach = shortest + _soft_positive(reach - shortest)
+    bend = pole - (pole * along).sum(axis=-1, keepdims=True) * along
+    bend = bend / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), 1e-9)
     cosine = (upper**2 + reach**2 - lower**2) / (2 * upper * reach)
-    middle = start + upper * (cosine * along + np.sqrt(1 - cosine**2) * aside)
+    middle = start + upper * (cosine * along + np.sqrt(1 - cosine**2) * bend)
     return middle, start + reach * along
 
 

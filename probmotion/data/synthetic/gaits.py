@@ -1,7 +1,7 @@
-"""Procedural gaits: people who walk, run and march; quadrupeds that walk and trot.
+"""Procedural gaits: walking, running and marching people, walking and trotting quadrupeds.
 
-Joint angles are smooth functions of a phase; speed, stride, lean, turning and more vary between
-clips. Bodies face +Z with their left on +X and have constant bone lengths.
+Joint angles are smooth functions of a phase; speed, stride, lean, turning and other parameters
+vary between clips. Bodies face +Z with their left on +X and have constant bone lengths.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ __all__ = ["GAITS", "make_gait", "make_gaits"]
 
 @dataclass(frozen=True)
 class Gait:
-    """Parameters of a style, as (mean, standard deviation) over clips.
+    """Parameters of a gait style, as (mean, standard deviation) over clips.
 
-    Angles are in radians, ``cadence`` in cycles per second, ``turning`` in radians per second.
+    Angles are in radians, ``cadence`` in cycles/s, ``bounce`` in metres, ``turning`` in rad/s.
     """
 
     body: str
@@ -72,7 +72,7 @@ def make_gaits(
     n, frames, fps, seed
         Number of clips, frames per clip, frames per second and random seed.
     styles : mapping of str to float, optional
-        Relative frequency of each style, all of one body; walk 0.5, run 0.3, march 0.2 by default.
+        Relative frequency of styles of one body; walk 0.5, run 0.3, march 0.2 by default.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def make_gaits(
 def make_gait(
     style: str, number: int = 0, *, frames: int = 30, fps: float = 30.0, seed: int = 0
 ) -> Motion:
-    """Return clip ``number`` of a style; it does not depend on other clips.
+    """Return clip ``number`` of a style, independent of other clips.
 
     Raises
     ------

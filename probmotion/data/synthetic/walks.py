@@ -1,4 +1,4 @@
-"""Walking clips: the recorded clips behind the prior ``walk2d``, and synthetic walks."""
+"""Walking clips: recorded clips for training the prior ``walk2d``, and synthetic walks."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
     "validation": ("cmu_single/cmu_02_02",),
     "test": ("deepmimic_human/humanoid3d_long_walk3", "deepmimic_human/humanoid3d_stealthy_walk"),
 }
-"""Clips by part, 3352 frames at 30 fps. Excluded are excerpts of other clips (humanoid3d_walk,
-humanoid3d_zombie_walk), styles with a single clip (zombie) and runs."""
+"""Clips by part, 3352 frames at 30 fps. Excerpts of other clips (humanoid3d_walk,
+humanoid3d_zombie_walk), styles with a single clip (zombie) and runs are excluded."""
 
 
 def walk_clips(folder: str | Path) -> dict[str, list[Motion]]:
@@ -54,7 +54,7 @@ def synthetic_walks(
 ) -> list[Motion]:
     """Return ``n`` procedural walks of ``seconds`` s at ``fps`` frames per second.
 
-    The walkers are people, or quadrupeds where people lack a joint of ``skeleton``; a
+    The body is a person, or a quadruped if the person lacks a joint of ``skeleton``. Raises
     ``ValueError`` if both lack one.
     """
     required = set() if skeleton is None else set(skeleton.canonical_names)
@@ -69,7 +69,7 @@ def synthetic_walks(
 
 
 def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
-    """Return the sub-skeleton that a body of :func:`synthetic_walks` has as well.
+    """Return the sub-skeleton shared with a body of :func:`synthetic_walks`.
 
     Joints are matched by canonical names with the body, person or quadruped, that shares more
     bones. A joint whose parent is dropped becomes a root. None if no bone is shared.

@@ -1,7 +1,7 @@
-"""Filters of 2D tracks: uncertain and outlying detections, poor, short and crowded tracks.
+"""Filters of 2D tracks: uncertain detections, outliers, and short, crowded or low-quality tracks.
 
 Source: *MAS*, section 6.1 ("filtering short motions, crowd motions, and motions of low quality"),
-which gives no limits; the limits are ours, except for the confidence thresholds (section 6.2).
+which states no limits; the defaults are ours, except the confidence thresholds (section 6.2).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from probmotion.validation import check_positive
 
 __all__ = ["drop_crowds", "drop_low_quality", "drop_short", "mask_outliers", "mask_uncertain"]
 
-_FEWEST = 3  # entries needed for a meaningful median
+_FEWEST = 3  # detections required for a meaningful median
 
 
 def mask_uncertain(tracks: Sequence[KeypointTrack], *, threshold: float = 0.3) -> Step:
     """Mark detections with a confidence below ``threshold`` as unseen (NaN, confidence 0).
 
-    *MAS* uses 0.3 for people, 0.5 for horses and 0.01 with a ball.
+    *MAS* uses 0.3 for people, 0.5 for horses and 0.01 for people with a ball.
     """
     check_positive("threshold", threshold)
     hidden = [track.confidence < threshold for track in tracks]
@@ -42,11 +42,11 @@ def mask_uncertain(tracks: Sequence[KeypointTrack], *, threshold: float = 0.3) -
 def mask_outliers(
     tracks: Sequence[KeypointTrack], *, distance: float = 0.15, window: float = 0.25
 ) -> Step:
-    """Mark detections far from the median of their joint in a time window as unseen.
+    """Mark detections over ``distance`` from their joint's median in a time window as unseen.
 
-    The greatest ``distance`` is in units of :func:`~probmotion.data.tracks.segments.track_size`,
-    the ``window`` in seconds; windows with fewer than 3 detections are skipped. The tracks must
-    have no jumps (:func:`~probmotion.data.tracks.segments.split_discontinuities`).
+    ``distance`` is in units of :func:`~probmotion.data.tracks.segments.track_size`, ``window`` in
+    seconds; windows with fewer than 3 detections are skipped. The tracks must have no jumps
+    (:func:`~probmotion.data.tracks.segments.split_discontinuities`).
     """
     check_positive("distance", distance)
     check_positive("window", window)
@@ -60,9 +60,9 @@ def mask_outliers(
 
 
 def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step:
-    """Drop tracks shorter than ``seconds`` (frames over frames per second)."""
+    """Drop tracks shorter than ``seconds`` (number of frames divided by frames per second)."""
     check_positive("seconds", seconds)
-    # Tolerance for rounded frame rates: 60 frames of .016666 s are a second.
+    # Tolerance for rounded frame rates: 60 frames of .016666 s count as 1 s.
     long = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
     why = f"dropped tracks shorter than {seconds:g} s"
     if tracks and not any(long):
@@ -77,9 +77,9 @@ def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step
 def drop_low_quality(
     tracks: Sequence[KeypointTrack], *, threshold: float = 0.3, share: float = 0.6
 ) -> Step:
-    """Drop tracks with less than ``share``, in (0, 1], of detections at ``threshold`` or more.
+    """Drop tracks in which under ``share`` of the entries have confidence ``threshold`` or more.
 
-    The fraction is over all joints and frames of a track.
+    The share, in (0, 1], is a fraction of all joints in all frames of a track.
     """
     check_positive("threshold", threshold)
     _check_fraction("share", share)
@@ -94,18 +94,18 @@ def drop_crowds(
     overlap: float = 0.3,
     videos: Sequence[str] | None = None,
 ) -> Step:
-    """Drop tracks that lie largely inside the bounding boxes of others in the same video.
+    """Drop tracks that lie largely inside another track's bounding box in the same video.
 
     The overlap with another track is the fraction of the track's box inside the other's,
     averaged over the frames in which the track is seen. A small person behind a large one is
-    dropped, the large one kept.
+    dropped, but not the large one.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Uncut tracks, with equal numbers of frames per video, else a ``ValueError``.
+        Uncut tracks; all tracks of a video must have the same number of frames.
     overlap : float
-        Greatest overlap with any other track, in (0, 1].
+        Maximum overlap with any other track, in (0, 1].
     videos : sequence of str, optional
         Video of each track; by default the name before its last space (``"video person"``) together
         with the number of frames.
@@ -116,19 +116,19 @@ def drop_crowds(
     groups: dict[tuple[str, int], list[int]] = {}
     for number, track in enumerate(tracks):
         video, space, _ = track.name.rpartition(" ")
-        guess = (video if space else f"{track.name} {number}", track.frames)
-        groups.setdefault(guess if videos is None else (videos[number], 0), []).append(number)
-    alone = [True] * len(tracks)
+        key = (video if space else f"{track.name} {number}", track.frames)
+        groups.setdefault(key if videos is None else (videos[number], 0), []).append(number)
+    isolated = [True] * len(tracks)
     for (video, _), members in groups.items():
         lengths = sorted({tracks[number].frames for number in members})
         if len(lengths) > 1:
-            raise ValueError(f"tracks of video {video!r} must have as many frames, got {lengths}")
+            raise ValueError(f"tracks of video {video!r} must have equal lengths, got {lengths}")
         boxes = np.stack([boxes_of(tracks[number]) for number in members])
         for index, number in enumerate(members):
-            others = [_overlap(boxes[index], other) for other in np.delete(boxes, index, axis=0)]
-            alone[number] = max(others, default=0.0) <= overlap
-    why = f"dropped tracks with over {overlap:.0%} of their box inside another's"
-    return _selected("crowds", tracks, alone, why)
+            overlaps = [_overlap(boxes[index], other) for other in np.delete(boxes, index, axis=0)]
+            isolated[number] = max(overlaps, default=0.0) <= overlap
+    why = f"dropped tracks with over {overlap:.0%} of their box inside another track's"
+    return _selected("crowds", tracks, isolated, why)
 
 
 def _masked(
@@ -140,15 +140,15 @@ def _masked(
 
 
 def _off_median(track: KeypointTrack, side: int) -> np.ndarray:
-    """Return the distance of entries from the median of ``side`` frames on either side, (L, J)."""
+    """Return distances (L, J) of entries from their median over ``side`` frames on either side."""
     visible = seen(track)
     points = np.where(visible[..., np.newaxis], track.keypoints, np.nan)
     padded = np.pad(points, ((side, side), (0, 0), (0, 0)), constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
-    judged = visible & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _FEWEST)
-    medians = np.nanmedian(windows[judged], axis=-1)
+    tested = visible & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _FEWEST)
+    medians = np.nanmedian(windows[tested], axis=-1)
     distances = np.zeros(visible.shape)
-    distances[judged] = np.linalg.norm(points[judged] - medians, axis=-1)
+    distances[tested] = np.linalg.norm(points[tested] - medians, axis=-1)
     return distances
 
 
@@ -157,12 +157,12 @@ def _selected(step: str, tracks: Sequence[KeypointTrack], keep: Sequence[bool], 
     return after, StepReport.of(step, tracks, after, why)
 
 
-def _overlap(boxes: np.ndarray, others: np.ndarray) -> float:
-    """Return the mean fraction of ``boxes`` (L, 2, 2) inside ``others``, over frames with a box."""
-    sides = np.fmin(boxes[:, 1], others[:, 1]) - np.fmax(boxes[:, 0], others[:, 0])
-    common = np.where(np.isnan(others[:, 0, 0]), 0.0, np.prod(np.maximum(sides, 0.0), axis=-1))
+def _overlap(boxes: np.ndarray, containers: np.ndarray) -> float:
+    """Return the mean fraction of ``boxes`` (L, 2, 2) inside ``containers`` where both exist."""
+    sides = np.fmin(boxes[:, 1], containers[:, 1]) - np.fmax(boxes[:, 0], containers[:, 0])
+    common = np.where(np.isnan(containers[:, 0, 0]), 0.0, np.prod(np.maximum(sides, 0.0), axis=-1))
     area = np.prod(boxes[:, 1] - boxes[:, 0], axis=-1)
-    counted = np.flatnonzero(area > 0)  # neither a missing box (NaN) nor a single joint
+    counted = np.flatnonzero(area > 0)  # excludes missing boxes (NaN) and single joints
     return float((common[counted] / area[counted]).mean()) if len(counted) else 0.0
 
 

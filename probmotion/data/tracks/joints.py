@@ -36,12 +36,12 @@ def with_joint(
     confidence : ndarray, (L,)
         Confidences.
     parent : str, optional
-        Name of the parent; a root by default.
+        Name of the parent joint; by default the new joint is a root.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, the name exists, or ``parent`` is unknown.
+        If a shape is wrong, the name exists, or ``parent`` is unknown.
     """
     points = np.asarray(keypoints, dtype=np.float64)
     weights = np.asarray(confidence, dtype=np.float64)
@@ -61,7 +61,7 @@ def with_joint(
 def with_midpoint(
     track: KeypointTrack, name: str, joints: Sequence[str], parent: str | None = None
 ) -> KeypointTrack:
-    """Return the track with a joint ``name`` at the mean of others, with their least confidence.
+    """Return the track with a joint ``name`` at the mean and least confidence of ``joints``.
 
     Raises ``ValueError`` if a joint is unknown, there are fewer than two, or the name exists.
     """
@@ -76,7 +76,7 @@ def retarget_track(track: KeypointTrack, skeleton: Skeleton, derive: bool = Fals
     """Return the track on another skeleton, with joints matched by name or canonical name.
 
     ``derive`` replaces a missing ``pelvis`` by the midpoint of the hips and a missing ``neck`` by
-    that of the shoulders. Raises ``ValueError`` if a joint of ``skeleton`` has no counterpart.
+    the midpoint of the shoulders. Raises ``ValueError`` if a joint has no counterpart.
     """
     if track.skeleton == skeleton:
         return track
@@ -106,12 +106,12 @@ def nearest_object(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the centre of the detected box closest to the athlete in each frame.
 
-    The distance of a box is that of its centre to the closest seen joint.
+    The distance of a box is measured from its centre to the closest seen joint.
 
     Parameters
     ----------
     track : KeypointTrack
-        The athlete.
+        Track of the athlete.
     boxes : sequence of ndarray, (n, 5)
         Finite boxes detected in each frame: left, top, right, bottom, in the track's unit, and
         confidence.
@@ -121,7 +121,7 @@ def nearest_object(
     keypoints : ndarray, (L, 2)
         Centres; NaN in frames without a box or a seen joint.
     confidence : ndarray, (L,)
-        Confidences of the boxes, 0 where there is none; see :func:`with_joint`.
+        Confidences of the boxes, 0 where the centre is NaN; see :func:`with_joint`.
     """
     if len(boxes) != track.frames:
         raise ValueError(f"boxes must have one entry per frame, {track.frames}, got {len(boxes)}")

@@ -54,12 +54,12 @@ def film_clips(
     noise: DetectorNoise | None = None,
     shortest: float = 1.0,
 ) -> PreparedTracks:
-    """Return prepared 2D tracks of 3D clips, seen by random cameras through a noisy detector.
+    """Return prepared 2D tracks of 3D clips, seen by random cameras with detector noise.
 
     Parameters
     ----------
     motions : sequence of Motion
-        Clips of any skeletons with the required joints.
+        Clips; each skeleton must contain the joints of ``skeleton``.
     skeleton : Skeleton
         Detected joints.
     fps : float
@@ -67,7 +67,7 @@ def film_clips(
     views, seed, filming, noise
         See :func:`~probmotion.data.projections.project_clips`.
     shortest : float
-        Shortest track to keep, seconds.
+        Minimum duration of a track, seconds.
     """
     filming = filming or Filming()
     clips = [motion.retarget(skeleton) for motion in motions]
@@ -77,10 +77,9 @@ def film_clips(
 
 
 def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
-    """Return tracks with confidence 1 from the threshold on and 0 below.
+    """Return tracks with confidence 1 at or above the threshold and 0 below it.
 
-    Confidences of synthetic detections only indicate which joints are lost and should not weight
-    errors.
+    Confidences of synthetic detections only indicate missing joints and should not weight errors.
     """
     return [replace(track, confidence=1.0 * (track.confidence >= threshold)) for track in tracks]
 
@@ -90,13 +89,13 @@ def film_windows(
 ) -> np.ndarray:
     """Return n random complete windows of projected clips, ``(n, frames, J, 2)``, metres.
 
-    The detector has errors but loses no joint; incomplete windows are dropped. All windows of all
+    The detector is noisy but misses no joint; incomplete windows are dropped. All windows of all
     clips in 64 views are equally likely, and mirrored with probability 1/2, as in training.
 
     Raises
     ------
     ValueError
-        If no clip is as long as a window.
+        If no clip contains a complete window.
     """
     noise = DetectorNoise(share=0.0)
     filmed = film_clips(motions, skeleton, fps, views=64, seed=seed, noise=noise).tracks
@@ -145,7 +144,7 @@ def read_tracks(
     paths : iterable of str or Path
         Files with unique names, or patterns. A track is named ``"<file>/<name>"``.
     skeleton : Skeleton, optional
-        Target skeleton; None: the tracks' own, which must be the same for all.
+        Target skeleton; None: the skeleton of the tracks, which must all have the same one.
     fps : float
         Frames per second of the data set.
     file_fps : float, optional
@@ -154,13 +153,13 @@ def read_tracks(
         Keypoint layout and number of people, for files that do not contain them; see
         :func:`~probmotion.io.read_keypoints`.
     threshold : float
-        Least confidence of a detection.
+        Minimum confidence of a detection.
     centre : {"frame", "sequence"}
         Whether the root is at the origin in every frame or on average.
     sizes : mapping of str to float, optional
-        Bone sizes to scale to, metres, of all bones or some; :func:`body_sizes` by default.
+        Bone sizes to scale to, metres, for all or some bones; :func:`body_sizes` by default.
     shortest : float
-        Shortest track to keep, seconds.
+        Minimum duration of a track, seconds.
 
     Raises
     ------
@@ -195,7 +194,7 @@ def read_tracks(
 
 
 def unique_files(paths: Iterable[str | Path]) -> dict[str, Path]:
-    """Return the files matching paths or patterns by their stems, which name clips."""
+    """Return a mapping from stems, the clip names, to the files matching paths or patterns."""
     files: dict[str, Path] = {}
     for path in files_named(paths):
         if path.stem in files:
@@ -230,35 +229,35 @@ def split_tracks(
     test: Sequence[str] = (),
     seed: int = 0,
 ) -> LearningTracks:
-    """Split tracks by clip: named clips, or a random tenth each.
+    """Split tracks by clip into training, validation and test tracks.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
         Prepared tracks.
     validation, test : sequence of str
-        Names of clips; both or neither.
+        Names of clips, for both or neither; a random tenth of the clips each by default.
     seed : int
         Seed of the random split.
 
     Raises
     ------
     ValueError
-        If only one of the two is given, a clip is in both or has no track, or none is left for
+        If only one of the two is given, a clip is in both or has no track, or no clip remains for
         training.
     """
     clips = {clip_of(track.name) for track in tracks}
     split = split_names(clips, validation=validation, test=test, seed=seed)
-    train, held, tested = (
+    train_tracks, validation_tracks, test_tracks = (
         tracks_of_clips(tracks, part) for part in (split.train, split.validation, split.test)
     )
-    return LearningTracks(train, held, tested, split)
+    return LearningTracks(train_tracks, validation_tracks, test_tracks, split)
 
 
 def split_names(
     clips: Iterable[str], *, validation: Sequence[str], test: Sequence[str], seed: int
 ) -> Split:
-    """Split the names of clips as :func:`split_tracks`."""
+    """Split the names of clips as in :func:`split_tracks`."""
     names = set(clips)
     if bool(validation) != bool(test):
         given, missing = ("validation", "test") if validation else ("test", "validation")
@@ -270,8 +269,8 @@ def split_names(
             known = ", ".join(sorted(names))
             raise ValueError(f"{part} must name clips among {known}, got {unknown[0]!r}")
     if twice := sorted(set(validation) & set(test)):
-        raise ValueError(f"validation and test must be disjoint, both have {twice[0]!r}")
+        raise ValueError(f"validation and test must be disjoint, got {twice[0]!r} in both")
     train = sorted(names - set(validation) - set(test))
     if not train:
-        raise ValueError("validation and test must leave training clips, got every clip")
+        raise ValueError("validation and test must exclude at least one clip for training, got all")
     return Split(tuple(train), tuple(sorted(validation)), tuple(sorted(test)))

@@ -17,7 +17,7 @@ _MIRRORED = "mirrored"
 
 
 def centre_tracks(tracks: Sequence[KeypointTrack], *, per: str = "frame") -> Step:
-    """Move the first root to the origin; tracks that never show it are dropped.
+    """Move the first root joint to the origin and drop tracks that never show it.
 
     ``per`` is ``"frame"``, for the root of every frame (frames without it become unseen), or
     ``"sequence"``, for the mean root over the frames in which it is seen.

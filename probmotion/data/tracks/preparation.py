@@ -5,19 +5,19 @@ Source: *MAS*, section 6.1. The steps, with the reason for their order:
 ============  ==================================================================================
 step          reason
 ============  ==================================================================================
-uncertain     first: later steps only distinguish seen from unseen
-crowds        needs whole tracks, side by side in time, with all joints
-joints        before quality, which concerns the joints used
+uncertain     first: later steps only distinguish seen and unseen detections
+crowds        requires uncut tracks over the same frames, with all joints
+joints        before quality, which is computed over the joints used
 segments      before interpolation, which must not cross jumps
 outliers      per segment, before gaps are filled
-quality       per segment, on detections alone: before gaps are filled
-gaps          before smoothing, which needs runs, and centring, which needs the root
+quality       per segment, from detections only: before gaps are filled
+gaps          before smoothing, which requires runs, and centring, which requires the root
 smooth        before resampling, which would alias jitter
 resample      to the frame rate of the data set
-short         after everything that changes durations
+short         after all steps that change durations
 scale         to metres: one factor per track
 centre        after smoothing: jitter of the root would move every joint
-quality       again: centring drops frames without a root
+quality       again: centring marks frames without a root as unseen
 ============  ==================================================================================
 """
 
@@ -49,7 +49,7 @@ __all__ = ["PreparedTracks", "prepare_tracks"]
 
 @dataclass(frozen=True, eq=False)
 class PreparedTracks:
-    """A data set of at least one track with one skeleton and frame rate, and a report per step."""
+    """Data set of at least one track with one skeleton and frame rate, and a report per step."""
 
     tracks: tuple[KeypointTrack, ...]
     reports: tuple[StepReport, ...]
@@ -86,7 +86,7 @@ def prepare_tracks(
     shortest: float = 1.0,
     centre: str = "frame",
 ) -> PreparedTracks:
-    """Run the steps of this module's table over raw tracks, with their default limits.
+    """Prepare raw tracks by the steps in this module's table, with their default limits.
 
     Parameters
     ----------
@@ -103,17 +103,17 @@ def prepare_tracks(
     videos : sequence of str, optional
         See :func:`~probmotion.data.tracks.filters.drop_crowds`.
     threshold : float
-        Least confidence of a detection: 0.3 for people, 0.5 for horses, 0.01 with a ball.
+        Minimum confidence of a detection: 0.3 for people, 0.5 for horses, 0.01 with a ball.
     shortest : float
-        Shortest track to keep, seconds.
+        Minimum duration of a track, seconds.
     centre : {"frame", "sequence"}
         See :func:`~probmotion.data.tracks.poses.centre_tracks`.
 
     Raises
     ------
     ValueError
-        If there is no track, tracks have several skeletons, a number is out of range, or a step
-        leaves no track.
+        If there is no track, tracks have several skeletons, a number is out of range, or no track
+        remains after a step.
     """
     check_positive("fps", fps)
     result = list(tracks)
@@ -141,7 +141,7 @@ def prepare_tracks(
         result, report = step(result)
         reports.append(report)
         if not result:
-            raise ValueError(f"no track is left after step {report}")
+            raise ValueError(f"no track remains after step {report}")
     return PreparedTracks(tuple(result), tuple(reports))
 
 

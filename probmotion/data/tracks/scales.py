@@ -1,7 +1,7 @@
 """Scaling of 2D tracks to metres by bone lengths, or to body lengths.
 
-A bone's projection is as long as the bone where it is perpendicular to the view, and shorter
-elsewhere. The 90 % quantile over a motion therefore estimates its length robustly.
+A bone's projection has full length if the bone is perpendicular to the view, and is shorter
+otherwise. The 90 % quantile over a motion therefore estimates its length robustly.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ _QUANTILE = 0.9
 def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     """Return the apparent size of each bone: the 90 % quantile of its projected length.
 
-    Sizes are by the name of the bone's lower joint, in the tracks' unit, over the frames in which
-    both ends are seen; bones that are never seen are missing. Raises ``ValueError`` if there is no
-    track, or the tracks have several skeletons.
+    Keys are names of the bones' lower joints; sizes are in the tracks' unit, over the frames in
+    which both ends are seen. Bones that are never seen are omitted. Raises ``ValueError`` if
+    there is no track, or the tracks have several skeletons.
     """
     if not tracks:
         raise ValueError("tracks must contain at least one, got none")
     skeleton = tracks[0].skeleton
     for number, track in enumerate(tracks):
         if track.skeleton != skeleton:
-            raise ValueError(f"tracks must have one skeleton, but tracks[{number}] has another")
+            raise ValueError(f"tracks must have one skeleton, got another in tracks[{number}]")
     sizes = {}
     for joint, parent in skeleton.bones:
         bones = [np.diff(track.keypoints[:, [parent, joint]], axis=1)[:, 0] for track in tracks]
@@ -47,8 +47,8 @@ def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
 def scale_to_bones(tracks: Sequence[KeypointTrack], sizes: Mapping[str, float]) -> Step:
     """Scale each track by the median ratio of reference ``sizes`` to its :func:`bone_sizes`.
 
-    Tracks that show no bone of ``sizes`` are dropped. Raises ``ValueError`` if ``sizes`` is empty,
-    a size is not positive, or a skeleton has none of its bones.
+    Tracks without a seen bone of ``sizes`` are dropped. Raises ``ValueError`` if ``sizes`` is
+    empty or contains no bone of a skeleton, or if a size is not positive.
     """
     if not sizes:
         raise ValueError("sizes must contain the size of at least one bone, got none")

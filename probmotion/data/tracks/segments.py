@@ -31,23 +31,23 @@ def split_discontinuities(
     A track jumps between two frames with seen joints if it moves by more than ``jump`` times its
     size (:func:`track_size`): the median displacement of the joints seen in both frames, or else
     the displacement of the centre of all seen joints. A gap is longer than ``unseen`` seconds
-    without any seen joint. Segments omit unseen frames at cuts and ends; those of a cut track are
-    numbered: ``"walk/left 0"``, or ``"walk/0"`` for the name ``"walk"``.
+    without any seen joint. Segments omit unseen frames at cuts and ends; segments of a cut track
+    are numbered: ``"walk/left 0"``, or ``"walk/0"`` for the name ``"walk"``.
     """
     check_positive("jump", jump)
     check_positive("unseen", unseen)
     segments: list[KeypointTrack] = []
-    jumps = gaps = never = 0
+    jumps = gaps = n_unseen = 0
     for track in tracks:
         frames = np.flatnonzero(seen(track).any(axis=1))
         if not len(frames):
-            never += 1
+            n_unseen += 1
             continue
         # A single joint has size 0.
-        far = _displacements(track, frames) > (jump * track_size(track) or np.inf)
+        jumped = _displacements(track, frames) > (jump * track_size(track) or np.inf)
         long = np.diff(frames) - 1 > unseen * track.fps
-        cuts = np.flatnonzero(far | long)
-        jumps += int((far & ~long).sum())
+        cuts = np.flatnonzero(jumped | long)
+        jumps += int((jumped & ~long).sum())
         gaps += int(long.sum())
         starts = [frames[0], *frames[cuts + 1]]
         stops = [*(frames[cuts] + 1), frames[-1] + 1]
@@ -62,9 +62,9 @@ def split_discontinuities(
             )
     why = (
         f"cut at {jumps} jumps of over {jump:g} track sizes and at {gaps} gaps of over {unseen:g} "
-        f"s; {never} tracks were never seen"
+        f"s; {n_unseen} tracks were never seen"
     )
-    return segments, StepReport.of("segments", tracks, segments, why, tracks_dropped=never)
+    return segments, StepReport.of("segments", tracks, segments, why, tracks_dropped=n_unseen)
 
 
 def _displacements(track: KeypointTrack, frames: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ _DEGREE = 2
 def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step:
     """Fill gaps of at most ``longest`` seconds of each joint by PCHIP interpolation.
 
-    A filled entry has the lesser confidence of the ends of its gap. Nothing is extrapolated.
+    The confidence of a filled entry is the minimum at the ends of its gap. Nothing is extrapolated.
     """
     check_positive("longest", longest)
     filled = []
@@ -51,7 +51,7 @@ def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> S
     """Smooth each joint over its runs of seen frames (Savitzky–Golay, degree 2).
 
     ``window``, in seconds, is rounded to an odd number of frames within the run; windows of fewer
-    than 5 frames change nothing.
+    than 5 frames have no effect.
     """
     check_positive("window", window)
     smoothed = []
@@ -74,8 +74,8 @@ def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> S
 def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
     """Resample tracks to ``fps`` frames per second, at most 10 000, by linear interpolation.
 
-    The first frame stays; no frame lies after the original end. An entry between two frames is seen
-    if both are, with interpolated confidence.
+    The first frame is preserved; no frame lies after the original end. An entry between two
+    frames is seen if both are, with interpolated confidence.
     """
     check_positive("fps", fps)
     if fps > _HIGHEST_FPS:
@@ -91,7 +91,7 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
     frames = int(np.floor(last / track.fps * fps + _ROUNDING)) + 1
     time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
     nearest = np.round(time)
-    # Frames that coincide with old ones do not depend on a neighbour, which may be unseen.
+    # Frames at the time of an original frame must not depend on a neighbour, possibly unseen.
     time = np.where(np.abs(time - nearest) < _SAME_TIME, nearest, time)
     before, after = time.astype(int), np.ceil(time).astype(int)
     weight = (time - before)[:, np.newaxis]
@@ -108,6 +108,6 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
 
 
 def _runs(visible: np.ndarray) -> list[list[int]]:
-    """Return the first frame and the end of each run of True."""
+    """Return the start and stop indices of each run of True values."""
     edges = np.flatnonzero(np.diff(visible, prepend=False, append=False))
     return edges.reshape(-1, 2).tolist()

@@ -1,4 +1,4 @@
-"""Reports of the preparation steps of 2D tracks, and what the steps share."""
+"""Reports of preparation steps of 2D tracks, and helpers shared by the steps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Step", "StepReport", "boxes_of", "entries_of", "masked", "seen"]
 
 @dataclass(frozen=True)
 class StepReport:
-    """Input, output and losses of one step.
+    """Input, output and dropped data of one step.
 
     ``entries_changed`` counts detections (joints of single frames) that were removed, filled or
     moved; ``frames_dropped`` includes the frames of dropped tracks.
@@ -42,7 +42,7 @@ class StepReport:
         frames_dropped: int | None = None,
         entries_changed: int = 0,
     ) -> StepReport:
-        """Return the report of a step; what is missing from its output counts as dropped."""
+        """Return the report of a step; missing tracks and frames count as dropped by default."""
         frames = [sum(track.frames for track in tracks) for tracks in (before, after)]
         return cls(
             step,
@@ -65,11 +65,11 @@ class StepReport:
 
 
 Step = tuple[list[KeypointTrack], StepReport]
-"""Result of a step."""
+"""Tracks and report returned by a step."""
 
 
 def seen(track: KeypointTrack) -> np.ndarray:
-    """Return which entries have a confidence above 0, (L, J) bool."""
+    """Return a mask of the entries with a confidence above 0, (L, J) bool."""
     return track.confidence > 0
 
 
@@ -88,7 +88,7 @@ def masked(track: KeypointTrack, hidden: np.ndarray) -> KeypointTrack:
 
 
 def boxes_of(track: KeypointTrack) -> np.ndarray:
-    """Return the least and greatest x and y of each frame, (L, 2, 2); NaN if no joint is seen."""
+    """Return the minimum and maximum x and y per frame, (L, 2, 2); NaN if no joint is seen."""
     visible = seen(track)[..., np.newaxis]
     least = np.where(visible, track.keypoints, np.inf).min(axis=1)
     greatest = np.where(visible, track.keypoints, -np.inf).max(axis=1)

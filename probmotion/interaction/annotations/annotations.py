@@ -34,7 +34,7 @@ class Annotations:
     skeleton : Skeleton
         Names and parents of the J joints.
     neighbours : ndarray, (n, 2, J, 2)
-        The joints in the previous and next frame of the same video; NaN at cuts, ends and
+        Joints in the previous and next frame of the same video; NaN at cuts, ends and
         occlusions.
     fps : float
         Frames per second of the videos.
@@ -44,7 +44,7 @@ class Annotations:
     sources : sequence of str, optional
         Name of the video of each annotation.
     dropped : mapping of str to int
-        Number of frames left out by a loader, by reason.
+        Number of frames dropped by a loader, by reason.
     """
 
     keypoints: np.ndarray
@@ -150,7 +150,7 @@ class Annotations:
             np.concatenate([other.neighbours for other in several]),
             first.fps,
             views=np.concatenate(views) if len(views) == len(several) else None,
-            sources=[name for some in names for name in some] if any(map(any, names)) else None,
+            sources=[name for video in names for name in video] if any(map(any, names)) else None,
             dropped={r: sum(other.dropped.get(r, 0) for other in several) for r in reasons},
         )
 
@@ -163,10 +163,10 @@ class Annotations:
         return text + (f", frames dropped: {', '.join(dropped)}" if dropped else "")
 
     def local_differences(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of each bone's image direction and length per frame (eq. 12's Δp).
+        """Return the change of each bone's image direction and length per frame (Δp in eq. 12).
 
-        Half the central difference if both neighbours exist, else the one-sided difference, else
-        0. A bone of length 0 has direction 0.
+        Uses half the difference of the neighbours if both exist, else the one-sided difference,
+        else 0. A bone of length 0 has direction 0.
 
         Returns
         -------
@@ -235,18 +235,18 @@ class Annotations:
                 sources=arrays["sources"].tolist() if "sources" in arrays else None,
                 dropped=dict(zip(arrays["dropped_reasons"].tolist(), counts, strict=True)),
             )
-        except (ValueError, KeyError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as why:
+        except (ValueError, KeyError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as err:
             raise ValueError(
                 f"{path} must be an archive written by Annotations.save, got an unreadable file "
-                f"({str(why)[:120]})"
-            ) from why
+                f"({str(err)[:120]})"
+            ) from err
 
 
 def _change(values: np.ndarray) -> np.ndarray:
     """Return the norm of the change per frame, ``(3, …, d) → (…)``."""
     before, current, after = values
     result = np.zeros(current.shape[:-1])
-    # From the last to the first choice; a difference is NaN if either frame is missing.
+    # In order of increasing preference; a difference is NaN if either frame is missing.
     for change in (after - current, current - before, (after - before) / 2):
         size = np.linalg.norm(change, axis=-1)
         result = np.where(np.isnan(size), result, size)

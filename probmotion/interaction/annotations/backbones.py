@@ -61,13 +61,13 @@ class BackboneEstimate:
     backbones : ndarray, (n, K, 3)
         Chest minus root, metres.
     rotations : ndarray, (n, K, 3, 3)
-        From the seed's axes to the image's.
+        Rotations from the seed's axes to the image axes.
     roots : ndarray, (n, K, 3)
         Root joints, metres; z relative to the first person.
     residuals : ndarray, (n, K)
         Root-mean-square residual of the visible torso joints, metres.
     lifted : ndarray, (n,)
-        Whether every person has at least three visible torso joints. The other rows are NaN.
+        Whether every person has at least three visible torso joints; other rows are NaN.
     """
 
     backbones: np.ndarray
@@ -100,8 +100,8 @@ def lift_torsos(
     check_finite("seed", seed)
     if not valid_frames(pair_frames(seed, skeleton)):
         raise ValueError(
-            "seed must have distinct roots and backbones not parallel to their line, got a "
-            "degenerate pair"
+            "seed must have distinct roots and backbones not parallel to the line between them, "
+            "got a degenerate pair"
         )
     torsos = [list(joints) for joints in joints_named(skeleton, TORSO)]
     seen = np.stack([visible[:, joints].sum(axis=-1) for joints in torsos])
@@ -157,10 +157,10 @@ def annotation_views(annotations: Annotations, seed: np.ndarray) -> np.ndarray:
 
 
 def _depths(roots: np.ndarray, rotations: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return Δz of each root relative to the first, (n, K); ``offsets`` (K, 3) are the seed's."""
+    """Return Δz of each root relative to the first, (n, K); ``offsets`` (K, 3) from the seed."""
     depths = np.zeros(rotations.shape[:2])
     for other in range(1, len(offsets)):
-        # The seed's offset rotated by the first torso and by the other one.
+        # The seed's offset rotated by the first torso and by the other torso.
         rotated = rotations[:, [0, other]] @ offsets[other]
         gap = rotated[..., :2] - (roots[:, other] - roots[:, 0])[:, np.newaxis]
         spread = offsets[other] @ offsets[other] / 4

@@ -4,7 +4,7 @@ The columns are
 
     i = N(r₂ − r₁),   j = N(Σ_k N(B_k)),   k = i × j,
 
-with roots r and backbones B = chest − root. The frame is not orthogonal and k not a unit vector.
+with roots r and backbones B = chest − root. The frame is not orthogonal and k is not a unit vector.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def valid_frames(frames: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return normalised vectors (…, 3); 0 stays 0."""
+    """Return normalised vectors (…, 3); zero vectors remain zero."""
     length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
     return vectors / np.maximum(length, 1e-300)[..., np.newaxis]
 

@@ -69,7 +69,7 @@ def draw_annotations(
     seed : int
         Seed of the frames, views, noise and occlusions.
     frames : sequence of ndarray, (L,) bool, optional
-        Mask of the frames to draw from, per clip; all by default.
+        Mask of the frames to draw from in each clip; all by default.
     world_views : ndarray, (n, 2), optional
         Azimuth (0: camera on the +Z side, π/2: +X side) and elevation of each camera, radians. By
         default uniform on the circle and on :data:`ELEVATIONS`.
@@ -104,8 +104,8 @@ def draw_annotations(
     if not valid.all():
         first = int(np.argmin(valid))
         raise ValueError(
-            "motions must have distinct roots and backbones not parallel to their line, got a "
-            f"degenerate pair in frame {numbers[first]} of clip {clips[first]}"
+            "motions must have distinct roots and backbones not parallel to the line between them, "
+            f"got a degenerate pair in frame {numbers[first]} of clip {clips[first]}"
         )
     views = view_angles(local, axes[:, 2])
     visible = _visible(n, skeleton, hidden, hidden_rng)
@@ -127,9 +127,9 @@ def draw_annotations(
 def world_axes(world_views: np.ndarray) -> np.ndarray:
     """Return the camera axes right, up and towards the viewer as rows: ``(n, 2) → (n, 3, 3)``."""
     azimuth, elevation = np.asarray(world_views, dtype=np.float64).T
-    sine, cosine, level = np.sin(azimuth), np.cos(azimuth), np.cos(elevation)
+    sine, cosine, horizontal = np.sin(azimuth), np.cos(azimuth), np.cos(elevation)
     right = np.stack([cosine, 0 * cosine, -sine], axis=-1)
-    towards = np.stack([level * sine, np.sin(elevation), level * cosine], axis=-1)
+    towards = np.stack([horizontal * sine, np.sin(elevation), horizontal * cosine], axis=-1)
     return np.stack([right, np.cross(towards, right), towards], axis=1)
 
 

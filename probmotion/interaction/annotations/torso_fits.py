@@ -29,7 +29,7 @@ _ROWS = 1024
 
 
 class BodyFit(NamedTuple):
-    """Fit of n projections."""
+    """Rigid-body fits of n projections."""
 
     rotations: np.ndarray  # R, (n, 3, 3), from the body's axes to the image's
     translations: np.ndarray  # c, (n, 2)
@@ -39,8 +39,8 @@ class BodyFit(NamedTuple):
 def fit_body(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
     """Return the least-squares rotation and translation of a rigid body for each projection.
 
-    ``points`` (n, M, 2), x right and y up, and their mask ``visible`` (n, M), with at least one
-    visible point per projection; ``body`` (M, 3), in the unit of the projections.
+    ``points`` (n, M, 2) have axes x right and y up; ``visible`` (n, M) marks at least one point per
+    projection; ``body`` (M, 3) is in the unit of the projections.
     """
     starts = range(0, max(len(points), 1), _ROWS)
     blocks = [_fit(points[s : s + _ROWS], visible[s : s + _ROWS], body) for s in starts]
@@ -68,13 +68,13 @@ def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
 @lru_cache(maxsize=1)
 def _directions() -> np.ndarray:
     """Return rotations (G, 3, 3) with third rows on a spherical spiral."""
-    number = np.arange(_DIRECTIONS) + 0.5
-    z = 1 - 2 * number / _DIRECTIONS
-    turn = np.pi * (1 + np.sqrt(5)) * number
+    index = np.arange(_DIRECTIONS) + 0.5
+    z = 1 - 2 * index / _DIRECTIONS
+    azimuth = np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - z**2)
-    third = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
-    aside = np.where(np.abs(third[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(aside, third)
+    third = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
+    helper = np.where(np.abs(third[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(helper, third)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(third, first), third], axis=1)
 
@@ -118,12 +118,12 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
         normal += scale[:, np.newaxis, np.newaxis] * np.eye(3)
         slope = np.einsum("nmai,nma->ni", jacobian, residual)
         step = np.linalg.solve(normal, slope[..., np.newaxis])[..., 0]
-        tried = rotations @ vector_to_matrix(step)
-        tried_residual, tried_squares = _residuals(tried, x, t)
-        better = tried_squares < squares
-        rotations = np.where(better[:, np.newaxis, np.newaxis], tried, rotations)
-        residual = np.where(better[:, np.newaxis, np.newaxis], tried_residual, residual)
-        squares = np.where(better, tried_squares, squares)
+        trial = rotations @ vector_to_matrix(step)
+        trial_residual, trial_squares = _residuals(trial, x, t)
+        better = trial_squares < squares
+        rotations = np.where(better[:, np.newaxis, np.newaxis], trial, rotations)
+        residual = np.where(better[:, np.newaxis, np.newaxis], trial_residual, residual)
+        squares = np.where(better, trial_squares, squares)
         damping = np.maximum(np.where(better, damping / 10, damping * 10), _LEAST_DAMPING)
     return rotations, squares
 

@@ -3,8 +3,8 @@
 If a track has all joints of ``person17`` by canonical name, they are used directly. Otherwise the
 limbs are used and the other joints are interpolated:
 
-- pelvis, spine, chest and neck on the line from mid-hips to mid-shoulders, at the fraction at which
-  the seed's joint projects onto the seed's line;
+- pelvis, spine, chest and neck on the line from mid-hips to mid-shoulders, at the same
+  fraction as the projection of the seed's joint onto the seed's line;
 - head at the midpoint of the ears, else midway from the neck to the top of the head, else the nose.
 
 An interpolated joint is occluded if any of its keypoints is.
@@ -40,14 +40,14 @@ def annotations_of_tracks(
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        One track per person, in the order of the seed, of the same frames.
+        One track per person, in the order of the seed, over the same frames.
     seed : ndarray, (J, 3)
         Pose-pair of ``pair17``, metres, for bone lengths and the joints of the trunk.
     metres_per_pixel : float, optional
         Scale of the image. By default the median over limb bones of the seed's length divided by
         the 95 % quantile of the projected length.
     least_confidence : float
-        Keypoints with lower confidence are occluded.
+        Minimum confidence; keypoints below it count as occluded.
 
     Returns
     -------
@@ -58,12 +58,12 @@ def annotations_of_tracks(
     seed = np.asarray(seed, dtype=np.float64)
     check_close_people("seed", seed, skeleton)
     if len(tracks) != len(skeleton.roots):
-        raise ValueError(f"tracks must have 2 tracks, one per person, got {len(tracks)}")
+        raise ValueError(f"tracks must contain 2 tracks, one per person, got {len(tracks)}")
     for number, track in enumerate(tracks):
         if (track.frames, track.fps) != (tracks[0].frames, tracks[0].fps):
             raise ValueError(
                 f"tracks[{number}] must have {tracks[0].frames} frames at {tracks[0].fps:g} frames "
-                f"per second, as tracks[0], got {track.frames} at {track.fps:g}"
+                f"per second, like tracks[0], got {track.frames} at {track.fps:g}"
             )
     check_positive("least_confidence", least_confidence)
     keypoints = np.concatenate(
@@ -159,5 +159,5 @@ def _scale(keypoints: np.ndarray, seed: np.ndarray, skeleton: Skeleton) -> float
         if longest > 0:
             ratios.append(float(np.linalg.norm(seed[joint] - seed[parent]) / longest))
     if not ratios:
-        raise ValueError("tracks must have a visible limb bone, got none: give metres_per_pixel")
+        raise ValueError("tracks must have a visible limb bone, got none: pass metres_per_pixel")
     return float(np.median(ratios))

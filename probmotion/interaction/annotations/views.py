@@ -43,7 +43,7 @@ class ViewDistribution:
     Parameters
     ----------
     views : ndarray, (n, 2)
-        φ (any turn) and θ in [0, π] of each annotation, radians; NaN if unknown. At least one
+        φ (modulo 2π) and θ in [0, π] of each annotation, radians; NaN if unknown. At least one
         must be known.
     bandwidth : float
         σ_v, radians.
@@ -84,9 +84,9 @@ class ViewDistribution:
         for start in range(0, len(flat), n_rows):
             rows = slice(start, start + n_rows)
             phi, theta = np.moveaxis(flat[rows, np.newaxis] - centres, -1, 0)
-            over = flat[rows, np.newaxis, 1] + centres[:, 1]
+            theta_sum = flat[rows, np.newaxis, 1] + centres[:, 1]
             direct = self._log_wrapped(phi) + self._log_wrapped(theta)
-            across = self._log_wrapped(phi + np.pi) + self._log_wrapped(over)
+            across = self._log_wrapped(phi + np.pi) + self._log_wrapped(theta_sum)
             log_f[rows] = logsumexp(np.logaddexp(direct, across), axis=-1)
         log_f -= math.log(len(centres))
         log_f[~((flat[:, 1] >= 0) & (flat[:, 1] <= np.pi))] = -np.inf
@@ -98,23 +98,23 @@ class ViewDistribution:
         chosen = self.known[rng.integers(len(self.known), size=n)]
         phi, theta = (self.views[chosen] + self.bandwidth * rng.standard_normal((n, 2))).T
         theta = np.mod(theta, 2 * np.pi)
-        over = theta > np.pi
-        theta = np.where(over, 2 * np.pi - theta, theta)
-        phi = np.mod(phi + np.where(over, 2 * np.pi, np.pi), 2 * np.pi) - np.pi
+        crossed = theta > np.pi
+        theta = np.where(crossed, 2 * np.pi - theta, theta)
+        phi = np.mod(phi + np.where(crossed, 2 * np.pi, np.pi), 2 * np.pi) - np.pi
         return np.stack([phi, theta], axis=-1)
 
     def near(self, views: np.ndarray, n: int) -> np.ndarray:
         """Return the n annotations with the smallest angle to each view (:func:`view_vectors`).
 
-        ``(V, 2) → (V, min(n, m))``, nearest first; ties go to the lower index.
+        ``(V, 2) → (V, min(n, m))``, nearest first; the lower index breaks ties.
         """
         check_count("n", n)
         check_shape("views", views, ("V", 2))
         queries = view_vectors(views)
         count = min(n, len(self.known))
         # The tree breaks ties arbitrarily: query all within the n-th distance, then sort.
-        reach, _ = self._tree.query(queries, k=[count])
-        within = self._tree.query_ball_point(queries, reach[:, 0] * (1 + 1e-9) + 1e-12)
+        radius, _ = self._tree.query(queries, k=[count])
+        within = self._tree.query_ball_point(queries, radius[:, 0] * (1 + 1e-9) + 1e-12)
         nearest = np.empty((len(views), count), dtype=np.int64)
         for row, (point, indices) in enumerate(zip(queries, within, strict=True)):
             candidates = np.array(sorted(indices))
@@ -167,7 +167,7 @@ def view_angles(frames: np.ndarray, direction: np.ndarray) -> np.ndarray:
     ):
         if not valid.all():
             index = np.argwhere(~valid)[0].tolist()
-            raise ValueError(f"{name} must be {requirement}, violated at index {index}")
+            raise ValueError(f"{name} must be {requirement}, got a violation at index {index}")
     solved = np.linalg.solve(frames, direction[..., np.newaxis])[..., 0]
     a, b, c = np.moveaxis(solved, -1, 0)
     # Equals arccos(b/√(a² + b² + c²)), but is accurate near the poles.

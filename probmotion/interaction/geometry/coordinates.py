@@ -20,7 +20,7 @@ __all__ = [
 def align_rigidly(source: Array, target: Array, visible: Array | None = None) -> Array:
     """Return ``source`` rigidly aligned to ``target`` by least squares (Kabsch 1976).
 
-    Rotation and translation only, fitted to the visible joints and applied to all joints.
+    A rotation and a translation are fitted to the visible joints and applied to all joints.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
     left, _, right = xp.linalg.svd(moments, full_matrices=False)
     # Undo a reflection by flipping the direction of the smallest singular value.
     mirrored = (xp.linalg.det(left) * xp.linalg.det(right) < 0)[..., None, None]
-    least = constant([0.0] * (source.shape[-1] - 1) + [1.0], source)[:, None]
-    right = xp.where(mirrored, right * (1 - 2 * least), right)
+    last_axis = constant([0.0] * (source.shape[-1] - 1) + [1.0], source)[:, None]
+    right = xp.where(mirrored, right * (1 - 2 * last_axis), right)
     return centred @ (left @ right) + target_centre
 
 
@@ -101,7 +101,7 @@ def dissimilarity(
     epsilon : float
         ε, metres.
     visible : Array of bool, (…, J), optional
-        Mask of visible joints. Edges with an occluded end are left out of the sums and of W.
+        Mask of visible joints. Edges with an occluded end are excluded from the sums and W.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def interaction_distance(
 ) -> Array:
     """Return the dissimilarity (eq. 8) of pose-pairs after rigid alignment, metres.
 
-    Symmetric, and invariant to rigid motion of either pair.
+    The distance is symmetric and invariant to rigid motion of either pair.
 
     Parameters
     ----------
@@ -219,6 +219,6 @@ def _mean(values: Array, weight: Array) -> Array:
     xp = array_namespace(values)
     weight = xp.broadcast_to(weight, values.shape)
     total = xp.sum(weight, axis=-1)
-    none = total <= 0
-    mean = xp.sum(values * weight, axis=-1) / xp.where(none, xp.ones_like(total), total)
-    return xp.where(none, xp.full_like(mean, float("inf")), mean)
+    empty = total <= 0
+    mean = xp.sum(values * weight, axis=-1) / xp.where(empty, xp.ones_like(total), total)
+    return xp.where(empty, xp.full_like(mean, float("inf")), mean)

@@ -2,7 +2,7 @@
 
 Joints are inserted one at a time: triangles with the new joint in their circumcircle form a cavity,
 and the boundary of the cavity is connected to the joint. Each hull edge has a ghost triangle with a
-vertex at infinity, so that joints outside the hull need no special case. The reference is
+vertex at infinity, so that joints outside the hull need no special case. Reference code:
 :mod:`probmotion.interaction.geometry.graphs`.
 """
 
@@ -35,7 +35,7 @@ def delaunay_edges(points: np.ndarray) -> tuple[np.ndarray, bool]:
     Returns
     -------
     edges : ndarray of int, (E, 2)
-        The smaller joint first, rows in lexicographic order.
+        The smaller joint index first, rows in lexicographic order.
     degenerate : bool
         Whether the joints were joggled.
     """
@@ -87,7 +87,7 @@ def _into_unit_box(points: np.ndarray, unit: np.ndarray) -> None:
         low_x, high_x = min(low_x, points[joint, 0]), max(high_x, points[joint, 0])
         low_y, high_y = min(low_y, points[joint, 1]), max(high_y, points[joint, 1])
     extent = max(high_x - low_x, high_y - low_y)
-    # Below this the square underflows: the joints coincide.
+    # The square of a smaller extent underflows: treat the joints as coincident.
     extent = extent if extent > 1e-150 else 1.0
     middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
     for joint in range(points.shape[0]):
@@ -100,7 +100,7 @@ def _into_unit_box(points: np.ndarray, unit: np.ndarray) -> None:
 def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
     """Write the edges and return their number, or 0 if the sign of a determinant was uncertain.
 
-    With ``exact``, determinants of differences decide, however small (for joggled joints).
+    With ``exact`` (for joggled joints), determinants of differences of any size are accepted.
     Otherwise each triangle stores the plane through its joints lifted to the paraboloid
     z = x² + y²; a joint below the plane is inside the circumcircle.
     """
@@ -152,7 +152,7 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
 
 @numba.njit(cache=True)
 def _first_triangle(unit: np.ndarray, order: np.ndarray, exact: bool) -> bool:
-    """Write the insertion order, a large counter-clockwise triangle first; False if none."""
+    """Write the insertion order, first a large counter-clockwise triangle; False if none."""
     n_joints = unit.shape[0]
     second, farthest = 0, -1.0
     for joint in range(1, n_joints):
@@ -186,7 +186,7 @@ def _turn(unit: np.ndarray, a: int, b: int, c: int) -> float:
 
 @numba.njit(cache=True)
 def is_obtuse(points: np.ndarray, a: int, b: int, vertex: int) -> bool:
-    """Return whether the angle at ``vertex`` is obtuse; if collinear, whether it is between."""
+    """Return whether the angle at ``vertex`` is obtuse, or 180° if the points are collinear."""
     x, y = points[vertex, 0], points[vertex, 1]
     return (points[a, 0] - x) * (points[b, 0] - x) + (points[a, 1] - y) * (points[b, 1] - y) < 0
 

@@ -22,7 +22,7 @@ N_NEIGHBOURS = 6
 JOGGLE = 1e-5
 """Displacement of degenerate joints, in units of their extent."""
 
-# Determinants of joints in the unit box have an uncertain sign below this size.
+# Determinants of joints in the unit box below this size have an uncertain sign.
 _TIE = 1e-13
 
 
@@ -34,7 +34,7 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
     - ``nearest-neighbours``: i–j if either is one of the other's six nearest joints.
     - ``gabriel``: i–j if no joint lies strictly inside the ball with diameter i–j; a subgraph of
       the Delaunay triangulation.
-    - ``complete``: all edges.
+    - ``complete``: all pairs of joints.
 
     Parameters
     ----------
@@ -130,28 +130,28 @@ def _in_unit_box(points: np.ndarray) -> np.ndarray:
 def _has_ties(unit: np.ndarray, triangulation: Delaunay) -> bool:
     """Return whether a joint lies on the circumcircle (sphere) of a neighbouring triangle."""
     simplices, neighbours = triangulation.simplices, triangulation.neighbors
-    which, side = np.nonzero(neighbours >= 0)
-    other = simplices[neighbours[which, side]]
-    opposite = other[~(other[:, :, None] == simplices[which][:, None, :]).any(axis=-1)]
+    simplex, side = np.nonzero(neighbours >= 0)
+    other = simplices[neighbours[simplex, side]]
+    opposite = other[~(other[:, :, None] == simplices[simplex][:, None, :]).any(axis=-1)]
     # Cocircular joints are coplanar once lifted to the paraboloid: the determinant is 0.
-    apart = unit[simplices[which]] - unit[opposite][:, None]
-    lifted = np.concatenate([apart, (apart**2).sum(axis=-1, keepdims=True)], axis=-1)
+    differences = unit[simplices[simplex]] - unit[opposite][:, None]
+    lifted = np.concatenate([differences, (differences**2).sum(axis=-1, keepdims=True)], axis=-1)
     return bool((np.abs(np.linalg.det(lifted)) < _TIE).any())
 
 
 def _neighbour_adjacency(points: np.ndarray) -> np.ndarray:
-    """Return the symmetric nearest-neighbour matrix, (J, J) bool; ties go to the lower index."""
+    """Return the symmetric nearest-neighbour matrix, (J, J) bool; the lower index breaks ties."""
     squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(squared, np.inf)
     nearest = np.argsort(squared, axis=1, kind="stable")[:, : min(N_NEIGHBOURS, len(points) - 1)]
-    near = np.zeros(squared.shape, dtype=bool)
-    np.put_along_axis(near, nearest, True, axis=1)
-    return near | near.T
+    adjacent = np.zeros(squared.shape, dtype=bool)
+    np.put_along_axis(adjacent, nearest, True, axis=1)
+    return adjacent | adjacent.T
 
 
 def _gabriel_adjacency(points: np.ndarray) -> np.ndarray:
     """Return the adjacency matrix of the Gabriel graph, (J, J) bool."""
-    to = points[:, None] - points[None]  # [i, k]: from k to i
+    differences = points[:, None] - points[None]  # [i, k]: from k to i
     # k is inside the ball with diameter i–j if and only if the angle i–k–j is obtuse.
-    products = np.einsum("ikd,jkd->ijk", to, to)
+    products = np.einsum("ikd,jkd->ijk", differences, differences)
     return ~(products < 0).any(axis=-1)

@@ -24,7 +24,7 @@ from probmotion.validation import check_finite, check_positive, check_shape
 __all__ = ["MEASURES", "PairComparer"]
 
 MEASURES = ("interaction", "cartesian", "shape-context")
-"""Distances of 2D pose-pairs; kernels use the index."""
+"""Names of distances between 2D pose-pairs; kernels use the index."""
 
 
 class PairComparer:
@@ -32,8 +32,8 @@ class PairComparer:
 
     A projection is first rigidly aligned to the visible joints of the annotation (no reflection).
 
-    - ``interaction``: eq. 8, metres. The graphs are those of all joints of the projection and of
-      the visible joints of the annotation; edges with an occluded end are ignored.
+    - ``interaction``: eq. 8, metres. The graphs connect all joints of the projection and the
+      visible joints of the annotation; edges with an occluded end are ignored.
     - ``cartesian``: root-mean-square distance of the visible joints, metres.
     - ``shape-context``: mean χ² cost of the visible joints' shape contexts, in [0, 1].
 
@@ -91,7 +91,7 @@ class PairComparer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance and index of the nearest candidate annotation.
 
-        Results are bit-identical for any batch and number of threads (``numba.set_num_threads``).
+        Results are bit-identical for any batch size and thread count (``numba.set_num_threads``).
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class PairComparer:
             Infinite if no candidate shares an edge (for measures without a graph: a joint) with the
             projection.
         indices : ndarray of int, (B, V)
-            Ties go to the first candidate.
+            The first candidate in case of ties.
         """
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])

@@ -45,16 +45,16 @@ def context_cost(
 ) -> float:
     """Return the mean χ² cost of a rotated projection, infinite once it exceeds ``best``.
 
-    ``bins`` from :func:`polar_bins`, (2, J, J); ``turn``, the rotation, radians; ``seen`` (J,) and
-    ``contexts`` (J, 60) uint8 of the annotation; ``shared``, the
+    ``bins`` (2, J, J) are from :func:`polar_bins`; ``turn`` is the rotation, radians; ``seen`` (J,)
+    and ``contexts`` (J, 60) uint8 describe the annotation; ``shared`` is the
     :func:`~probmotion.interaction.geometry.shape_context.shared_table` of J − 1.
     """
     n_joints, n_visible = contexts.shape[0], int(seen.sum())
     if n_visible < 2:
         return np.inf
     total, n_rows, turned = 0.0, 0, turn * _PER_RADIAN
-    # The tolerance keeps ties despite rounding.
-    enough = (best + 1e-9) * n_visible * (n_visible - 1)
+    # The tolerance preserves ties despite rounding errors.
+    limit = (best + 1e-9) * n_visible * (n_visible - 1)
     counts = np.empty(contexts.shape[1], dtype=np.uint8)
     for i in range(n_joints):
         if seen[i] == 0:
@@ -73,6 +73,6 @@ def context_cost(
             total += shared[counts[k], contexts[i, k]]
         n_rows += 1
         # Lower bound of the cost: the remaining joints may match exactly.
-        if n_rows * (n_visible - 1) - total > enough:
+        if n_rows * (n_visible - 1) - total > limit:
             return np.inf
     return 1.0 - total / (n_visible * (n_visible - 1))

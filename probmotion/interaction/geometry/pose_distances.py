@@ -88,4 +88,4 @@ MEASURES: Mapping[str, Measure] = {
     "cartesian": (_centred, cartesian_minima),
     "shape-context": (_ringed, shape_minima),
 }
-"""The distances by name."""
+"""Distances by name."""

@@ -21,9 +21,9 @@ __all__ = [
 RING_EDGES = (0.15, 0.3, 0.6, 1.2)
 """Boundaries of the five distance rings, metres; the last ring is unbounded."""
 N_ANGLES = 12
-"""Angular bins in 2D."""
+"""Number of angular bins in 2D."""
 N_BANDS, N_SECTORS = 4, 8
-"""Bins in 3D: sine of the elevation (equal areas) and azimuth."""
+"""Numbers of bins in 3D, in the sine of the elevation (equal areas) and the azimuth."""
 
 
 def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
@@ -43,7 +43,7 @@ def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.
     Returns
     -------
     ndarray of uint8, (…, J, 60) or (…, J, 160)
-        0 in the rows of occluded joints.
+        Counts; 0 in the rows of occluded joints.
     """
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, ("…", "J", 3 if points.shape[-1:] == (3,) else 2))
@@ -54,12 +54,12 @@ def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.
     visible = np.ones(n_joints, dtype=bool) if visible is None else np.asarray(visible, dtype=bool)
     check_shape("visible", visible, ("…", n_joints))
     flat = points.reshape(-1, n_joints, n_axes)
-    shown = np.broadcast_to(visible, (*batch, n_joints)).reshape(-1, n_joints)
+    masks = np.broadcast_to(visible, (*batch, n_joints)).reshape(-1, n_joints)
     n_bins = (len(RING_EDGES) + 1) * (N_ANGLES if n_axes == 2 else N_BANDS * N_SECTORS)
     counts = np.zeros((len(flat), n_joints, n_bins), dtype=np.uint8)
-    for item, (joints, seen) in enumerate(zip(flat, shown, strict=True)):
+    for item, (joints, mask) in enumerate(zip(flat, masks, strict=True)):
         bins = _bins_in_plane(joints) if n_axes == 2 else _bins_in_space(joints)
-        i, j = np.nonzero(seen[:, None] & seen[None, :] & ~np.eye(n_joints, dtype=bool))
+        i, j = np.nonzero(mask[:, None] & mask[None, :] & ~np.eye(n_joints, dtype=bool))
         np.add.at(counts[item], (i, bins[i, j]), 1)
     return counts.reshape(*batch, n_joints, n_bins)
 
@@ -75,26 +75,26 @@ def shape_context_distance(
     Parameters
     ----------
     first, second : ndarray, (…, J, K)
-        From :func:`shape_contexts` with the same visible joints.
+        Results of :func:`shape_contexts` with the same visible joints.
     visible : ndarray of bool, (…, J), optional
         Mask of visible joints; all by default.
 
     Returns
     -------
     ndarray, (…)
-        Infinite where fewer than two joints are visible.
+        Mean cost; infinite where fewer than two joints are visible.
     """
     check_shape("first", first, ("…", "J", "K"))
     check_shape("second", second, ("…", *first.shape[-2:]))
     visible = np.ones(first.shape[-2], dtype=bool) if visible is None else visible
     check_shape("visible", visible, ("…", first.shape[-2]))
     h, g = _normalised(first), _normalised(second)
-    both = h + g
-    cost = 0.5 * ((h - g) ** 2 / np.where(both > 0, both, 1.0)).sum(axis=-1)
-    counted = np.broadcast_to(visible, cost.shape)
-    n_counted = counted.sum(axis=-1)
-    mean = np.where(counted, cost, 0.0).sum(axis=-1) / np.maximum(n_counted, 1)
-    return np.where(n_counted > 1, mean, np.inf)
+    total = h + g
+    cost = 0.5 * ((h - g) ** 2 / np.where(total > 0, total, 1.0)).sum(axis=-1)
+    mask = np.broadcast_to(visible, cost.shape)
+    n_visible = mask.sum(axis=-1)
+    mean = np.where(mask, cost, 0.0).sum(axis=-1) / np.maximum(n_visible, 1)
+    return np.where(n_visible > 1, mean, np.inf)
 
 
 def shared_table(most: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`StoredChain`: resumable state of a long chain in a file."""
+"""`StoredChain`: checkpoint file of a long chain."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _SECONDS = 30.0
 
 
 class StoredChain:
-    """Periodic, atomic checkpoint of a chain's state in ``path``, an ``.npz`` file without pickle.
+    """Periodic, atomic checkpoints of a chain's state in ``path``, an ``.npz`` file without pickle.
 
-    Resuming reproduces the draws bit by bit. Without a path nothing is written.
+    Resumed chains produce bit-identical draws. Without a path, nothing is written.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path, self._written = path, time.monotonic()
 
     def load(self) -> Mapping[str, np.ndarray] | None:
-        """Return the last state written, or None; ``ValueError`` if the file is damaged."""
+        """Return the last checkpoint, or None; raise ``ValueError`` if the file is corrupt."""
         if self.path is None or not self.path.is_file():
             return None
         try:
@@ -39,12 +39,12 @@ class StoredChain:
             ) from error
 
     def save(self, state: Callable[[], Mapping[str, np.ndarray]]) -> None:
-        """Write the state if it is due; write errors only warn."""
+        """Write the state if 30 s have passed since the last checkpoint; warn if writing fails."""
         if self.path is None or time.monotonic() < self._written + _SECONDS:
             return
         try:
             with written_whole(self.path) as unfinished:
                 np.savez(unfinished, allow_pickle=False, **state())
         except OSError as error:
-            warnings.warn(f"{error}; the chain continues", stacklevel=2)
+            warnings.warn(f"checkpoint was not written: {error}; sampling continues", stacklevel=2)
         self._written = time.monotonic()

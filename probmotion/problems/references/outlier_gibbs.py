@@ -1,13 +1,13 @@
-"""`OutlierGibbs`: reference draws given noisy 3D joints with outliers.
+"""`OutlierGibbs`: Gibbs sampler for 3D joints with Student-t noise.
 
 Student-t noise is Gaussian noise with random precision factors λ ~ Gamma(ν/2, rate ν/2) per
-coordinate (Andrews and Mallows 1974). Given λ the posterior is exact, including style and azimuth;
-given the motion the λ are independent,
+coordinate (Andrews and Mallows 1974). Given λ, the posterior of motion, style and azimuth has a
+closed form; given the motion X, the λ are independent,
 
     λ | X, y ~ Gamma((ν + 1)/2, rate (ν + (y − X)²/σ²)/2).
 
-Gibbs sampling alternates the two without rejections or tuning. NUTS on positions does not cross
-between azimuths.
+Gibbs sampling alternates between the two, without rejections or tuning. NUTS on positions does not
+move between azimuths.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ __all__ = ["OutlierGibbs"]
 
 @dataclass(frozen=True)
 class OutlierGibbs:
-    """Gibbs sampling of motions and precision factors.
+    """Gibbs sampler of motions and precision factors.
 
     Parameters
     ----------
     warmup : int
-        Iterations before the first draw, from precision factors drawn from their prior.
+        Iterations before the first draw; precision factors are initialised from their prior.
     thin : int
         Iterations per draw.
     """
@@ -52,7 +52,7 @@ class OutlierGibbs:
         check_count("thin", self.thin)
 
     def draws_from(self, posterior: MotionPosterior) -> bool:
-        """Whether the likelihood is 3D joints with Student-t noise and the prior exact."""
+        """Return whether the prior is exact and the likelihood is Student-t noise on 3D joints."""
         likelihood = posterior.likelihood
         noisy = isinstance(likelihood, Joints3D) and likelihood.degrees_of_freedom is not None
         return noisy and isinstance(posterior.prior, HasExactPosterior)
@@ -67,7 +67,7 @@ class OutlierGibbs:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``draws`` states of each of ``chains`` chains; see the sampler protocol."""
+        """Return ``draws`` states from each of ``chains`` chains; see the sampler protocol."""
         if not self.draws_from(posterior):
             raise ValueError(
                 "posterior must have an exact prior and Joints3D with Student-t noise, got "

@@ -1,8 +1,8 @@
-"""Compiled Metropolis proposals of pose pairs.
+"""Compiled Metropolis proposals for pose pairs.
 
 The base measure is a product: uniform bone directions, normal log lengths and normal root
 positions, as in ``PoseChart.log_measure`` without the roots' frames. Proposals rotate bones or
-shift a length or position; they preserve areas and volumes and need no Jacobian.
+change a length or position; they preserve area and volume, so no Jacobian is needed.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _ANY_ANGLE = 0.3
 
 
 class Body(NamedTuple):
-    """Skeleton and seed of two or more people.
+    """Skeleton and seed pose of two or more people.
 
-    ``parents`` (J,) int64, −1 for roots; ``below`` (J, J): whether a joint is another or its
-    descendant; ``roots``, ``chests`` (K,) int64; ``person`` (J,) int64, 0 to K − 1; ``seed``
+    ``parents`` (J,) int64, −1 for roots; ``below[j, k]``: whether joint k is joint j or one of its
+    descendants; ``roots``, ``chests`` (K,) int64; ``person`` (J,) int64, 0 to K − 1; ``seed``
     (J, 3), metres.
     """
 
@@ -49,7 +49,7 @@ class Body(NamedTuple):
 
 
 def moves_of(body: Body) -> np.ndarray:
-    """Return all moves, (moves, 3): kind, joint or root, and second joint or −1.
+    """Return all moves, (n_moves, 3): kind, joint or root, and second joint or −1.
 
     The second joint is a crank's only child or a hinge's sibling.
     """
@@ -72,7 +72,7 @@ def propose(
     rng: np.random.Generator,
     proposed: np.ndarray,
 ) -> None:
-    """Write the proposal of one of :func:`moves_of`; ``size`` in radians, metres or log length."""
+    """Write the proposal of one move; ``size`` is its scale in radians, metres or log length."""
     kind, joint, other = move
     proposed[:] = pose
     parent = body.parents[joint]
@@ -109,15 +109,15 @@ def propose(
         angle = vector[0]
         if rng.random() < _ANY_ANGLE:
             angle = np.pi * (2.0 * rng.random() - 1.0)
-        # Rotation about the line between two joints leaves both bones' lengths unchanged.
+        # Rotation about the line between two joints preserves both bone lengths.
         axis = pose[other] - pose[parent if kind == CRANK else joint]
         length = np.sqrt((axis**2).sum())
         if length == 0:
             return
         _rotation(axis * (angle / length), turn)
-        alone = np.zeros(len(pose), dtype=np.bool_)
-        alone[joint] = True
-        _turn_about(proposed, alone, pose[parent], turn)
+        rotated = np.zeros(len(pose), dtype=np.bool_)
+        rotated[joint] = True
+        _turn_about(proposed, rotated, pose[parent], turn)
         if kind == HINGE:
             vector[:] = proposed[joint] - pose[joint]
             for k in range(len(pose)):
@@ -139,7 +139,7 @@ def resample_placement(
         new[i] = start[i] + body.root_noise / np.sqrt(n_roots) * rng.standard_normal()
     turn = np.empty((3, 3))
     _any_rotation(rng, turn)
-    # The centre is drawn from its conditional; accept by the density of the roots around it.
+    # The centre is drawn from its conditional; only relative root positions affect acceptance.
     before, after = 0.0, 0.0
     for root in body.roots:
         for i in range(3):
@@ -185,7 +185,7 @@ def _any_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _of_quaternion(w: float, x: float, y: float, z: float, R: np.ndarray) -> None:
-    # Assignments of rows would take three seconds longer to compile.
+    # Row assignments would increase compile time by three seconds.
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)

@@ -1,4 +1,4 @@
-"""Lookup of stored references: the user's and the shipped ones."""
+"""Lookup of reference posteriors, user-computed or shipped."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _SHIPPED = Path(__file__).parent
 
 
 def references_folder() -> Path:
-    """Return the user's folder of references, beside the downloads."""
+    """Return the folder of user-computed references in the data folder."""
     from probmotion.data.downloads import data_folder
 
     return data_folder() / "references"
 
 
 def find_reference(name: str) -> StoredReference | None:
-    """Return the stored reference of a problem, preferring the user's, or None."""
-    for place in (references_folder(), _SHIPPED):
-        if (place / name / "certificate.json").is_file():
-            return StoredReference.load(place / name)
+    """Return the stored reference of a problem, user-computed before shipped, or None."""
+    for folder in (references_folder(), _SHIPPED):
+        if (folder / name / "certificate.json").is_file():
+            return StoredReference.load(folder / name)
     return None

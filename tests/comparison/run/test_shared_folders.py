@@ -27,7 +27,7 @@ def test_a_problem_is_locked_until_the_other_process_is_killed(tmp_path):
     diary = tmp_path / "diary"
     with start("-c", HOLDER, tmp_path) as holder:
         assert holder.stdout.readline() == "locked\n"
-        with pytest.raises(ValueError, match=r"out is .*, where another process is running gener"):
+        with pytest.raises(ValueError, match=r"in use, got .*, where another process is running g"):
             compare(generation(), PriorDraws(diary=str(diary)), out=tmp_path, **SMALL)
         assert count(diary) == 0
         # Other problems are not locked.
@@ -51,7 +51,7 @@ def test_locks_are_released_after_errors(tmp_path):
 
 def test_a_file_system_without_locks_raises(tmp_path, monkeypatch):
     monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(38, "Function not implemented")))
-    with pytest.raises(OSError, match=r"out is .* files cannot be locked: Function not impl"):
+    with pytest.raises(OSError, match=r"out must support file locks, got .*: Function not impl"):
         compare(generation(), PriorDraws(), out=tmp_path, **SMALL)
 
 
@@ -77,7 +77,7 @@ def test_folders_of_other_versions_raise(tmp_path, monkeypatch):
     first = {name: value for name, value in stored.items() if name != "format"}
     for other, version in ((stored | {"format": 7}, 7), (first, 1)):
         plan.write_text(json.dumps(other))
-        message = rf"out is .*, which another version of probmotion wrote \(format {version}, not 2"
+        message = rf"out must be written by .* \(format 2\), got .* of format {version};"
         with pytest.raises(ValueError, match=message):
             compare(generation(), sampler, out=tmp_path, **SMALL)
         with pytest.raises(ValueError, match=message):

@@ -90,7 +90,7 @@ def test_overlap_is_averaged_over_seen_frames():
     assert drop_crowds(tracks, overlap=0.24)[0] == tracks[1:]
     with pytest.raises(ValueError, match="videos must have one name per track, 2, got 1"):
         drop_crowds(tracks, videos=["v"])
-    with pytest.raises(ValueError, match=r"video 'v' must have as many frames, got \[10, 12\]"):
+    with pytest.raises(ValueError, match=r"video 'v' must have equal lengths, got \[10, 12\]"):
         drop_crowds([tracks[0], square(12)], videos=["v", "v"])
 
 

@@ -159,10 +159,10 @@ def test_named_clips_are_held_out_with_all_their_segments():
     [
         (["clip3"], [], "validation requires test"),
         ([], ["clip3"], "test requires validation"),
-        (["clip3", "clip4"], ["clip4"], "validation and test must be disjoint, both have 'clip4'"),
+        (["clip3", "clip4"], ["clip4"], "validation and test must be disjoint, got 'clip4'"),
         (["clip3"], ["walk"], "test must name clips among clip0, .*, got 'walk'"),
         (["clip3/x"], ["clip4"], "validation must name clips among clip0, .*, got 'clip3/x'"),
-        (NAMES[:10], NAMES[10:], "validation and test must leave training clips"),
+        (NAMES[:10], NAMES[10:], "validation and test must exclude at least one clip"),
     ],
 )
 def test_invalid_parts(validation, test, message):

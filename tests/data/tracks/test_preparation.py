@@ -115,7 +115,7 @@ def test_options_select_steps(raw, clean, result):
     # A track is prepared independently of others.
     (alone,) = prepared(raw[3:4], clean).tracks
     np.testing.assert_array_equal(alone.keypoints, result.tracks[3].keypoints)
-    with pytest.raises(ValueError, match="no track is left after step crowds: tracks 2 → 0"):
+    with pytest.raises(ValueError, match="no track remains after step crowds: tracks 2 → 0"):
         prepared([raw[0], raw[0]], clean, videos=["one", "one"])
 
 
@@ -125,8 +125,8 @@ def test_invalid_input(raw, clean):
     for tracks, options, message in (
         ([], {}, "tracks must contain at least one, got none"),
         (raw, {"fps": None}, "fps must be a finite number above 0, got None"),
-        (raw[-1:], {}, "no track is left after step segments: tracks 1"),
-        (raw[:6], {"threshold": 2}, "no track is left after step segments: tracks 6"),
+        (raw[-1:], {}, "no track remains after step segments: tracks 1"),
+        (raw[:6], {"threshold": 2}, "no track remains after step segments: tracks 6"),
         ([snake], {"skeleton": PERSON}, "tracks of tail, mid, head cannot be retargeted: .*own"),
         ([raw[0], snake], {}, "tracks must have one skeleton, got several; pass skeleton"),
     ):

@@ -130,7 +130,7 @@ def test_people_in_one_video_may_be_a_crowd_and_views_and_videos_may_not(person,
         return detections(person, idx=0), detections(other, idx=1)
 
     assert [track.name[-9:] for track in read(*pair(800))] == ["/people 0", "/people 1"]
-    with pytest.raises(ValueError, match="no track is left after step crowds"):
+    with pytest.raises(ValueError, match="no track remains after step crowds"):
         read(*pair(5))
     result = read(detections(person, "a/")[:60], detections(person, "b/")[:90])
     assert [track.frames for track in result] == [40, 60]

@@ -57,7 +57,7 @@ DOTS = KeypointTrack(TRACK.keypoints, TRACK.confidence, Skeleton(["a", "b", "c"]
     ("call", "message"),
     [
         (lambda: bone_sizes([]), "tracks must contain at least one, got none"),
-        (lambda: bone_sizes([TRACK, DOTS]), r"tracks must have one skeleton, but tracks\[1\]"),
+        (lambda: bone_sizes([TRACK, DOTS]), r"tracks must have one skeleton, got another"),
         (lambda: scale_to_bones([TRACK], {}), "sizes must contain the size of at least one bone"),
         (lambda: scale_to_bones([TRACK], {"knee": 0.0}), r"sizes\['knee'\] must be a finite"),
         (lambda: scale_to_bones([TRACK], {"tail": 1.0}), r"track 'leg' \(ankle, knee\), got tail"),

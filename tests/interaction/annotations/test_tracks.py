@@ -136,7 +136,7 @@ BALL = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], 
 @pytest.mark.parametrize(
     ("second", "options", "message"),
     [
-        ([], {}, "tracks must have 2 tracks, one per person, got 1"),
+        ([], {}, "tracks must contain 2 tracks, one per person, got 1"),
         ([SHORT], {}, r"tracks\[1\] must have 40 frames at 30 .*, got 39 at 30"),
         ([replace(SECOND, fps=25.0)], {}, r"tracks\[1\] must have 40 .*, got 40 at 25"),
         ([replace(SECOND, confidence=0 * SECOND.confidence)], {}, "all 2 people are visible, got"),

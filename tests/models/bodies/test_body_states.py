@@ -203,7 +203,7 @@ def test_rest_pose_is_upright_and_independent_of_the_heading(walkers):
 
 def test_invalid_bodies_and_motions_are_rejected(walkers):
     rest = walkers[0].rest
-    with pytest.raises(ValueError, match="motions must contain at least one, got none"):
+    with pytest.raises(ValueError, match="motions must contain at least one motion, got none"):
         rest_pose(PERSON, [])
     with pytest.raises(ValueError, match="skeleton must have left-right pairs"):
         rest_pose(Skeleton(["a", "b"], [-1, 0]), [np.ones((2, 2, 3))])

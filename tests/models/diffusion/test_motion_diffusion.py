@@ -215,9 +215,9 @@ def test_trained_priors_are_loaded_from_folder_and_file(trainee, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "change", "options", "message"),
     [
-        ("evaluator", {}, {}, "contains a evaluator, expected a motion-diffusion"),
-        (KIND, {"size": vars(TINY) | {"width": 64}}, {}, "weights do not match its settings"),
-        (KIND, {"parents": None}, {}, "does not contain valid motion-diffusion settings"),
+        ("evaluator", {}, {}, "must contain a motion-diffusion, got a evaluator"),
+        (KIND, {"size": vars(TINY) | {"width": 64}}, {}, "weights must match the checkpoint"),
+        (KIND, {"parents": None}, {}, "must contain valid motion-diffusion settings"),
         (KIND, {}, {"frames": 99}, "frames must be at most 12, the network's longest motion, got"),
         (KIND, {}, {"frames": 1}, "frames must be an integer of at least 2, got 1"),
         (KIND, {}, {"device": "tpu"}, "device must be cpu or cuda, got 'tpu'"),

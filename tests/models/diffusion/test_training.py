@@ -169,7 +169,7 @@ def test_run_with_dropout_resumes_bit_identically(tmp_path):
     parts = run("parts", 12)
     assert whole.model.read_bytes()[-20_000:] == parts.model.read_bytes()[-20_000:]
     assert [row["loss"] for row in whole.history] == [row["loss"] for row in parts.history]
-    with pytest.raises(ValueError, match=r"contains a run with .*; use another folder"):
+    with pytest.raises(ValueError, match=r"must be .* to resume .*; use another folder"):
         run("parts", 12, seed=2)
 
 

@@ -322,7 +322,7 @@ def test_invalid_inputs_are_rejected(prior, make_prior, denoiser, tmp_path):
     confidence[5:20] = 0
     empty = replace(observed(prior, frames=30), confidence=confidence)
     for given, seen, overlap, message in (
-        (other, likelihood, 3, "prior must be the one that the denoiser was trained for"),
+        (other, likelihood, 3, "prior must be that of the denoiser's training"),
         (None, likelihood, 3, "prior must be the Motion-DVAE .*, got NoneType"),
         (prior, likelihood, 8, "overlap must be less than the denoiser's window of 8 frames"),
         (prior, likelihood, -1, "overlap must be an integer of at least 0, got -1"),
@@ -336,7 +336,7 @@ def test_invalid_inputs_are_rejected(prior, make_prior, denoiser, tmp_path):
         MotionDenoiser.load(path, other)
     weights = denoiser.networks.state_dict()
     save_checkpoint(path, Checkpoint(KIND, {"network": {}}, weights))
-    with pytest.raises(CheckpointError, match="does not contain valid denoiser settings"):
+    with pytest.raises(CheckpointError, match="must contain valid denoiser settings"):
         MotionDenoiser.load(path, prior)
     with pytest.raises(ValueError, match="denoiser must have a training record to be saved"):
         MotionDenoiser(denoiser.networks, prior).save(path)

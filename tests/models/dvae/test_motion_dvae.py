@@ -156,10 +156,10 @@ def test_checkpoint_round_trip(prior, tmp_path):
 def test_invalid_checkpoints_are_rejected(prior, tmp_path):
     path = tmp_path / "a.safetensors"
     weights, network = prior.model.state_dict(), prior.card["network"]
-    invalid = "does not contain valid Motion-DVAE settings: "
+    invalid = "must contain valid Motion-DVAE settings, got an error: "
     for kind, settings, message in (
-        ("evaluator", network, "contains a evaluator, expected a motion-dvae"),
-        (KIND, network | {"size": network["size"] | {"hidden": 64}}, "weights do not match its"),
+        ("evaluator", network, "must contain a motion-dvae, got a evaluator"),
+        (KIND, network | {"size": network["size"] | {"hidden": 64}}, "weights must match the"),
         (KIND, {"size": network["size"]}, invalid),
         (KIND, network | {"size": network["size"] | {"groups": 7}}, invalid),
         (KIND, network | {"size": network["size"] | {"wings": 2}}, invalid),

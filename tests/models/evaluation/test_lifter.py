@@ -282,9 +282,9 @@ OTHER = [KeypointTrack(np.ones((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "point"
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda lifter, flow: replace(TINY, deepest=8.0), "deepest must be below distance, 7.0"),
+        (lambda lifter, flow: replace(TINY, deepest=8.0), "deepest must be below distance=7.0"),
         (lambda lifter, flow: replace(TINY, steepest=1.6), "steepest must be below pi/2, got 1.6"),
-        (lambda lifter, flow: LossWeights(bones=-1), "bones must be a number of at least 0"),
+        (lambda lifter, flow: LossWeights(bones=-1), "bones must be a finite number of at least 0"),
         (lambda lifter, flow: lifter.lift(views()[0]), r"views must have shape .*got \(5, 14, 2\)"),
         (lambda lifter, flow: lifter.lift(views()[:, :0]), "views must contain a motion and a fr"),
         (lambda lifter, flow: lifter.lift(np.nan * views()), "views must be finite"),

@@ -152,7 +152,7 @@ STILL = [KeypointTrack(np.zeros((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "still
     [
         ([], GOOD, "tracks must contain at least one track, got none"),
         (OCCLUDED, GOOD, "a frame with every joint at confidence 0.3 or more, got none"),
-        (GOOD + OTHER, GOOD, "tracks must have one skeleton, 'person' has other joints"),
+        (GOOD + OTHER, GOOD, "tracks must share one skeleton, got another in 'person'"),
         (GOOD, OTHER, "validation must have the same skeleton as tracks"),
         (STILL, STILL, "blur must be above 0 for poses in a subspace, got 0"),
     ],

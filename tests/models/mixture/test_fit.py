@@ -99,7 +99,7 @@ def test_invalid_clips_are_rejected():
     dogs = make_gaits(1, styles={"quadruped-trot": 1.0})
     for motions, message in (
         ([], "motions must contain at least one clip, got none"),
-        (clips, "motions must contain a clip of at least 99 frames, the longest has"),
+        (clips, "motions must contain a clip of at least 99 frames, got at most"),
         ([*clips, *make_gaits(2, fps=25.0)], "motions must share one frame rate"),
         ([*clips, *dogs], "motions must share one skeleton"),
     ):

@@ -304,7 +304,7 @@ def test_unsupported_likelihoods_and_cameras_are_rejected(prior, motions):
     ("change", "message"),
     [
         ({"noise": 0.0}, "noise must be a finite number above 0, got 0.0"),
-        ({"weights": np.array([0.5, 0.6])}, "weights must be numbers above 0 that sum to 1"),
+        ({"weights": np.array([0.5, 0.6])}, "weights must be positive and sum to 1"),
         ({"azimuths": 0}, "azimuths must be an integer of at least 1, got 0"),
         ({"coordinates": "polar"}, "coordinates must be 'latent' or 'positions', got 'polar'"),
         ({"means": np.zeros((K, L, J, 2))}, "means must have shape"),

@@ -90,16 +90,16 @@ def test_truncated_files_and_pickles_are_rejected(path, length):
 
 def test_other_files_are_rejected(path, tmp_path):
     for missing in (tmp_path / "none.safetensors", tmp_path):
-        with pytest.raises(FileNotFoundError, match="there is no checkpoint"):
+        with pytest.raises(FileNotFoundError, match="source must be a file"):
             load_checkpoint(missing, KIND)
-    with pytest.raises(CheckpointError, match="contains a toy, expected a motion-diffusion"):
+    with pytest.raises(CheckpointError, match="must contain a motion-diffusion, got a toy"):
         load_checkpoint(path, "motion-diffusion")
     with safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()["probmotion"])
     for metadata, message in (
-        (json.dumps(header | {"format": 99}), "checkpoint of version 99, expected version 1"),
-        (None, "is not a checkpoint of probmotion"),
-        ("[1]", "is not a checkpoint of probmotion"),
+        (json.dumps(header | {"format": 99}), "checkpoint of version 1, got version 99"),
+        (None, "must be a checkpoint of probmotion"),
+        ("[1]", "must be a checkpoint of probmotion"),
     ):
         save_file({"a": torch.zeros(2)}, path, metadata=metadata and {"probmotion": metadata})
         with pytest.raises(CheckpointError, match=message):

@@ -239,10 +239,10 @@ def test_invalid_arguments_are_rejected():
     for call, message in (
         (lambda: batches(), "tracks must contain at least one track, got none"),
         (lambda: batches(track(fps=25.0), track()), "one frame rate, got 20 for .* and 25 for"),
-        (lambda: batches(track(), POINT), "have one skeleton, b/0 differs from clip/0"),
+        (lambda: batches(track(), POINT), "same skeleton, got another for b/0 than for clip/0"),
         (lambda: held_out(POINT), "validation must have the same skeleton as tracks"),
         (lambda: held_out(track(fps=25.0)), "the frame rate of tracks, 20, got 25"),
-        (lambda: batches(track(), threshold=1.5), r"a confidence of 1\.5 or more, got none"),
+        (lambda: batches(track(), threshold=1.5), r"confidence of at least 1\.5, got none"),
         (lambda: batches(track(), threshold=math.nan), r"^threshold must be .*got nan"),
         (lambda: batches(POINT).standards, "deviation must be above 0"),
         (lambda: Standards(np.zeros((1, 2)), -np.ones((1, 2))), "deviation must be at least 0"),
