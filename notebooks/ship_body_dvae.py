@@ -144,7 +144,7 @@ def _measured(table: Path | None) -> str:
     ]
     head = (
         "\nMeasured by `python notebooks/ablations/motion_dvae.py` on the clips held out, mm:\n\n"
-        "| recording | estimate | G-MPJPE | hidden joints | acceleration, of the truth's |\n"
+        "| recording | estimate | G-MPJPE | occluded joints | acceleration relative to the truth's |\n"
         "|---|---|---|---|---|\n"
     )
     return head + "\n".join(lines) + "\n"

@@ -259,7 +259,7 @@ def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
     world = accuracy.joint_errors(found, truth)
     row = {"mpjpe": local.mean(), "g_mpjpe": world.mean()}
     if recording.hidden.any():
-        for name, mask in (("visible", ~recording.hidden), ("hidden", recording.hidden)):
+        for name, mask in (("visible", ~recording.hidden), ("occluded", recording.hidden)):
             row[f"mpjpe_{name}"] = accuracy.mean_over(local, mask)
             row[f"g_mpjpe_{name}"] = accuracy.mean_over(world, mask)
     row = {name: 1000 * float(value) for name, value in row.items()}
@@ -473,7 +473,7 @@ def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, f
     low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
     inside = (truth.positions >= low) & (truth.positions <= high)
     row = {}
-    for name, which in (("seen", ~hidden), ("hidden", hidden)):
+    for name, which in (("seen", ~hidden), ("occluded", hidden)):
         if which.any():
             row[f"spread_{name}_mm"] = 1000 * float(spread[which].mean())
             row[f"error_{name}_mm"] = 1000 * float(error[which].mean())
