@@ -214,7 +214,7 @@ def test_invalid_clips_are_one_line_and_write_nothing(write_walks, clips, tmp_pa
         f"{given} --validation walk9 --test walk1": "validation must name clips among "
         f"{known}, got 'walk9'",
         f"{given} --validation walk0 walk1 walk2 --test walk4 walk3": "validation and test must "
-        "leave training clips",
+        "exclude at least one clip for training",
         "--validation walk-0": "validation requires --clips",
         "--test walk-0": "test requires --clips",
         f"{given} {twin}": "files must have unique names, got ",

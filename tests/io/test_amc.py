@@ -140,7 +140,9 @@ def test_skeleton_file_is_found_or_given(tmp_path):
     (tmp_path / "other").mkdir()
     away = (tmp_path / "other" / "run_01.amc").resolve()
     subject.rename(away)
-    with pytest.raises(FileNotFoundError, match=r"no .*run_01\.asf or .*run\.asf with the skelet"):
+    with pytest.raises(
+        FileNotFoundError, match=r"expected the skeleton .*run_01\.asf or .*run\.asf, got"
+    ):
         read_amc(away)
     assert read_amc(away, tmp_path / "made.asf").frames == len(FRAMES)
     for files in ((away, tmp_path / "none.asf"), (tmp_path / "none.amc",)):

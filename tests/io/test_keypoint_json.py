@@ -160,7 +160,9 @@ def test_skeleton_by_count_by_name_or_given(tmp_path):
         (track,) = read_keypoints(written(tmp_path, content), fps=1)
         assert track.skeleton == Skeleton.preset(name)
     path = written(tmp_path, [{"image_id": 0, "keypoints": [1.0] * 75}])
-    with pytest.raises(MotionFileError, match=r"name the 25 keypoints .*'body25' and 'body25b'"):
+    with pytest.raises(
+        MotionFileError, match=r"must be given for 25 keypoints \('body25' or 'body25b'"
+    ):
         read_keypoints(path, fps=1)
     given = Skeleton([f"k{i}" for i in range(25)], [-1] * 25)
     assert read_keypoints(path, 1, given)[0].skeleton == given

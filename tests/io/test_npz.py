@@ -115,9 +115,18 @@ TRACK = {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2)), "posit
         ({"positions": None}, "expected the key positions, got fps, joint_names, parents"),
         ({"fps": None}, "expected the key fps"),
         ({"joint_names": None}, "expected the key joint_names"),
-        ({"positions": np.zeros((4, 2))}, r"positions must have shape \(L, J, 3\) or .*\(4, 2\)"),
-        ({"positions": np.zeros((4, 2, 2))}, r"positions must have shape .* got \(4, 2, 2\)"),
-        ({"positions": np.zeros((0, 2, 3))}, r"positions must have shape .* got \(0, 2, 3\)"),
+        (
+            {"positions": np.zeros((4, 2))},
+            r"positions must have nonempty shape \(L, J, 3\) or .*\(4, 2\)",
+        ),
+        (
+            {"positions": np.zeros((4, 2, 2))},
+            r"positions must have nonempty shape .* got \(4, 2, 2\)",
+        ),
+        (
+            {"positions": np.zeros((0, 2, 3))},
+            r"positions must have nonempty shape .* got \(0, 2, 3\)",
+        ),
         ({"positions": NAN}, "positions must be finite, got 18 values that are NaN"),
         ({"positions": NAN * np.nan}, "24 values that are NaN"),
         ({"positions": np.full((4, 2, 3), np.inf)}, "must be between -1e9 and 1e9, got inf"),
@@ -140,7 +149,7 @@ TRACK = {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2)), "posit
             r"rotations must have shape \(4, 2, 3, 3\), got \(4, 2, 3\)",
         ),
         (TWO | {"persons": np.array(["a"])}, "persons must be 2 strings, got"),
-        (TRACK | {"keypoints": NAN}, r"keypoints must have shape .* got \(4, 2, 3\)"),
+        (TRACK | {"keypoints": NAN}, r"keypoints must have nonempty shape .* got \(4, 2, 3\)"),
         (
             TRACK | {"confidence": np.ones((4, 3))},
             r"confidence must have shape \(4, 2\), got \(4, 3",

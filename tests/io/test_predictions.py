@@ -48,10 +48,16 @@ def test_resampling_of_linear_motion_is_exact(tmp_path):
     ("changes", "message"),
     [
         ({"positions": None}, "expected the key positions, got joint_names, fps"),
-        ({"positions": CLIPS[..., :2]}, r"positions must have shape .*, got \(2, 7, 4, 2\)"),
+        (
+            {"positions": CLIPS[..., :2]},
+            r"positions must have nonempty shape .* got \(2, 7, 4, 2\)",
+        ),
         ({"positions": np.where(CLIPS > 2, np.nan, CLIPS)}, "positions must be finite, got"),
         ({"joint_names": np.array(["a", "a", "b", "c"])}, "joint_names must be unique"),
-        ({"joint_names": np.array(["a", "b", "LeftKnee", "Hips"])}, "the joint 'right_knee'"),
+        (
+            {"joint_names": np.array(["a", "b", "LeftKnee", "Hips"])},
+            "got 'right_knee', which has no counterpart",
+        ),
     ],
 )
 def test_defects_are_reported(tmp_path, changes, message):

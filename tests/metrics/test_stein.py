@@ -146,7 +146,7 @@ def test_missing_and_infinite_gradients():
 
     zero = np.zeros((3, 12))
     for prior, theta, error, message in (
-        (Bent("numpy"), zero, NoGradient, "Bent with no likelihood is not differentiable, torch m"),
+        (Bent("numpy"), zero, NoGradient, "Bent with no likelihood is not differentiable, torch r"),
         (Stepped(), zero, NoGradient, "posterior has no score: Stepped has no gradient"),
         (Unclosed(), zero, NoGradient, "posterior has no score: noise is Student's"),
         (Mute(), zero, NoGradient, "posterior has no score: Mute has no log density"),

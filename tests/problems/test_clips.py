@@ -81,7 +81,7 @@ STILL = replace(gaits()[0], positions=np.repeat(gaits()[0].positions[:1], 60, ax
     [
         (gaits()[:1], {}, "motions must contain at least 2 clips, .* got 1"),
         ([*gaits(), gaits()[-1]], {}, r"motions must be distinct, .* twice \(as run-2 and run-2\)"),
-        ([STILL, gaits()[0]], {}, "motions must contain windows that differ"),
+        ([STILL, gaits()[0]], {}, "motions must contain different windows"),
         (gaits(), {"frames": 61}, "held_out must be a clip of at least frames=61"),
         (
             [*gaits(frames=20), gaits()[0]],

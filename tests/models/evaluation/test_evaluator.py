@@ -149,7 +149,7 @@ def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
 
 def test_saved_encoder_gives_the_same_features(evaluator, views, tmp_path, run, monkeypatch):
     monkeypatch.setattr(checkpoints, "WEIGHTS", tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"checkpoint full; .* one of no names"):
+    with pytest.raises(FileNotFoundError, match=r"source must be .* one of no names, got 'full'"):
         TrackEvaluator.load("full")
     full, half = tmp_path / "full.safetensors", tmp_path / "half.safetensors"
     evaluator.save(full)

@@ -341,7 +341,7 @@ def test_command_reports_early_stopping(tmp_path, capsys):
     best = load_checkpoint(tmp_path / "model.safetensors", "line").settings["step"]
     printed = capsys.readouterr().out
     assert f": step {best}, loss" in printed
-    assert f"step {best + 3}, as the validation loss" in printed
+    assert f"stopped early at step {best + 3}: the validation loss" in printed
     run_training(Overfits(), EARLY, tmp_path, "cpu")
     assert "is finished" in capsys.readouterr().out
 
