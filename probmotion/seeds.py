@@ -26,14 +26,14 @@ _INTEGERS = (int, np.integer)
 class RandomNumbers(Protocol):
     """Source of random arrays whose first axis indexes draws.
 
-    Satisfied by a NumPy generator and by :class:`NormalStreams`, which has one stream per draw.
+    NumPy generators and :class:`NormalStreams`, with one stream per draw, satisfy this protocol.
     """
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:
-        """Return numbers uniform on [0, 1)."""
+        """Return uniform random numbers on [0, 1)."""
 
     def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
-        """Return standard normal numbers."""
+        """Return standard normal random numbers."""
 
 
 def sequence(seed: int, *path: Name) -> np.random.SeedSequence:
@@ -111,15 +111,15 @@ class NormalStreams:
 
     @classmethod
     def of_draws(cls, seed: int, draws: list[tuple[int, int]]) -> NormalStreams:
-        """Return the streams of ``draws``, pairs (chain, draw)."""
+        """Return the streams of ``draws``, a list of pairs (chain, draw)."""
         return cls([generator(seed, "draw", chain, draw) for chain, draw in draws])
 
     def normal(self, *shape: int) -> np.ndarray:
-        """Return the next standard normal numbers, shape ``(B, *shape)``, float64."""
+        """Return the next standard normal random numbers, shape ``(B, *shape)``, float64."""
         return self.standard_normal((len(self.generators), *shape))
 
     def uniform(self, *shape: int) -> np.ndarray:
-        """Return the next numbers uniform on [0, 1), shape ``(B, *shape)``, float64."""
+        """Return the next uniform random numbers on [0, 1), shape ``(B, *shape)``, float64."""
         return self.random((len(self.generators), *shape))
 
     def random(self, size: tuple[int, ...]) -> np.ndarray:

@@ -35,7 +35,7 @@ def one_thread() -> Iterator[None]:
     # SciPy bundles a separate BLAS, which can be limited only after loading.
     import scipy.linalg  # noqa: F401
 
-    # On an executor, another thread may be importing torch or JAX, and array libraries would use
+    # In a thread pool, another thread may be importing torch or JAX, and array libraries would use
     # the partially imported module. import_module waits until the import is complete.
     if current_thread() is not main_thread():
         for name in ("torch", "jax"):
@@ -50,7 +50,7 @@ def one_thread() -> Iterator[None]:
 
 
 class _Shared:
-    """Process-wide limits and the number of threads inside the block.
+    """Process-wide limits and the number of threads inside :func:`one_thread`.
 
     ``torch_threads`` is torch's thread count at the first entry, 0 if torch was not loaded.
     """
@@ -118,12 +118,12 @@ def _environment_of_one() -> Iterator[None]:
 
 @contextmanager
 def _per_thread_limits(torch: Any) -> Iterator[None]:
-    """Limit the per-thread counts of OpenMP and torch."""
+    """Limit the current thread to one OpenMP thread and one torch thread inside the block."""
     from threadpoolctl import ThreadpoolController
 
     before = torch.get_num_threads() if torch else 0
-    # A thread that loads torch while another thread is in the block inherits a count of 1 and would
-    # restore 1 on exit.
+    # A thread that loads torch while another thread is inside one_thread inherits a count of 1 and
+    # would restore 1 on exit.
     if before == 1 and not only_one_thread():
         before = _SHARED.torch_threads or before
     try:

@@ -14,7 +14,7 @@ __all__ = ["check_count", "check_finite", "check_positive", "check_shape"]
 def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> None:
     """Raise ``ValueError`` unless the shape of ``value`` is ``expected``.
 
-    Integers in ``expected`` are compared; strings (``"L"``, ``"J"``) accept any size; a leading
+    Integers in ``expected`` must match, strings (``"L"``, ``"J"``) accept any size, and a leading
     ``"…"`` accepts any batch axes.
     """
     batch = bool(expected) and expected[0] == "…"

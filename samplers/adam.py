@@ -8,7 +8,7 @@ __all__ = ["Adam"]
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015, algorithm 1); updates ``parameters`` in place."""
+    """Adam optimiser (Kingma and Ba 2015, algorithm 1) that updates ``parameters`` in place."""
 
     def __init__(self, parameters: np.ndarray, learning_rate: float) -> None:
         self.parameters = parameters
@@ -24,7 +24,7 @@ class Adam:
         self.mean += 0.1 * gradient
         self.square *= 0.999
         self.square += 0.001 * gradient**2
-        # Correct the bias of moments initialised at 0.
+        # Correct the bias of running moments that start at 0.
         scale = np.sqrt(self.square / (1 - 0.999**self.n_steps))
         scale += 1e-8
         step = self.learning_rate / (1 - 0.9**self.n_steps)

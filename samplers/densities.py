@@ -1,4 +1,4 @@
-"""Log densities with evaluation counts, starting points and continuation of runs."""
+"""Log densities with evaluation counts, starting points of chains and continuation of runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Density:
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None, guided: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log density, (n,), and the proposal guide at ``theta``, (n, dim).
+        """Return the log density, (n,), and the guide of proposals at ``theta``.
 
         With ``generators``, one per point, the density is estimated from random views. The
         guide has shape (n, dim) if ``guided``, else (n, 0).
@@ -106,9 +106,9 @@ def starting_points(
 
     Every chain resamples ``candidates`` prior draws (sampling-importance-resampling, Rubin 1987).
     With enough candidates, starting points are approximate posterior draws: they cover the modes in
-    proportion to their mass, and R-hat detects chains that do not mix. If the prior has seeds,
-    chain c starts at seed c modulo their number. ``shape`` is (chains, dim) or (chains, walkers,
-    dim).
+    proportion to their mass, and R-hat detects chains that do not mix. Chains of one walker cycle
+    through the seed coordinates of the prior (``HasSeeds``), if any. ``shape`` is (chains, dim) or
+    (chains, walkers, dim).
     """
     if initial is not None:
         assert not isinstance(initial, MotionDraws)
@@ -142,7 +142,7 @@ def continued(
     chains: int,
     seed: int,
 ) -> Mapping[str, np.ndarray] | None:
-    """Return the final state of ``initial`` if it is an earlier run, else ``None``.
+    """Return the final state of the earlier run ``initial``; ``None`` if it is not a run.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Sampler of posteriors with a closed form."""
+"""Exact sampling from posteriors with a closed form."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ExactSampler(IndependentSampler):
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether the posterior has a closed form."""
+        """Return whether the posterior can be sampled exactly."""
         return _closed_form(posterior)[0] is not None
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
@@ -47,7 +47,7 @@ class ExactSampler(IndependentSampler):
 
 
 def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable | None, str, str]:
-    """Return the closed-form posterior or ``None``, the reason, and the reason in one word."""
+    """Return the closed-form posterior, or ``None`` with the reason as text and as one word."""
     prior = posterior.prior
     if posterior.truncated:
         return None, "cannot draw from a posterior with a truncated density", "truncated"

@@ -24,11 +24,11 @@ __all__ = ["Batches", "IndependentSampler"]
 
 @dataclass
 class Batches:
-    """Batches of at most ``size`` draws.
+    """Function that draws a batch of motions, with its batch ``size`` and counts.
 
     ``draw(streams, tick)`` returns motions, (B, L, J, 3), in units of ``scale`` metres. It calls
-    ``tick`` ``steps`` times, updates the evaluation ``counts``, and may append θ, (B, dim), to
-    ``thetas`` for θ and log densities in the result.
+    ``tick`` ``steps`` times and updates the evaluation ``counts``. It may append θ, (B, dim), to
+    ``thetas``; the result then contains θ and log densities.
     """
 
     draw: Callable[[NormalStreams, Callable[[], Any]], np.ndarray]
@@ -100,8 +100,8 @@ class IndependentSampler:
             return _with_coordinates(result, posterior, thetas) if thetas else result
 
         bars = progress_bar(source.steps * -(-len(pairs) // source.size), self.name, progress)
-        # Rounding of multithreaded matrix products depends on the batch size, and a hundred steps
-        # amplify the differences.
+        # Rounding of multithreaded matrix products depends on the batch size, and a hundred
+        # denoising steps amplify the differences.
         try:
             with threadpool_limits(1, user_api="blas"), bars as bar:
                 for batch in batches(pairs, source.size):

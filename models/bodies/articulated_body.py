@@ -1,7 +1,7 @@
 """Articulated body: joint positions from bone rotations and a rigid pose.
 
-These are the ξ of a motion VAE learnt from 2D (*Ponymation*, section 3.1): ξ₁ ∈ SE(3) is the rigid
-pose, ξ_b ∈ SO(3) the rotation of bone b from its rest pose.
+The body has the parameters ξ of *Ponymation* (section 3.1), a motion VAE learnt from 2D: ξ₁ ∈ SE(3)
+is its rigid pose, ξ_b ∈ SO(3) the rotation of bone b from its rest pose.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ __all__ = ["ArticulatedBody"]
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedBody:
-    """Skeleton with a rest pose, whose bones rotate.
+    """Skeleton with a rest pose and bones that rotate about its joints.
 
-    Trunks have their own rotation, as in :class:`~probmotion.models.bodies.body_states.BodyStates`.
+    Trunks rotate separately, as in :class:`~probmotion.models.bodies.body_states.BodyStates`.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class ArticulatedBody:
         J joints, one root.
     rest : ndarray, (J, 3)
         Offset of each joint from its parent in the rest pose, metres; the root's is ignored. The
-        body faces +Z, up is +Y and its left is +X. Joint ranges assume a mean pose, as from
+        body faces +Z, +Y is up and +X its left. Joint ranges assume a mean pose, as returned by
         :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
 
     Raises
@@ -68,13 +68,13 @@ class ArticulatedBody:
 
     @cached_property
     def _turning(self) -> tuple[int, ...]:
-        """The rig's joints with children, except the root."""
+        """Indices of the rig's joints with children, except the root."""
         below = set(self._rig.parents) - {self.skeleton.roots[0], -1}
         return tuple(joint for joint in range(self._rig.n_joints) if joint in below)
 
     @property
     def bones(self) -> tuple[str, ...]:
-        """Names of the B rotating bones, by the joint they rotate about; trunks last."""
+        """Names of the joints about which the B bones rotate; trunks last."""
         return tuple(self._rig.joint_names[joint] for joint in self._turning)
 
     @cached_property
@@ -89,7 +89,7 @@ class ArticulatedBody:
     def length_groups(self) -> tuple[int, ...]:
         """Index of each joint's bone-length group, 0 to G−1, shared by mirrored bones.
 
-        The bones of an asymmetric skeleton have a group each; that of the root has no effect.
+        In an asymmetric skeleton, every bone has its own group. The root's group has no effect.
         """
         order = self.skeleton.mirrored_order
         n_joints = self.skeleton.n_joints
@@ -98,7 +98,7 @@ class ArticulatedBody:
 
     @property
     def n_groups(self) -> int:
-        """Number of bone lengths G."""
+        """Number of bone-length groups G."""
         return max(self.length_groups) + 1
 
     @property
@@ -108,12 +108,12 @@ class ArticulatedBody:
 
     @property
     def lower(self) -> np.ndarray:
-        """Minimum rotation vectors in range, (B, 3), radians."""
+        """Lower limits of the rotation vectors, (B, 3), radians."""
         return self._ranges[0]
 
     @property
     def upper(self) -> np.ndarray:
-        """Maximum rotation vectors in range, (B, 3), radians."""
+        """Upper limits of the rotation vectors, (B, 3), radians."""
         return self._ranges[1]
 
     @cached_property
@@ -135,7 +135,7 @@ class ArticulatedBody:
         return lower, upper
 
     def range_excess(self, turns: Array) -> Array:
-        """Return the summed squared excess over the ranges: ``(…, B, 3) → (…)``, radians²."""
+        """Return the sum of squared excesses over the limits: ``(…, B, 3) → (…)``, radians²."""
         check_shape("turns", turns, ("…", len(self.bones), 3))
         xp = array_namespace(turns)
         lower, upper = constant(self.lower, turns), constant(self.upper, turns)
@@ -152,7 +152,7 @@ class ArticulatedBody:
     ) -> Array:
         """Return the joint positions, (…, L, J, 3), metres.
 
-        Differentiable; NumPy or torch arrays of one library, batch axes broadcast.
+        Differentiable. Arguments are NumPy or torch arrays of one library; batch axes broadcast.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class ArticulatedBody:
     def _rotations(
         self, xp: Any, turned: Array, root_rotation: Array, shape: tuple[int, ...]
     ) -> Array:
-        """Return the rotations of the rig's joints, (…, L, J', 3, 3)."""
+        """Return the rotations of the J' joints of the rig, (…, L, J', 3, 3)."""
         identity = constant(np.eye(3), turned)
         rotations = {joint: turned[..., at, :, :] for at, joint in enumerate(self._turning)}
         rotations[self.skeleton.roots[0]] = root_rotation

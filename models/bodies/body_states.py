@@ -3,8 +3,8 @@
 The state of a frame (x_t of Motion-DVAE) consists of the root translation (3) and the 6D rotations
 (Zhou et al. 2019) of all joints with children, root first. Bone lengths are stored separately.
 
-A trunk joint with paired limbs, such as the neck of ``person14``, has an additional rotation for
-the trunk. Otherwise the hips of skeletons without spine joints would tilt when the trunk bends.
+A trunk, such as the bone that ends at the neck of ``person14``, has its own rotation. Otherwise the
+hips of skeletons without spine joints would tilt when the trunk bends.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class BodyStates:
         """Skeleton with two additional joints per trunk.
 
         The first, at the lower end of the trunk, rotates the trunk. The second, a guide slightly
-        above, rotates with the limbs and sets the pitch of the lower joint if these are collinear.
+        above, rotates with the limbs and sets the lower joint's pitch if the limbs are collinear.
         """
         names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
         for joint in self._trunks:
@@ -79,7 +79,7 @@ class BodyStates:
         return Skeleton(names, parents)
 
     def _rigged(self, offsets: Array) -> Array:
-        """Return offsets (…, J, 3) extended by those of the rig's joints."""
+        """Return offsets (…, J, 3), followed by those of the rig's additional joints."""
         xp = array_namespace(offsets)
         parts = [offsets]
         for joint in self._trunks:
@@ -95,26 +95,26 @@ class BodyStates:
 
     @cached_property
     def turning(self) -> tuple[int, ...]:
-        """Rotating joints: the joints with children, root first, trunks last."""
+        """Indices of the rotating joints, which have children; root first, trunks last."""
         root = self.skeleton.roots[0]
         parents = set(self._rig.parents) - {root}
         return (root, *(joint for joint in range(self._rig.n_joints) if joint in parents))
 
     @property
     def dim(self) -> int:
-        """Length of a state."""
+        """Length of a pose vector."""
         return 3 + 6 * len(self.turning)
 
     @property
     def groups(self) -> tuple[tuple[str, int, int], ...]:
-        """Name, start and end of each part of a state; orientation is the root's rotation."""
+        """Name, start and end of each part of a pose vector; orientation is the root's rotation."""
         return (("translation", 0, 3), ("orientation", 3, 9), ("rotations", 9, self.dim))
 
     def body(self, positions: np.ndarray) -> np.ndarray:
         """Return the rest offsets β of a recorded body, ``(L, J, 3) → (J, 3)``, metres.
 
-        Bone lengths are means over frames. Directions are means for joints with several children,
-        since bodies differ in the width of hips and shoulders, and those of ``rest`` otherwise.
+        Bone lengths are means over frames. Bones from joints with several children have mean
+        directions, as the widths of hips and shoulders differ; others have those of ``rest``.
         """
         lengths = np.zeros(self.skeleton.n_joints)
         for joint, parent in self.skeleton.bones:
@@ -138,7 +138,7 @@ class BodyStates:
         return self.rest * (np.asarray(lengths)[:, None] / np.where(bones > 0, bones, 1.0))
 
     def states(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the states closest to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
+        """Return the pose vectors closest to positions, ``(L, J, 3), (J, 3) → (L, dim)``.
 
         Positions do not determine the twist of a limb; see
         :func:`~probmotion.motion.kinematics.fit_rotations`.
@@ -151,7 +151,7 @@ class BodyStates:
     def positions(self, states: Array, body: Array) -> Array:
         """Return the joint positions M_β(x): ``(…, L, dim), (…, J, 3) → (…, L, J, 3)``, metres.
 
-        ``body`` is β, the rest offsets of one body or of one for each motion.
+        ``body`` is β: the rest offsets of one body, or of one body per motion.
         """
         check_shape("states", states, ("…", "L", self.dim))
         xp = array_namespace(states)
@@ -168,7 +168,7 @@ class BodyStates:
         return joints[..., : self.skeleton.n_joints, :]
 
     def _turns(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the global rotations of the rig's joints, (L, J', 3, 3)."""
+        """Return the global rotations of the J' joints of the rig, (L, J', 3, 3)."""
         rest = self._rigged(body)
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), rest)
         translation = np.zeros((len(positions), 1, 3))
@@ -176,7 +176,7 @@ class BodyStates:
 
 
 def trunk_joints(skeleton: Skeleton) -> tuple[int, ...]:
-    """Return the upper ends of trunks: unpaired siblings of paired joints."""
+    """Return the joints at the upper ends of trunks: unpaired siblings of paired joints."""
     paired = {joint for pair in skeleton.mirrored_pairs for joint in pair}
     branching = {parent for joint, parent in skeleton.bones if joint in paired}
     return tuple(j for j, parent in skeleton.bones if parent in branching and j not in paired)
@@ -204,7 +204,7 @@ def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
 def heading_of(matrix: np.ndarray) -> np.ndarray:
     """Return the angle of the closest rotation about Y, ``(…, 3, 3) → (…)``, radians.
 
-    It is ill-conditioned close to half turns about horizontal axes.
+    The angle is ill-conditioned close to half turns about horizontal axes.
     """
     return np.arctan2(matrix[..., 0, 2] - matrix[..., 2, 0], matrix[..., 0, 0] + matrix[..., 2, 2])
 
@@ -219,7 +219,7 @@ def turned_about_vertical(positions: Array, angle: Array) -> Array:
 
 
 def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array:
-    """Return canonical motions in the world: rotated about Y, then translated on the ground.
+    """Transform canonical motions to the world: rotated about Y, then translated on the ground.
 
     ``(…, L, J, 3), (…), (…, 2) → (…, L, J, 3)``: heading in radians, X and Z in metres.
     """
@@ -230,7 +230,7 @@ def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array
 
 
 def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
-    """Return rest offsets with the mean bones of motions (L, J, 3): (J, 3), metres.
+    """Return rest offsets (J, 3), metres: the mean bones of motions (L, J, 3).
 
     Every frame is first rotated so that its left side points to +X and it faces +Z.
 

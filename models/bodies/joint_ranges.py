@@ -1,7 +1,7 @@
 """Soft joint-rotation limits, looked up by joint name.
 
-The values are ours, not anatomical: round numbers wide enough for motion capture of walks, dances
-and jumps and for trotting dogs. They exclude bodies bent the wrong way.
+The limits are hand-chosen, not anatomical: round numbers, wide enough for motion capture of walks,
+dances and jumps and of trotting dogs. They exclude joints that bend the wrong way.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 __all__ = ["range_of"]
 
 Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-"""Minimum and maximum X, Y and Z of a rotation vector, radians, left side of the body."""
+"""Minimum and maximum X, Y and Z of a rotation vector, radians, for joints on the left side."""
 
-_UNKNOWN: Box = ((-1.2, 1.2), (-1.2, 1.2), (-1.2, 1.2))
+_UNKNOWN: Box = ((-1.2, 1.2), (-1.2, 1.2), (-1.2, 1.2))  # For joints without an entry.
 # Positive X swings a hanging limb backwards and bows an upright trunk. Positive Z lifts a hanging
 # left limb sideways.
 _PEOPLE: Mapping[str, Box] = {
@@ -37,7 +37,7 @@ _ANIMALS: Mapping[str, Box] = {
     "ankle": ((-1.5, 1.5), (-0.5, 0.5), (-0.5, 0.5)),
     "wrist": ((-1.8, 1.8), (-0.5, 0.5), (-0.5, 0.5)),
 }
-_SAME = {
+_SAME = {  # Joints with the limits of another joint.
     "lower_spine": "spine", "chest": "spine", "upper_neck": "neck", "lower_neck": "neck",
     "head": "neck", "nose": "neck", "palm": "wrist", "foot": "ankle",
 }  # fmt: skip
@@ -54,13 +54,13 @@ def range_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the minimum and maximum rotation vector of a joint from the rest pose, (3,), radians.
 
-    A knee or elbow is a hinge whose axis is perpendicular to its two bones; it opens until they are
-    collinear. If they are collinear in the rest pose, the axis is perpendicular to them and to Z
-    (X for a hanging limb): human shins then bend backwards and forearms forwards. Those of animals
-    bend both ways, because their joint names do not distinguish elbows and knees from wrists and
-    hocks.
+    A knee or elbow is a hinge whose axis is perpendicular to its two bones; it extends until they
+    are collinear. If they are collinear in the rest pose, the axis is perpendicular to them and Z
+    (the X axis for a hanging limb): human shins then bend backwards and human forearms forwards.
+    Animal limbs bend both ways, because the joint names of animals do not distinguish elbows and
+    knees from wrists and hocks.
 
-    ``name`` is canonical, e.g. ``left_knee``; right joints have the mirrored range of left ones.
+    ``name`` is canonical, e.g. ``left_knee``; right joints have the mirrored limits of left ones.
     Joints without an entry may rotate 1.2 radians about every axis. ``above`` and ``below`` are the
     bones that end and begin at the joint in the rest pose; the body faces +Z and its left is +X.
     """

@@ -1,8 +1,8 @@
 """Prior over 3D motion learnt from 2D tracks only (MAS, sections 4.1 and 6.2).
 
-It is a denoiser of single 2D views, which samplers such as `mas` turn into 3D motion. Diffusion
-runs in metres divided by one ``scale``, as for the exact prior; data are standardised per joint
-only at the network's input and output.
+The prior is a denoiser of single 2D views, which samplers such as `mas` combine into 3D motion.
+Diffusion runs in normalised units (metres divided by ``scale``). Only the input and output of the
+network are standardised per joint.
 """
 
 from __future__ import annotations
@@ -36,18 +36,17 @@ KIND = "motion-diffusion"
 # many tokens, or one motion. Kernels treat the remainder of blocks of four rows differently, so
 # chunks have 1, 4, 8, 16, … motions.
 _TOKENS = 512
-# Maximum deviation of an observed root from the origin, in units of its noise.
+# Maximum deviation of an observed root from the origin, in standard deviations of its noise.
 _ROOT_DEVIATIONS = 6.0
 # Tokens per chunk on a GPU, for 8 GiB at the paper's size.
 _GPU_TOKENS = 200_000
 
 
 class MotionDiffusion(TrackNetwork):
-    """2D motion diffusion model as a prior that denoises views.
+    """Motion prior that denoises views with a 2D motion diffusion model.
 
-    Parameters are those of :class:`~probmotion.models.training.track_network.TrackNetwork`, and
-    ``frames``, the length L of the prior's motions: at most that of the network, which is the
-    default.
+    Parameters are those of :class:`~probmotion.models.training.track_network.TrackNetwork` and
+    ``frames``, the length L of the prior's motions, by default the maximum of the network.
     """
 
     settings: DiffusionSettings
@@ -83,7 +82,7 @@ class MotionDiffusion(TrackNetwork):
         source : str or Path
             A checkpoint, the folder of a training run, or the name of a shipped prior.
         frames, device
-            As for the class.
+            As in :class:`MotionDiffusion`.
 
         Raises
         ------
@@ -130,7 +129,7 @@ class MotionDiffusion(TrackNetwork):
         return self.standards.scale
 
     def motion(self, theta: Array) -> Array:
-        """Return the positions θ: ``(…, dim) → (…, L, J, 3)``, metres."""
+        """Return the joint positions in θ: ``(…, dim) → (…, L, J, 3)``, metres."""
         check_shape("theta", theta, ("…", self.dim))
         return theta.reshape(*theta.shape[:-1], self.frames, self.skeleton.n_joints, 3)
 
@@ -138,12 +137,12 @@ class MotionDiffusion(TrackNetwork):
         """Return the network's estimate of E[x₀ | x_t] for each view.
 
         Arrays are (B, V, L, J, 2) in normalised units, L at most ``settings.frames``. ``cameras``
-        are ignored, as the network was trained on views of unknown cameras.
+        is ignored, as the network was trained on views of unknown cameras.
 
         Raises
         ------
         ValueError
-            If the shape is wrong, a number is not finite or ᾱ is not above 0 and at most 1.
+            If the shape is wrong, a value is not finite or ᾱ is not above 0 and at most 1.
         """
         self._check(x_t)
         if alpha_bar == 1:
@@ -159,10 +158,10 @@ class MotionDiffusion(TrackNetwork):
     def view_covariance_product(
         self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
     ) -> np.ndarray:
-        """Return (1−ᾱ)/√ᾱ Jᵀ v, J the Jacobian of :meth:`denoise`; arrays (B, V, L, J, 2).
+        """Return (1−ᾱ)/√ᾱ Dᵀ v, with D the Jacobian of :meth:`denoise`; arrays (B, V, L, J, 2).
 
-        For the exact denoiser this is Cov[x₀ | x_t] v (Tweedie); the J of a network is only
-        approximately symmetric.
+        For the exact denoiser, the product is Cov[x₀ | x_t] v (Tweedie). The Jacobian of a network
+        is only approximately symmetric.
         """
         self._check(x_t)
         check_shape("vectors", vectors, x_t.shape)
@@ -178,7 +177,7 @@ class MotionDiffusion(TrackNetwork):
         return product
 
     def check_observations(self, likelihood: Likelihood) -> None:
-        """Raise ``ValueError`` if observed roots are off the origin and the prior's are not.
+        """Raise ``ValueError`` if observed roots are off the origin but the prior's root is not.
 
         A prior trained on root-centred tracks has its root at the origin.
         """
@@ -221,7 +220,7 @@ class MotionDiffusion(TrackNetwork):
         return denoise
 
     def _chunks(self, views: np.ndarray) -> Iterator[tuple[slice, torch.Tensor]]:
-        """Yield rows and the views of their motions as one batch, (n V, L, J, 2)."""
+        """Yield slices of n motions, each with all their views as one batch (n V, L, J, 2)."""
         B, V, L = views.shape[:3]
         cpu = self._device == "cpu"
         n = max(1, (_TOKENS if cpu else _GPU_TOKENS) // (V * (L + 1)))
@@ -239,5 +238,5 @@ class MotionDiffusion(TrackNetwork):
 
 
 def _numbers(views: torch.Tensor, like: np.ndarray) -> np.ndarray:
-    """Return a batch of views as an array (n, V, L, J, 2) in the caller's precision."""
+    """Return a batch of views as an array (n, V, L, J, 2) in the precision of ``like``."""
     return views.unflatten(0, (-1, like.shape[1])).cpu().numpy().astype(like.dtype)

@@ -1,7 +1,7 @@
 """Transformer of the motion diffusion model (MDM, Tevet et al. 2023; used in 2D by MAS).
 
-An encoder over frames with linear maps from and to the 2J coordinates of a frame, one additional
-token for the noise level, and sinusoidal position embeddings.
+The transformer is an encoder over frames, with linear maps from and to the 2J coordinates of a
+frame, one additional token for the noise level, and sinusoidal position embeddings.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ __all__ = ["MotionTransformer", "sinusoids"]
 
 
 class MotionTransformer(nn.Module):
-    """Denoising network: (noisy motion, level) → clean motion, in standardised units.
+    """Network that maps a noisy motion and its noise level to the clean motion, all standardised.
 
-    ``features`` is 2J, the length of a frame, and ``frames`` the maximum L.
+    ``features`` is 2J, the number of coordinates per frame; ``frames`` is the maximum length L.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class MotionTransformer(nn.Module):
     ) -> torch.Tensor:
         """Return the clean motions, ``(N, L, 2J), (N,), (N, L) → (N, L, 2J)``.
 
-        Levels are 0 to T and may be fractional; frames that are not ``valid`` are padding.
+        Noise levels are 0 to T and may be fractional. Frames that are not ``valid`` are padding.
         """
         first = self.level(sinusoids(levels, self.width))[:, None]
         tokens = torch.cat([first, self.enter(motions)], dim=1)

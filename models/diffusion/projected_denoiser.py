@@ -1,6 +1,6 @@
-"""2D denoiser of a 3D prior, trained on projections of its motions.
+"""2D denoiser for a 3D prior, trained on projections of its motions.
 
-It allows samplers that require a 2D denoiser, such as `mas`, for priors without one.
+With this denoiser, samplers such as `mas` apply to priors without a 2D denoiser of their own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from probmotion.validation import check_count
 
 __all__ = ["denoiser_of"]
 
-_HELD_OUT = 10
+_HELD_OUT = 10  # One in this many motions is held out.
 _Size = Literal["tiny", "small", "paper"]
 
 

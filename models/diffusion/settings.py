@@ -1,4 +1,4 @@
-"""Sizes and noise levels of the motion diffusion model."""
+"""Settings of the motion diffusion model: network size and noise levels."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from probmotion.validation import check_count
 
 __all__ = ["DiffusionSettings", "TransformerSettings"]
 
-_SIZES = ("layers", "width", "heads", "feedforward")
+_SIZES = ("layers", "width", "heads", "feedforward")  # Fields passed on to the encoder.
 
 
 @dataclass(frozen=True)
 class TransformerSettings:
-    """Size of a transformer over frames; ``ValueError`` if a number is out of range.
+    """Size of a transformer over frames; raises ``ValueError`` if a number is out of range.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class TransformerSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings(TransformerSettings):
-    """Size of the network and its noise levels; ``ValueError`` if a number is out of range.
+    """Size and noise levels of the network; raises ``ValueError`` if a number is out of range.
 
     Parameters
     ----------
@@ -85,17 +85,17 @@ class DiffusionSettings(TransformerSettings):
 
     @classmethod
     def paper(cls, frames: int = 180) -> DiffusionSettings:
-        """Return the published size (section 6.2)."""
+        """Return the size published in MAS (section 6.2)."""
         return cls(frames)
 
     @classmethod
     def reference_code(cls, frames: int = 180) -> DiffusionSettings:
-        """Return the size in the authors' released code."""
+        """Return the size in the MAS authors' released code."""
         return cls(frames, layers=8, schedule_power=4)
 
     @property
     def schedule(self) -> NoiseSchedule:
-        """The noise levels."""
+        """Noise levels of the cosine schedule."""
         return NoiseSchedule.cosine(self.steps, power=self.schedule_power)
 
     def network(self, n_joints: int, seed: int = 0) -> MotionTransformer:
@@ -108,7 +108,7 @@ class DiffusionSettings(TransformerSettings):
     def level(self, alpha_bar: float) -> float:
         """Return the fractional index of the noise level ᾱ, interpolated in log noise.
 
-        Beyond the last level it is T, since the signal there is below a thousandth.
+        Beyond the last level the index is T, since the signal there is below a thousandth.
         """
         if not 0 < alpha_bar <= 1:
             raise ValueError(f"alpha_bar must be above 0 and at most 1, got {alpha_bar:.3g}")

@@ -1,7 +1,7 @@
 """Denoising of a 2D track with a 2D motion diffusion model.
 
-A detection is the true keypoint plus an error of standard deviation σ. Up to a factor this is a
-noisy motion at the level with √((1−ᾱ)/ᾱ) = σ, and the denoiser estimates its posterior mean.
+A detection is the true keypoint plus an error of standard deviation σ. Up to a factor, detections
+are a noisy motion at the level with √((1−ᾱ)/ᾱ) = σ; the denoiser estimates the posterior mean.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ def denoise_track(
     threshold: float = 0.3,
     rounds: int = 10,
 ) -> KeypointTrack:
-    """Return the denoised track.
+    """Return a denoised copy of a track.
 
-    Joints at or above the threshold move by at most ``noise`` in root mean square over frames and
-    axes, the bound for an exact posterior mean. Joints below it are filled in: they start at the
-    prior's mean and follow the denoiser at decreasing noise levels, with the visible joints fixed.
-    This fill is a heuristic, not a draw.
+    Visible joints, with a confidence of at least ``threshold``, move by at most ``noise`` in root
+    mean square over frames and axes, the bound for an exact posterior mean. Other joints are filled
+    in: they start at the prior's mean and follow the denoiser at decreasing noise levels, with the
+    visible joints fixed. Their positions are heuristic estimates, not posterior draws.
 
     Parameters
     ----------
     track : KeypointTrack
         Prepared track with the prior's joints, frame rate and centring; metres.
     prior : MotionDiffusion
-        Denoiser.
+        Prior that provides the denoiser.
     noise : float
-        Standard deviation σ of a confident detection, metres.
+        Standard deviation σ of the errors of visible joints, metres.
     threshold : float
         Minimum confidence of a visible joint.
     rounds : int
@@ -54,7 +54,7 @@ def denoise_track(
     Returns
     -------
     KeypointTrack
-        All joints in all frames; visible joints have confidence 1, the others are unchanged.
+        All joints in all frames; the confidence of visible joints is 1, that of others unchanged.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def _shrunk_towards(
 
     The mean square deviation of the posterior mean from a detection is σ² − v, with v the posterior
     variance. A value r² above σ² indicates an error of the network. If this error were independent,
-    its variance would be r² − σ², and the optimal weight of the estimate σ²/r².
+    its variance would be r² − σ², and σ²/r² the optimal weight of the estimate.
     """
     deviation = np.where(visible[..., None], seen - clean, 0.0)
     count = 2 * np.maximum(visible.sum(axis=0), 1)

@@ -21,12 +21,12 @@ __all__ = ["DiffusionTrainee", "usual_training"]
 
 
 class DiffusionTrainee(TrackTrainee):
-    """Trainee of a motion diffusion model.
+    """Trainee of a motion diffusion model for :func:`~probmotion.models.training.trainer.train`.
 
     The loss is the mean squared error of the estimate of x₀ (not of ε), in standardised units, over
     visible joints, at noise levels t ~ U{1..T}. Parameters are those of
-    :class:`~probmotion.models.training.track_trainee.TrackTrainee`.
-    Every joint must be visible in at least one frame of ``tracks``.
+    :class:`~probmotion.models.training.track_trainee.TrackTrainee`. Every joint must be visible in
+    at least one frame of ``tracks``.
     """
 
     kind = KIND
@@ -83,8 +83,8 @@ class DiffusionTrainee(TrackTrainee):
 def usual_training(size: str) -> TrainingSettings:
     """Return the training settings of size ``tiny``, ``small``, ``paper`` or ``reference-code``.
 
-    Training diverges with the paper's "Adam, 0.1 lr"; ``paper`` is AdamW with learning rate 1e-4, a
-    moving average and gradient clipping. ``reference-code`` follows the authors' released code.
+    Training diverges with the published learning rate of 0.1. ``paper`` uses AdamW at 1e-4 with a
+    moving average and gradient clipping; ``reference-code`` follows the MAS authors' code.
     """
     known = {
         "tiny": TrainingSettings(steps=1000, learning_rate=2e-3, ema=0.99),

@@ -1,4 +1,4 @@
-"""Training of the denoiser from noisy joints only (Motion-DVAE, appendices B, C and E.2)."""
+"""Training of the motion denoiser on noisy joints only (Motion-DVAE, appendices B, C and E.2)."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ __all__ = ["DenoiserTrainee", "usual_denoiser_training"]
 
 
 class DenoiserTrainee(WindowTrainee):
-    """Loss and data for :func:`~probmotion.models.training.trainer.train` of a denoiser.
+    """Trainee of a motion denoiser for :func:`~probmotion.models.training.trainer.train`.
 
-    The loss is minus the evidence lower bound of noisy joints, per frame. Clips are used only to
-    simulate noisy joints and for their bone lengths (β, which is not inferred). The prior is fixed.
+    The loss is the negative evidence lower bound of noisy joints per frame. Clips provide only
+    the simulated noisy joints and the bone lengths β, which are not inferred. The prior is fixed.
 
     Parameters
     ----------
     clips : sequence of Motion
-        Motion with the prior's skeleton and frame rate, metres.
+        Clips with the prior's skeleton and frame rate, metres.
     validation : sequence of Motion
         Held-out clips.
     prior : MotionDVAE
@@ -41,9 +41,9 @@ class DenoiserTrainee(WindowTrainee):
     noise : JointNoise
         Corruption model.
     latent_weight : float
-        Weight of the motion prior; 0 for the ablation "no prior".
+        Weight of the KL term of the latents; 0 for the ablation without a motion prior.
     annealing : int
-        Steps over which this weight rises.
+        Number of steps over which ``latent_weight`` rises from 0.
     seed : int
         Seed of the initial weights and the validation noise.
     """
@@ -105,9 +105,9 @@ class DenoiserTrainee(WindowTrainee):
 
 
 def usual_denoiser_training(size: str) -> tuple[TrainingSettings, int]:
-    """Return the training settings of a size and its KL annealing steps.
+    """Return the training settings of a size and the number of its KL annealing steps.
 
-    ``paper``: up to 500 epochs with a patience of 10 (E.2); an epoch of AMASS is 1000 steps here.
+    ``paper``: up to 500 epochs with a patience of 10 (E.2); an epoch is 1000 steps here.
     Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=400, batch=32, learning_rate=3e-3, ema=0.98)

@@ -1,4 +1,4 @@
-"""Inference networks of the Motion-DVAE, q(z_t | z_{1:t−1}, y_{t:T}, x₀)."""
+"""Inference networks of the Motion-DVAE: latents z_t given joints y and the first state x₀."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class _JointPosterior:
     def posterior(
         self, state: tuple[torch.Tensor, torch.Tensor], frame: int, moved: State
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and log scale of q(z_t | …) from [h^lat_{t−1}, h^data_t]."""
+        """Return mean and log scale of q(z_t | …) given the recurrent state and y_{t:T}."""
         inputs = torch.cat([state[0], self.read[:, frame - 1]], dim=-1)
         return mean_and_log_scale(self.encoder.latents(inputs))
 
@@ -123,6 +123,6 @@ class _TrackingPosterior:
 
 
 def _read_backwards(reader: nn.LSTM, inputs: EncoderInputs) -> torch.Tensor:
-    """Return (B, T, H) features; entry t summarises frames t to T."""
+    """Return features (B, T, H) of a backward LSTM; those at t summarise frames t to T."""
     features, _ = reader(inputs.observed[:, 1:].flip(1))
     return features.flip(1)

@@ -1,8 +1,8 @@
 """Amortised inference from noisy joints: q(x₀, z, v | y) and its evidence lower bound.
 
-q = q_ω(x₀ | y) Π_t q_φ(z_t | z_{1:t−1}, y_{t:T}, x₀) q_γ(v_t | z_{1:t}, y_t, x₀) with the networks
-of the prior frozen (Motion-DVAE supplement, B to E). q_ω also models position and heading, which
-noisy joints determine only approximately.
+For first state x₀, latents z, noise variances v and joints y, q is q_ω(x₀ | y) Π_t
+q_φ(z_t | z_{1:t−1}, y_{t:T}, x₀) q_γ(v_t | z_{1:t}, y_t, x₀) (Motion-DVAE supplement, B to E). The
+prior is frozen. q_ω also models position and heading, which y determines only approximately.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ __all__ = ["Bound", "Denoiser", "DenoisingNetworks", "InferenceDraw"]
 
 # Units of the placement corrections, metres and radians.
 _GROUND, _TURN = 0.1, 0.3
-_LOG_SCALE_BOUND = 5.0
-# Smaller reciprocal degrees of freedom are treated as Gaussian, as scale-mixture terms cancel.
+_LOG_SCALE_BOUND = 5.0  # Smooth bound on the log scales of q_ω, before an offset of −1.
+# Noise with smaller reciprocal degrees of freedom is treated as Gaussian, for numerical accuracy.
 _GAUSSIAN_TAILS = 1e-4
 
 
 class DenoisingNetworks(nn.Module):
-    """Trainable networks: latent encoder q_φ, initial-state network q_ω and noise network q_γ.
+    """Inference networks: latent encoder q_φ, initial-state network q_ω and noise network q_γ.
 
     q_φ is initialised with the encoder of ``prior``, q_ω and q_γ from ``seed``.
     """
@@ -69,10 +69,10 @@ class DenoisingNetworks(nn.Module):
         half: torch.Tensor,
         squares: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return α and β of q_γ, (B, L, J, 3) each, in units of noise².
+        """Return α and β of q_γ = IG(α, β), (B, L, J, 3) each, for v in units of noise².
 
-        Given the motion, v is exactly IG(λ/2 + ½, λ/2 + ½ r²/s²). The network e_b returns
-        factors of both, initially 1. Arguments are generative states (B, L, H), encoder features
+        Given the motion, v is exactly IG(λ/2 + ½, λ/2 + ½ r²/s²). The network multiplies both
+        parameters by factors, initially 1. Arguments: generative states (B, L, H), encoder features
         (B, L, M), ``half`` λ/2 (B,) and squared standardised residuals r²/s² (B, L, J, 3).
         """
         features = torch.cat([hidden, observed], dim=-1)
@@ -107,10 +107,10 @@ class Bound:
 class InferenceDraw:
     """One draw from q per window.
 
-    ``positions`` (B, L, J, 3): M_β(μ_x) in world coordinates; ``rolled``: z and innovations;
+    ``positions`` (B, L, J, 3): decoded joints M_β(μ_x), world, metres; ``rolled``: z, innovations;
     ``first`` (B, r): coordinates of x₀; ``heading`` (B,), radians; ``ground`` (B, 2), metres;
     ``observed`` (B, L, M): encoder features in the drawn frame; ``hidden`` (B, L, H): generative
-    states; ``first_kl`` (B,): KL of x₀ and placement against the prior.
+    states; ``first_kl`` (B,): KL(q_ω ‖ p) of x₀ and placement.
     """
 
     positions: torch.Tensor
@@ -131,7 +131,7 @@ class Denoiser:
         self.networks = networks
 
     def noise_numbers(self, length: int) -> tuple[int, tuple[int, int]]:
-        """Return the shapes of standard normals per window: 3 + r for q_ω, and (T, Z) for z."""
+        """Return shapes of standard normal draws per window: 3 + r for q_ω and (T, Z) for z."""
         return 3 + self.prior.rank, (length - 1, self.prior.settings.latent)
 
     def infer(
@@ -139,7 +139,7 @@ class Denoiser:
     ) -> InferenceDraw:
         """Return one draw from q per window.
 
-        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; 0 for the mean of q.
+        ``first_noise`` (B, 3 + r) and ``noise`` (B, T, Z) are standard normal; zeros: mean of q.
         """
         model = self.prior.model
         trust = torch.where(windows.seen, trust_weight(windows.noise), 0.0)
@@ -212,7 +212,7 @@ class Denoiser:
     def _first_kl(
         self, windows: NoisyWindows, mean: torch.Tensor, log_scale: torch.Tensor
     ) -> torch.Tensor:
-        """Return KL of q_ω against N(0, I) poses, N(0, spread²) positions and uniform headings."""
+        """Return KL(q_ω ‖ p), p: poses N(0, I), positions N(0, spread²) and uniform headings."""
         spread = self.prior.spread / _GROUND
         at_origin = -on_ground(windows.ground)[:, None, None, :]
         origin = turned_about_vertical(at_origin, -windows.heading)[:, 0, 0, [0, 2]] / _GROUND
@@ -226,5 +226,5 @@ class Denoiser:
 
 
 def _half_freedom(windows: NoisyWindows, heavy: torch.Tensor) -> torch.Tensor:
-    """Return λ/2 for windows with Student-t noise and 1, which is unused, for Gaussian noise."""
+    """Return λ/2 for windows with Student-t noise and an unused 1 for Gaussian noise."""
     return torch.where(heavy, 0.5 / windows.tails.clamp(min=_GAUSSIAN_TAILS), 1.0)

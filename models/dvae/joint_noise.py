@@ -14,7 +14,7 @@ __all__ = ["JointNoise", "NoisyJoints"]
 
 
 class NoisyJoints(NamedTuple):
-    """Noisy windows: joints (B, L, J, 3), noise (B, L, J), seen (B, L, J), tails (B,)."""
+    """Noisy joints (B, L, J, 3), noise scale and visibility (B, L, J), 1/λ (B,) of Student-t."""
 
     joints: np.ndarray
     noise: np.ndarray
@@ -33,7 +33,7 @@ class JointNoise:
     outliers : float
         Fraction of windows with Student-t noise of 2 to 8 degrees of freedom; the rest is Gaussian.
     hidden : float
-        Fraction of windows with temporarily occluded limbs and single occluded joints.
+        Fraction of windows in which limbs and single joints are temporarily occluded.
 
     Raises
     ------

@@ -15,8 +15,8 @@ __all__ = ["Generative", "Inference", "Rollout", "rollout"]
 class Generative(Protocol):
     """Generative model p(z_t | z_{1:t−1}, x₀) with a recurrent state.
 
-    ``start`` returns the state at frame 0 given x₀ (B, D), ``priors`` mean and log scale of the
-    next z for each state, (B, T, Z) each, and ``step`` the state after z_t.
+    ``start`` returns the state at frame 0 given x₀ (B, D); ``priors`` returns mean and log scale
+    of the next z for each state, (B, T, Z) each; ``step`` returns the state after z_t.
     """
 
     def start(self, initial: torch.Tensor) -> Any: ...
@@ -40,7 +40,7 @@ class Inference(Protocol):
 
 @dataclass(frozen=True)
 class Rollout:
-    """Result of :func:`rollout`.
+    """Latents and generative states of B windows, returned by :func:`rollout`.
 
     ``states``: generative states of frames 1 to T; ``latents`` (B, T, Z): z; ``innovations``
     (B, T, Z): (z − μ_z)/σ_z under the generative model; ``kl`` (B,): Σ_t KL(q ‖ p) of z_t, 0

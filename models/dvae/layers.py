@@ -9,8 +9,8 @@ from torch import nn
 
 __all__ = ["State", "mean_and_log_scale", "n_encoder_inputs", "perceptron", "trust_weight"]
 
-_LOG_SCALE_BOUND = 6.0
-_HALF_WEIGHT_NOISE = 0.05
+_LOG_SCALE_BOUND = 6.0  # Maximum absolute log scale.
+_HALF_WEIGHT_NOISE = 0.05  # Noise of a joint with weight ½, metres.
 
 
 class State(NamedTuple):

@@ -33,13 +33,13 @@ __all__ = ["KIND", "MotionDenoiser", "NoisyMotion"]
 
 KIND = "motion-denoiser"
 
-_ROWS = 64
-_AVERAGED = 8
-_MEANS = 64
+_ROWS = 64  # Maximum number of windows per batch of draws.
+_AVERAGED = 8  # Draws averaged by `NoisyMotion.predict`.
+_MEANS = 64  # Draws per window for the mean of q.
 
 
 class MotionDenoiser:
-    """Inference networks of one Motion-DVAE, trained on noisy joints; ``card``: training record."""
+    """Inference networks for one Motion-DVAE; ``card`` is the record of their training."""
 
     def __init__(
         self, networks: DenoisingNetworks, prior: MotionDVAE, card: Mapping[str, Any] | None = None
@@ -49,7 +49,7 @@ class MotionDenoiser:
         self.card = dict(card or {})
 
     def __repr__(self) -> str:
-        """Summary for tables and stored draws."""
+        """Return a summary for tables and stored draws."""
         numbers = sum(value.numel() for value in self.networks.parameters())
         return f"{type(self).__name__}({self.prior.skeleton.n_joints} joints, {numbers} numbers)"
 
@@ -81,7 +81,7 @@ class MotionDenoiser:
         save_checkpoint(path, Checkpoint(KIND, self.card, self.networks.state_dict()), half=half)
 
     def reads(self, likelihood: Likelihood | None) -> bool:
-        """Return whether the observations are noisy 3D joints."""
+        """Return whether the networks can process the likelihood: noisy 3D joints."""
         return isinstance(likelihood, Joints3D)
 
     def on(
@@ -92,7 +92,7 @@ class MotionDenoiser:
         degrees_of_freedom: float | None = None,
         overlap: int = 10,
     ) -> NoisyMotion:
-        """Return the inference for one recording, with a copy of the networks.
+        """Return windowed inference for one recording, with a copy of the networks.
 
         ``prior`` is this denoiser's prior, of any length and body. ``degrees_of_freedom``
         overrides the likelihood's λ (``inf``: Gaussian noise). ``overlap`` is the number of
@@ -134,7 +134,7 @@ class NoisyMotion:
         return list(self.denoiser.networks.parameters())
 
     def bound(self, rng: np.random.Generator, *, initial_entropy: bool = True) -> Bound:
-        """Return the terms of the bound at one draw per window, (B,) each."""
+        """Return the terms of the bound at one draw; ``initial_entropy`` adds the KL of q_ω."""
         inferred = self.denoiser.infer(self.windows, *self._numbers(rng, 1))
         return self.denoiser.bound(self.windows, inferred, first=initial_entropy)
 
@@ -172,9 +172,9 @@ class NoisyMotion:
     def predict(self, rng: np.random.Generator, *, average: bool = True) -> np.ndarray:
         """Return the predicted motion, (L, J, 3), metres (D, equation 11).
 
-        Averages draws of the precision-weighted mean of observed and decoded joints, or of the
-        decoded joints where occluded. Frame 0 is M_β(μ_ω). ``average=False`` decodes the means of q
-        once instead ("NN output").
+        The prediction is the average over draws of the precision-weighted mean of observed and
+        decoded joints, or of decoded joints where occluded. The first frame of a window, and all
+        frames with ``average=False``, are decoded from the means of q instead.
         """
         zeros = np.zeros((1, len(self.windows), self._total), dtype=np.float32)
         decoded = self._by_window(self._inferred_from(zeros).positions)[0]
@@ -199,7 +199,7 @@ class NoisyMotion:
 
     @torch.no_grad()
     def _inferred_from(self, numbers: np.ndarray) -> InferenceDraw:
-        """Return draws from random numbers (n, B, …) without gradients."""
+        """Return draws of q for standard normal ``numbers`` (n, B, …), without gradients."""
         first, noise = torch.as_tensor(numbers).flatten(0, 1).tensor_split([self._first], dim=1)
         windows = self.windows.repeated(len(numbers))
         return self.denoiser.infer(windows, first, noise.unflatten(1, self._shape))

@@ -1,6 +1,6 @@
 """`MotionDVAE`: dynamical variational autoencoder prior of 3D motion (Motion-DVAE supplement, A).
 
-Its coordinates θ are standard normal: ground position and heading, initial pose, and the
+The coordinates θ are standard normal: ground position and heading, initial pose, and the
 innovations of each frame's latent z_t.
 """
 
@@ -39,8 +39,8 @@ __all__ = ["KIND", "MotionDVAE", "description_of"]
 
 KIND = "motion-dvae"
 
-_PLACE = 4
-_CHUNK = 256
+_PLACE = 4  # Number of coordinates of ground position and heading.
+_CHUNK = 256  # Number of motions decoded at once.
 
 
 class MotionDVAE(StandardNormalPrior):
@@ -48,9 +48,9 @@ class MotionDVAE(StandardNormalPrior):
 
     θ ~ N(0, I) contains the initial ground position of the root in units of ``spread`` (2), the
     initial heading as a 2D direction (2), the principal coordinates of the first pose (r), and the
-    innovations ε_t of z_t = μ_z(h_{t−1}) + σ_z(h_{t−1}) ε_t for frames 1 to L − 1.
+    innovations ε_t of z_t = μ_z(h_{t−1}) + σ_z(h_{t−1}) ε_t for frames 1 to L − 1 and LSTM state h.
 
-    Y is up and the floor is at Y = 0. Transform other observations to this floor first.
+    Y is up and the floor is at Y = 0. Transform observations with another floor first.
 
     Parameters
     ----------
@@ -175,14 +175,14 @@ class MotionDVAE(StandardNormalPrior):
         return float(torch.exp(self.model.generative.log_scales[-1]))
 
     def motion(self, theta: Array) -> Array:
-        """Return M_β(μ_x) at θ, ``(…, dim) → (…, L, J, 3)``, metres; NumPy or torch."""
+        """Return the decoded joints at θ, ``(…, dim) → (…, L, J, 3)``, metres; NumPy or torch."""
         shape = (self.frames, self.skeleton.n_joints, 3)
         return decode_rows(self._motion, theta, self.dim, shape, _CHUNK)
 
     def coordinates(
         self, ground: np.ndarray, heading: np.ndarray, first: np.ndarray, innovations: np.ndarray
     ) -> np.ndarray:
-        """Return θ of motions, with unit length of the two heading coordinates.
+        """Return the coordinates θ of motions, with a unit vector for the heading.
 
         Arguments are X and Z of the initial root (…, 2), metres, the initial heading (…), radians,
         coordinates of the first pose (…, r) and innovations ε (…, L − 1, Z).

@@ -17,8 +17,8 @@ from probmotion.motion.motion import Motion
 
 __all__ = ["VALIDATION_BATCH", "MotionWindows", "WindowTrainee", "Windows", "canonical_windows"]
 
-VALIDATION_BATCH = 256
-_TEMPO = 1.25
+VALIDATION_BATCH = 256  # Number of held-out windows.
+_TEMPO = 1.25  # Maximum tempo; the minimum is its reciprocal.
 
 
 class Windows(NamedTuple):
@@ -29,7 +29,7 @@ class Windows(NamedTuple):
 
 
 class MotionWindows:
-    """All windows of ``frames`` frames of some clips and of their mirror images.
+    """All windows of ``frames`` frames in motion clips and their mirror images.
 
     Raises ``ValueError`` if no clip is long enough, or clips differ in skeleton or frame rate.
     """
@@ -79,7 +79,7 @@ class MotionWindows:
         return self.at(np.linspace(0, len(self) - 1, min(n, len(self))).astype(int))
 
     def at(self, numbers: np.ndarray) -> Windows:
-        """Return windows by index."""
+        """Return the windows with given indices, at the original tempo."""
         clips = self._clip[numbers]
         segments = [
             self._states[clip][start : start + self.frames]
@@ -96,7 +96,7 @@ def _between(states: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def canonical_windows(states: np.ndarray) -> np.ndarray:
-    """Return windows with the first frame at the origin and heading 0, (B, L, D)."""
+    """Return windows that start above the origin with heading 0, (B, L, D)."""
     root = rotation_6d_to_matrix(states[..., 3:9])
     heading = heading_of(root[:, 0])
     cosine, sine = np.cos(heading), np.sin(heading)
@@ -112,7 +112,7 @@ def canonical_windows(states: np.ndarray) -> np.ndarray:
 
 
 class WindowTrainee:
-    """Training and held-out windows of clips, and an annealed loss weight."""
+    """Base class of trainees on windows of clips, with an annealed loss weight."""
 
     _loss: Callable[..., torch.Tensor]
 
@@ -135,7 +135,7 @@ class WindowTrainee:
         self._full_weight = self._weight = weight
 
     def anneal(self, step: int) -> None:
-        """Set the loss weight of a step."""
+        """Set the loss weight for a training step."""
         self._weight = self._full_weight * min(1.0, step / max(1, self.annealing))
 
     def training_loss(

@@ -68,9 +68,9 @@ class DVAENetwork(nn.Module):
 
 
 class DVAEModel(nn.Module):
-    """Generative network, encoder, standardisation and initial-state distribution p(x₀).
+    """Model with generative network, encoder, standardisation and distribution p(x₀).
 
-    ``dim`` D is the dimension of a state, ``rank`` r the number of principal directions of x₀.
+    ``dim`` D is the dimension of a state x, ``rank`` r the number of principal directions of x₀.
     """
 
     state_mean: torch.Tensor
@@ -114,9 +114,9 @@ class DVAEModel(nn.Module):
     ) -> torch.Tensor:
         """Return encoder features of frames, (…, L, 4 J + 1).
 
-        Arguments are canonical joints (…, L, J, 3), metres, ignored where occluded, their weights
-        (…, L, J) from :func:`trust_weight`, 0 where occluded, and reciprocal degrees of
-        freedom (…), 0 for Gaussian noise.
+        ``joints`` (…, L, J, 3): canonical, metres, ignored where occluded; ``trust`` (…, L, J):
+        weights from :func:`trust_weight`, 0 where occluded; ``tails`` (…): reciprocal degrees of
+        freedom, 0 for Gaussian noise.
         """
         visible = (joints - self.joint_mean) / self.joint_deviation
         visible = torch.where(trust[..., None] > 0, visible, 0.0)

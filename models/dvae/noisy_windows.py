@@ -16,7 +16,7 @@ from probmotion.posteriors.likelihoods import Joints3D
 
 __all__ = ["NoisyWindows", "Stitching", "rough_placement"]
 
-_PLACEMENT_FRAMES = 5
+_PLACEMENT_FRAMES = 5  # Maximum number of frames for the estimate of a placement.
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class NoisyWindows:
     ``joints`` (B, L, J, 3): y, metres, 0 where occluded; ``noise`` (B, L, J): standard deviation
     (Student-t: scale), metres, 1 where occluded; ``seen`` (B, L, J): visibility; ``tails`` (B,):
     reciprocal degrees of freedom, 0 for Gaussian noise; ``heading`` (B,), radians, and ``ground``
-    (B, 2), metres: of the first frame; ``bodies`` (B, J, 3): rest offsets, metres.
+    (B, 2), metres: initial placement; ``bodies`` (B, J, 3): rest offsets, metres.
     """
 
     joints: torch.Tensor
@@ -47,7 +47,7 @@ class NoisyWindows:
         bodies: np.ndarray,
         skeleton: Skeleton,
     ) -> NoisyWindows:
-        """Return windows of arrays in the shapes above, with their estimated placement."""
+        """Return windows from arrays with the shapes of the fields; estimate the placement."""
         heading, ground = rough_placement(joints, seen, skeleton)
         joints, noise = np.where(seen[..., None], joints, 0.0), np.where(seen, noise, 1.0)
         single = partial(torch.tensor, dtype=torch.float32)
@@ -68,13 +68,13 @@ class NoisyWindows:
         return NoisyWindows(*(part.repeat(n, *[1] * (part.ndim - 1)) for part in parts))
 
     def in_frame(self, heading: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
-        """Return canonical joints, (B, L, J, 3); undefined where occluded."""
+        """Return joints in a canonical frame, (B, L, J, 3); undefined where occluded."""
         moved = self.joints - on_ground(ground)[:, None, None, :]
         return turned_about_vertical(moved, -heading)
 
 
 def on_ground(ground: torch.Tensor) -> torch.Tensor:
-    """Return ground points in space, ``(…, 2) → (…, 3)``."""
+    """Return ground points (X, Z) as points (X, 0, Z), ``(…, 2) → (…, 3)``."""
     x, z = ground[..., 0], ground[..., 1]
     return torch.stack([x, torch.zeros_like(x), z], dim=-1)
 
@@ -173,7 +173,7 @@ class Stitching:
 
         Averaging independent draws reduces their variance. Deviations from the window ``means``
         (B, length, J, 3) are therefore divided by the root of the summed squared weights, which
-        preserves a common variance.
+        restores the variance if it is the same in all windows.
         """
         squares = self.joined(self.weights[..., None] ** 2)[:, 0]
         deviations = self.mean(windows - means) / np.sqrt(squares)[:, None, None]

@@ -28,11 +28,11 @@ class DVAESettings:
     groups : int
         Number of groups in group normalisation.
     decoder : {"cumulative", "direct"}
-        ``direct`` (published): μ_x = d_x(h_t). ``cumulative``: μ_x adds d_x(h_t) and a linear map
-        of z_t to the previous frame, starts exactly at x₀ and uses a ``TrackingEncoder``;
-        it requires much less training data.
+        Mean of a state: ``direct`` (published) d_x(h_t); ``cumulative`` the previous mean,
+        initially x₀, plus d_x(h_t) and a linear map of z_t. The cumulative decoder requires much
+        less training data and is combined with a ``TrackingEncoder``.
     decoder_scale : {"learned", "unit"}
-        s_x: one learned standard deviation per part of the state, or 1 (published).
+        Standard deviation s_x of the decoder: learned per part of the state, or 1 (published).
 
     Raises
     ------

@@ -29,8 +29,8 @@ from probmotion.motion.motion import Motion
 
 __all__ = ["DVAETrainee", "refit_joint_scale", "usual_dvae_training"]
 
-_STATISTICS_WINDOWS = 4000
-_EXPLAINED_VARIANCE = 0.999
+_STATISTICS_WINDOWS = 4000  # Maximum number of windows for the standardisation.
+_EXPLAINED_VARIANCE = 0.999  # Minimum fraction explained by the first-pose directions.
 
 
 class DVAETrainee(WindowTrainee):
@@ -50,7 +50,7 @@ class DVAETrainee(WindowTrainee):
     states : BodyStates
         Conversion between poses and state vectors.
     annealing : int
-        Steps over which the KL weight rises from 0 to 1.
+        Number of steps over which the KL weight rises from 0 to 1.
     seed : int
         Seed of the initial weights and the validation noise.
 
@@ -89,7 +89,7 @@ class DVAETrainee(WindowTrainee):
         states = windows.states
         joints = self.states.positions(states, windows.bodies)
         deviation = states.std(axis=(0, 1))
-        # Bounded below, or standardisation would amplify nearly constant dimensions.
+        # Bound deviations below, or standardisation would amplify nearly constant dimensions.
         least = 0.05 * float(np.median(deviation)) or 1.0
         statistics = {
             "state_mean": states.mean(axis=(0, 1)),
@@ -151,7 +151,7 @@ def _reconstruct(
 
 
 def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0) -> float:
-    """Set the joint decoder scale to its RMS error on held-out clips and return it, metres.
+    """Set the decoder scale of joints to their RMS error on held-out clips and return it, metres.
 
     The prior is modified in place. The training error underestimates this scale, which weights the
     decoder in eq. 11. ``seed`` seeds the encoder draws.
@@ -168,7 +168,7 @@ def refit_joint_scale(prior: MotionDVAE, clips: Sequence[Motion], seed: int = 0)
 def usual_dvae_training(size: str) -> tuple[TrainingSettings, int]:
     """Return the training settings of a size and the number of its KL annealing steps.
 
-    ``paper``: Adamax, batches of 64, 200 epochs, KL annealed over 50 (A.4); an epoch is 1000
+    ``paper``: Adamax, batches of 64, 200 epochs, annealing over 50 (A.4); an epoch is 1000
     steps here. Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=600, batch=32, learning_rate=3e-3, ema=0.98)

@@ -1,7 +1,7 @@
-"""Terms of the denoising evidence lower bound (Motion-DVAE supplement, C), misprints corrected.
+"""Terms of the denoising evidence lower bound (Motion-DVAE supplement, C), with corrections.
 
-The noise model is y − x ~ N(0, s² v̄), v̄ ~ IG(λ/2, λ/2): Student-t with λ degrees of freedom and
-scale s in metres. All terms are elementwise; the caller sums over the observed entries.
+The noise of observed coordinates is N(0, s² v̄) with v̄ ~ IG(λ/2, λ/2): Student-t with λ degrees of
+freedom and scale s in metres. Except for ``gaussian_kl``, terms are elementwise, to be summed.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def inverse_gamma_kl(
 ) -> Tensor:
     """Return KL(IG(α, β) ‖ IG(α₀, β₀)) elementwise, with density ∝ v^(−α−1) exp(−β/v).
 
-    (α − α₀) ψ(α) − log Γ(α) + log Γ(α₀) + α₀ (log β − log β₀) + α (β₀ − β)/β; the last term of
-    the bound has α₀ = β₀ = λ/2. Computed in double precision, returned in the dtype of ``alpha``.
+    The result is (α − α₀) ψ(α) − log Γ(α) + log Γ(α₀) + α₀ (log β − log β₀) + α (β₀ − β)/β. In
+    the bound, α₀ = β₀ = λ/2. Computed in double precision, returned in the dtype of ``alpha``.
     """
     # log Γ exceeds 10⁶ for λ = 10⁶, so single precision would be too coarse.
     a, b = alpha.double(), beta.double()
@@ -53,9 +53,9 @@ def expected_log_normal(
 ) -> Tensor:
     """Return E[log N(residual; 0, s² v̄)] over v̄ ~ IG(α, β), elementwise.
 
-    −½ (log 2π + log s² + log β − ψ(α) + (α/β) residual²/s²), as E[1/v̄] = α/β and
-    E[log v̄] = log β − ψ(α). The supplement omits E[log v], which makes its bound unbounded
-    in v. ``residual`` and ``scale`` (s) are in metres.
+    The result is −½ (log 2π + log s² + log β − ψ(α) + (α/β) residual²/s²), as E[1/v̄] = α/β and
+    E[log v̄] = log β − ψ(α). The supplement omits E[log v̄]; its objective is therefore unbounded.
+    ``residual`` and ``scale`` (s) are in metres.
     """
     log_variance = torch.log(beta) - torch.digamma(alpha)
     square = (residual / scale) ** 2

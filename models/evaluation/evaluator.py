@@ -1,7 +1,7 @@
 """Feature extractor for the comparison of generated and real 2D motions.
 
-It is the encoder of a variational autoencoder trained on 2D data (MAS, section 6.3, after Guo et
-al. 2020); the decoder is only used in training.
+The extractor is the encoder of a variational autoencoder trained on 2D data (MAS, section 6.3,
+after Guo et al. 2020). The decoder is only used in training.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ KIND = "track-evaluator"
 # Tokens per chunk. The fixed shape makes features independent of the batch.
 _TOKENS = 1024
 _GPU_TOKENS = 200_000
-_ENCODER = "encoder."
+_ENCODER = "encoder."  # Prefix of the encoder's weights in a checkpoint.
 
 
 class TrackEvaluator(TrackNetwork):
-    """Features of 2D motions: the latent mean of a variational autoencoder.
+    """Feature extractor of 2D motions: the latent mean of a variational autoencoder.
 
     Use the features to compare sets of motions (:mod:`probmotion.metrics.generation`). They
-    represent only the variation in the training data and are comparable only for the same file,
+    reflect only the variation in the training data and are comparable only for the same file,
     frame rate, centring and camera distance. Parameters are those of
     :class:`~probmotion.models.training.track_network.TrackNetwork`.
     """

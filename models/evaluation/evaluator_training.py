@@ -20,10 +20,10 @@ __all__ = ["EvaluatorTrainee"]
 
 
 class EvaluatorTrainee(TrackTrainee):
-    """Loss and data for :func:`~probmotion.models.training.trainer.train` of an evaluator.
+    """Trainee of an evaluator for :func:`~probmotion.models.training.trainer.train`.
 
     The loss is the mean squared error in standardised units over visible joints, plus ``kl_weight``
-    times the mean divergence of the latents from N(0, I). Parameters are those of
+    times the mean KL divergence of the latents from N(0, I). Parameters are those of
     :class:`~probmotion.models.training.track_trainee.TrackTrainee`; occluded joints are set to
     their mean.
     """

@@ -2,8 +2,8 @@
 
 The network estimates the depth of each joint and the elevation of the camera (Wandt, Little and
 Rhodin, "ElePose", CVPR 2022). A joint at p in the image and z metres behind the root is at
-(p (1 + z/d), z) in camera coordinates, with d the camera's distance and focal length, so that a
-lifted pose projects exactly onto its 2D pose.
+(p (1 + z/d), z) in camera coordinates, where d is both the distance and the focal length of the
+camera. A lifted pose therefore projects exactly onto its 2D pose.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class LifterSettings:
-    """Size of the network and assumptions about cameras.
+    """Size of the lifter network and assumptions about cameras.
 
     Parameters
     ----------
     width : int
         Width of every layer.
     blocks : int
-        Residual blocks of each of the two branches.
+        Number of residual blocks in each of the two branches.
     deepest : float
         Maximum depth of a joint relative to the root, metres, less than ``distance``.
     steepest : float
@@ -78,7 +78,7 @@ class LifterSettings:
 
 
 class LifterNetwork(nn.Module):
-    """Joint depths and camera elevation from a root-centred 2D pose; the root has depth 0."""
+    """Network that estimates joint depths and camera elevation from a root-centred 2D pose."""
 
     mean: torch.Tensor
     deviation: torch.Tensor
@@ -97,7 +97,7 @@ class LifterNetwork(nn.Module):
             self.elevation = _branch(settings, 1)
 
     def forward(self, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return depths, metres, and elevations, radians: ``(N, J, 2) → (N, J), (N,)``."""
+        """Return depths, 0 for the root, and elevations, radians: ``(N, J, 2) → (N, J), (N,)``."""
         flat = (poses[:, self.joints].flatten(1) - self.mean) / self.deviation
         hidden = self.entry(flat)
         deepest = self.settings.deepest
@@ -193,7 +193,7 @@ class PoseLifter:
     def lift(self, views: np.ndarray) -> np.ndarray:
         """Return the 3D motion of each 2D motion: ``(N, L, J, 2) → (N, L, J, 3)``, metres.
 
-        Y is up and the root at the origin. The centred views are the exact projections by
+        Y is up and the root at the origin. The centred views are exact projections of the result by
         ``Cameras.around([0], [elevation], distance=settings.distance, perspective=True)`` with the
         :meth:`elevations` of the views.
 
@@ -216,7 +216,7 @@ class PoseLifter:
     def elevations(self, views: np.ndarray) -> np.ndarray:
         """Return the camera elevation of each motion, radians: ``(N, L, J, 2) → (N,)``.
 
-        This is the mean over frames, since the camera is assumed to be static.
+        The result is the mean over frames, since the camera is assumed to be static.
         """
         return self._estimates(views)[2]
 

@@ -1,7 +1,7 @@
 """Training of the lifter on 2D poses only (Wandt, Little and Rhodin, "ElePose", CVPR 2022).
 
-Each 2D pose is lifted, rotated to a random azimuth and projected at the estimated elevation of
-another pose's camera. The loss is low if a normalising flow of 2D poses assigns the projection a
+Each 2D pose is lifted, rotated to a random azimuth and projected at the camera elevation estimated
+for another pose. The loss is low if a normalising flow of 2D poses assigns the projection a
 high density and the pose lifted from the projection equals the first 3D pose.
 """
 
@@ -43,7 +43,7 @@ class LossWeights:
     likelihood : float
         Weight of the negative log density of the new projections, nats per coordinate.
     points : float
-        Weight of the squared distance between the first and second 3D pose, metres².
+        Weight of the squared distance between the lifted poses of input and projection, metres².
     picture : float
         Weight of the squared distance between the input and the final projection, metres².
     bones : float
@@ -62,7 +62,7 @@ class LossWeights:
 
 
 def bone_sizes(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
-    """Return bone lengths estimated from 2D poses, equal for mirrored bones: (K,), metres.
+    """Return the lengths of K bones from 2D poses, equal for mirrored bones: (K,), metres.
 
     The 2D length of a bone is at most its length. The 90 % quantile over the data replaces the body
     proportions that ElePose estimates from 3D data.
@@ -91,8 +91,8 @@ def lifting_losses(
     """Return the terms of the loss, named as in :class:`LossWeights`.
 
     The lifter maps root-centred poses (N, J, 2) to depths (N, J) and elevations (N,). ``azimuth``
-    (N,) is that of the new cameras relative to the original ones, ``order`` (N,) the permutation
-    that assigns them the estimated elevations, ``sizes`` (K,) the bone lengths.
+    (N,): azimuths of the new cameras relative to the original ones; ``order`` (N,): permutation of
+    the estimated elevations for the new cameras; ``sizes`` (K,): bone lengths, metres.
     """
     bones = torch.tensor(flow.skeleton.bones, device=poses.device)
     zero = torch.zeros_like(azimuth)
@@ -112,10 +112,10 @@ def lifting_losses(
 
 
 class LifterTrainee(PoseTrainee):
-    """Trainee of a lifter on 2D data.
+    """Trainee of a lifter for :func:`~probmotion.models.training.trainer.train`.
 
     Parameters are those of :class:`~probmotion.models.evaluation.pose_flow_training.PoseTrainee`,
-    plus a flow trained on similar tracks and the weights of the loss terms.
+    plus ``flow``, trained on similar tracks, and ``weights`` of the loss terms.
     """
 
     kind = KIND

@@ -1,9 +1,9 @@
 """Normalising flow over 2D poses.
 
-Pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR 2022). Joints are so
-strongly correlated that a flow over their coordinates is almost singular. As in the paper, the flow
-acts on the leading principal components; unlike in the paper, the remaining ones are Gaussian, so
-that the density covers all coordinates.
+The flow is the pose prior of an unsupervised lifter (Wandt, Little and Rhodin, "ElePose", CVPR
+2022). As in the paper, it acts on the leading principal components, since joints are so strongly
+correlated that a flow over their coordinates would be almost singular. Unlike in the paper, the
+other components are Gaussian, so that the density covers all coordinates.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MOST = 1.5
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Size of the flow and preparation of poses.
+    """Size of a pose flow and preparation of its training poses.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class FlowSettings:
     width : int
         Width of each coupling's network.
     share : float
-        Proportion of the variance in the leading principal components; in (0, 1].
+        Proportion of the variance explained by the leading principal components, in (0, 1].
     blur : float
         Standard deviation of the noise added to coordinates in training, metres. It smooths the
         density so that its gradients are useful further from the data.
@@ -105,7 +105,7 @@ class CouplingFlow(nn.Module):
             nn.init.zeros_(last.bias)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return z and log |det dz/dx|: ``(N, D) → (N, D), (N,)``."""
+        """Return z and ``log |det dz/dx|``: ``(N, D) → (N, D), (N,)``."""
         log_determinant = x.new_zeros(len(x))
         for order, network in zip(self.orders, self.networks, strict=True):
             fixed, changed = x[:, order].split([self.fixed, x.shape[1] - self.fixed], dim=1)
@@ -117,9 +117,9 @@ class CouplingFlow(nn.Module):
 
 
 class PoseFlow(nn.Module):
-    """Density of root-centred 2D poses.
+    """Density model of root-centred 2D poses.
 
-    The flow covers the ``components`` leading principal components, at least 2. The root is at the
+    The flow acts on the ``components`` leading principal components, at least 2. The root is at the
     origin and not part of the density.
     """
 
@@ -189,7 +189,7 @@ class PoseFlow(nn.Module):
         return digest.hexdigest()
 
     def log_density(self, poses: torch.Tensor) -> torch.Tensor:
-        """Return the log density of root-centred poses per metre^2(J−1): ``(N, J, 2) → (N,)``."""
+        """Return the log density of root-centred poses per metre^(2(J−1)): ``(N, J, 2) → (N,)``."""
         check_shape("poses", poses, ("N", self.skeleton.n_joints, 2))
         flat = poses[:, self.joints].flatten(1)
         standard = (flat - self.mean) @ self.basis / self.deviation

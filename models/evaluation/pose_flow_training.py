@@ -21,8 +21,8 @@ __all__ = ["PoseFlowTrainee", "PoseTrainee", "whole_poses"]
 def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray:
     """Return the fully visible poses and their mirror images, root-centred: (N, J, 2), metres.
 
-    Every joint must have a confidence of at least ``threshold``. Raises ``ValueError`` if there is
-    no track, skeletons differ, or no frame is fully visible.
+    In a fully visible pose, all joints have a confidence of ``threshold`` or more. Raises
+    ``ValueError`` if there is no track, skeletons differ, or no frame is fully visible.
     """
     if not tracks:
         raise ValueError("tracks must contain at least one track, got none")
@@ -45,7 +45,7 @@ def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray
 
 
 class PoseTrainee:
-    """Data and settings of a network trained on fully visible 2D poses.
+    """Base class of trainees on fully visible 2D poses: data and settings.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class PoseTrainee:
         Seed of initial weights and validation noise.
     """
 
-    _validation_poses: int
+    _validation_poses: int  # Maximum number of held-out poses in the validation loss.
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class PoseTrainee:
 
 
 class PoseFlowTrainee(PoseTrainee):
-    """Trainee of a pose flow.
+    """Trainee of a pose flow for :func:`~probmotion.models.training.trainer.train`.
 
     The loss is the mean negative log density per coordinate, in nats. Parameters are those of
     :class:`PoseTrainee`.

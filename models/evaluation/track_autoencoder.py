@@ -1,6 +1,6 @@
 """Variational autoencoder of 2D motions.
 
-Follows the released code of MAS: transformers with the latent of ACTOR (Petrovich et al. 2021).
+The architecture, with the latent of ACTOR (Petrovich et al. 2021), follows the released MAS code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["EvaluatorSettings", "TrackAutoencoder", "TrackEncoder"]
 
 @dataclass(frozen=True)
 class EvaluatorSettings(TransformerSettings):
-    """Size of the autoencoder.
+    """Size of the autoencoder and weight of its KL divergence.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class EvaluatorSettings(TransformerSettings):
     latent : int
         Number of features.
     kl_weight : float
-        Weight of the Kullback-Leibler divergence from N(0, I), summed over the latent, relative to
+        Weight of the KL divergence of the latent from N(0, I), summed over dimensions, relative to
         the mean squared error in standardised units.
     """
 
@@ -65,9 +65,9 @@ class EvaluatorSettings(TransformerSettings):
 
 
 class TrackEncoder(nn.Module):
-    """Encoder: standardised motion → mean and log variance of its latent.
+    """Encoder of a standardised motion into the mean and log variance of its latent.
 
-    Two learnt tokens precede the frames; mean and log variance are linear in their outputs (ACTOR).
+    Two learnt tokens precede the frames; their outputs are mapped linearly to the results (ACTOR).
     """
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:
@@ -93,7 +93,7 @@ class TrackEncoder(nn.Module):
 
 
 class TrackDecoder(nn.Module):
-    """Decoder: latent → standardised motion.
+    """Decoder of a latent into a standardised motion.
 
     The input token of every frame is the embedded latent plus a positional embedding.
     """

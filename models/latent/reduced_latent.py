@@ -1,7 +1,7 @@
 """Low-dimensional subspace of a latent prior.
 
-It is spanned by the k directions along which the decoded motion varies most, so that random-walk
-samplers mix.
+Random-walk samplers mix in this subspace, which is spanned by the k directions along which the
+decoded motion varies most.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from probmotion.validation import check_count, check_shape
 
 __all__ = ["ReducedLatent"]
 
-_ROWS = 64
+_ROWS = 64  # Number of draws per batch.
 
 
 class ReducedLatent(StandardNormalPrior):
     """Prior over θ ~ N(0, I_k) with latent code z = U θ.
 
-    U (Z, k) contains the leading eigenvectors of E[JᵀJ], with J = ∂X/∂z the decoder's Jacobian at
-    prior draws. E[JᵀJ] is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one product per draw.
+    U (Z, k) contains the leading eigenvectors of E[JᵀJ], with J = ∂X/∂z the Jacobian of the motion
+    X at prior draws. E[JᵀJ] is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one product per draw.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class ReducedLatent(StandardNormalPrior):
     k : int
         Number of directions, at most the prior's ``dim``.
     seed : int
-        Seed of the estimate.
+        Seed of the draws for this estimate.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """Gaussian-mixture prior conditioned on a likelihood, with exact denoisers.
 
-At each joint and frame a linear Gaussian likelihood of X is exp(−½ xᵀΛx + ηᵀx). A noisy view
-x_t = √ᾱ P X + √(1−ᾱ) ε has the same form: it adds ᾱ/(1−ᾱ) PᵀP to Λ and √ᾱ/(1−ᾱ) Pᵀ x_t to η.
-Hence E[X₀ | x_t, y] is the posterior mean of a mixture (see
-:mod:`~probmotion.models.mixture.posterior`). Λ is the same for all draws at a noise level, so
+At each joint and frame a linear Gaussian likelihood of X is exp(−½ xᵀΛx + ηᵀx). The likelihood of a
+noisy view x_t = √ᾱ P X + √(1−ᾱ) ε, with projection P, has the same form: it adds ᾱ/(1−ᾱ) PᵀP to Λ
+and √ᾱ/(1−ᾱ) Pᵀ x_t to η. Hence E[X₀ | x_t, y] is the posterior mean of a mixture
+(:mod:`~probmotion.models.mixture.posterior`). Λ is the same for all draws at a noise level, so
 everything that depends on it is computed once per batch.
 """
 
@@ -25,7 +25,7 @@ __all__ = ["ConditionedMixture"]
 
 
 class ConditionedMixture:
-    """p(X | y) as a prior, with exact E[X₀ | X_t, y] and E[x₀ | x_t, y] for every view.
+    """Posterior p(X | y) as a prior, with exact E[X₀ | X_t, y] and E[x₀ | x_t, y] for every view.
 
     θ contains all positions; ``scale`` is the prior's (metres per normalised unit).
 
@@ -88,7 +88,7 @@ class ConditionedMixture:
         return out
 
     def _mean(self, seen: np.ndarray, alpha_bar: float, axes: np.ndarray) -> np.ndarray:
-        """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``; P is ``axes``, (M, 3)."""
+        """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``, F = L·J; P is ``axes``, (M, 3)."""
         prior, scale, variance = self.prior, self.prior.scale, self.prior.noise**2
         if not 0 < alpha_bar < 1:
             raise ValueError(f"alpha_bar must be between 0 and 1 (exclusive), got {alpha_bar!r}")
@@ -116,7 +116,7 @@ class ConditionedMixture:
     ) -> np.ndarray:
         """Return S (E[m + W z] + δ² η), the mean over components and latents, (B, F, 3).
 
-        ``linear`` is (B, K, A, 1 + r), ``gram`` (K, A, 1 + r, 1 + r).
+        S is ``shrink``, η ``shift``. ``linear`` is (B, K, A, 1 + r), ``gram`` (K, A, 1 + r, 1 + r).
         """
         prior = self.prior
         latent_precision = np.eye(prior.rank) + gram[..., 1:, 1:]

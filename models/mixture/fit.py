@@ -23,10 +23,10 @@ def fit_styles(
     stride: int | None,
     seed: int,
 ) -> dict[str, Any]:
-    """Return the fields of a prior; arguments as in :meth:`GaussianMixtureMotion.fit`.
+    """Fit a mixture and return its fields; arguments as in :meth:`GaussianMixtureMotion.fit`.
 
-    Each style is a probabilistic PCA (Tipping and Bishop 1999): the r leading principal directions
-    with variances reduced by δ², the mean variance of the other directions, pooled over styles.
+    Each style is a probabilistic PCA (Tipping and Bishop 1999) with r principal directions. Their
+    variances are reduced by δ², the mean variance of all other directions, pooled over styles.
     """
     check_count("rank", rank)
     windows, clip_of = cut_windows(motions, frames, stride)

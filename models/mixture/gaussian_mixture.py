@@ -1,7 +1,7 @@
 """Gaussian mixture prior over motions, with exact density, denoisers and posterior.
 
-K styles, each a probabilistic PCA, rotated about the vertical by a yaw that is uniform on a grid of
-A azimuths: K·A Gaussian components with covariance W Wᵀ + δ² I.
+Each of K styles is a probabilistic PCA with covariance W Wᵀ + δ² I, rotated about the vertical by a
+yaw that is uniform on a grid of A azimuths. The mixture thus has K·A Gaussian components.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class GaussianMixtureMotion:
     means : ndarray, (K, L, J, 3)
         Mean motion of each style, metres.
     factors : ndarray, (K, r, L, J, 3)
-        W: displacement per unit of each latent coordinate, metres.
+        W: displacements per unit of each of the r latent coordinates, metres.
     weights : ndarray, (K,)
         Probabilities of the styles, summing to 1.
     noise : float
@@ -126,7 +126,7 @@ class GaussianMixtureMotion:
         frames : int
             Length L of the prior's motions.
         rank : int
-            r: latent dimensions per style.
+            Number of latent dimensions r per style.
         styles : int or sequence of str
             Number of k-means clusters, or one label per clip.
         weights : sequence of float, optional
@@ -160,7 +160,7 @@ class GaussianMixtureMotion:
 
     @property
     def rank(self) -> int:
-        """Latent dimensions r."""
+        """Number of latent dimensions r."""
         return self.factors.shape[1]
 
     @property
@@ -182,7 +182,7 @@ class GaussianMixtureMotion:
 
     @cached_property
     def base_fields(self) -> np.ndarray:
-        """Three base fields of each mean and factor, metres, (K, 1 + r, 3, L·J, 3)."""
+        """Base fields (``turned_mixture``) of means and factors, metres, (K, 1 + r, 3, L·J, 3)."""
         return turning_fields(self._fields)
 
     @property
@@ -198,7 +198,7 @@ class GaussianMixtureMotion:
         return self.exact_posterior(None).sample(rng, n)
 
     def motion(self, theta: Array) -> Array:
-        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; not for latent θ."""
+        """Return the positions at θ, ``(…, dim) → (…, L, J, 3)``; undefined for latent θ."""
         if self.coordinates == "latent":
             raise ValueError(
                 "coordinates must be 'positions', got 'latent', where the motion at θ is random; "
@@ -326,7 +326,7 @@ class GaussianMixtureMotion:
         )
 
     def reduced(self) -> tuple[GaussianMixtureMotion, np.ndarray]:
-        """Return the same prior on the span of its scalar fields, and a basis of that span.
+        """Return an equivalent prior on the span of its scalar fields, and a basis of that span.
 
         The prior depends on frames and joints only through the x, y and z fields of the means and
         factors. Operations that are linear and treat all entries alike (rotation, orthographic

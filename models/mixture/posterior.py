@@ -58,7 +58,7 @@ class MixturePosterior:
         constant_part -= 0.5 * np.linalg.slogdet(np.linalg.inv(self._shrink))[1].sum()
         constant_part += 0.5 * variance * float((self.shift * shrunk_shift).sum())
         log_weights = np.log(weights)[:, None] - math.log(len(yaws))
-        # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z
+        # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z, π: prior of k, a
         self._offset = (
             log_weights + constant_part + self._linear[..., 0] - 0.5 * self._gram[..., 0, 0]
         )
@@ -172,7 +172,7 @@ class MixturePosterior:
         return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
 
     def _log_terms(self, latent: Array) -> Array:
-        """Return log π p(y | z, k, a), ``(…, r) → (…, K·A)``."""
+        """Return log p(k, a) p(y | z, k, a), ``(…, r) → (…, K·A)``."""
         xp = array_namespace(latent)
         rank = self._slope.shape[-1]
         batch = latent.shape[:-1]

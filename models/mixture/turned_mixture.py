@@ -1,7 +1,7 @@
 """Gaussian mixture of components rotated about the vertical, with exact density and denoiser.
 
-Component (k, a) has mean R(ψ_a) m_k, factors R(ψ_a) W_k and isotropic noise δ². A rotated field is
-a trigonometric combination of three base fields,
+Component (k, a), with style k < K and azimuth ψ_a, a < A, has mean R(ψ_a) m_k, r factors R(ψ_a) W_k
+and noise variance δ². A rotated field f is a trigonometric combination of three base fields,
 
     R(ψ) f = cos ψ (f_x, 0, f_z) + sin ψ (f_z, 0, −f_x) + (0, f_y, 0),
 
@@ -27,7 +27,7 @@ rounding of a point must not depend on the batch size, as a sampler's steps ampl
 
 
 def turning_fields(fields: np.ndarray) -> np.ndarray:
-    """Return the three base fields of each field: ``(…, F, 3) → (…, 3, F, 3)``."""
+    """Return the three base fields of each field of F vectors: ``(…, F, 3) → (…, 3, F, 3)``."""
     x, y, z = fields[..., 0], fields[..., 1], fields[..., 2]
     zero = np.zeros_like(x)
     return np.stack(
@@ -48,8 +48,8 @@ def turning_coefficients(yaws: np.ndarray) -> np.ndarray:
 class _Level(NamedTuple):
     """Quantities that depend only on the noise level.
 
-    √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r);
-    and the matrices from base products and a constant 1 to whitened latents, (K, A r, 3 r + 1).
+    √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r),
+    λ as in ``_State``; and matrices (K, A r, 3 r + 1) from base products and 1 to whitened latents.
     """
 
     signal: float
@@ -60,9 +60,9 @@ class _Level(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Mixture conditioned on one noisy observation of each of n points.
+    """Posterior of components and latents given one noisy observation of each of n points.
 
-    p(k, a | x), (K, A, n), and the whitened latents ``u`` = (1 + ᾱλ/τ)^(−½) Bᵀ W_kᵀ R(ψ_a)ᵀ
+    Contains p(k, a | x), (K, A, n), and the whitened latents u = (1 + ᾱλ/τ)^(−½) Bᵀ W_kᵀ R(ψ_a)ᵀ
     (x − √ᾱ R(ψ_a) m_k), (K, A, r, n): E[z | x, k, a] = √ᾱ/τ B (1 + ᾱλ/τ)^(−½) u, with λ and B the
     eigenvalues and eigenbasis of the component's Gram matrix.
     """
@@ -72,10 +72,10 @@ class _State(NamedTuple):
 
 
 class TurnedMixture:
-    """Mixture of x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε' in D dimensions.
+    """Gaussian mixture of noisy points x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε' in ℝ^D.
 
-    Parameters are base fields of means (first) and factors (K, 1 + r, 3, D), equally likely
-    azimuths ψ (A,), style probabilities (K,) and the variance δ².
+    ``fields`` (K, 1 + r, 3, D) contains the base fields of each mean and its factors, ``yaws`` (A,)
+    the equally likely azimuths, ``weights`` (K,) the style probabilities, and ``variance`` is δ².
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class TurnedMixture:
         # Base products → products with every rotated eigenvector: (K, A r, 3 r).
         spread = np.einsum("ac,kair->karic", self.turns, basis, optimize=True)
         self.to_latent = np.ascontiguousarray(spread.reshape(K, A * self.rank, 3 * self.rank))
-        # A row of zeros per style, for the constant 1 in the products, which shifts the latents.
+        # Each style's row of zeros reserves a row of products for a constant that shifts latents.
         rows = np.zeros((K, 3 * width + 1, D))
         rows[:, :-1] = fields.reshape(K, 3 * width, D)
         self._fields = rows.reshape(-1, D)
@@ -170,7 +170,7 @@ class TurnedMixture:
     def residual_variance(self, x: np.ndarray) -> np.ndarray:
         """Return the mean square of x outside its most likely component's subspace: (n,).
 
-        The expectation is δ².
+        Its expected value is δ².
         """
         level = self._level(1.0)
         # ‖x − m‖² minus its component inside the subspace, Σ (Bᵀ Wᵀ (x − m))² / λ.
@@ -201,7 +201,7 @@ class TurnedMixture:
         return _Level(signal, total, (1 - alpha_bar) / total, root, to_latent)
 
     def _offsets(self, level: _Level) -> np.ndarray:
-        """Return the terms of log π p(x | k, a) that do not depend on x, (K, A)."""
+        """Return the terms of log p(k, a, x) that depend on (k, a) but not on x, (K, A)."""
         energy = level.signal**2 * self.square_mean / level.total
         return self.log_weights[:, None] + np.log(level.root).sum(axis=-1) - 0.5 * energy
 
@@ -220,9 +220,9 @@ class TurnedMixture:
     def _products(
         self, x: np.ndarray, level: _Level, *, shifted: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return products with every rotated mean (K, A, n) and whitened eigenvector (K, A, r, n).
+        """Return products of x with rotated means (K, A, n) and whitened eigenvectors (K, A, r, n).
 
-        With ``shifted``, the latter are products of x minus the component's noisy mean.
+        With ``shifted``, the component's noisy mean is subtracted from x for the latter.
         """
         K, A = self.shape
         n = len(x)
@@ -249,7 +249,7 @@ class TurnedMixture:
 
 
 def _blocks(n: int) -> Iterator[tuple[slice, int]]:
-    """Yield the rows of each block and their number."""
+    """Yield the slice of rows of each block and the number of rows."""
     for start in range(0, n, _BLOCK):
         stop = min(n, start + _BLOCK)
         yield slice(start, stop), stop - start

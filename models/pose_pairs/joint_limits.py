@@ -1,14 +1,14 @@
 """Pose-conditioned joint-angle limits (Akhter and Black 2015).
 
 The directions allowed for a bone depend on the direction of its parent. Twist is not limited, as
-joint positions do not determine it. Parent directions have coarse bins, bone directions fine cells.
-A table has one bit per bin and cell, set if they occur in or close to motion capture data
-(:mod:`.joint_limits_learning`).
+joint positions do not determine it. Parent directions are divided into coarse bins, bone directions
+into fine cells. A table has one bit per bin and cell, set if the combination occurs in or close to
+motion capture data (:mod:`.joint_limits_learning`).
 
-The left axis of the pelvis frame is parallel to the line of the hips, its up axis closest to the
-spine. The frame of neck and arms uses the shoulders and the chest's bone instead. Other bones use
-their parent's frame, rotated by the minimal rotation from the parent's mean direction, so that the
-singularity is opposite to the usual directions.
+The pelvis frame has its left axis along the line of the hips and its up axis as close to the spine
+as possible. The frame of neck and arms uses the shoulders and the chest's bone instead. Other bones
+use their parent's frame, rotated by the smallest angle from the parent's mean to its actual
+direction. This rotation is undefined only opposite to the mean direction.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ class JointLimits:
     allowed : ndarray of bool, (9, bins, cells)
         Allowed direction cells per bin of the parent's direction; at least one per bin. The nine
         parts are the bones ending in hip, knee, ankle, chest, shoulder, elbow, wrist, neck and
-        head, shared by both sides. ``tilt`` limits the spine instead.
+        head, shared by both sides. The spine is limited by ``tilt`` instead.
     rest : ndarray, (9, 3)
         Mean direction of each bone in its frame, unit vectors.
     tilt : float
-        Maximum angle of the spine to the plane between the hips, radians.
+        Maximum angle between the spine and the plane orthogonal to the hip line, radians.
     bin_rings, cell_rings : int
         Number of rings of the sphere's partition into bins and cells; see :func:`sphere_rings`.
     provenance : mapping
-        Training data and settings, JSON-serialisable.
+        Record of the training data and settings, JSON-serialisable.
     skeleton : Skeleton
         Skeleton of the poses; each of its trees has the joints of ``person17``.
     """
@@ -190,8 +190,8 @@ def sphere_rings(n_rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a partition of the sphere into ``n_rings`` rings of nearly square cells.
 
     Cells are mirror-symmetric in the first axis. ``rings`` (n_rings, 2) contains the number of
-    cells and the index of the first cell of each ring, from the positive second axis; ``centres``
-    (cells, 3) are unit vectors.
+    cells and the index of the first cell of each ring, ordered from the positive second axis;
+    ``centres`` (cells, 3) are unit vectors.
     """
     heights = (np.arange(n_rings) + 0.5) * np.pi / n_rings
     counts = 2 * np.round(n_rings * np.sin(heights)).astype(np.int64)

@@ -1,6 +1,6 @@
 """Compiled geometry of joint limits: frames, minimal rotations and cells of the sphere.
 
-Vectors are tuples and matrices are tuples of columns, which compile to registers.
+Vectors are tuples, and matrices are tuples of columns; Numba compiles both to registers.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ __all__ = [
 
 Vector = tuple[float, float, float]
 Frame = tuple[Vector, Vector, Vector]
-NO_LENGTH = (0.0, 0.0, 0.0)
-_TINY = 1e-12
+NO_LENGTH = (0.0, 0.0, 0.0)  # direction of a vector of length 0
+_TINY = 1e-12  # length below which a vector counts as 0
 
 
 @numba.njit(cache=True)
 def cell_of(direction: Vector, rings: np.ndarray) -> int:
-    """Return the cell of a unit vector on a sphere with rings about the second axis."""
+    """Return the index of the cell of a unit vector; ``rings`` are about the second axis."""
     height = min(1.0, max(-1.0, direction[1]))
     ring = min(len(rings) - 1, int(np.arccos(height) / np.pi * len(rings)))
     cells = rings[ring, 0]
@@ -43,7 +43,7 @@ def unit(v: Vector) -> Vector:
 def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
     """Return the frame with left axis left − right and the up axis closest to ``up``.
 
-    If an axis is undefined, a fixed direction replaces it; such poses are invalid.
+    If an axis is undefined, a deterministic orthogonal direction replaces it.
     """
     x = unit((left[0] - right[0], left[1] - right[1], left[2] - right[2]))
     if x == NO_LENGTH:
@@ -74,7 +74,7 @@ def from_frame(frame: Frame, local: Vector) -> Vector:
 
 @numba.njit(cache=True)
 def least_rotation(a: Vector, b: Vector) -> Frame:
-    """Return the minimal rotation of the unit vector ``a`` to ``b``."""
+    """Return the rotation by the smallest angle from the unit vector ``a`` to ``b``."""
     c = _dot(a, b)
     if c < -1.0 + 1e-9:
         # A half turn: the axis is arbitrary but deterministic.
@@ -133,8 +133,8 @@ def closeness_of(
     """Return the cosine between each cell's centre and the nearest sample, (bins, cells).
 
     A bin uses the samples with a parent direction in the bin or at a cosine of at least
-    ``bin_reach`` to its centre. The value of a cell with a sample is 1, of a bin without samples
-    -2. Compiled code sums in a fixed order.
+    ``bin_reach`` to its centre. A cell that contains a sample has the value 1; cells of a bin
+    without samples have the value -2. Compiled sums have a fixed order and are reproducible.
     """
     closeness = np.full((len(bins), len(centres)), -2.0)
     for sample in range(len(parents)):

@@ -29,17 +29,17 @@ __all__ = ["PARTS", "LimitArrays", "local_directions", "project_poses"]
 
 PARTS = ("hip", "knee", "ankle", "chest", "shoulder", "elbow", "wrist", "neck", "head")
 """Bones with a table, by end joint; shared by both sides."""
-# NumPy integers, as Numba compiles a function once for each literal argument.
+# NumPy integers: Numba would compile a function again for each literal integer argument.
 HIP, KNEE, ANKLE, CHEST, SHOULDER, ELBOW, WRIST, NECK, HEAD = np.arange(9)
 
-# Joints of `person17`, and the last descendant of the spine.
+# Joints of `person17`; LAST_OF_TRUNK is the last descendant of the spine.
 SPINE, CHEST_JOINT, NECK_JOINT, HEAD_JOINT = np.arange(1, 5)
 LEFT_SHOULDER, RIGHT_SHOULDER, LAST_OF_TRUNK, LEFT_HIP, RIGHT_HIP = np.array([5, 8, 10, 11, 14])
 N_JOINTS = 17
 _PARENTS = np.array(Skeleton.preset("person17").parents)
 
-_UP = (0.0, 1.0, 0.0)
-_BISECTIONS = 12
+_UP = (0.0, 1.0, 0.0)  # up axis of every frame
+_BISECTIONS = 12  # steps that locate the boundary of the allowed cells
 
 
 class LimitArrays(NamedTuple):
@@ -54,13 +54,13 @@ class LimitArrays(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """State of the traversal of one person; ``correct`` enables corrections."""
+    """State of the traversal of one person."""
 
     limits: LimitArrays
-    correct: bool
-    directions: np.ndarray
-    valid: np.ndarray
-    local: np.ndarray
+    correct: bool  # whether invalid bones are corrected
+    directions: np.ndarray  # (17, 3), unit vectors of the bones by end joint
+    valid: np.ndarray  # (17,), bool
+    local: np.ndarray  # (17, 2, 3), directions of the parent and the bone in the bone's frame
 
 
 @numba.njit(cache=True)
@@ -134,7 +134,7 @@ def _between(a: Vector, b: Vector, fraction: float) -> Vector:
 
 @numba.njit(cache=True)
 def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, walk: Walk) -> Vector:
-    """Check one bone given its parent's direction, correct it, and return it in ``frame``.
+    """Check and correct a bone given its parent's direction; return its direction in ``frame``.
 
     A bone of length 0 is valid and gets its mean direction.
     """
@@ -160,8 +160,8 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
 def _walk_person(walk: Walk) -> None:
     """Check the 16 bones, parents first, correcting ``directions`` in place.
 
-    ``local`` (17, 2, 3) receives the parent's and the bone's direction. Frames depend only on bones
-    already corrected, and corrections do not change frames already used, so the result is valid.
+    ``local`` receives the directions of each parent and bone. Frames depend only on bones already
+    corrected, and corrections do not change frames already used, so the result is valid.
     """
     limits, correct, directions, valid, local = walk
     pelvis = line_frame(
@@ -169,7 +169,7 @@ def _walk_person(walk: Walk) -> None:
     )
     spine = _check_spine(pelvis, walk)
 
-    # In this frame the hips are mirror images: check one, correct both.
+    # In the pelvis frame the hips are mirror images: check one, correct both.
     hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, walk)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
     for i in range(2):
@@ -212,7 +212,7 @@ def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     u = in_frame(pelvis, _row(directions, SPINE))
     valid[SPINE] = abs(u[0]) <= limits.tilt
     if correct and not valid[SPINE]:
-        # Slightly inside the limit, against rounding.
+        # Stay slightly inside the limit despite rounding.
         tilt = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
         u = (tilt, np.sqrt(1.0 - tilt * tilt), 0.0)
         _set_and_turn(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
@@ -231,7 +231,7 @@ def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) ->
 
 @numba.njit(cache=True)
 def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
-    """Write the unit vector of each bone; 0 for bones of length 0."""
+    """Write the unit vector of each bone to ``directions``; 0 for bones of length 0."""
     for joint in range(1, N_JOINTS):
         end, start = tree[joint], tree[_PARENTS[joint]]
         bone = (
@@ -246,7 +246,7 @@ def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> N
 def project_poses(
     poses: np.ndarray, trees: np.ndarray, limits: LimitArrays
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask of joints with valid bones, (n, J), and the nearest valid poses, (n, J, 3).
+    """Return a mask of joints with a valid bone, (n, J), and nearby valid poses, (n, J, 3).
 
     ``trees`` (K, 17) contains the joints of each person in the order of ``person17``.
     """

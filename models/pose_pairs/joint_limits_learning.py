@@ -37,9 +37,9 @@ HELD_OUT = (
 """Clips excluded from the data of the shipped limits, for evaluation."""
 
 _PERSON = Skeleton.preset("person17")
-# Minimum left component of a hip: swapped hips would flip the frame of the pelvis.
+# Minimum left component of the left hip's direction: swapped hips would flip the pelvis frame.
 _LEAST_LEFT_OF_HIP = 0.1
-# Below 1, for robustness to outlier frames.
+# Quantile of the spine's tilt that sets its limit; below 1 for robustness to outlier frames.
 _TILT_QUANTILE = 0.999
 
 
@@ -51,15 +51,15 @@ def learn_limits(
     bin_rings: int = 6,
     cell_rings: int = 22,
 ) -> JointLimits:
-    """Return limits that allow the directions in ``motions`` and close directions.
+    """Learn limits that allow the bone directions in ``motions`` and directions close to them.
 
     Parameters
     ----------
     motions : sequence of Motion or ndarray (L, 17, 3)
         Motions of one person, metres, with the joints of ``person17`` or retargetable to it.
-        Mirror images are included.
+        Their mirror images are added.
     dilation : float
-        Maximum angle between an allowed and an observed direction, radians, in [0, π/2).
+        Maximum angle from an allowed direction to an observed one, radians, in [0, π/2).
     bin_dilation : float
         Maximum angle between parent directions that share observations, radians, in [0, π/2).
     bin_rings, cell_rings : int
@@ -167,7 +167,7 @@ def _poses(motions: Iterable[Motion | np.ndarray]) -> np.ndarray:
 
 
 def _samples(local: np.ndarray, part: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return parent and bone directions of a part, (n, 3): both sides, or mirrored."""
+    """Return parent and bone directions of a part, (n, 3), on both sides or with mirror images."""
     if PARTS[part] in _PERSON.joint_names:
         middle = local[:, _PERSON.index(PARTS[part])]
         sides = [middle, middle * np.array([-1.0, 1.0, 1.0])]
@@ -187,7 +187,7 @@ def _local(poses: np.ndarray, rest: np.ndarray, bin_rings: int, cell_rings: int)
 
 
 def _mean_directions(poses: np.ndarray, bin_rings: int, cell_rings: int) -> np.ndarray:
-    """Return each part's mean direction; two passes, as some frames depend on other means."""
+    """Return each part's mean direction, in two passes because frames depend on other means."""
     rest = np.tile([0.0, 1.0, 0.0], (len(PARTS), 1))
     for _ in range(2):
         local = _local(poses, rest, bin_rings, cell_rings)
@@ -206,7 +206,7 @@ def _without_empty_rows(allowed: np.ndarray, bins: np.ndarray) -> np.ndarray:
         known = np.flatnonzero(rows.any(axis=-1))
         for row in np.flatnonzero(~rows.any(axis=-1)):
             closeness = bins[known] @ bins[row]
-            # Ties are common: a bin and its mirror image.
+            # A bin and its mirror image are often equally close.
             nearest = known[closeness > closeness.max() - 1e-9]
             filled[part, row] = rows[nearest].any(axis=0)
     return filled

@@ -26,26 +26,26 @@ _LIKELIHOOD = (
 class PairSettings:
     """Settings of the pose-pair posterior.
 
-    Defaults are those of the paper except for ``limit``: a density truncated at 100 times that of
-    the seed is constant over most draws. The paper states no unit for ``noise``; 0.01 m was
-    chosen in ``notebooks/ablations/pose_pairs.py`` (parts noise and calibration).
+    Defaults are those of the paper except for ``limit``: truncated at the published 100 times the
+    seed's density, the posterior is constant over most draws. The paper states no unit for
+    ``noise``; ``notebooks/ablations/pose_pairs.py`` selects 0.01 m (parts noise and calibration).
 
     Parameters
     ----------
     penetration_weight : float
-        w of eq. 2.
+        Weight w of the squared penetration depth (eq. 2).
     position_noise : float
-        σ_p of eq. 2, metres.
+        Standard deviation σ_p of positions (eq. 2), metres.
     max_invalid : int
         Maximum number of joint angles beyond the limits.
     view_bandwidth : float
-        σ_v of eq. 5, radians.
+        Bandwidth σ_v of the view distribution (eq. 5), radians.
     shortest_edge : float
-        ε of eq. 8, metres.
+        Lower bound ε of edge lengths (eq. 8), metres.
     noise : float
-        σ_l of eq. 9, metres (dimensionless for shape contexts).
+        Standard deviation σ_l of eq. 9, metres (dimensionless for shape contexts).
     limit : float
-        c of eq. 11; infinity disables truncation.
+        Truncation factor c of eq. 11; infinity disables truncation.
     n_views, n_near : int
         Number of views m, and number of annotations compared per view.
     measure, graph : str
@@ -89,19 +89,19 @@ def pair_posterior(
     Parameters
     ----------
     seed : ndarray, (J, 3) or (S, J, 3)
-        One or several 3D pose-pairs, metres; the first is θ = 0 and the reference of truncation.
+        One or several 3D pose-pairs, metres. The first has θ = 0; truncation is relative to it.
     annotations : Annotations or None
-        Annotated pairs; unknown views are estimated from the seed. ``None`` for the prior alone.
+        Annotated pairs; unknown views are estimated from the seed. ``None``: prior alone.
     settings : PairSettings, optional
         Settings of the prior and the likelihood.
     skeleton : Skeleton, optional
         Skeleton of the seed; ``pair17`` by default.
     fps : float
-        Frames per second, if there are no annotations.
+        Frames per second; the annotations' frame rate replaces it if there are annotations.
     limits : JointLimits, optional
         Joint limits; the shipped ones by default.
     view_seed : int
-        Seed of the fixed views.
+        Random seed of the views, which stay fixed.
 
     Raises
     ------

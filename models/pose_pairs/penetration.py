@@ -30,9 +30,9 @@ class Capsules(NamedTuple):
 def capsules_of(skeleton: Skeleton) -> Capsules:
     """Return a skeleton's capsules and the pairs tested for penetration.
 
-    The pairs are all bones of different trees and, within a tree, bones that neither share a joint
-    nor have a common neighbour. Close capsules of a tree overlap at rest, and the joint limits
-    restrict their folding.
+    These are all pairs of bones of different trees and, within a tree, pairs that neither share a
+    joint nor have a common neighbour. Neighbouring capsules overlap at rest, and the joint limits
+    restrict how far they fold.
     """
     if skeleton.radii is None:
         raise ValueError("skeleton must have radii, one per joint, got none")
@@ -48,7 +48,7 @@ def penetration_depth(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     Parameters
     ----------
     positions : ndarray, (…, J, 3)
-        Metres.
+        Joint positions, metres.
     skeleton : Skeleton
         Skeleton with radii.
 
@@ -65,10 +65,10 @@ def penetration_depth(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def penetrating_bones(pose: np.ndarray, skeleton: Skeleton) -> list[tuple[str, str, float]]:
-    """Return the penetrating bones of a pose (J, 3), deepest first.
+    """Return the penetrating pairs of bones of a pose (J, 3), deepest first.
 
-    Each entry is (bone, bone, depth in metres), with bones named by end joint; depths sum to
-    :func:`penetration_depth`.
+    Each entry is (bone, bone, depth in metres). Bones are named by their end joint. The depths sum
+    to :func:`penetration_depth`.
     """
     bones, radii, pairs = capsules_of(skeleton)
     given = np.ascontiguousarray(pose, dtype=np.float64)

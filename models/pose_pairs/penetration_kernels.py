@@ -1,4 +1,4 @@
-"""Compiled distances of segments and penetration depths of capsules."""
+"""Compiled distances between segments and penetration depths of capsules."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 
 __all__ = ["capsule_depth", "segment_distance", "total_depths"]
 
-_TINY = 1e-18
+_TINY = 1e-18  # squared length below which a segment counts as a point, m²
 
 
 @numba.njit(cache=True, inline="always")
@@ -17,9 +17,9 @@ def _within(x: float) -> float:
 
 @numba.njit(cache=True)
 def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray) -> float:
-    """Return the distance of the segments p–q and r–s, metres; segments may have length 0.
+    """Return the distance between the segments p–q and r–s, metres; their length may be 0.
 
-    Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+    The algorithm is that of Ericson, Real-Time Collision Detection (2005), section 5.1.9.
     """
     a = e = f = b = c = 0.0
     for i in range(3):
@@ -35,7 +35,7 @@ def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray)
     elif a > _TINY and e <= _TINY:
         along = _within(-c / a)
     elif a > _TINY and e > _TINY:
-        # Parallel lines: any starting point will do.
+        # For parallel lines, any starting point is valid.
         volume = a * e - b * b
         along = _within((b * f - c * e) / volume) if volume > 1e-12 * a * e else 0.0
         across = (b * along + f) / e
@@ -64,7 +64,7 @@ def capsule_depth(
 def total_depths(
     poses: np.ndarray, bones: np.ndarray, radii: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:
-    """Return the total depth ρ of each pose, (n,), skipping pairs with disjoint bounding balls."""
+    """Return the total depth ρ of each pose, (n,); skip pairs with disjoint bounding spheres."""
     total = np.zeros(len(poses))
     middles, reach = np.empty((len(bones), 3)), np.empty(len(bones))
     for n in range(len(poses)):

@@ -1,4 +1,4 @@
-"""Coordinates of poses relative to a seed: rotations and log lengths of bones, and root motion."""
+"""Coordinates of poses relative to a seed: root poses, bone rotations and log bone lengths."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["PoseChart"]
 
 @dataclass(frozen=True, eq=False)
 class PoseChart:
-    """Coordinates θ of poses of K trees, 0 at the seed.
+    """Chart between coordinates θ and poses of K trees, with θ = 0 at the seed.
 
-    With the seed's bone vectors ``b_j``, bases ``E_j`` (3, 2) orthogonal to them and the parent's
-    rotation ``G``: ``G_j = G exp(E_j α_j)`` and ``x_j = x_parent + e^{λ_j} G_j b_j``. A root has
-    ``G = exp(ω)`` and ``x = x_seed + t``. θ contains ω of every root, t of every root, then
-    (α₁, α₂, λ) of every bone in the order of ``skeleton.bones``.
+    Bone j has rotation ``G_j = G exp(E_j α_j)`` and end joint ``x_j = x_parent + e^{λ_j} G_j b_j``,
+    with the parent's rotation ``G``, the seed's bone vector ``b_j`` and a basis ``E_j`` (3, 2)
+    orthogonal to it. A root has rotation ``exp(ω)`` and position ``x_seed + t``. θ contains ω of
+    every root, t of every root, then (α₁, α₂, λ) of every bone in the order of ``skeleton.bones``.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class PoseChart:
     bone_noise : float
         Standard deviation of the log bone lengths.
     root_noise : float
-        Standard deviation of the root coordinates, metres.
+        Standard deviation of the root positions about the seed's, per axis, metres.
     """
 
     seed: np.ndarray
@@ -84,7 +84,7 @@ class PoseChart:
         frames = vector_to_matrix(turns)
         joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
         positions = [joints]
-        # Process one generation of bones at a time, to use few large matrix products.
+        # Process one generation of bones at a time: few large matrix products are faster.
         for bones, above in self._generations:
             frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
             joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
@@ -129,7 +129,7 @@ class PoseChart:
         """Return the log density of the base measure of poses: ``(…, dim) → (…)``, NumPy.
 
         Root rotations (Haar) and bone directions are uniform, root positions and log lengths
-        Gaussian, all normalised. Rotations beyond π have density 0: directions are counted once.
+        Gaussian, all normalised. Rotations beyond π have density 0, so each direction counts once.
         """
         theta = to_numpy(theta)
         turns, places, bends, stretches = self._parts(theta)
@@ -145,7 +145,7 @@ class PoseChart:
         return np.where(inside, total, -np.inf)
 
     def speeds(self, turn: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-        """Return mean squared steps of the coordinates, (…, dim), from steps of joints (eq. 12).
+        """Return mean squared steps of the coordinates, (…, dim), from those of joints (eq. 12).
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class PoseChart:
 
     @cached_property
     def _places(self) -> list[int]:
-        """Position of each joint in the order of generations."""
+        """Index of each joint in the order of generations."""
         order = list(self.skeleton.roots)
         order += [self.skeleton.bones[k][0] for bones, _ in self._generations for k in bones]
         return [order.index(joint) for joint in range(self.skeleton.n_joints)]

@@ -22,16 +22,16 @@ _JITTER = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PosePairPrior:
-    """Prior f(Θ) = exp(−E(X(Θ))/2σ_p²), 0 with more than ``max_invalid`` invalid joint angles.
+    """Prior f(Θ) = exp(−E(X(Θ))/2σ_p²), 0 for more than ``max_invalid`` invalid joint angles.
 
-    ``E = ‖X − X̂‖² + w ρ²`` (eq. 2), with X̂ the nearest pose within the joint limits and ρ the total
-    penetration depth, metres. The unnormalised density is relative to the base measure
-    :meth:`PoseChart.log_measure`, as eq. 2 alone is improper in position and bone lengths.
+    The energy is ``E = ‖X − X̂‖² + w ρ²`` (eq. 2), with the pose X, the pose X̂ closest to it within
+    the joint limits and the total penetration depth ρ, metres. The unnormalised density is relative
+    to the measure :meth:`PoseChart.log_measure`: eq. 2 is improper in position and bone lengths.
 
     Parameters
     ----------
     seed : ndarray, (J, 3) or (S, J, 3)
-        Initial poses of chains, metres; the first is θ = 0. Poses must be of close people and
+        Initial poses of chains, metres; the first has θ = 0. People must be close and poses
         within the support.
     skeleton : Skeleton
         Skeleton of the J joints, K trees, with bone radii.
@@ -40,9 +40,9 @@ class PosePairPrior:
     limits : JointLimits, optional
         Joint limits; the shipped ones by default.
     penetration_weight : float
-        w of eq. 2.
+        Weight w of the squared penetration depth (eq. 2).
     position_noise : float
-        σ_p of eq. 2, metres.
+        Standard deviation σ_p of positions (eq. 2), metres.
     max_invalid : int
         Maximum number of joint angles beyond the limits.
     bone_noise, root_noise : float
@@ -105,7 +105,7 @@ class PosePairPrior:
         return self.chart.coordinates(poses)
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n initial points, (n, dim): the seeds cyclically, with small noise."""
+        """Return n initial points, (n, dim): the seeds, repeated cyclically, plus small noise."""
         chosen = self.seed_coordinates()[np.arange(n) % len(self.seed)]
         return chosen + _JITTER * rng.standard_normal((n, self.dim))
 
@@ -118,7 +118,7 @@ class PosePairPrior:
         theta = to_numpy(theta)
         log_measure = self.log_measure(theta)
         flat = theta.reshape(-1, self.dim)
-        # Bone lengths can overflow.
+        # Exponentials of log bone lengths can overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             positions = self.motion(flat)
         inside = np.isfinite(log_measure.reshape(-1)) & np.isfinite(positions).all(axis=(1, 2, 3))
@@ -146,7 +146,7 @@ class PosePairPrior:
     def coordinate_speeds(self, joint_speeds: np.ndarray) -> np.ndarray:
         """Return the mean squared step of each coordinate: ``(…, J, 2) → (…, dim)``.
 
-        ``joint_speeds`` contains the squared turns, radians², and stretches, metres², of joints.
+        ``joint_speeds`` contains each joint's mean squared turn, radians², and stretch, metres².
         """
         return self.chart.speeds(joint_speeds[..., 0], joint_speeds[..., 1])
 

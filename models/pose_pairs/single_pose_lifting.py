@@ -4,8 +4,8 @@ The energy is minimised for each person of a 2D pair separately, with the seed's
 
     E = Σ_visible ‖x_j − p_j‖² + w_v ‖X − X̂‖² + w_s Σ ‖α‖²
 
-with x the orthographic projection of the pose X, X̂ the nearest valid pose, and α the joint angles
-relative to the seed. X̂ is updated after each minimisation over X (alternating projections).
+with the orthographic projection x of the pose X, keypoints p, the nearest valid pose X̂, and joint
+angles α relative to the seed. Minimisations over X and updates of X̂ alternate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 
 __all__ = ["lift_people"]
 
-_STEP = 1e-5  # of central differences, radians and metres
+_STEP = 1e-5  # step of central differences, radians or metres
 
 
 def lift_people(
@@ -54,17 +54,17 @@ def lift_people(
     limits : JointLimits, optional
         Joint limits; the shipped ones by default.
     validity_weight : float
-        w_v.
+        Weight w_v of the squared distance to the nearest valid pose.
     seed_weight : float
-        w_s, m²/rad².
+        Weight w_s of the squared joint angles, m²/rad².
     rounds : int
-        Number of minimisations over X.
+        Number of minimisations over X, each after an update of X̂.
 
     Returns
     -------
     positions : ndarray, (J, 3)
-        Metres in the annotation's axes: right, up, towards the viewer. Root depths are those
-        of the seed.
+        Lifted pose-pair, metres, in the annotation's axes: right, up, towards the viewer. Root
+        depths are those of the seed.
     """
     n_joints = skeleton.n_joints
     check_shape("keypoints", keypoints, (n_joints, 2))
@@ -81,7 +81,7 @@ def lift_people(
     check_finite("keypoints", keypoints)
     limits = JointLimits.shipped() if limits is None else limits
     seed = np.asarray(seed, dtype=np.float64)
-    # The seed in image axes, aligned in the image plane to the visible joints.
+    # Express the seed in image axes and align it in the image plane to the visible joints.
     right, up = image_axes(pair_frames(seed[None], skeleton), np.asarray(view)[None])[0, :, 0].T
     rotated = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
     aligned = align_rigidly(rotated[:, :2], keypoints, visible)

@@ -1,6 +1,6 @@
 """Checkpoints of networks: safetensors files with a JSON header.
 
-Such files cannot run code when loaded. The header's ``probmotion`` entry contains the format
+Loading such a file cannot execute code. The header's ``probmotion`` entry contains the format
 version, the kind of network, its settings and the SHA-256 of settings and tensors.
 """
 
@@ -38,17 +38,17 @@ MODEL = "model.safetensors"
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 """Folder of the networks shipped with the package."""
-_FORMAT = 1
-_ENTRY = "probmotion"
+_FORMAT = 1  # version of the format
+_ENTRY = "probmotion"  # key of the header's metadata
 
 
 class CheckpointError(ValueError):
-    """A file is not a checkpoint, is damaged, or contains another kind of network."""
+    """Error for a file that is no checkpoint, is damaged or contains another kind of network."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Kind of a network, JSON settings (for its size and training record) and weights."""
+    """Checkpoint of a network: its kind, JSON settings (size, training record) and weights."""
 
     kind: str
     settings: Mapping[str, Any]
@@ -131,7 +131,7 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
 
 @contextmanager
 def valid_settings(source: str | Path, network: str) -> Iterator[None]:
-    """Convert errors due to missing or invalid settings to ``CheckpointError``."""
+    """Convert errors due to missing or invalid settings of a network to ``CheckpointError``."""
     try:
         yield
     except (KeyError, TypeError, ValueError) as error:
@@ -149,7 +149,7 @@ def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> Non
 
 
 def weights_digest(network: nn.Module) -> str:
-    """Return a digest of a network's weights in half precision."""
+    """Return the SHA-256 of a network's weights in half precision."""
     tensors = {
         name: tensor.detach().cpu().half() if tensor.is_floating_point() else tensor.cpu()
         for name, tensor in network.state_dict().items()

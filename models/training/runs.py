@@ -1,4 +1,4 @@
-"""Saving and resuming of training runs."""
+"""Functions to save and resume training runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run",
 STATE, LOSSES = "state.safetensors", "losses.csv"
 """Names of the files for resuming and of the losses, in the folder of a run."""
 
-_LONGEST_DIFFERENCE = 200
+_LONGEST_DIFFERENCE = 200  # characters; error messages do not quote longer values
 
 
 @dataclass(eq=False)
@@ -36,12 +36,12 @@ class Run:
     """State of a training run after ``step`` steps."""
 
     network: nn.Module
-    average: nn.Module
+    average: nn.Module  # network with the moving average of the weights
     optimiser: torch.optim.Optimizer
     step: int = 0
     seconds: float = 0.0
-    history: list[dict[str, float]] = field(default_factory=list)
-    recent: list[float] = field(default_factory=list)
+    history: list[dict[str, float]] = field(default_factory=list)  # rows of losses.csv
+    recent: list[float] = field(default_factory=list)  # losses since the last row
 
 
 def keep_run(
@@ -110,8 +110,8 @@ def resume_run(run: Run, folder: Path, kind: str, described: dict[str, Any]) -> 
 def check_same_run(
     saved: Mapping[str, Any], described: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> None:
-    """Raise ``ValueError`` unless saved and described settings are equal."""
-    # Runs saved before a setting was introduced used its present default.
+    """Raise ``ValueError`` if saved and described settings that affect steps differ."""
+    # A run without a setting was saved before its introduction and used its present default.
     defaults = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part, settings in described.items():
         for name, wanted in settings.items():

@@ -18,9 +18,9 @@ class TrainingSettings:
     Parameters
     ----------
     steps : int
-        Gradient steps.
+        Number of gradient steps.
     batch : int
-        Sequences per step.
+        Number of sequences per step.
     learning_rate : float
         Learning rate of the optimiser.
     warmup : int
@@ -32,7 +32,7 @@ class TrainingSettings:
     clip : float
         Maximum norm of the gradient; ``inf`` disables clipping.
     checkpoint_every : int
-        Steps between checkpoints, each with a validation loss.
+        Steps between checkpoints; a validation loss is computed at each.
     seed : int
         Seed of weights, batches and noise.
     optimiser : {"adamw", "adamax"}
@@ -87,5 +87,5 @@ class TrainingSettings:
         return self.learning_rate * 0.5**halvings * min(1.0, step / max(1, self.warmup))
 
     def decay(self, step: int) -> float:
-        """Return the decay of the moving average: min(ema, (1 + k)/(10 + k)), as in TensorFlow."""
+        """Return the average's decay at step k: min(ema, (1 + k)/(10 + k)), as in TensorFlow."""
         return min(self.ema, (1 + step) / (10 + step))

@@ -19,7 +19,7 @@ __all__ = ["Augmentation", "Batch", "TrackBatches", "describe_tracks", "learning
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Data augmentation of tracks (MAS, section 6.1; the authors' training).
+    """Settings of the data augmentation of tracks, as in the training of MAS (section 6.1).
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Augmentation:
     Raises
     ------
     ValueError
-        If a number is out of range.
+        If a parameter is out of range.
     """
 
     shortest: float = 0.5
@@ -80,24 +80,24 @@ class Batch(NamedTuple):
 class TrackBatches:
     """Sampler of random windows of tracks.
 
-    Tracks are drawn in proportion to their length; shorter tracks than a window count as one.
+    Tracks are drawn in proportion to their length; those shorter than a window count as one window.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Tracks of one skeleton and frame rate: metres, centred.
+        Centred tracks of one skeleton and frame rate, metres.
     frames : int
         Length L of a window; shorter tracks are padded.
     threshold : float
         Minimum confidence of a visible joint.
     augmentation : Augmentation
-        Augmentation of windows.
+        Settings of the augmentation of windows.
 
     Raises
     ------
     ValueError
         If ``tracks`` is empty, tracks differ in skeleton or frame rate, no joint is visible, or a
-        number is out of range.
+        parameter is out of range.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class TrackBatches:
             np.where(seen[..., None], track.keypoints, 0.0).astype(np.float32)
             for track, seen in zip(tracks, self._seen, strict=True)
         ]
-        # Windows per track: a short track counts as one.
+        # Number of windows per track; a short track counts as one.
         lengths = np.array([track.frames for track in tracks])
         windows = lengths / np.minimum(lengths, frames)
         windows *= [seen.any() for seen in self._seen]
@@ -152,8 +152,8 @@ class TrackBatches:
     def standards(self) -> Standards:
         """Mean and standard deviation of visible joints under mirroring and translation.
 
-        Scaling is ignored: with factors of .95 to 1.05 it increases the variance of projected walks
-        by a seventh.
+        Scaling is ignored: factors of .95 to 1.05 would increase the variance of projected walks by
+        a seventh.
         """
         points, seen = self.all_frames()
         points = points.astype(np.float64)

@@ -21,7 +21,7 @@ Size = TypeVar("Size")
 
 
 class TrackNetwork:
-    """Trained network on standardised 2D data, with its ``settings`` and training record ``card``.
+    """Base class of a trained network on standardised 2D data, with its training record ``card``.
 
     Raises ``ValueError`` if shapes are inconsistent, ``fps`` is not positive or the device is not
     available.
@@ -52,7 +52,7 @@ class TrackNetwork:
 def load_track_checkpoint(
     source: str | Path, kind: str, size: type[Size]
 ) -> tuple[Checkpoint, Size, Standards, Skeleton, float]:
-    """Return a checkpoint and its settings, standardisation, skeleton and frame rate."""
+    """Return a checkpoint, its settings (a ``size``), standardisation, skeleton and frame rate."""
     checkpoint = load_checkpoint(source, kind)
     with valid_settings(source, kind):
         stored = checkpoint.settings["network"]

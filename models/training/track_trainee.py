@@ -16,16 +16,16 @@ from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["TrackTrainee"]
 
-_VALIDATION_BATCH = 256
+_VALIDATION_BATCH = 256  # windows per validation loss
 
 
 class TrackTrainee:
-    """Data, standardisation and settings of a network trained on windows of 2D tracks.
+    """Base class of trainees: data, standardisation and settings for windows of 2D tracks.
 
-    Requires prepared tracks of one skeleton and frame rate (metres, centred), tracks of held-out
-    clips, and the network's settings with its ``frames``. ``threshold`` is the minimum confidence
-    of joints in the loss: .3 for people, .5 for horses, .01 for data with a ball. Raises
-    ``ValueError`` under the conditions of :class:`TrackBatches`.
+    ``tracks`` are prepared (metres, centred) and have one skeleton and frame rate; ``validation``
+    contains tracks of held-out clips; ``size`` contains the network's settings with its ``frames``.
+    ``threshold`` is the minimum confidence of joints in the loss: .3 for people, .5 for horses, .01
+    for data with a ball. Raises ``ValueError`` under the conditions of :class:`TrackBatches`.
     """
 
     network: nn.Module

@@ -32,14 +32,14 @@ __all__ = ["Anneals", "Diverged", "Trainee", "TrainingResult", "check_device", "
 
 
 class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
-    """A loss, gradient or weight is not finite; the message names the last good checkpoint."""
+    """Error for a loss, gradient or weight that is not finite; names the last good checkpoint."""
 
 
 class Trainee(Protocol):
     """Interface of a network with its loss and data.
 
     ``kind`` identifies its checkpoints. ``settings``, JSON-compatible, specifies the network and
-    its data, so that a run is not resumed with other data.
+    its data, so that a run cannot be resumed with other settings or data.
     """
 
     kind: str
@@ -77,7 +77,7 @@ class TrainingResult:
         Entry of ``history`` for the saved weights: the lowest validation loss with ``patience``,
         otherwise the last.
     steps : int
-        Steps taken by this call, 0 if the run was already finished.
+        Number of steps taken by this call, 0 if the run was already finished.
     """
 
     model: Path
@@ -134,7 +134,7 @@ def train(
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     run = _start(trainee, settings, target)
-    # Use the JSON representation.
+    # JSON has neither tuples nor infinity.
     clip = None if math.isinf(settings.clip) else settings.clip
     training = asdict(settings) | {"halve_at": list(settings.halve_at), "clip": clip}
     record = {"network": dict(trainee.settings), "training": training}

@@ -17,13 +17,13 @@ from probmotion.seeds import RandomNumbers
 
 __all__ = ["EncodedLatent", "VAEEncoder"]
 
-_AVERAGED = 64
+_AVERAGED = 64  # number of draws averaged for a predicted motion
 
 
 class VAEEncoder:
     """Encoder q(z | keypoints) of a motion VAE, for keypoints of one view.
 
-    Uses the weights of the prior. The rigid path of the prior sets the subject's position; see
+    The weights are those of the prior, whose rigid path sets the subject's position; see
     :meth:`~probmotion.models.vae.motion_vae.MotionVAE.placed_by`.
     """
 
@@ -61,7 +61,7 @@ class VAEEncoder:
 class EncodedLatent:
     """Approximate posterior q(z) = N(μ, diag σ²) of one track, initialised by the encoder.
 
-    ``mean`` and ``log_deviation`` are μ and log σ, (Z,), in double precision.
+    ``mean`` and ``log_deviation`` are μ and log σ, (Z,) each, in double precision.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class EncodedLatent:
         return latent_weight * self.divergence() - data
 
     def divergence(self) -> torch.Tensor:
-        """Return KL(q ‖ N(0, I)) = −½ Σ (log σ² − σ² − μ² + 1) (equation 6)."""
+        """Return KL(q ‖ N(0, I)) = −½ Σ (log σ² − σ² − μ² + 1) (Ponymation, equation 6)."""
         log_variance = 2 * self.log_deviation
         return -0.5 * (log_variance - torch.exp(log_variance) - self.mean**2 + 1).sum()
 
@@ -114,7 +114,7 @@ class EncodedLatent:
 
 
 def _encoded(prior: Any, likelihood: Keypoints2D) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return μ and log σ of q(z | keypoints), (Z,), in double precision."""
+    """Return μ and log σ of q(z | keypoints), (Z,) each, in double precision."""
     camera = likelihood.cameras
     distance = None
     if not camera.orthographic:

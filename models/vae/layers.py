@@ -38,7 +38,7 @@ FRAMES_AT_ONCE = 160
 Limits memory and fits the processor cache: training steps take 10 % less time than with 640 frames.
 """
 
-_INITIAL_SCALE = 0.05
+_INITIAL_SCALE = 0.05  # factor of the initial weights of a quiet `Readout`
 
 
 class TransformerLayer(nn.Module):
@@ -59,7 +59,7 @@ class TransformerLayer(nn.Module):
             nn.Linear(width, size.feedforward), nn.GELU(), nn.Linear(size.feedforward, width)
         )
         if memory:
-            # W_O W_V of attention to one token; queries and keys have no effect.
+            # Product W_O W_V of attention to one token; queries and keys have no effect.
             self.told = nn.Linear(memory, width)
 
     def forward(
@@ -72,7 +72,7 @@ class TransformerLayer(nn.Module):
     ) -> torch.Tensor:
         """Return the tokens after this layer, ``(N, K, width) → (N, first, width)``.
 
-        N may be 1 for queries shared by all memories (N, memory). ``seen`` (N, K) is True for
+        N may be 1 for tokens shared by all memories, (N, memory). ``seen`` (N, K) is True for
         tokens to attend to. ``first`` limits the result to the first tokens.
         """
         normalised = self.attention_norm(tokens)
@@ -129,7 +129,7 @@ class Readout(nn.Linear):
 
 
 class FrameEncoder(nn.Module):
-    """E_s: encodes the joints of a frame into one vector, the output of a learnt token.
+    """Spatial encoder E_s: encodes the joints of a frame into the output of a learnt token.
 
     The descriptor of a joint contains its keypoint, confidence, rest position, image features and
     index (one hot). Occluded joints are masked.
@@ -180,7 +180,7 @@ class FrameEncoder(nn.Module):
 
 
 class BoneDecoder(nn.Module):
-    """D_s: decodes frame vectors into bone rotations, with one query per bone."""
+    """Spatial decoder D_s: decodes frame vectors into bone rotations, with a query per bone."""
 
     def __init__(self, size: MotionVAESettings, n_bones: int) -> None:
         super().__init__()
@@ -204,7 +204,7 @@ class BoneDecoder(nn.Module):
 
 
 def _attend(packed: torch.Tensor, heads: int, seen: torch.Tensor | None) -> torch.Tensor:
-    """Return the attention output; arguments as in :func:`short_attention`."""
+    """Return the attention output; the arguments are those of :func:`short_attention`."""
     if packed.dtype == torch.bfloat16 and packed.device.type == "cpu":
         return short_attention(packed, heads, seen)
     queries, keys, values = packed.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
@@ -232,7 +232,7 @@ def _cast_tokens(tokens: torch.Tensor) -> torch.Tensor:
 
 
 def body_size(rest: torch.Tensor) -> torch.Tensor:
-    """Return the mean joint distance from the root, metres: the unit of the descriptors.
+    """Return the mean distance of joints from the root, metres: the unit of joint descriptors.
 
     Unscaled keypoints would be small compared with the joint embedding.
     """

@@ -26,9 +26,9 @@ __all__ = [
 
 
 def project_to_image(positions: torch.Tensor, distance: float | None) -> torch.Tensor:
-    """Project camera coordinates, ``(…, 3) → (…, 2)``, in metres at the subject's distance.
+    """Project camera coordinates to the image, ``(…, 3) → (…, 2)``, metres at the subject.
 
-    The subject is at Z = 0, ``distance`` metres from the camera; orthographic for None.
+    The subject is at Z = 0, ``distance`` metres from the camera; ``None``: orthographic.
     """
     x, y, z = positions.unbind(-1)
     plane = torch.stack([x, -y], dim=-1)
@@ -40,8 +40,8 @@ def reconstruction(
 ) -> torch.Tensor:
     """Return the reprojection loss Σ_t Σ_j c ‖p(X) − u‖², ``(…, L, J, 3) → (…)``, m².
 
-    ``keypoints`` u (…, L, J, 2) must be finite where ``weight`` c (…, L, J) is 0; ``distance`` is
-    as for :func:`project_to_image`.
+    The projection p is :func:`project_to_image`. ``keypoints`` u (…, L, J, 2) must be finite where
+    ``weight`` c (…, L, J) is 0.
     """
     square = ((project_to_image(positions, distance) - keypoints) ** 2).sum(dim=-1)
     return (weight * square).sum(dim=(-2, -1))
@@ -52,9 +52,9 @@ def roughness(
 ) -> torch.Tensor:
     """Return the temporal regulariser R_temp = Σ_t ‖ξ_t − ξ_{t−1}‖², ``(…)``.
 
-    ``turns`` (…, L, B, 3): rotation vectors of bones; ``rotation`` (…, L, 3, 3): of the body;
-    ``translation`` (…, L, D): root positions, metres. Half the squared difference of two close
-    rotation matrices approximates their squared angle.
+    ξ_t consists of ``turns`` (…, L, B, 3), rotation vectors of bones, ``rotation`` (…, L, 3, 3) of
+    the body and ``translation`` (…, L, D), root positions, metres. Half the squared difference of
+    two close rotation matrices approximates the squared angle between them.
     """
     bones = turns.diff(dim=-3).square().sum(dim=(-3, -2, -1))
     angles = 0.5 * rotation.diff(dim=-3).square().sum(dim=(-3, -2, -1))
@@ -85,13 +85,13 @@ def hypothesis_losses(
 
 
 def weighted_sum(terms: Mapping[str, torch.Tensor], settings: MotionVAESettings) -> torch.Tensor:
-    """Return Σ λ · term with the weights of the settings."""
+    """Return the sum of the loss terms, weighted by the settings of the same names."""
     weighted = (getattr(settings, name) * value for name, value in terms.items())
     return sum(weighted, torch.zeros(()))
 
 
 def best_hypothesis(hypotheses: PoseHypotheses, losses: torch.Tensor) -> PoseHypotheses:
-    """Return the view hypothesis with the smallest loss (B, H) per sequence, without the axis H.
+    """Return each sequence's view hypothesis with the smallest loss (B, H); drop the axis H.
 
     The choice is not differentiated.
     """

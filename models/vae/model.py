@@ -14,11 +14,11 @@ from probmotion.models.vae.settings import MotionVAESettings
 
 __all__ = ["KIND", "MotionVAEModel", "description_of"]
 
-KIND = "motion-vae"
+KIND = "motion-vae"  # kind of the checkpoints
 
 
 class MotionVAEModel(nn.Module):
-    """Motion VAE network and pose network."""
+    """Module with the motion VAE network and the pose network as parts."""
 
     def __init__(self, vae: MotionVAENetwork, pose: PoseNetwork) -> None:
         super().__init__()

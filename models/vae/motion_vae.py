@@ -1,7 +1,7 @@
 """`MotionVAE`: a prior over articulated motion with one latent code per sequence (Ponymation).
 
-z ~ N(0, I); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. The rigid path, the
-position and orientation of the body, is not part of the code but a separate parameter.
+z ~ N(0, I); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. The rigid path
+(position and orientation of the body per frame) is not part of the code but a separate parameter.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = ["MotionVAE"]
 
-_ROWS = 64
+_ROWS = 64  # number of latent codes decoded at once
 
 
 class MotionVAE(StandardNormalPrior):
-    """Motions of an articulated body, learnt from 2D tracks.
+    """Prior over motions of an articulated body, learnt from 2D tracks.
 
     θ is the latent code z ~ N(0, I). The rigid path is fixed: by default the body is upright at the
     origin and faces +Z, which suffices without observations. :meth:`placed_by` estimates it from
@@ -54,15 +54,15 @@ class MotionVAE(StandardNormalPrior):
     network : MotionVAENetwork
         Trained encoder and decoder.
     pose_network : PoseNetwork
-        Trained network of rigid poses.
+        Trained network that estimates rigid poses.
     settings : MotionVAESettings
-        Size of both networks.
+        Settings of both networks.
     body : ArticulatedBody
         Skeleton, rest pose and joint ranges.
     fps : float
         Frames per second.
     rigid : RigidPath, optional
-        Root pose per frame.
+        Root pose per frame; by default upright at the origin.
     log_lengths : ndarray, (G,), optional
         Log bone lengths relative to the rest pose, shared by mirrored bones; 0 by default.
     card : mapping, optional
@@ -73,7 +73,7 @@ class MotionVAE(StandardNormalPrior):
     Raises
     ------
     ValueError
-        If shapes are inconsistent or a number is out of range.
+        If shapes are inconsistent or a parameter is out of range.
     """
 
     stand_ins: ClassVar[Mapping[str, str]] = {

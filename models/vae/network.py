@@ -1,4 +1,4 @@
-"""Networks of the motion VAE: joints of frames → one latent code → bone rotations.
+"""Networks of the motion VAE, from 2D joints to one latent code and on to bone rotations.
 
 Source: Ponymation, section 3.3 and table 5. Transformers over the joints of a frame, E_s, and over
 frames, E_t, encode q(z); transformers with timestamp queries, D_t, and bone queries, D_s, decode z.
@@ -26,9 +26,9 @@ from probmotion.validation import check_shape
 
 __all__ = ["FrameMap", "MotionVAENetwork", "TimeDecoder", "TimeEncoder"]
 
-_TOKEN_SCALE = 0.02
+_TOKEN_SCALE = 0.02  # standard deviation of the initial tokens μ and σ
 _INITIAL_LOG_VARIANCE = -4.0
-_LOG_VARIANCE_BOUND = 10.0
+_LOG_VARIANCE_BOUND = 10.0  # largest absolute log variance
 
 
 class FrameMap(nn.Module):
@@ -60,7 +60,7 @@ class FrameMap(nn.Module):
 
 
 class TimeEncoder(nn.Module):
-    """E_t: encodes frame vectors into mean and log variance of z.
+    """Temporal encoder E_t: encodes frame vectors into mean and log variance of z.
 
     Two learnt tokens, μ and σ, precede the frames; position encodings are sinusoidal.
     """
@@ -94,7 +94,7 @@ class TimeEncoder(nn.Module):
 
 
 class TimeDecoder(nn.Module):
-    """D_t: decodes z into frame vectors, with one query per timestamp."""
+    """Temporal decoder D_t: decodes z into frame vectors, with one query per timestamp."""
 
     def __init__(self, size: MotionVAESettings) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ class TimeDecoder(nn.Module):
 
 
 class MotionVAENetwork(nn.Module):
-    """Encoder q(z | 2D joints) and motion decoder."""
+    """Motion VAE network: encoder q(z | 2D joints) and decoder to bone rotations."""
 
     def __init__(
         self, settings: MotionVAESettings, n_joints: int, n_bones: int, seed: int = 0

@@ -27,9 +27,9 @@ class ObservedView:
     """Normalised keypoints of one view.
 
     ``keypoints`` (L, J, 2): relative to the root, metres at the subject's distance, x right and y
-    down, 0 where occluded; ``confidence`` (L, J): 1, or 0 where occluded; ``root`` (L, 2): relative
-    to the camera axis, in the same units; ``distance``: depth of the subject, metres, ``None`` for
-    an orthographic camera.
+    down, 0 where occluded; ``confidence`` (L, J): 1, or 0 where occluded; ``root`` (L, 2): root
+    keypoint relative to the camera axis, in the same units; ``distance``: depth of the subject,
+    metres, ``None`` for an orthographic camera.
     """
 
     keypoints: np.ndarray
@@ -84,10 +84,10 @@ def observed_view(
 ) -> ObservedView:
     """Convert observations of one view to the normalised format of the networks.
 
-    Joints below .3 of the largest confidence are masked, as in training by default. An occluded
-    root is interpolated in time. ``distance`` is the depth of the subject in a perspective camera,
-    metres, 1 by default. Raises ``ValueError`` for several views, other joints, a frame without a
-    visible joint, or a root that is never visible.
+    Joints below .3 of the largest confidence are masked. An occluded root is interpolated in time.
+    ``distance`` is the depth of the subject in a perspective camera, metres, 1 by default. Raises
+    ``ValueError`` for several views, joints other than the skeleton's, a frame without a visible
+    joint, or a root that is never visible.
     """
     _check_observations(likelihood, skeleton)
     camera, root = likelihood.cameras, skeleton.roots[0]
@@ -119,7 +119,7 @@ def _check_observations(likelihood: Keypoints2D, skeleton: Skeleton) -> None:
 
 
 def _visibility(likelihood: Keypoints2D) -> np.ndarray:
-    """Return the mask of joints for the network, (L, J).
+    """Return the mask of joints that the network treats as visible, (L, J).
 
     The confidence scale is arbitrary, so only ratios of confidences are meaningful.
     """

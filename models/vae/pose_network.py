@@ -1,7 +1,7 @@
-"""Pose network: the pose of each frame from its 2D joints, for several view hypotheses.
+"""Pose network: estimates the pose of a frame from its 2D joints under several view hypotheses.
 
 Source: Ponymation, section 3.2 (rigid pose and bone rotations from a single image, with one
-hypothesis per quadrant). It is trained first and is the teacher of the motion VAE; inference uses
+hypothesis per quadrant). The network is trained first and teaches the motion VAE; inference uses
 its rigid poses because the latent code does not contain them.
 """
 
@@ -51,12 +51,12 @@ class PoseHypotheses:
 class PoseNetwork(nn.Module):
     """Network that predicts the pose of a frame from its 2D joints for each view hypothesis.
 
-    Frames are independent, except that bone lengths are predicted from their mean. The body has
+    Frames are independent, except that bone lengths use the mean over frames. The body has
     ``n_joints`` joints, ``n_bones`` bones and ``n_groups`` groups of bones with a common length;
     ``seed`` determines the initial weights.
     """
 
-    quarters: torch.Tensor
+    quarters: torch.Tensor  # (H, 3, 3), rotations to the centres of the quadrants
 
     def __init__(
         self, settings: MotionVAESettings, n_joints: int, n_bones: int, n_groups: int, seed: int = 0

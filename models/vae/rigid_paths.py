@@ -22,7 +22,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["BodyEstimate", "RigidPath", "estimate_body"]
 
-_OFF_ORTHONORMAL = 1e-4
+_OFF_ORTHONORMAL = 1e-4  # tolerance for the entries of R Rᵀ − I
 _PASSES = 3
 """Number of alternating updates of distance and pose; the initial distance is already close."""
 
@@ -34,14 +34,14 @@ class RigidPath:
     Parameters
     ----------
     rotations : ndarray, (L, 3, 3)
-        From the body's frame (Y up, front +Z, left +X) to the world.
+        Rotations from the body's frame (Y up, front +Z, left +X) to the world.
     translations : ndarray, (L, 3)
         Root positions, metres.
 
     Raises
     ------
     ValueError
-        If shapes disagree, a number is not finite or a matrix is not a rotation.
+        If shapes disagree, an entry is not finite or a matrix is not a rotation.
     """
 
     rotations: np.ndarray
@@ -81,7 +81,7 @@ class RigidPath:
 
 @dataclass(frozen=True, eq=False)
 class BodyEstimate:
-    """Best view hypothesis of a pose network for one track.
+    """Estimate of the body in one track: the best view hypothesis of a pose network.
 
     ``path``: rigid path in the world; ``turns`` (L, bones, 3): bone rotation vectors;
     ``log_lengths`` (G,): relative to the rest pose; ``losses`` (H,): of all hypotheses;
@@ -111,8 +111,8 @@ def estimate_body(
     rest-pose size matches the image; distances per frame would be noisy. A larger subject is
     therefore placed too close, with the same projection.
 
-    Raises ``ValueError`` for several views, other joints or a frame without a visible joint, and if
-    the estimated body is beside or behind the camera.
+    Raises ``ValueError`` for several views, joints other than the body's or a frame without a
+    visible joint, and if the estimated body is beside or behind the camera.
     """
     view = observed_view(likelihood, body.skeleton)
     if view.distance is not None:
@@ -139,7 +139,7 @@ def _best_hypothesis(
 
 
 def _first_distance(view: ObservedView, body: ArticulatedBody) -> float:
-    """Estimate the initial distance: bones project to π/4 of their length on average."""
+    """Estimate the initial distance, as bones project to π/4 of their length on average."""
     joints, parents = (list(side) for side in zip(*body.skeleton.bones, strict=True))
     visible = (view.confidence[:, joints] > 0) & (view.confidence[:, parents] > 0)
     bones = np.linalg.norm(view.keypoints[:, joints] - view.keypoints[:, parents], axis=-1)
@@ -154,7 +154,7 @@ def _first_distance(view: ObservedView, body: ArticulatedBody) -> float:
 def _size_ratio(best: PoseHypotheses, body: ArticulatedBody, view: ObservedView) -> float:
     """Return the size of the posed body with rest-pose lengths relative to the observation."""
     place = torch.nn.functional.pad(best.translation, (0, 1))
-    # Free bone lengths would compensate for a wrong distance.
+    # Estimated bone lengths could compensate for a wrong distance and are not used.
     posed = body.positions(best.turns, best.rotation, place)[0].double().numpy()
     weight = view.confidence[..., None]
     product = (weight * view.keypoints * view.seen(posed)).sum()

@@ -13,7 +13,7 @@ __all__ = ["CONFIDENCE_THRESHOLD", "MotionVAESettings"]
 CONFIDENCE_THRESHOLD = 0.3
 """Minimum confidence of visible joints in training and inference."""
 
-_WEIGHTS = ("reconstruction", "smoothness", "ranges", "lengths", "kl", "teacher")
+_WEIGHTS = ("reconstruction", "smoothness", "ranges", "lengths", "kl", "teacher")  # loss weights
 
 
 @dataclass(frozen=True)
@@ -23,27 +23,27 @@ class MotionVAESettings:
     Parameters
     ----------
     frames : int
-        T, number of frames per motion.
+        Number of frames T per motion.
     width : int
         Token width of all transformers.
     layers, heads : int
-        Number of layers of each of E_s, E_t, D_t and D_s, and of attention heads per layer.
+        Number of layers of each encoder (E_s, E_t) and decoder (D_t, D_s), and heads per layer.
     feedforward : int
-        Hidden width of each layer; not published. A quarter of ``width`` reconstructs as well as
-        the full width at size ``small``.
+        Hidden width of the perceptron of each layer; not published. At size ``small``, a quarter
+        of ``width`` reconstructs as well as the full width.
     latent : int
-        Dimension of z.
+        Dimension of the latent code z.
     spatial : bool
-        Use E_s and D_s; otherwise linear maps of all joints and bones (ablation, table 7).
+        Whether to use E_s and D_s; otherwise linear maps of joints and bones (ablation, table 7).
     hypotheses : int
-        H, number of view hypotheses of the pose network, 1 to 4, at quarter turns.
+        Number of view hypotheses H of the pose network, 1 to 4, at quarter turns.
     image_features : int
-        F, size of image features per frame and per joint; 0 for tracks without images.
+        Size F of image features per frame and per joint; 0 for tracks without images.
     mixed_precision : bool
-        Multiply in bfloat16 during training; weights, sums, outputs and losses stay in single
-        precision. Several times faster on processors with AVX-512 BF16 or AMX.
+        Whether to multiply in bfloat16 during training; weights, sums, outputs and losses stay in
+        single precision. Several times faster on processors with AVX-512 BF16 or AMX.
     reconstruction : float
-        Weight of the squared reprojection error, m².
+        Weight of the squared reprojection error, which is in m².
     smoothness : float
         Weight λ of the temporal regulariser R_temp.
     ranges : float
@@ -51,14 +51,14 @@ class MotionVAESettings:
     lengths : float
         Weight of squared log ratios of bone lengths to the rest pose.
     kl : float
-        λ_KL, weight of the divergence of q(z) from N(0, I).
+        Weight λ_KL of the divergence KL(q(z) ‖ N(0, I)).
     teacher : float
-        Weight of the squared distance to the pose network's poses.
+        Weight of the squared difference from the pose network's bone rotations.
 
     Raises
     ------
     ValueError
-        If a number is out of range, or ``width`` is not an even multiple of ``heads``.
+        If a parameter is out of range, or ``width`` is odd or not a multiple of ``heads``.
     """
 
     frames: int = 10
@@ -111,7 +111,7 @@ class MotionVAESettings:
         """Return the settings of the shipped priors, which train in minutes on two cores.
 
         Smoothness and teacher weights are .01 and .1: the published 1 would suppress all motion,
-        because the reconstruction loss is only a few hundredths of a m² here.
+        because the reconstruction loss of joints is only a few hundredths of a m².
         """
         size = cls(width=96, layers=2, heads=2, feedforward=96, latent=48)
         return replace(size, smoothness=0.01, teacher=0.1)
@@ -120,6 +120,6 @@ class MotionVAESettings:
     def paper(cls) -> MotionVAESettings:
         """Return the published size and weights (section 3.3, table 5).
 
-        The published reconstruction loss is on images; ours is on joints, in metres.
+        The published reconstruction loss compares images; the loss here compares joints, in m².
         """
         return cls()

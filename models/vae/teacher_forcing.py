@@ -14,11 +14,11 @@ __all__ = ["TeacherForcedPoses", "scaled"]
 
 
 class TeacherForcedPoses:
-    """Teacher poses of all frames of tracks and their mirror images, under every view hypothesis.
+    """Teacher poses of all frames of tracks and of mirror images, under every view hypothesis.
 
     The teacher is fixed and treats frames independently, so its output for a frame can be reused
-    in every window; scaled windows use :func:`scaled`. A frame of a person requires about 3 kB. The
-    device is that of the rest pose (J, 3). Raises ``ValueError`` if ``batches`` shifts windows.
+    in every window; scaled windows use :func:`scaled`. A stored frame of a person takes about 3 kB
+    on the device of the rest pose (J, 3). Raises ``ValueError`` if ``batches`` shifts windows.
     """
 
     @torch.no_grad()
@@ -52,7 +52,7 @@ class TeacherForcedPoses:
             poses.rotation.transpose(1, 2),
             poses.translation.transpose(1, 2),
             poses.turns.transpose(1, 2),
-            # The network predicts lengths linearly from the mean over frames.
+            # The network predicts log lengths linearly from the mean over frames.
             poses.log_lengths.mean(dim=1),
         )
 
@@ -60,8 +60,8 @@ class TeacherForcedPoses:
 def scaled(hypotheses: PoseHypotheses, scale: torch.Tensor) -> PoseHypotheses:
     """Return poses with root positions and bone lengths scaled by ``scale``, (B,).
 
-    This scales projections exactly for orthographic cameras. For a camera at 7 m and a body 5 %
-    larger, the error is 3 mm at a joint .5 m closer than the root.
+    This scales orthographic projections exactly. For a perspective camera at 7 m and a scale of
+    1.05, the error is 3 mm at a joint .5 m closer than the root.
     """
     factor = scale.reshape(-1, *[1] * (hypotheses.translation.ndim - 1))
     log_factor = scale.log().reshape(-1, *[1] * (hypotheses.log_lengths.ndim - 1))

@@ -40,7 +40,7 @@ from probmotion.validation import check_positive
 
 __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 
-# Loss weight of unselected hypotheses, so that all continue to learn.
+# Weight of the mean loss over all hypotheses, so that unselected ones continue to learn.
 _OTHERS = 0.05
 # Tolerance of the root position for rounding, metres.
 _CENTRED = 1e-3
@@ -49,7 +49,7 @@ _AT_REST = 500
 
 
 class _VAETrainee(TrackTrainee):
-    """Data and checks shared by both phases."""
+    """Base class with the data and checks of both phases."""
 
     def __init__(
         self,
@@ -133,11 +133,11 @@ class _VAETrainee(TrackTrainee):
 
 
 class PoseTrainee(_VAETrainee):
-    """First phase: rigid poses and bone rotations per frame under several view hypotheses.
+    """Trainee of the first phase: the pose network under several view hypotheses.
 
-    The loss of a sequence is that of its best hypothesis: reprojection error, smoothness, joint
-    ranges and bone lengths. During the first 500 steps the hypothesis is selected with the body in
-    its rest pose.
+    The loss of a sequence is that of its best hypothesis plus .05 times the mean over hypotheses.
+    Its terms are reprojection error, smoothness, joint ranges and bone lengths. In the first 500
+    steps, the best hypothesis is selected with the body in its rest pose.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class PoseTrainee(_VAETrainee):
     size : MotionVAESettings
         Network size and loss weights.
     body : ArticulatedBody
-        Body; its rest pose may be estimated with
+        Body of the subjects; its rest pose may be estimated with
         :func:`~probmotion.motion.rest_poses.estimate_rest_pose`.
     distance : float, optional
         Distance of the cameras from the subject, metres; orthographic by default.
@@ -223,8 +223,8 @@ class PoseTrainee(_VAETrainee):
     ) -> torch.Tensor:
         """Return the losses of all views with rest-pose bones, (B, H).
 
-        Bone rotations can compensate for a wrong view: the first hypothesis to learn would also be
-        selected for other quadrants, and the rest never.
+        Bone rotations can compensate for a wrong view. With them, the first hypothesis to learn
+        would also be selected for other quadrants, and the other hypotheses never.
         """
         rest_pose = replace(
             hypotheses,
@@ -236,7 +236,7 @@ class PoseTrainee(_VAETrainee):
 
 
 class MotionVAETrainee(_VAETrainee):
-    """Second phase: one latent code for the bone rotations of a sequence (equations 2 to 7).
+    """Trainee of the second phase: a motion VAE with one latent code per sequence (eqs. 2 to 7).
 
     E_s and D_s are initialised with the pose network's weights. The pose network is fixed and
     provides the rigid poses.
@@ -314,7 +314,7 @@ class MotionVAETrainee(_VAETrainee):
             "reconstruction": reconstruction(positions, keypoints, confidence, self.distance),
             "smoothness": roughness(turns, teacher.rotation, teacher.translation),
             "ranges": self.body.range_excess(turns).sum(dim=-1),
-            # Equation 6 is printed with σ instead of σ².
+            # The paper prints equation 6 with σ instead of σ².
             "kl": gaussian_kl(mean, 0.5 * log_variance, zero, zero),
             "teacher": (turns - teacher.turns).square().sum(dim=(-3, -2, -1)),
         }

@@ -1,6 +1,6 @@
 """Long motions from several latent codes, joined by optimised transitions (Ponymation, appendix A).
 
-Latents are drawn for consecutive segments. Transition latents are optimised so that their first and
+Each segment has a given latent code. The codes of transitions are optimised so that their first and
 last frames match the neighbouring segments.
 """
 
@@ -35,7 +35,7 @@ def long_motion(
     transitions: int | None = None,
     prior_weight: float = 1e-3,
 ) -> np.ndarray:
-    """Return one long motion: the segments of the codes with a transition between each pair.
+    """Return one long motion: a segment per code, with a transition between neighbours.
 
     A transition consists of one or more motions of the prior. Its first two frames match the end
     of the previous segment, its last two frames the start of the next. L-BFGS minimises the
@@ -52,8 +52,8 @@ def long_motion(
     iterations : int
         L-BFGS iterations per transition.
     transitions : int, optional
-        Codes per transition. By default the smallest number, up to four, for which no joint
-        accelerates more than in the segments, or else the one with the smallest acceleration.
+        Number of codes per transition. By default the smallest, up to four, for which no joint
+        accelerates more than in the segments, or else that with the smallest acceleration.
     prior_weight : float
         Weight of ‖z‖² relative to squared radians.
 
@@ -164,7 +164,7 @@ def _joined(
         ends = torch.cat([joined[-_SHARED:], motion[-_SHARED:]])
         mismatch = mismatch + _mismatch(motion, ends)
         joined = torch.cat([joined, _corrected(motion, ends)[_SHARED:]])
-    # Spread this correction over the entire transition.
+    # Spread the correction at both ends over the entire transition.
     ends = torch.cat([before[-_SHARED:], after[:_SHARED]])
     return _corrected(joined, ends), mismatch + _mismatch(joined, ends)
 

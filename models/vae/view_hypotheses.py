@@ -1,7 +1,7 @@
 """Accuracy of view hypotheses against known 3D motion (*Ponymation*, section 3.1).
 
 A projection is ambiguous up to reflection in depth. Joint ranges, perspective and camera height
-resolve it. The 3D truth is used only for evaluation.
+resolve this ambiguity. The 3D truth is used only for evaluation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["HypothesisAccuracy", "evaluate_hypotheses"]
 
 # A hypothesis counts as correct up to this multiple of the smallest error.
 _AS_GOOD = 1.2
-_TO_Y_UP = np.array([1.0, -1.0, -1.0])
+_TO_Y_UP = np.array([1.0, -1.0, -1.0])  # from OpenCV axes to y up, z towards the camera
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class HypothesisAccuracy:
     Parameters
     ----------
     right : float
-        Proportion of sequences with an error of at most 1.2 times that of the best hypothesis.
+        Proportion of sequences whose selected hypothesis has at most 1.2 times the smallest error.
     depth_right : float
-        Proportion of sequences closer to the truth than their mirror image in depth.
+        Proportion of selected hypotheses closer to the truth than their mirror image in depth.
     error : float
         Mean joint error of the selected hypothesis, relative to the root, metres.
     least_error : float
@@ -71,7 +71,7 @@ def evaluate_hypotheses(
     Parameters
     ----------
     network : PoseNetwork
-        Trained network.
+        Trained pose network.
     settings : MotionVAESettings
         Settings of the network, with the loss weights that select a hypothesis.
     body : ArticulatedBody
@@ -79,13 +79,13 @@ def evaluate_hypotheses(
     clips : sequence of Motion
         3D clips with the body's joints.
     n : int
-        Number of random sequences and views.
+        Number of random sequences, each with a random view.
     fps : float
         Frame rate of the network.
     filming : Filming, optional
-        Camera distribution.
+        Distribution of cameras.
     noise : DetectorNoise, optional
-        Detector errors; by default without missing joints.
+        Model of detector errors; by default without missing joints.
     seed : int
         Seed of sequences, cameras and errors.
 

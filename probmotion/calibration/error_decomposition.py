@@ -1,14 +1,14 @@
 """Decomposition of a multi-view sampler's error on a problem with exact draws.
 
-The samplers of a chain from exact draws to `mas` differ by one component each. The part of a
-component is the difference between consecutive samplers:
+A chain of samplers leads from exact draws to `mas`; consecutive samplers differ by one component.
+The part of a component is the difference of the samplers' error measures (T: steps of `mas`):
 
-- ``remainder``: exact draws → `ancestral3d` with 10 T steps; about 0 for a correct implementation
-- ``discretisation``: → T steps
-- ``single view``: → `mas` with the exact denoiser of each view, conditional on any observations
-- ``noise sharing``: → independent noise in each view
-- ``guidance``: → unconditional denoiser with guidance, if there are observations
-- ``network``: → a learnt 2D denoiser
+- ``remainder``: from exact draws to `ancestral3d` with 10 T steps; 0 if correctly implemented
+- ``discretisation``: from 10 T to T steps
+- ``single view``: from the 3D denoiser to `mas` with exact 2D denoisers, both given observations
+- ``noise sharing``: from noise shared by all views to independent noise in each view
+- ``guidance``: from conditional to unconditional, guided denoising, if there are observations
+- ``network``: from the exact to a learnt 2D denoiser
 
 Measures are signed (:mod:`~probmotion.calibration.error_measures`), so the parts of each seed add
 up exactly. Samplers share seeds; intervals are Student's t intervals of paired differences.
@@ -36,10 +36,10 @@ from probmotion.validation import check_count
 
 __all__ = ["decompose_error"]
 
-_MORE = 10
+_MORE = 10  # steps of the `remainder` sampler, as a multiple of T
 # Settings of `mas` that are compatible with the decomposition.
 _SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance", "batch")
-_SHARED = ("schedule_power", "batch")
+_SHARED = ("schedule_power", "batch")  # also settings of `ancestral3d`
 
 
 def decompose_error(
@@ -70,8 +70,8 @@ def decompose_error(
     settings : mapping, optional
         Settings of `mas`: n_views, elevation, view_weights, schedule_power, guidance, batch.
     shared_noise : bool, optional
-        Whether `mas` projects one 3D noise into all views, which removes the noise-sharing part. By
-        default only with observations, where guidance requires it.
+        Whether `mas` projects one 3D noise into all views, which removes the noise-sharing part.
+        True by default if there are observations, because guidance requires it.
     learnt : MotionPrior, optional
         Prior of the same motions with a learnt 2D denoiser, e.g. from
         `probmotion.models.diffusion.projected_denoiser.denoiser_of`. The network part includes
@@ -119,7 +119,7 @@ def decompose_error(
 
 @dataclass(frozen=True)
 class _Link:
-    """Sampler in the chain, named after its part of the error; the first returns exact draws."""
+    """Sampler in the chain, named after the part that it adds; the first returns exact draws."""
 
     name: str
     sampler: Sampler
@@ -133,7 +133,7 @@ def _chain(
     shared_noise: bool | None,
     learnt: MotionPrior | None,
 ) -> tuple[list[_Link], list[str]]:
-    """Return the samplers in order, and notes on absent parts."""
+    """Return the samplers in order, and notes on omitted parts."""
     for name in settings:
         if name not in _SETTINGS:
             raise ValueError(f"settings must be among {', '.join(_SETTINGS)}, got {name!r}")

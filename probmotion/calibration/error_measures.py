@@ -1,4 +1,4 @@
-"""Signed error measures of draws; their differences along a chain of samplers add up."""
+"""Signed error measures of draws; their differences between consecutive samplers add up."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ MEASURES: Mapping[str, str] = {
     "distance": "squared sliced distance / mean variance",
 }
 
-_SETS, _DIRECTIONS, _POOL = 8, 256, 4000
-_LARGE = 0.95
+_SETS, _DIRECTIONS, _POOL = 8, 256, 4000  # exact sets, projections, exact draws in the pool
+_LARGE = 0.95  # fraction of the exact variance in the large principal directions
 
 
 class ErrorMeasures:
     """Error measures of draws from a problem with an exact posterior.
 
-    - ``spread``: log of the covariance trace over that of exact draws; negative: overconfident
-    - ``small``: mean log(variance / exact variance) over the small principal directions, beyond
-      those that account for 95 % of the exact variance
-    - ``off``: log of the mean variance off the manifold over that of exact draws, if defined
-    - ``mean``: squared error of the mean over the trace, minus its expectation for exact draws
-    - ``distance``: squared sliced 2-Wasserstein distance to exact draws over the mean variance of
-      a projection; positive even for exact draws
+    - ``spread``: log(trace of the covariance / exact trace); negative: overconfident
+    - ``small``: mean log(variance / exact variance) over the small principal directions, i.e. all
+      but the largest, which account for 95 % of the exact variance
+    - ``off``: log(mean variance off the manifold / exact value), if the prior has a manifold
+    - ``mean``: (squared error of the mean − its sampling variance) / exact trace
+    - ``distance``: squared sliced 2-Wasserstein distance to exact draws, divided by the mean exact
+      variance of a projection; positive even for exact draws
 
     Raises ``ValueError`` if the problem has no exact posterior.
     """
@@ -59,7 +59,7 @@ class ErrorMeasures:
     def of(self, positions: np.ndarray, seed: int) -> dict[str, float]:
         """Return every measure of draws, (n, L, J, 3), metres.
 
-        ``seed`` determines the exact draws and directions, shared by all samplers.
+        ``seed`` determines the exact draws and projections, which all samplers share.
         """
         n = len(positions)
         flat = positions.reshape(n, -1)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ErrorDecomposition", "StoredValues"]
 
-_FLOOR, _WHOLE = "floor", "whole"
+_FLOOR, _WHOLE = "floor", "whole"  # rows of the table besides the parts
 
 
 class ErrorDecomposition:
@@ -34,7 +34,7 @@ class ErrorDecomposition:
         Measures by sampler in the order of the chain (exact draws first), then by seed. Samplers
         are named after their part of the error.
     notes : sequence of str
-        Notes on absent parts.
+        Notes on omitted parts.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class ErrorDecomposition:
         }
 
     def differences(self, measure: str) -> dict[str, np.ndarray]:
-        """Return each part by seed, (seeds,); the parts add up to the total error."""
+        """Return the values of each part, (seeds,); the parts add up to the total error."""
         if measure not in self.values:
             raise ValueError(f"measure must be one of {', '.join(self.values)}, got {measure!r}")
         links = list(self.values[measure].items())
@@ -66,8 +66,8 @@ class ErrorDecomposition:
     def table(self) -> pd.DataFrame:
         """Return the tidy table: setting, measure, part, mean, low, high.
 
-        Besides the parts there are ``floor``, the measure of exact draws, and ``whole``, the sum of
-        the parts. ``low`` to ``high`` is a pointwise 95 % interval of the mean over seeds.
+        The parts ``floor`` and ``whole`` are the measure of exact draws and the sum of all parts.
+        ``low`` to ``high`` is a pointwise 95 % interval of the mean over seeds.
         """
         import pandas as pd
 
@@ -82,7 +82,7 @@ class ErrorDecomposition:
 
     @property
     def findings(self) -> list[str]:
-        """Summary of each measure: its significant parts in decreasing order of size."""
+        """Summaries of the measures: total error, and significant parts in decreasing order."""
         sentences = []
         table = self.table().set_index(["measure", "part"])
         for measure in self.values:
@@ -114,9 +114,9 @@ class ErrorDecomposition:
 
 
 class StoredValues:
-    """Store of the measures of each sampler and seed, as JSON in ``folder`` if it is not None.
+    """Stored measures of each sampler and seed, saved as JSON in ``folder`` unless it is None.
 
-    ``question`` identifies the decomposition. Raises ``ValueError`` for a folder with another one.
+    ``question`` identifies the decomposition. Raises ``ValueError`` if the folder has another one.
     """
 
     def __init__(self, folder: Path | None, question: Any) -> None:
@@ -135,11 +135,11 @@ class StoredValues:
             self._values = stored["values"]
 
     def get(self, name: str, seed: int) -> dict[str, float] | None:
-        """Return the measures, if stored."""
+        """Return the measures of a sampler and seed, or None if they are not stored."""
         return self._values.get(f"{name} {seed}")
 
     def put(self, name: str, seed: int, values: dict[str, float]) -> None:
-        """Store the measures."""
+        """Store the measures of a sampler and seed."""
         self._values[f"{name} {seed}"] = values
         if self.path is None:
             return

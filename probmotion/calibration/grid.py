@@ -41,7 +41,7 @@ from probmotion.validation import check_count
 __all__ = ["calibrate"]
 
 FEWEST_SIMULATIONS = 10
-# Offset of simulation numbers for random reference points (truths of other simulations).
+# Offset from a simulation's number to that of another one, whose truth is its reference point.
 _ELSEWHERE = 2**32
 
 
@@ -62,9 +62,9 @@ def calibrate(
     """Simulate every problem, run every sampler on each simulation, and rank the truth.
 
     A simulation is a truth from the prior and observations of it. If a sampler is correct, the
-    truth is exchangeable with its draws. Only ranks are stored, after each simulation, as a run of
-    :func:`~probmotion.comparison.compare` with the simulation number as seed. Repeat the call to
-    resume an interrupted calibration; increase ``simulations`` to extend it.
+    truth is exchangeable with its draws. Each simulation is stored as a run of
+    :func:`~probmotion.comparison.compare`, with ranks instead of draws and its number as seed.
+    Repeat the call to resume an interrupted calibration; increase ``simulations`` to extend it.
 
     Parameters
     ----------
@@ -77,18 +77,18 @@ def calibrate(
     chains : int
         Number of chains.
     out : str or Path, optional
-        Folder for ranks, ``table.csv`` and ``failures.json`` in the subfolder ``calibration``; may
-        be that of a comparison. Temporary by default.
+        Parent of the folder ``calibration`` with ranks, ``table.csv`` and ``failures.json``; may be
+        the folder of a comparison. Temporary by default.
     workers, executor, time_limit, progress
         As for :func:`~probmotion.comparison.compare`.
     budget : Budget, optional
-        Budget of each sampler per simulation; pilots run on the problem itself.
+        Budget of each sampler per simulation; pilots sample the problem, not a simulation.
 
     Raises
     ------
     ValueError
-        If an argument is invalid, a problem cannot be simulated, or ``out`` contains ranks of
-        the same names with other settings.
+        If an argument is invalid, a problem cannot be simulated, or ``out`` contains ranks of the
+        same problems and samplers with other settings.
     OSError
         If ``out`` is not writable.
     KeyboardInterrupt

@@ -14,7 +14,7 @@ from probmotion.validation import check_positive
 
 __all__ = ["Overconfident"]
 
-_CHANGED = ("positions", "theta", "log_density")
+_CHANGED = ("positions", "theta", "log_density")  # variables that are not copied
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Overconfident:
     Parameters
     ----------
     sampler : Sampler
-        Original sampler.
+        Sampler whose draws are shrunk.
     factor : float
-        Shrinkage factor, between 0 and 1.
+        Factor of deviations from the mean, greater than 0 and less than 1.
     """
 
     name: ClassVar[str] = "overconfident"
@@ -50,7 +50,7 @@ class Overconfident:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` overconfident draws; raise as the original sampler."""
+        """Return ``chains`` × ``draws`` overconfident draws; raise the errors of ``sampler``."""
         try:
             drawn = self.sampler.sample(
                 posterior, draws=draws, chains=chains, seed=seed, initial=initial, progress=progress

@@ -1,4 +1,4 @@
-"""Scalar quantities of motions, by which the truth is ranked among draws."""
+"""Scalar quantities of motions for ranking the truth among draws."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from probmotion.posteriors.problem import Problem
 
 __all__ = ["Quantity", "log_densities", "quantities"]
 
-_DIRECTIONS = 3
+_DIRECTIONS = 3  # number of random directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ def quantities(posterior: MotionPosterior, seed: int = 0) -> list[Quantity]:
     """Return the quantities of a posterior's motions, the same for all samplers and draws.
 
     - ``direction 1`` to ``3``: root-relative motion projected on random directions
-    - ``height of <joint>``: of a random joint in a random frame, metres
-    - ``hidden <joint>``: a random occluded joint, if any, along a random direction
-    - ``speed``: mean step length over joints and frames, metres, for several frames
+    - ``height of <joint>``: height of a random joint in a random frame, metres
+    - ``hidden <joint>``: root-relative coordinate of an occluded joint, if any, on a random axis
+    - ``speed``: mean displacement of joints between frames, metres, if there are several frames
 
-    ``posterior`` is that of the problem, not of a simulation; ``seed`` determines random choices.
+    ``posterior`` belongs to the problem, not to a simulation; ``seed`` determines random choices.
     """
     rng = seeds.generator(seed, "quantities")
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)

@@ -18,7 +18,7 @@ from probmotion.posteriors.problem import Problem
 
 __all__ = ["Rank", "independent_draws", "rank", "ranks_of_truth"]
 
-_FEWEST = 4
+_FEWEST = 4  # minimum draws per chain for an effective sample size
 
 
 class Rank(NamedTuple):
@@ -29,22 +29,22 @@ class Rank(NamedTuple):
 
 
 def rank(truth: float, draws: np.ndarray, rng: np.random.Generator) -> float:
-    """Return (r + U) / (L + 1), r the rank of the truth among L draws, ties broken at random.
+    """Return the rank (r + U) / (L + 1): r of L draws are below the truth, U is uniform on [0, 1].
 
-    ``truth`` and ``draws`` (L,) are values of one quantity; draws must be independent. The rank is
-    uniform on [0, 1] for every L if truth and draws are exchangeable, so runs of different lengths
-    can be pooled.
+    ``truth`` and ``draws`` (L,) are values of one quantity; draws must be independent. Ties are
+    broken at random. If truth and draws are exchangeable, the rank is uniform on [0, 1] for every
+    L, so runs of different lengths can be pooled.
     """
     below, equal = int((draws < truth).sum()), int((draws == truth).sum())
     return float((below + (equal + 1) * rng.random()) / (len(draws) + 1))
 
 
 def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
-    """Return values (chain, draw) of a run, evenly thinned to about independent values, (n,).
+    """Return values (chain, draw) of a run, evenly thinned to n nearly independent ones, (n,).
 
     n is the effective sample size of the quantity (bulk, Vehtari et al. 2021; draws /
-    autocorrelation time for an ensemble), or the number of draws if independent. It is 1 if values
-    are constant or not finite, chains have fewer than 4 draws, or the autocorrelation time is NaN.
+    autocorrelation time for an ensemble), or the number of draws if these are independent. It is 1
+    if values are constant or not finite, a chain has fewer than 4 draws, or the time is NaN.
     """
     flat = values.reshape(-1)
     if draws.independent:
@@ -72,7 +72,7 @@ def ranks_of_truth(
     """Return the rank of a simulation's truth in each quantity of ``problem``.
 
     The quantity ``distance`` is the root mean square distance of joints from the truth of another
-    simulation, ``elsewhere``, in metres. ``seed`` breaks ties.
+    simulation, ``elsewhere``, in metres. ``seed`` determines how ties are broken.
     """
     if simulation.truth is None or elsewhere.truth is None:
         raise ValueError(f"simulations of {problem.name} must have a truth, got none")

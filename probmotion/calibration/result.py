@@ -1,4 +1,4 @@
-"""Results of a calibration: ranks of simulated truths, stored in a folder."""
+"""Calibration results: ranks of simulated truths, stored in a folder."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Calibration:
     plan : Plan
         Plan of the grid; its ``seeds`` is the number of simulations.
     temporary : bool
-        Delete the folder when this object is garbage-collected.
+        Whether to delete the parent of ``folder`` when this object is garbage-collected.
     """
 
-    # Subfolder of the ``out`` of calibrate().
+    # Subfolder of ``out`` in calibrate().
     FOLDER = "calibration"
 
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
@@ -76,7 +76,7 @@ class Calibration:
         return [result for result in self.results if (result.problem, result.sampler) == pair]
 
     def ranks(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
-        """Return the ranks of the truth in [0, 1] by quantity, (n,), per successful simulation."""
+        """Return the ranks of the n successful simulations' truths in [0, 1] by quantity, (n,)."""
         return self._values(problem, sampler, "rank ")
 
     def ranked_among(self, problem: str, sampler: str) -> dict[str, np.ndarray]:
@@ -107,7 +107,7 @@ class Calibration:
         return bool(self._blocks(self.plan.problems))
 
     def _blocks(self, problems: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Return the ranks of every sampler with at least two simulations, by its verdict."""
+        """Return the ranks of samplers with at least two ranked simulations, keyed by verdict."""
         blocks = {}
         for problem, sampler in product(problems, self.plan.samplers):
             ranks = self.ranks(problem, sampler)
@@ -147,9 +147,9 @@ class Calibration:
     def table(self) -> CalibrationTable:
         """Return a data frame with a row per problem, sampler and quantity, printed as a summary.
 
-        Quantity "all" combines all quantities. Columns: ``p_value`` of uniform ranks (all: smallest
-        after Holm's adjustment), ``coverage_90`` of 90 % credible sets (all: mean over central
-        intervals), ``coverage_error``: mean abs(coverage − level) (all: mean over quantities),
+        The row "all" combines the quantities as stated in parentheses. ``p_value``: p-value of
+        uniform ranks (smallest, Holm-adjusted); ``coverage_90``: coverage of 90 % credible sets
+        (mean over central intervals); ``coverage_error``: mean abs(coverage − level) (mean);
         ``simulations`` and ``failed``: numbers of successful and failed simulations.
         """
         from probmotion.calibration.table import CalibrationTable

@@ -1,4 +1,4 @@
-"""Table and verdicts of a calibration."""
+"""Calibration table, and verdicts on the calibration of samplers."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _COLUMNS = [
     "problem", "sampler", "quantity", "p_value", "coverage_90", "coverage_error", "simulations",
     "failed",
 ]  # fmt: skip
-_SHOWN = 0.9
-_SIGNIFICANT = 0.05
-_FEWEST = 2
+_SHOWN = 0.9  # level of the credible sets in the table and the verdicts
+_SIGNIFICANT = 0.05  # significance level of the verdicts
+_FEWEST = 2  # minimum number of simulations for a verdict
 _LEGEND = """\
 p: p-value of uniform ranks, all quantities together (Holm); worst: quantity with the smallest p;
 90 % covers: fraction of truths in central 90 % intervals, mean over quantities; density, distance:
@@ -35,7 +35,7 @@ level|, mean over quantities, about 0.3/√simulations for exact draws"""
 
 @dataclass(frozen=True, eq=False)
 class Ranked:
-    """Ranks of the truth in [0, 1] by quantity, (n,), of one sampler on one problem.
+    """Ranks of the truths in [0, 1] by quantity, (n,), for one sampler on one problem.
 
     Failed simulations have an entry in ``failures`` instead of ranks; ``simulations`` and
     ``planned`` are the numbers of finished and planned simulations.

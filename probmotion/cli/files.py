@@ -15,7 +15,7 @@ __all__ = ["Convert", "Show", "file_called"]
 
 
 def file_called(path: Path) -> Path:
-    """Return the shipped network named ``path``, or ``path`` itself."""
+    """Return the file of a shipped network if ``path`` is the name of one, else ``path``."""
     if path.suffix or path.exists():
         return path
     from probmotion import models

@@ -1,7 +1,7 @@
 """Command-line options for the settings of samplers, generated from their dataclasses.
 
-Numbers and strings are separate options. Objects such as a guidance or a proposal are written as
-in Python: ``DPS`` or ``DPS(strength=0.5)``.
+Settings that are numbers or strings are separate options. Settings that are objects, such as a
+guidance or a proposal, are written as in Python: ``DPS`` or ``DPS(strength=0.5)``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = [
 
 
 def _option_name(sampler: str) -> str:
-    """Return the name of a sampler as an identifier."""
+    """Return the name of a sampler, converted to a Python identifier."""
     name = re.sub(r"\W", "_", sampler)
     return name if name.isidentifier() and not iskeyword(name) else f"sampler_{name}"
 
@@ -127,7 +127,7 @@ def sampler_called(name: str, settings: Any) -> Any:
 
 
 def objects_as_words() -> ConstructorRegistry:
-    """Return the tyro registry with a rule for settings that are objects of several dataclasses."""
+    """Return a tyro registry with a rule for settings that accept one of several dataclasses."""
     from tyro.constructors import ConstructorRegistry
 
     registry = ConstructorRegistry()

@@ -45,7 +45,7 @@ class BodyClips:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the synthetic recordings."""
+    """Noise added to the joints of the clips."""
 
     least: float = 0.01
     """Minimum standard deviation of the noise, metres."""
@@ -110,7 +110,7 @@ class TrainDVAE:
 class TrainDenoiser:
     """Train a denoiser of 3D joints with a Motion-DVAE prior, from noisy joints alone.
 
-    Clips are only used to generate noisy joints, on the prior's skeleton and frame rate. Writes
+    Noisy joints are generated from clips with the prior's skeleton and frame rate. Writes
     model.safetensors and losses.csv. Run the same command again to resume an interrupted run;
     increase --steps to extend a finished one.
     """

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Steps", "check_enough_clips", "check_out", "listed", "run_training"]
 
-_LISTED = 6
+_LISTED = 6  # maximum number of printed names
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Optimisation settings; defaults depend on the size."""
+    """Optimisation settings; defaults depend on the network size."""
 
     steps: int | None = None
     """Number of gradient steps."""
@@ -38,7 +38,7 @@ class Steps:
     """Device; cuda uses mixed precision."""
 
     def settings(self, usual: TrainingSettings) -> TrainingSettings:
-        """Return the default settings of a size, overridden by the given options."""
+        """Return the default settings ``usual``, overridden by the given options."""
         from probmotion.models.training.trainer import check_device
 
         check_device(self.device)  # early, since data preparation takes minutes
@@ -69,7 +69,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
-    """Train or resume training, and print the result."""
+    """Start or resume the training of a network, and print the result."""
     from probmotion.models.training.checkpoints import MODEL, load_checkpoint
     from probmotion.models.training.runs import steps_taken
     from probmotion.models.training.trainer import train

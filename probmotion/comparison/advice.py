@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Advice", "Standing", "advise"]
 
-_WIDTH = 100
-# A tied sampler is preferred to the best if it takes less than this fraction of the time.
+_WIDTH = 100  # line width of printed advice
+# A tied sampler is preferred to the best one if it takes less than this fraction of its time.
 _CHEAPER = 0.5
-# Probability that R-hat of mixed chains exceeds the limit; also the level of the test over seeds.
+# Probability that R-hat of independent draws exceeds its limit, and level of the test over seeds.
 _LEVEL = 0.05
 _WARNINGS: Sequence[tuple[str, float, float, str]] = (
     ("swd_ratio", 1 / 1.5, 1.5, "far from the references: swd ratio {:.3g}"),
@@ -45,13 +45,13 @@ class Standing:
     Parameters
     ----------
     sampler : str
-        Name.
+        Name of the sampler.
     value, spread : float
-        Mean and standard deviation over seeds of the headline metric; the latter NaN for one seed.
+        Mean of the headline metric over seeds, and its standard deviation (NaN for one seed).
     seconds : float
-        Mean time of a run.
+        Mean time of a run, seconds.
     warnings : tuple of str
-        Metrics outside their acceptable range, and seeds without draws.
+        Warnings about metrics outside their acceptable range, and about seeds without draws.
     """
 
     sampler: str
@@ -75,18 +75,18 @@ class Advice:
     problem, description : str
         Name and description of the problem.
     how : str
-        Settings of the measurements.
+        Number of draws and seeds, budget and command of the measurements.
     metric : str
         Headline metric with its description.
     recommended : Standing
         Best of the tied samplers without warnings (of all tied samplers if all have warnings), or
-        the fastest of them if it takes less than half the time.
+        the fastest of them if it takes less than half the time of the best.
     tied : tuple of Standing
         Other samplers tied with the best, without warnings.
     tied_with_warnings : tuple of Standing
         Other samplers tied with the best, with warnings.
     worse : tuple of Standing
-        Samplers that are significantly worse.
+        Samplers that are significantly worse than the best.
     without_draws : dict of str
         One-word reason for missing draws, by sampler.
     """
@@ -148,7 +148,7 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
         for (name, _), row in seed_values(rows[rows["metric"] == metric]).items()
         if row.notna().any()
     }
-    # A single sampler is tied with itself.
+    # Without a test, i.e. with a single sampler or seed, all samplers are tied.
     tied = best_of(metric, values, range(measurements.seeds))[1] or set(values)
     standings = [_standing(rows, name, metric, measurements) for name in values]
     standings.sort(key=lambda each: _error(metric, each.value))
@@ -208,7 +208,7 @@ def _standing(rows: pd.DataFrame, sampler: str, metric: str, measurements: Measu
 
 
 def _rhat_warning(rhat: pd.Series, at_most: float) -> list[str]:
-    """Return a warning if R-hat exceeds its limit at significantly many seeds."""
+    """Return a warning if R-hat exceeds its limit at significantly many seeds (binomial test)."""
     above, n = int((rhat > at_most).sum()), len(rhat)
     if above and binom.sf(above - 1, n, _LEVEL) <= _LEVEL:
         where = "" if above == n else f" at {above} of {n} seeds"

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_comparison"]
 
-_DRAWS = 4
-_POSES = 6
+_DRAWS = 4  # draws per sampler
+_POSES = 6  # poses per sampler of problems with held-out poses
 _SIDE_VIEW = np.pi / 2 - 0.35
 """Heading of bodies without observations, radians."""
 
@@ -32,8 +32,8 @@ def draw_comparison(
 ) -> list[Path]:
     """Write ``quality_against_cost.png`` and ``skeletons_<problem>.png``; return their paths.
 
-    The quality plot is omitted without a measured headline metric. Skeletons with observations are
-    viewed at a right angle to the first camera, with the truth in grey.
+    The quality plot is omitted if no headline metric was measured. With observations, motions are
+    viewed at a right angle to the first camera, if any, with the truth in grey.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def _draw_problem(comparison: GridResults, problem: Problem, path: Path) -> None
     for result in comparison.results:
         if result.problem == problem.name and result.seed == 0 and result.failure is None:
             motions = comparison.draws(problem.name, result.sampler).flat()
-            # Consecutive draws of a chain are similar.
+            # Choose evenly spaced draws, because consecutive draws of a chain are similar.
             drawn[result.sampler] = motions[:: max(1, len(motions) // shown)]
     rows = {}
     if "exact" in drawn:

@@ -40,7 +40,7 @@ _FIGURE = "quality_against_cost.png"
 class Comparison(GridResults):
     """Draws and metrics of every sampler on every problem.
 
-    :class:`~probmotion.comparison.results.grid_results.GridResults` documents its table and draws.
+    See :class:`~probmotion.comparison.results.grid_results.GridResults` for table and draws.
     """
 
     def plot(self, path: str | Path | None = None) -> Path:
@@ -77,16 +77,16 @@ def compare(
     Parameters
     ----------
     problems : str, Problem, MotionPosterior, or several
-        Names of registered problems, or objects; a mapping assigns other names.
+        Names of registered problems, or objects; the keys of a mapping replace their names.
     samplers : str, Sampler, or several, optional
-        Names of registered samplers with default settings, or objects; a mapping assigns other
-        names. All registered samplers by default.
+        Names of registered samplers with default settings, or objects; the keys of a mapping
+        replace their names. All registered samplers by default.
     draws : int
         Number of draws per run, summed over chains.
     chains : int
         Number of chains per run.
     seeds : int
-        Number of replicates.
+        Number of replicates per problem and sampler, with seeds 0, 1, …
     out : str or Path, optional
         Folder for the runs, ``table.csv`` and ``failures.json``; temporary by default.
     workers : int

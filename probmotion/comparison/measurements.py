@@ -34,7 +34,7 @@ _STORED_METRICS = (
     "c2st",
     "rhat",
 )
-_DIGITS = 5
+_DIGITS = 5  # significant digits of stored values
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Measured:
     command : str
         Command that produced the measurements.
     draws, seeds : int
-        Draws per run, and number of replicates.
+        Number of draws per run, and number of replicates.
     rhat_at_most : float
         95 % quantile of R-hat for ``draws`` independent draws.
     notes : list of str

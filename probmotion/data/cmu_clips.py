@@ -1,4 +1,4 @@
-"""Clips of one person from the CMU database, by name."""
+"""Loading of clips of one person from the CMU database by name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["cmu_clip"]
 
 _FPS = 30.0
 _SOURCE_FPS = 120.0
-_FRAMES = 900
+_FRAMES = 900  # maximum length of a clip, 30 s
 _NAME = re.compile(r"cmu_(?P<subject>\d{2,3})_(?P<trial>\d{2})", re.ASCII)
 _DATASET = "cmu-01-02-03"
 _SUBJECTS = ("01", "02", "03")  # subjects of _DATASET
@@ -30,8 +30,8 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
 
     Searches the folders of :func:`~probmotion.data.downloads.data_places` for an archive
     (``cmu_02_02.npz``, or below ``cmu_single``) or the original files (``02.asf`` and
-    ``02_02.amc``, or below ``cmu-01-02-03``), reduced to every fourth frame. Both sources yield
-    identical single-precision positions of at most 30 seconds. Nothing is downloaded.
+    ``02_02.amc``, or below ``cmu-01-02-03``), of which every fourth frame is used. Both sources
+    yield identical single-precision positions of at most 30 seconds. Nothing is downloaded.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     Returns
     -------
     Motion
-        At 30 frames per second, on the database's 31 joints (38 in the archives of subject 131).
+        Clip at 30 frames per second, with 31 joints (38 in the archives of subject 131).
 
     Raises
     ------

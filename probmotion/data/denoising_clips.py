@@ -1,4 +1,4 @@
-"""Clips of one person for training denoisers, recorded or synthetic, split by clip."""
+"""Recorded and synthetic clips of one person for training denoisers, split by clip."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["DENOISING_CLIPS", "denoising_clips", "synthetic_denoising_clips"]
 
 _FPS = 30.0
-_FRAMES = 30
+_FRAMES = 30  # window length
 _HUMANOID_TRAINING = (
     "backflip", "cartwheel", "crawl", "dance_a", "dance_spin", "getup_facedown", "long_walk1",
     "long_walk2", "long_zombie", "punch", "roll", "sideflip", "spin", "spinkick", "stealthy_walk0",
@@ -44,10 +44,10 @@ DENOISING_CLIPS: Mapping[str, tuple[str, ...]] = {
 }
 """Clips by part of the split: 45 of the 48 clips of one person.
 
-The test clips are a climb, a walk, sword play, a dance and DeepMimic's walk, which have
-similar training clips, and getting up from the back (``humanoid3d_getup_faceup``), which has none.
-Excluded are two excerpts, ``humanoid3d_walk`` and ``humanoid3d_zombie_walk``, and
-``humanoid3d_jog``, which is shorter than a window.
+Five test clips resemble training clips: a climb, a walk, sword play, a dance and DeepMimic's walk.
+The sixth, getting up from the back (``humanoid3d_getup_faceup``), does not. Three clips are
+excluded: ``humanoid3d_walk`` and ``humanoid3d_zombie_walk`` are excerpts of other clips, and
+``humanoid3d_jog`` is shorter than a window.
 """
 
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
@@ -56,10 +56,10 @@ _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
     """Return the recorded clips of each part on ``person14`` at 30 frames per second.
 
-    ``folder`` contains the clips of :data:`DENOISING_CLIPS` as ``.npz``; a missing file raises
-    ``FileNotFoundError``. A clip is split at frames marked as ``suspect`` in its file (marker
-    jumps) into segments named ``cmu_01_07-0``, …; ``suspect`` must be one bool per frame, else
-    ``ValueError``.
+    ``folder`` contains the clips of :data:`DENOISING_CLIPS` as ``.npz``. A clip is split at frames
+    marked as ``suspect`` in its file (marker jumps) into segments named ``cmu_01_07-0``, …. Raises
+    ``FileNotFoundError`` if a file is missing, and ``ValueError`` if ``suspect`` is not one bool
+    per frame.
     """
     return {
         part: [segment for name in names for segment in _segments(Path(folder) / f"{name}.npz")]
@@ -70,9 +70,9 @@ def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
 def synthetic_denoising_clips(
     n: int = 60, *, seconds: float = 4.0, seed: int = 0
 ) -> dict[str, list[Motion]]:
-    """Return synthetic people who walk, run and march, on ``person14`` at 30 frames per second.
+    """Return synthetic clips of people who walk, run or march, on ``person14`` at 30 fps.
 
-    The training part has ``n`` clips of ``seconds`` s; validation and test have n / 5 each, at
+    The training part has ``n`` clips of ``seconds`` s, validation and test n / 5 clips each, at
     least one per style.
     """
     check_count("n", n)

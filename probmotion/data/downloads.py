@@ -1,7 +1,7 @@
 """Download of public motion data by name, with verification and a cache.
 
 ``registry.csv`` lists the repository, commit, path, SHA-256 and size of each file.
-The data are Carnegie Mellon University's (:data:`CMU_TERMS`); cite :data:`CMU_ACKNOWLEDGEMENT`.
+Terms of Carnegie Mellon University apply (:data:`CMU_TERMS`); cite :data:`CMU_ACKNOWLEDGEMENT`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CMU_TERMS = (
 """CMU's terms as stated by the database. The data themselves may not be sold."""
 
 SALSA_TRIALS = ("01", "02", "03", "04", "05", "06", "07", "09", "10", "11")
-"""Trials of :func:`salsa_pairs`. The registry also lists 12 to 15; 08 does not exist."""
+"""Trials that :func:`salsa_pairs` loads. The registry also lists 12 to 15; 08 does not exist."""
 
 _ADDRESS = "https://raw.githubusercontent.com"
 _FOLDER_VARIABLE = "PROBMOTION_DATA"
@@ -51,10 +51,10 @@ _TIMEOUT = 30.0  # seconds without a response
 
 
 class DownloadError(OSError):
-    """A file cannot be downloaded, or its SHA-256 is wrong; the message contains its URL."""
+    """Error for a failed download or a wrong SHA-256; the message contains the URL of the file."""
 
 
-class _Entry(NamedTuple):
+class _Entry(NamedTuple):  # row of registry.csv
     dataset: str
     repository: str
     commit: str
@@ -69,7 +69,7 @@ class _Entry(NamedTuple):
 
 
 def data_folder() -> Path:
-    """Return the download folder: ``PROBMOTION_DATA`` if set, else the user's cache."""
+    """Return the download folder: ``PROBMOTION_DATA`` if set, else a folder in the user's cache."""
     import pooch
 
     return Path(os.environ.get(_FOLDER_VARIABLE) or pooch.os_cache("probmotion"))
@@ -78,8 +78,8 @@ def data_folder() -> Path:
 def data_places(folder: str | Path | None = None) -> list[Path]:
     """Return the folders to search for clips, in order.
 
-    If ``folder`` is given, only this folder; by default ``PROBMOTION_DATA`` (environment variable),
-    ``../shared/data`` beside the current directory, and the cache of :func:`download`.
+    If ``folder`` is given, it is the only one. The defaults are the environment variable
+    ``PROBMOTION_DATA`` if set, ``../shared/data`` and :func:`data_folder`.
     """
     if folder is not None:
         return [Path(folder)]
@@ -105,11 +105,11 @@ def download(
     dataset : str
         ``"cmu-salsa"`` (BVH, subjects 60 and 61) or ``"cmu-01-02-03"`` (ASF and AMC).
     names : sequence of str, optional
-        File names, such as ``"60_10_scaled.bvh"``; all by default (71 and 62 MB).
+        File names, such as ``"60_10_scaled.bvh"``; all files by default (71 MB or 62 MB).
     folder : str or Path, optional
         Parent of the data set's folder; :func:`data_folder` by default.
     base_url : str, optional
-        URL of a mirror, followed by ``/repository/commit/path``; GitHub's by default.
+        URL of a mirror, to which ``/repository/commit/path`` is appended; GitHub by default.
     progress : bool
         Whether to show a progress bar for each file.
 
@@ -136,7 +136,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     Returns
     -------
     list of Motion
-        The trials :data:`SALSA_TRIALS` on ``pair17`` at 30 fps, ``cmu_60_61_01`` first.
+        Clips of :data:`SALSA_TRIALS`, in this order, on ``pair17`` at 30 fps.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Classical filters of noisy 3D joints: baselines without a body model."""
+"""Classical filters for noisy 3D joint positions: baselines without a body model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = [
 
 _FIRST_POSITION = 10.0  # prior sd of the first position about the mean observation, m
 _FIRST_SPEED = 10.0  # prior sd of the first velocity, m/s
-_LEAST, _MOST = 1e-3, 1e3  # range of the fitted acceleration, m/s^1.5
+_LEAST, _MOST = 1e-3, 1e3  # range of the fitted √q, m/s^1.5
 
 
 def savitzky_golay(
@@ -41,7 +41,7 @@ def savitzky_golay(
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres; unobserved entries are ignored and may be NaN.
+        Positions, metres; unobserved entries are ignored and may be NaN.
     seen : ndarray of bool, (L, J)
         Whether an entry is observed.
     fps : float
@@ -54,7 +54,7 @@ def savitzky_golay(
     Returns
     -------
     ndarray, (L, J, 3)
-        Metres.
+        Smoothed positions, metres.
 
     Raises
     ------
@@ -86,24 +86,24 @@ def kalman_smooth(
     fps: float,
     acceleration: float | np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return each joint's posterior under a constant-velocity model with white acceleration.
+    """Return the posterior of each joint under a constant-velocity model with white acceleration.
 
     Coordinates are independent. With white acceleration of spectral density q = acceleration²,
-    the state (position, velocity) evolves over a time d by F with process noise Q,
+    a time step d multiplies the state (position, velocity) by F and adds noise of covariance Q,
 
         F = [1 d; 0 1],  Q = q [d³/3 d²/2; d²/2 d].
 
-    Observations have Gaussian noise of variance noise² / confidence. The first position is
-    normal about the mean of the joint's observations with sd 10 m, the first velocity about 0 with
-    sd 10 m/s. The Kalman filter and the Rauch–Tung–Striebel smoother (Rauch, Tung and Striebel
-    1965, "Maximum likelihood estimates of linear dynamic systems") give the exact posterior.
+    Observations have Gaussian noise of variance noise² / confidence. The prior of the first frame
+    is Gaussian: position about the mean of the observations (sd 10 m), velocity about 0 (10 m/s).
+    The Kalman filter and the Rauch–Tung–Striebel smoother (Rauch, Tung and Striebel 1965, "Maximum
+    likelihood estimates of linear dynamic systems") give the exact posterior.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres; entries of confidence 0 are ignored and may be NaN.
+        Positions, metres; entries of confidence 0 are ignored and may be NaN.
     confidence : ndarray, (L, J)
-        Factor of the precision; 0 for a missing entry.
+        Factor of the precision (inverse variance) of an entry; 0 for a missing entry.
     noise : float
         Standard deviation of a coordinate of confidence 1, metres.
     fps : float
@@ -119,8 +119,8 @@ def kalman_smooth(
     Raises
     ------
     ValueError
-        If shapes disagree, a joint is never observed, an observed entry is not finite, or a number
-        is out of range.
+        If shapes disagree, a joint is never observed, an observed entry is not finite, or another
+        argument is out of range.
     """
     if acceleration is None:
         acceleration = fit_acceleration(joints, confidence, noise=noise, fps=fps)
@@ -130,7 +130,7 @@ def kalman_smooth(
     means, variances = np.empty_like(problem.joints), np.empty(problem.variance.shape)
     means[-1], variances[-1] = mean[:, 0], covariance[:, 0, 0]
     for frame in range(len(means) - 2, -1, -1):
-        # Gᵀ = P⁻¹ F C, with C filtered and P predicted.
+        # Smoother gain G: Gᵀ = P⁻¹ F C, with filtered covariance C and predicted covariance P.
         predicted = passes.predicted_covariance[frame + 1]
         moved = problem.step @ passes.covariance[frame]
         gain = np.swapaxes(np.linalg.solve(predicted, moved), -1, -2)
@@ -150,7 +150,7 @@ def log_marginal_likelihood(
     fps: float,
     acceleration: float | np.ndarray,
 ) -> np.ndarray:
-    """Return log p(observations) of each joint, (J,); arguments as :func:`kalman_smooth`."""
+    """Return log p(observations) of each joint, (J,); arguments as in :func:`kalman_smooth`."""
     problem = _Problem.of(joints, confidence, noise, fps, acceleration)
     return _forward(problem).log_marginal_likelihood
 
@@ -158,10 +158,10 @@ def log_marginal_likelihood(
 def fit_acceleration(
     joints: np.ndarray, confidence: np.ndarray, *, noise: float, fps: float
 ) -> np.ndarray:
-    """Return the maximum-likelihood acceleration of each joint, (J,), m/s^1.5.
+    """Return the maximum-likelihood √q of each joint (:func:`kalman_smooth`), (J,), m/s^1.5.
 
     Maximises :func:`log_marginal_likelihood` between 0.001 and 1000 m/s^1.5 by Brent's method on
-    the logarithm. The result for a joint at rest is the lower bound.
+    the logarithm of √q. The result for a joint at rest is close to the lower bound.
     """
     joints, confidence = np.asarray(joints), np.asarray(confidence)
     _Problem.of(joints, confidence, noise, fps, 1.0)  # validates the input
@@ -176,7 +176,7 @@ def fit_acceleration(
     return np.array([10.0**fit.x for fit in fits])
 
 
-class _Problem(NamedTuple):
+class _Problem(NamedTuple):  # validated input of the Kalman filter
     joints: np.ndarray  # (L, J, 3) minus the centre, 0 where missing
     variance: np.ndarray  # (L, J) of the noise, infinite where missing
     centre: np.ndarray  # (J, 3) means of the observed entries
@@ -215,7 +215,7 @@ class _Problem(NamedTuple):
 
 
 class _Passes(NamedTuple):
-    """Filtered and ``predicted`` states of each frame; axes share covariances."""
+    """Filtered and ``predicted`` states of each frame; the x, y and z axes share covariances."""
 
     mean: np.ndarray  # (L, J, 2, 3)
     covariance: np.ndarray  # (L, J, 2, 2)
@@ -254,7 +254,7 @@ def _forward(problem: _Problem) -> _Passes:
 
 
 def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
-    """Return the joints with 0 where missing."""
+    """Validate the input and return the joints with 0 where missing."""
     joints = np.asarray(joints, dtype=np.float64)
     check_shape("joints", joints, ("L", "J", 3))
     check_shape(name, seen, joints.shape[:2])
@@ -270,10 +270,10 @@ def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
 
 
 def filled_between(joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return joints (L, J, 3) with linear interpolation over time and constant extrapolation.
+    """Return joints (L, J, 3) with missing entries interpolated linearly over time.
 
-    Entries that are not ``seen`` (L, J) are replaced. Raises ``ValueError`` if a joint is never
-    observed, or an observed entry is not finite.
+    ``seen`` (L, J) marks observed entries; the first and the last are extrapolated as constants.
+    Raises ``ValueError`` if a joint is never observed, or an observed entry is not finite.
     """
     seen = np.asarray(seen, dtype=bool)
     joints = _seen_joints(joints, seen, "seen")

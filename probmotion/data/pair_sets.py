@@ -1,4 +1,4 @@
-"""Data sets of pose pairs: dance frames, held-out clips, body heights and the seed pose."""
+"""Data sets of pose pairs: dance frames, held-out clips, body heights and seed poses."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = [
 ]
 
 SALSA_HELD_OUT = ("cmu_60_61_03", "cmu_60_61_07", "cmu_60_61_11")
-"""Held-out salsa clips: 3 of 10, 2658 of the 8257 dance frames."""
+"""Names of the held-out salsa clips: 3 of 10 clips, with 2658 of the 8257 dance frames."""
 
 # Fractions of the body height below the ankles and above the base of the skull, from Drillis and
 # Contini (ankle .039, eyes .936, chin .870 of the height).
 _FOOT = 0.039
 _SKULL = 0.10
-_SEED_POSES = 400
+_SEED_POSES = 400  # maximum number of pose pairs compared by choose_seed
 _HEIGHTS = (0.5, 3.0)  # plausible heights, m
 _FARTHEST = 5.0  # maximum distance between roots, m
 _MOST_APART, _FASTEST = 1.2, 7.0  # limits of dance frames, m and m/s
@@ -43,8 +43,8 @@ def dance_frames(
 ) -> np.ndarray:
     """Return a mask of the frames that show the dance.
 
-    Excludes the opening, before the partners are first close together; frames with a person
-    over ``farthest`` from all others; and glitches, the frames before and after too fast a step.
+    The mask excludes the opening (before the partners first come close), frames with a person over
+    ``farthest`` from all others, and glitches (before and after a step faster than ``fastest``).
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def dance_frames(
 def describe_dance_frames(motion: Motion) -> str:
     """Return a sentence with the numbers of frames that :func:`dance_frames` includes and excludes.
 
-    An excluded frame is counted once, under the first reason that applies.
+    The default limits apply. An excluded frame counts only for the first reason that applies.
     """
     opening, distant, glitch = _excluded_frames(motion, _MOST_APART, _FASTEST)
     counts = opening.sum(), (distant & ~opening).sum(), (glitch & ~distant & ~opening).sum()
@@ -93,7 +93,7 @@ def ground_truth(
     Returns
     -------
     positions : ndarray, (n, J, 3)
-        Metres.
+        Pose pairs, metres.
     clip, frame : ndarray of int, (n,)
         Index of the motion and of its frame.
 
@@ -163,9 +163,9 @@ def hold_out(
 def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """Return the standing heights of the people, estimated from their bone lengths.
 
-    The height is the sum of shin, thigh (means of both sides), the distance from the pelvis to
-    the midpoint of the hips and the bones from pelvis to ``head``, divided by 0.861: 3.9 % of the
-    height is below the ankles and 10 % above the base of the skull.
+    The height is the sum of the lengths of shin and thigh (means of both sides), the distance from
+    the pelvis to the midpoint of the hips, and the bones from pelvis to ``head``, divided by 0.861,
+    because 3.9 % of the height is below the ankles and 10 % above the base of the skull.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def person_height(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     Returns
     -------
     ndarray, (…, K)
-        Metres.
+        Heights, metres.
     """
     positions = np.asarray(positions, dtype=np.float64)
     check_shape("positions", positions, ("…", skeleton.n_joints, 3))
@@ -207,7 +207,7 @@ def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
 
 
 def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
-    """Return the motion scaled about the origin to a mean :func:`person_height`, metres."""
+    """Return the motion scaled about the origin to a mean :func:`person_height` of ``height`` m."""
     check_positive("height", height)
     factor = height / person_height(motion.positions, motion.skeleton).mean()
     offsets = motion.rest_offsets
@@ -221,8 +221,8 @@ def scaled_to_height(motion: Motion, height: float = 1.7) -> Motion:
 def choose_seed(positions: np.ndarray) -> int:
     """Return the index of the medoid pose pair, for use as the seed pose.
 
-    Distances are root mean square over the joints after rigid alignment (Kabsch), between at most
-    400 evenly spaced pose pairs, so that the choice is deterministic.
+    The medoid has the least sum of distances to the others. Distances are root mean squares over
+    joints after rigid alignment (Kabsch), between at most 400 evenly spaced pose pairs.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def choose_seed(positions: np.ndarray) -> int:
 def _aligned_distances(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the aligned rms distances of a centred pose (J, 3) to others (n, J, 3).
 
-    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB), where the trace has the maximum σ₁ + σ₂ ± σ₃.
+    ‖A R − B‖² = ‖A‖² + ‖B‖² − 2 tr(Rᵀ AᵀB); the trace is at most σ₁ + σ₂ ± σ₃ (σ of AᵀB).
     """
     products = pose.T @ others
     sigma = np.linalg.svd(products, compute_uv=False)

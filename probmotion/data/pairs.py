@@ -38,14 +38,14 @@ def load_pairs(paths: str | Path | Iterable[str | Path]) -> list[Motion]:
     Returns
     -------
     list of Motion
-        On ``pair17`` (:func:`pair_of`), sorted by path, named by their files.
+        Clips on ``pair17`` (:func:`pair_of`), sorted by path and named after their files.
 
     Raises
     ------
     FileNotFoundError
         If no file matches.
     ValueError
-        As :func:`pair_of`.
+        If a motion does not show two people with all joints (:func:`pair_of`).
     """
     patterns: list[str | Path] = []
     for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
@@ -74,12 +74,12 @@ def pair_of(motion: Motion) -> Motion:
 def pair_motion(first: Motion, second: Motion, name: str = "") -> Motion:
     """Combine the motions of two people into one on ``pair17``.
 
-    Both must be in metres, in one world frame, and start at the same time.
+    Both motions must be in metres, share a world frame and start at the same time.
 
     Parameters
     ----------
     first, second : Motion
-        One person each, with the same frame rate and number of frames.
+        Motions of one person each, with the same frame rate and number of frames.
     name : str
         Name of the combined motion; both names by default.
 
@@ -118,7 +118,7 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     The files are the DAZ-friendly conversion of the CMU database, subjects 60 and 61, in the scaled
     version of :mod:`probmotion.data.downloads`. Each person is scaled about the origin (1.286 and
     1.201 m per unit); the first 24 and last 6 frames are cut; the rate is halved from 60 fps; the
-    2 % quantile of the lowest joint's height is moved to the floor, y = 0.
+    2 % quantile of the lowest joint's height becomes the floor, y = 0.
 
     Parameters
     ----------
@@ -128,12 +128,12 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
     Returns
     -------
     Motion
-        On ``pair17``, named ``cmu_60_61_TT``.
+        Motion on ``pair17``, named ``cmu_60_61_TT``.
 
     Raises
     ------
     ValueError
-        If the files belong to different trials, lengths differ or a file is damaged.
+        If the files belong to different trials, differ in length, are too short or damaged.
     """
     trial = _salsa_trial(Path(lead), Path(follow))
     leader, follower = (

@@ -98,7 +98,7 @@ class DetectorNoise:
 
 @dataclass(frozen=True)
 class Filming:
-    """Camera placement and image centring.
+    """Placement of random cameras and centring of their images.
 
     Parameters
     ----------
@@ -109,8 +109,8 @@ class Filming:
     distance : float
         Distance of the cameras from the subject, metres.
     perspective : bool
-        Whether cameras are perspective, not orthographic; images are in metres at the subject's
-        distance.
+        Whether the cameras are perspective instead of orthographic; either way, images are in
+        metres at the subject's distance.
     centre : {"frame", "sequence"}
         Whether the root is at the origin in every frame or on average.
     """
@@ -160,13 +160,13 @@ def project_clips(
     seed : int
         Seed of cameras and detection errors; the tracks of a clip do not depend on other clips.
     filming, noise : optional
-        Camera placement, and error model of the detector.
+        :class:`Filming` and :class:`DetectorNoise`, with their defaults if omitted.
 
     Returns
     -------
     list of KeypointTrack
-        Named ``"<clip>/<view>"``; metres at the subject's distance, x right and y down, centred on
-        the root.
+        Tracks named ``"<clip>/<view>"``, in metres at the subject's distance, with x right and y
+        down, centred on the root.
 
     Raises
     ------

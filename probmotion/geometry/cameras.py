@@ -17,14 +17,14 @@ __all__ = ["Cameras"]
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """Batch of V cameras.
+    """Batch of V cameras, either all perspective or all orthographic.
 
     Parameters
     ----------
     rotation : ndarray, (V, 3, 3)
-        Rotations from world to camera axes.
+        Rotations R from world to camera axes.
     translation : ndarray, (V, 3)
-        Camera coordinates of the world origin, metres.
+        Camera coordinates t of the world origin, metres.
     focal : ndarray, (V,)
         Focal length. Perspective: image units per unit of x/z. Orthographic: image units per metre.
     centre : ndarray, (V, 2), optional
@@ -95,7 +95,7 @@ class Cameras:
             Elevation above the horizon, radians.
         distance : float
             Distance from the origin, metres; also the focal length of perspective cameras, so that
-            the scale at the origin is one image unit per metre (MAS, appendix C).
+            the scale at the origin is one image unit per metre (*MAS*, appendix C).
         start : float
             Azimuth of the first camera, radians; 0 is the +Z axis.
         perspective : bool
@@ -153,7 +153,7 @@ class Cameras:
 
     @property
     def image_axes(self) -> np.ndarray:
-        """P, the world directions of the image axes times the focal length, (V, 2, 3).
+        """Matrices P (V, 2, 3): world directions of the image axes times the focal length.
 
         For orthographic cameras ``project(X) = P X + offset``.
         """

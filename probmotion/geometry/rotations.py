@@ -19,14 +19,14 @@ __all__ = [
     "vector_to_quaternion",
 ]  # fmt: skip
 
-# Squared angle below which the series are exact in float64; the first omitted term is 1e-19.
+# Squared angle below which Taylor series are exact in float64; omitted terms are below 1e-18.
 _SMALL = 1e-6
 
 
 def vector_to_matrix(vector: Array) -> Array:
     """Return the matrix of a rotation vector (axis times angle): ``(…, 3) → (…, 3, 3)``.
 
-    Rodrigues' formula, ``R = I + sin θ/θ K + (1 − cos θ)/θ² K²``.
+    Rodrigues' formula, ``R = I + sin θ/θ K + (1 − cos θ)/θ² K²``, θ = ‖vector‖, K x = vector × x.
     """
     check_shape("vector", vector, ("…", 3))
     xp = array_namespace(vector)
@@ -81,15 +81,15 @@ def quaternion_to_matrix(quaternion: Array) -> Array:
     xp = array_namespace(quaternion)
     real = quaternion[..., :1, None]
     cross = _cross_matrix(quaternion[..., 1:])
-    # R = I + 2 w K + 2 K², K the cross product with the imaginary part.
+    # R = I + 2 w K + 2 K², where K x is the cross product of the imaginary part and x.
     return constant(np.eye(3), quaternion) + 2 * real * cross + 2 * xp.matmul(cross, cross)
 
 
 def matrix_to_quaternion(matrix: Array) -> Array:
     """Return the unit quaternion of a matrix, w at least 0: ``(…, 3, 3) → (…, 4)``.
 
-    4 q qᵀ is linear in R. Its row with the largest diagonal entry is q times a factor of at least
-    2.
+    The matrix 4 q qᵀ is linear in R. Its row with the largest diagonal entry is q times a factor of
+    magnitude 2 or more.
     """
     check_shape("matrix", matrix, ("…", 3, 3))
     xp = array_namespace(matrix)
@@ -111,7 +111,7 @@ def matrix_to_quaternion(matrix: Array) -> Array:
 
 
 def quaternion_product(first: Array, second: Array) -> Array:
-    """Return the Hamilton product, ``second`` then ``first``: ``(…, 4), (…, 4) → (…, 4)``."""
+    """Return the Hamilton product (``second`` acts first): ``(…, 4), (…, 4) → (…, 4)``."""
     check_shape("first", first, ("…", 4))
     check_shape("second", second, ("…", 4))
     xp = array_namespace(first, second)
@@ -131,8 +131,8 @@ def quaternion_product(first: Array, second: Array) -> Array:
 def rotation_6d_to_matrix(numbers: Array) -> Array:
     """Return the rotation matrix of a 6D vector by Gram-Schmidt: ``(…, 6) → (…, 3, 3)``.
 
-    Entries 0:3 and 3:6 are the first two columns and must not be parallel (Zhou et al. 2019, "On
-    the continuity of rotation representations in neural networks", eq. 15).
+    Entries 0:3 and 3:6 determine the first two columns and must not be parallel (Zhou et al. 2019,
+    "On the continuity of rotation representations in neural networks", eq. 15).
     """
     check_shape("numbers", numbers, ("…", 6))
     xp = array_namespace(numbers)
@@ -156,7 +156,7 @@ def euler_to_matrix(angles: Array, order: str) -> Array:
     Parameters
     ----------
     angles : Array, (…, 3)
-        Radians, in the order of ``order``.
+        Angles about the axes of ``order``, radians.
     order : str
         Three of ``X``, ``Y``, ``Z`` without adjacent repeats: ``"ZXY"`` is ``R_z R_x R_y``, the
         BVH channels ``Zrotation Xrotation Yrotation``.

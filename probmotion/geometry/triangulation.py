@@ -2,12 +2,12 @@
 
 Each joint of each frame is an independent least-squares problem with 3 unknowns and 2 V equations.
 A camera projects the point X to (u, v) = (a/c, b/c), where a, b, c are the rows of its projection
-matrix times (X, 1). With a', b', c' the first three entries of the rows,
+matrix times (X, 1). With a', b', c' the first three entries of the rows, (u, v) has the Jacobian
 
     J = [a' − u c', b' − v c'] / c,
     JᵀJ = (a'a'ᵀ + b'b'ᵀ − u (a'c'ᵀ + c'a'ᵀ) − v (b'c'ᵀ + c'b'ᵀ) + (u² + v²) c'c'ᵀ) / c²,
 
-so the normal equations of all points are products of fixed camera matrices with a few numbers per
+so the normal equations of all points are products of fixed camera matrices with a few values per
 view and point. Orthographic cameras are the case c' = 0, c = 1.
 """
 
@@ -39,20 +39,20 @@ def triangulate(
     initial: Array | None = None,
     iterations: int = 2,
 ) -> Array:
-    """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for every frame and joint (MAS, section 4.2).
+    """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for every frame and joint (*MAS*, section 4.2).
 
-    Orthographic cameras are solved in closed form. Perspective cameras use ``iterations`` steps of
-    simplified Gauss-Newton: residual and gradient are exact, the normal matrix is from the first
-    linearisation.
+    p(X, v) is the image of X in view v. Orthographic cameras have a closed-form solution. For
+    perspective cameras, ``iterations`` steps of simplified Gauss-Newton use exact residuals and
+    gradients, but the normal matrix of the first linearisation.
 
     Parameters
     ----------
     keypoints : Array, (…, V, L, J, 2)
-        x, image units; NumPy, torch or JAX.
+        Image points x_v, image units; NumPy, torch or JAX.
     cameras : Cameras
         The V views.
     weights : Array, (V,), (…, V) or (…, V, L, J), optional
-        w, 1 by default. Keypoints of weight 0 are ignored and may be NaN.
+        Weights w_v, 1 by default. Keypoints of weight 0 are ignored and may be NaN.
     initial : Array, (…, L, J, 3), optional
         Initial points for perspective cameras, metres; the linear ray intersection by default.
     iterations : int
@@ -121,7 +121,7 @@ def triangulate(
 
 
 class _Equations(NamedTuple):
-    """Fixed matrices of V cameras."""
+    """Matrices of the normal equations that depend only on the V cameras."""
 
     projection: Array  # (3 V, 4): rows a, then b, then c
     square: Array  # (6, V): a'a'ᵀ + b'b'ᵀ
@@ -188,7 +188,7 @@ def _on_rays(
 ) -> tuple[Array, Array]:
     """Return the normal equations of the rays (a' − u c')·X = u c₄ − a₄, and likewise for v.
 
-    For c' = 0 they are exact.
+    For c' = 0 these equations are exact.
     """
     V = seen.shape[1]
     origin = equations.projection[:, 3:]

@@ -25,9 +25,9 @@ __all__ = ["AnnotatedPairs"]
 class AnnotatedPairs:
     """Likelihood of pose-pairs given annotations in similar views (Yin et al. 2018, eqs. 5-9).
 
-    L(Θ) ∝ (1/m) Σᵢ max_j exp(−d(M Θ_vᵢ, p_j)²/2σ_l²) with vᵢ ~ f(v). The m views are drawn once
-    from ``seed``, so that the density is deterministic; :meth:`evaluate` with generators draws
-    fresh views for an unbiased estimate of the integral over views.
+    L(Θ) ∝ (1/m) Σᵢ max_j exp(−d(M Θ_vᵢ, p_j)²/2σ_l²) with m views vᵢ ~ f(v), where M Θ_v is the
+    pose-pair Θ projected to view v, p_j an annotation and d the dissimilarity. Views are fixed by
+    ``seed``, unless :meth:`evaluate` draws fresh ones for an unbiased estimate.
 
     Parameters
     ----------
@@ -38,16 +38,16 @@ class AnnotatedPairs:
     n_near : int
         Number of annotations compared per view, nearest in view angle.
     noise : float
-        σ_l, in the unit of the dissimilarity: metres; dimensionless for shape contexts.
+        Scale σ_l of the dissimilarity, metres; dimensionless for shape contexts.
     view_bandwidth : float
-        σ_v, radians.
+        Bandwidth σ_v of the view distribution f(v), radians.
     measure : str
-        Distance: ``"interaction"``, ``"cartesian"`` or ``"shape-context"``.
+        Dissimilarity d: ``"interaction"``, ``"cartesian"`` or ``"shape-context"``.
     graph : str
         Graph of the interaction coordinates; one of
         :data:`probmotion.interaction.geometry.graphs.GRAPHS`.
     shortest_edge : float
-        ε of eq. 8, metres.
+        Lower limit ε of the edge lengths in eq. 8, metres.
     seed : int
         Seed of the views.
     """
@@ -109,7 +109,7 @@ class AnnotatedPairs:
         seed_pose : ndarray, (J, 3)
             3D pose-pair with the torsos to fit, metres.
         **settings
-            The other parameters of the class.
+            Other parameters of :class:`AnnotatedPairs`.
         """
         check_shape("seed_pose", np.asarray(seed_pose), (annotations.skeleton.n_joints, 3))
         views = annotation_views(annotations, seed_pose)
@@ -197,12 +197,12 @@ class AnnotatedPairs:
         Parameters
         ----------
         closest : ndarray of int, (…, m)
-            Annotations D', one per view, with repetitions.
+            Indices of the annotations D' of eq. 12, one per view; may repeat.
 
         Returns
         -------
         speeds : ndarray, (…, J, 2)
-            Mean squared turn of the bone, radians², and stretch, metres², per frame.
+            Mean squared rotation (radians²) and stretch (metres²) of each bone per frame.
         """
         return self._squared_differences[closest].mean(axis=-3)
 

@@ -1,7 +1,7 @@
 """Completion of occluded joints from posterior draws (Yin et al. 2018, section 6, figure 12).
 
-In 3D or in the image: select the draws nearest in the visible joints, take their median, and
-deform it onto the visible joints.
+The completion, in 3D or in the image, is the median of the draws that are nearest in the visible
+joints, deformed so that it matches the visible joints exactly.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = [
 BANDWIDTH = 0.3
 """Default bandwidth of :func:`blend`, metres."""
 
-_FEWEST = 4  # minimum number of visible joints: a tetrahedron
+_FEWEST = 4  # minimum number of visible joints, enough for a tetrahedron in 3D
 
 
 class CompletionResult(NamedTuple):
-    """Completed pair and the draws used.
+    """Completed pose-pair and the draws (or annotation) it is computed from.
 
-    ``positions`` (J, D), metres, contain the visible joints unchanged; ``median`` (J, D) is not
-    yet deformed; ``indices`` (n,) are the indices of its draws, nearest first.
+    ``positions`` (J, D), D = 2 or 3, metres, contain the visible joints unchanged; ``median``
+    (J, D) is the median before deformation; ``indices`` (n,) are those of its draws, nearest first.
     """
 
     positions: np.ndarray
@@ -72,7 +72,7 @@ def complete(
     bandwidth : float
         Bandwidth of the deformation, metres.
     measure : str
-        One of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
+        Distance, one of :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
     """
     pose, visible = _checked("pose", pose, visible, skeleton, 3)
     draws = np.asarray(draws, dtype=np.float64)
@@ -117,10 +117,10 @@ def nearest_annotation_completion(
     skeleton: Skeleton,
     annotated_visible: np.ndarray | None = None,
 ) -> CompletionResult:
-    """Complete the occluded joints of a 2D pair (J, 2) from the nearest annotation, a baseline.
+    """Complete the occluded joints of a 2D pair (J, 2) from the nearest annotation (baseline).
 
-    Selects the nearest annotation in interaction coordinates of the visible joints among
-    annotations with every occluded joint, and aligns it rigidly in the image.
+    Of the annotations that contain every occluded joint, the nearest in interaction coordinates of
+    the visible joints is selected and rigidly aligned in the image.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def blend(
 
         Δ_h = Σ_v w_hv (target_v − median_v) / Σ_v w_hv,   w_hv = exp(−‖median_h − median_v‖²/2b²).
 
-    ``median`` and ``target`` (J, D) and the bandwidth b in metres; at least one joint is visible.
+    ``median`` and ``target`` (J, D) and the bandwidth b are in metres; a joint must be visible.
     """
     check_positive("bandwidth", bandwidth)
     hidden = ~visible
@@ -176,7 +176,7 @@ def occluded_joint_error(truth: np.ndarray, estimate: np.ndarray, hidden: np.nda
     Parameters
     ----------
     truth, estimate : ndarray, (…, J, D)
-        Pairs, D = 2 or 3, metres.
+        Pose-pairs, D = 2 or 3, metres.
     hidden : ndarray of bool, (…, J)
         Mask of occluded joints; at least one.
     """
@@ -195,7 +195,7 @@ def _deformed_median(
     visible: np.ndarray,
     bandwidth: float,
 ) -> CompletionResult:
-    """Return the completion from the nearest draws, (n, J, D)."""
+    """Return the completion of ``target`` (J, D) from the nearest draws ``poses`` (n, J, D)."""
     aligned = align_rigidly(poses, np.broadcast_to(target, poses.shape), visible)
     median = np.median(aligned, axis=0)
     return CompletionResult(blend(median, target, visible, bandwidth), median, indices)

@@ -17,10 +17,10 @@ _BLOCK = 4096  # number of projections per block; does not affect the result
 
 
 class RetrievalResult(NamedTuple):
-    """The n draws closest to each 2D pair, nearest first.
+    """Retrieved draws: the n closest to each 2D pair, nearest first.
 
-    ``indices`` (…, n) of the draws; ``views`` (…, n, 2), best view of each draw, radians;
-    ``distances`` (…, n), metres (dimensionless for shape contexts).
+    ``indices`` (…, n) are those of the draws, ``views`` (…, n, 2) the best view of each draw in
+    radians, and ``distances`` (…, n) are in metres (dimensionless for shape contexts).
     """
 
     indices: np.ndarray
@@ -62,7 +62,7 @@ def retrieve(
 ) -> RetrievalResult:
     """Return the n draws with the smallest distance to each 2D pair over all views.
 
-    Projections are rigidly aligned in the image. Of repeated draws, only the first is considered.
+    Projections are rigidly aligned to the pair. Of identical draws, only the first is considered.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ def retrieve(
     skeleton : Skeleton
         Skeleton of the J joints.
     views : ndarray, (V, 2), optional
-        Views (φ, θ) in the local frame (eqs. 3-5), radians: :func:`view_grid` by default, or
-        :func:`views_around` an estimate.
+        Views (φ, θ) in the local frame (eqs. 3-5), radians. Default: :func:`view_grid`. Use
+        :func:`views_around` if an estimate of the view is available.
     visible : ndarray of bool, (…, J), optional
         Mask of annotated joints; all by default.
     n : int

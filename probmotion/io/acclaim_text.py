@@ -16,7 +16,7 @@ Line = tuple[int, list[str]]
 
 @dataclass(frozen=True)
 class AcclaimText:
-    """Nonblank lines of a text file, without comments, and its number of lines ``length``."""
+    """Nonblank ``lines`` of a text file, without comments, and its line count ``length``."""
 
     file: str
     lines: list[Line]

@@ -2,7 +2,7 @@
 
 A bone with axes C (:mod:`probmotion.io.asf`) and channel rotation M is rotated by C M C⁻¹ relative
 to its parent; the first channel listed is applied first. The end of a bone is the end of its
-parent plus the rotated bone.
+parent plus the rotated offset of the bone.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def read_amc(
         ASF file of the skeleton. Default: the file in the same folder named after the motion or
         its subject (``02.asf`` for ``02_01.amc``).
     fps : float
-        Frames per second, which files rarely declare: 120 for most of the CMU database, 60 for
-        some of it. If the file declares another rate, an error is raised.
+        Frames per second, which files rarely declare. Most files of the CMU database have 120, some
+        have 60. An error is raised if the file declares another rate.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def _check_declarations(text: AcclaimText, fps: float) -> None:
 
 
 def _frames(text: AcclaimText, body: AcclaimSkeleton) -> list[dict[str, list[float]]]:
-    """Return the channel values of every frame by joint."""
+    """Return the channel values of every frame, by joint name."""
     names = body.skeleton.joint_names
     counts = {
         name: len(channels) for name, channels in zip(names, body.channels, strict=True) if channels

@@ -1,8 +1,8 @@
 """Reader of ASF skeleton files.
 
 A bone extends from its parent's end along a world direction in the rest pose and rotates about its
-own axes: the world axes rotated by C. A joint is the end of the bone with the same name; ``root``
-is the origin. Files are Y up, right-handed.
+own axes: the world axes rotated by C. A joint is the end of the bone with the same name. The
+joint ``root`` is at the origin. Files are Y up, right-handed.
 
 Source: M. Meredith and S. Maddock, "Motion capture file formats explained" (2001).
 """
@@ -21,7 +21,7 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["AcclaimSkeleton", "read_asf"]
 
-_INCH = 0.0254
+_INCH = 0.0254  # metres
 _ROOT = "root"
 _ROTATIONS = ("RX", "RY", "RZ")
 _TRANSLATIONS = ("TX", "TY", "TZ")
@@ -75,7 +75,7 @@ def read_asf(path: str | Path) -> AcclaimSkeleton:
     ------
     MotionFileError
         If the file is truncated, damaged or of another format, or uses unsupported features:
-        radians, a root away from the origin, another axis order than XYZ, or translating bones.
+        radians, a root away from the origin, an axis order other than XYZ, or translating bones.
     """
     text = AcclaimText.of(Path(path))
     sections = _sections(text)
@@ -144,7 +144,7 @@ def _unit(text: AcclaimText, entries: dict[str, Line]) -> float:
 def _root(text: AcclaimText, entries: dict[str, Line]) -> _Bone:
     """Return the root as a bone of length 0 at the origin."""
     for name in ("position", "orientation"):
-        # Programs disagree on whether motions are relative to these.
+        # Programs disagree on whether motions are relative to the position and orientation.
         line, words = entries.get(name, (0, ["0"] * 3))
         if any(text.numbers(line, name, words, 3)):
             text.fail(line, f"{name} must be 0 0 0, got {' '.join(words)[:60]}")
@@ -154,7 +154,7 @@ def _root(text: AcclaimText, entries: dict[str, Line]) -> _Bone:
 
 
 def _add_bones(text: AcclaimText, lines: list[Line], bones: dict[str, _Bone]) -> None:
-    """Add the bones of ``:bonedata`` by name."""
+    """Add the bones of ``:bonedata`` to ``bones``, by name."""
     begun: int | None = None
     entries: dict[str, Line] = {}
     for line, words in lines:
@@ -198,7 +198,7 @@ def _bone(text: AcclaimText, begun: int, entries: dict[str, Line]) -> _Bone:
     angles = np.deg2rad(text.numbers(line, "axis", words[:3], 3))
     line, words = entries.get("dof", (begun, []))
     channels = _channels(text, line, words, _ROTATIONS)
-    # Rotation about X first, about Z last.
+    # The axes are rotated about X first and about Z last.
     return _Bone(begun, direction * length, euler_to_matrix(angles[::-1], "ZYX"), channels)
 
 

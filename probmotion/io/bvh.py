@@ -1,9 +1,9 @@
 """Reader of BVH motion files.
 
-The world transform of a joint is that of its parent times its translation times the rotations of
-its channels in the order listed, outermost first. A position channel replaces the offset
-along its axis, on roots and on other joints, as in Blender's importer. BVH specifies no unit or
-axes; files are Y up, right-handed, and the unit is inferred.
+The world transform of a joint is the matrix product of its parent's world transform, its
+translation and its channels' rotations, from left to right in the order listed. Position channels
+replace the joint's offset along their axes, as in Blender's importer. BVH specifies no unit or
+axes: files are read as Y up, right-handed, and the unit is inferred.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from probmotion.validation import check_positive
 
 __all__ = ["read_bvh"]
 
-_UNITS = {
+_UNITS = {  # metres per unit
     "metres": 1.0,
     "1/0.45 inch, as in conversions of the CMU database": 0.0254 / 0.45,
     "centimetres": 0.01,
@@ -40,9 +40,9 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     path : str or Path
         BVH file.
     scale : float, optional
-        Metres per unit of the file. Default: inferred among metres, centimetres, millimetres and
-        the CMU database's 1/0.45 inch, so that the longest chain of bones is closest to 2.4 m
-        (foot to hand of an adult), with a :class:`MotionFileWarning` if it is not metres.
+        Metres per unit of the file. Default: the one of metres, centimetres, millimetres and the
+        CMU database's 1/0.45 inch for which the longest chain of bones is closest to 2.4 m (foot to
+        hand of an adult). A :class:`MotionFileWarning` is issued if it is not metres.
     end_sites : bool
         Whether to include End Sites as joints, named after their parent plus ``_end``.
 
@@ -56,7 +56,7 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     Raises
     ------
     MotionFileError
-        If the file is truncated, out of order or damaged.
+        If the file is truncated, damaged or of another format.
     ValueError
         If ``scale`` is not above 0.
     """

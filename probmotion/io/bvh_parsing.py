@@ -53,7 +53,7 @@ class BVHContent:
 def parse_bvh(content: bytes, file: str) -> BVHContent:
     r"""Parse a BVH file in UTF-8 or else Latin-1; ``file`` is its name in error messages.
 
-    Lines may end in ``\\n``, ``\\r\\n`` or ``\\r``, blank lines are skipped and keywords are
+    Lines may end in ``\n``, ``\r\n`` or ``\r``. Blank lines are skipped. Keywords are
     case-insensitive. A name extends to the end of the line or a brace.
     """
     return _Parser(content, file).parse()
@@ -204,8 +204,8 @@ class _Parser:
     def frame_rate(self, line: int, text: str) -> float:
         """Return frames per second.
 
-        A frame time that equals that of an integer rate within its last printed digit (and 0.15 %),
-        such as 0.033333 s, is read as that rate.
+        A frame time such as 0.033333 s is read as an integer rate if both agree to the last printed
+        digit and to 0.15 %.
         """
         frame_time = self.number(line, text)
         least, most = FRAME_TIMES

@@ -15,9 +15,9 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["write_bvh"]
 
-_ORDER = "ZYX"
-_DECIMALS = 8
-_TOLERANCE = 1e-6  # metres; larger than the rounding of constant bones in float32 files, 1e-7 m
+_ORDER = "ZYX"  # order of the rotation channels
+_DECIMALS = 8  # of offsets and channel values
+_TOLERANCE = 1e-6  # metres; larger than the rounding of bone lengths in float32 files, 1e-7 m
 
 
 def write_bvh(motion: Motion, path: str | Path) -> None:
@@ -26,7 +26,7 @@ def write_bvh(motion: Motion, path: str | Path) -> None:
     A motion without rotations is written with rotations fitted to its positions. If rotations and
     constant offsets reproduce all positions to 1e-6 m, joints have rotation channels only.
     Otherwise every joint also has position channels, which replace its offset, as in Blender. Both
-    files reproduce positions to 1e-6 m when read with ``scale=1``. Joints are written depth first,
+    kinds reproduce positions to 1e-6 m when read with ``scale=1``. Joints are written depth first,
     with a ``ROOT`` block for each root.
 
     Raises

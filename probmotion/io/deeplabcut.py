@@ -1,8 +1,8 @@
 """Reader of DeepLabCut CSV tables with keypoint tracks of one or several animals.
 
-The header rows are ``scorer``, ``individuals`` (for several animals), ``bodyparts`` and ``coords``:
-x, y and, except in manually labelled data, likelihood. The first column is the frame number or the
-image path, which newer labelled tables split into three columns. Source: DeepLabCut user guide.
+The header rows are ``scorer``, ``individuals`` (for several animals), ``bodyparts`` and ``coords``.
+Coordinates are x, y and, except in manually labelled data, likelihood. The first column is the
+frame number or image path, which newer labelled tables split into three. Source: DeepLabCut guide.
 
 Empty and NaN cells become NaN keypoints with confidence 0. Labelled keypoints have confidence 1.
 The individual ``single`` contains points outside animals, such as the corners of a box.
@@ -26,8 +26,8 @@ from probmotion.validation import check_positive
 
 __all__ = ["read_deeplabcut"]
 
-_NO_ANIMAL = "single"
-_MISSING = frozenset(("", "nan", "NaN"))
+_NO_ANIMAL = "single"  # individual of the points outside animals
+_MISSING = frozenset(("", "nan", "NaN"))  # cells without a value
 
 Rows = list[tuple[int, list[str]]]
 """Line numbers and cells of the nonempty rows."""
@@ -54,7 +54,7 @@ def read_deeplabcut(
     -------
     tracks : list of KeypointTrack
         One per animal and video, over all frames of the table. Points outside animals (``single``)
-        form a separate track, which is dropped if they lack joints of ``skeleton``.
+        form a separate track, which is dropped if it lacks a joint of ``skeleton``.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _rows(path: Path) -> Rows:
 
 
 def _header(rows: Rows, path: Path) -> tuple[int, dict[str, dict[str, Columns]], Rows]:
-    """Return the number of index columns, the columns of body parts by animal, and the data."""
+    """Return the number of index columns, the columns of body parts by animal and the data rows."""
     names = [row[0].strip().lower() for _, row in rows[:4]]
     several = names[1:2] == ["individuals"]
     expected = ["scorer", *["individuals"] * several, "bodyparts", "coords"]

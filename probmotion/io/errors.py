@@ -56,7 +56,7 @@ def errors_in(where: object) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a file; raise :class:`MotionFileError` if it cannot be read."""
+    """Return a file's content; raise :class:`MotionFileError` if it exists but is unreadable."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -68,7 +68,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def decoded_lines(content: bytes) -> list[str]:
-    """Return the lines of a UTF-8 or else Latin-1 text, with any line endings."""
+    """Return the lines of a text in UTF-8 (or else Latin-1) with any line endings."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:

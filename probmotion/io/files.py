@@ -26,7 +26,7 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
     Parameters
     ----------
     path : str or Path
-        Motion file; an ``.amc`` requires its ``.asf`` skeleton in the same folder.
+        Motion file; an ``.amc`` file requires its ``.asf`` skeleton in the same folder.
     fps : float, optional
         Frames per second to resample to; the file's rate by default.
 
@@ -144,12 +144,12 @@ def load_all(
     paths : str, Path or iterable of them
         Files, or patterns such as ``"walks/*.bvh"``.
     fps : float, optional
-        Frames per second to resample to.
+        Frames per second to resample to; the rate of each file by default.
 
     Raises
     ------
     FileNotFoundError
-        If a pattern matches no file.
+        If a pattern matches no file or a file does not exist.
     """
     return [load(path, fps) for path in files_named(paths)]
 

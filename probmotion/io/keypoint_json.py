@@ -4,18 +4,18 @@
 format                 content
 =====================  ==========================================================================
 COCO annotations       ``{"images": […], "annotations": [{"image_id", "keypoints", …}], …}``
-COCO results,          ``[{"image_id": "12.jpg", "keypoints": [x, y, confidence, …], "idx": 1},
-AlphaPose              …]``
+COCO results           ``[{"image_id": "12.jpg", "keypoints": [x, y, confidence, …]}, …]``
+AlphaPose              as COCO results, with the track id in ``"idx"``
 AlphaPose "open",      ``{"12.jpg": {"people": [{"pose_keypoints_2d": […]}]}, …}``,
 AlphaPose "cmu"        ``{"12.jpg": {"bodies": [{"joints": […]}]}, …}``
 OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": […]}]}``, one per
                        frame; one such file; or a list of frames in one file
 =====================  ==========================================================================
 
-Frames are the images listed in the file (COCO annotations, OpenPose). Results list only images with
-a detection; the frame is the last number in the image's name, and tracks include all frames between
-the first and the last. Keypoints of confidence 0 are NaN. The visibility v of COCO annotations
-becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible.
+In COCO annotations and OpenPose files, the listed images are the frames. The other formats list
+only images with a detection: the frame is the last number in the image's name, and tracks include
+all frames from the first to the last. Keypoints of confidence 0 are NaN. The visibility v of COCO
+annotations becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["read_keypoint_json"]
 
-_BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}
-_TWO_LAYOUTS = {25: " ('body25' or 'body25b')"}
+_BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}  # presets
+_TWO_LAYOUTS = {25: " ('body25' or 'body25b')"}  # ambiguous keypoint counts
 
 
 def read_keypoint_json(
@@ -64,9 +64,9 @@ def read_keypoint_json(
     fps : float
         Frames per second, which these files do not contain.
     skeleton : Skeleton or str, optional
-        The detector's keypoints in its order, or the name of a preset. Default: the COCO
-        ``categories``, or else by count: 16 AlphaPose, 17 COCO, 18 OpenPose, 26 Halpe; 25 is
-        ambiguous.
+        The detector's keypoints in its order, or the name of a preset. Default: the keypoints of
+        the COCO ``categories``, or else the preset with as many keypoints (16 AlphaPose, 17 COCO,
+        18 OpenPose, 26 Halpe); 25 keypoints are ambiguous.
     people : int, optional
         Number of people to track between images in a file without track ids; see
         :func:`~probmotion.io.keypoint_linking.link_people`.
@@ -83,7 +83,7 @@ def read_keypoint_json(
         If the file contains no keypoint tracks or is damaged.
     ValueError
         If ``fps`` is not above 0, ``skeleton`` is an unknown name, or ``people`` exceeds
-        the largest number in an image.
+        the largest number of people in an image.
     """
     path = Path(path)
     check_positive("fps", fps)

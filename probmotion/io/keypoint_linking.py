@@ -15,11 +15,11 @@ __all__ = ["link_people"]
 def link_people(detections: Sequence[Detection], people: int) -> list[Detection]:
     """Return the detections of ``people`` people, with track ids ``"0"``, ``"1"``, …
 
-    Tracking starts at a video's first image with at least that many people, where the most
-    confident detections are numbered from left to right, and proceeds forwards and backwards. In
-    every other image, detections are assigned to people by the minimum total keypoint distance from
-    positions extrapolated at constant velocity (Hungarian method). Other detections are dropped.
-    People who swap positions during occlusion may be confused.
+    Tracking starts at the first image of a video with at least ``people`` detections and proceeds
+    forwards and backwards. In this image, the most confident detections are numbered from left to
+    right. In every other image, the Hungarian method assigns detections to people: it minimises
+    the total distance to keypoints extrapolated at constant velocity. Unassigned detections are
+    dropped. People who swap positions during occlusion may be confused.
     """
     videos: dict[str, dict[int, list[Detection]]] = {}
     for detection in detections:
@@ -48,7 +48,7 @@ def link_people(detections: Sequence[Detection], people: int) -> list[Detection]
 
 
 def _expected(last: Detection, before: Detection | None, frame: int) -> np.ndarray:
-    """Return a person's keypoints in ``frame``, extrapolated at the velocity of their mean."""
+    """Return keypoints (J, 3) of a person, moved to ``frame`` at the velocity of their mean."""
     values = last.values.copy()
     if before is not None:
         step = _middle(last.values) - _middle(before.values)
@@ -58,7 +58,7 @@ def _expected(last: Detection, before: Detection | None, frame: int) -> np.ndarr
 
 
 def _assigned(detections: list[Detection], expected: list[np.ndarray]) -> dict[int, Detection]:
-    """Return the detections assigned to people, by the number of the person."""
+    """Return the detection assigned to each person, by index of the person."""
     from scipy.optimize import linear_sum_assignment
 
     cost = np.array([[_distance(where, one.values) for one in detections] for where in expected])
@@ -66,7 +66,7 @@ def _assigned(detections: list[Detection], expected: list[np.ndarray]) -> dict[i
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the mean distance of common keypoints, or of the mean keypoints if none is common."""
+    """Return the mean distance of keypoints detected in both, else of the mean keypoints."""
     both = (first[:, 2] > 0) & (second[:, 2] > 0)
     if not both.any():
         return float(np.linalg.norm(_middle(first) - _middle(second)))

@@ -16,14 +16,14 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["Detection", "Frames", "frame_number", "keypoint_values", "natural", "tracks_of"]
 
-_LONGEST_TRACK = 500_000
+_LONGEST_TRACK = 500_000  # frames
 
 
 @dataclass(frozen=True)
 class Detection:
     """Keypoints of one person in one image: ``values`` (J, 3) are x, y and confidence.
 
-    ``person`` is the track id, None if missing; ``where`` is the location in error messages.
+    ``person`` is the track id, None if missing; error messages give the location ``where``.
     """
 
     video: str
@@ -34,7 +34,7 @@ class Detection:
 
 
 Frames = dict[str, range]
-"""Range of the frame numbers of each video."""
+"""Range of frame numbers of each video, by the name of the video."""
 
 
 def keypoint_values(value: Any, where: str) -> np.ndarray:
@@ -91,10 +91,10 @@ def tracks_of(
     fps: float,
     file: Path,
 ) -> list[KeypointTrack]:
-    """Return one track per video and person, sorted by both.
+    """Return one track per video and person, sorted by video, then by person.
 
-    Tracks span all frames of their video, by default from the first to the last detection;
-    keypoints of missing detections are NaN with confidence 0.
+    Tracks span the ``frames`` of their video, by default from the first to the last detection.
+    Keypoints of missing detections are NaN with confidence 0.
     """
     unnamed = sum(detection.person is None for detection in detections)
     if 0 < unnamed < len(detections):

@@ -17,8 +17,8 @@ key                     shape                       meaning
 ``name``                (), optional                name of the clip
 ======================  ==========================  ================================================
 
-Keys of a track: ``keypoints`` (L, J, 2) and ``confidence`` (L, J), or (V, L, J, 2) and (V, L, J)
-with V ``camera_names``; ``fps``, ``joint_names`` and ``parents``. Other keys are ignored.
+Keys of keypoint tracks: ``keypoints`` (L, J, 2) and ``confidence`` (L, J), with a leading axis V
+for V ``camera_names``; ``fps``, ``joint_names`` and ``parents``. Other keys are ignored.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def read_npz(path: str | Path) -> Motion:
     """Read a motion from an ``.npz`` archive.
 
-    Several people share one skeleton, with a root for each and joints named ``person:joint``. Z-up
-    worlds are rotated to Y up about the x axis. Joints without a position in any frame are dropped
-    with a :class:`MotionFileWarning`.
+    Several people form one skeleton, with one root per person and joints named ``person:joint``.
+    Z-up positions are rotated to Y up about the x axis. Joints without a position in any frame are
+    dropped with a :class:`MotionFileWarning`.
 
     Raises
     ------
@@ -172,14 +172,14 @@ class Archive:
         return array
 
     def points(self, key: str, shapes: str) -> np.ndarray:
-        """Return a nonempty array of one of the two ``shapes``, with three or four axes."""
+        """Return a nonempty array with three or four axes, of one of the two ``shapes``."""
         array = self.numbers(key)
         if array.ndim not in (3, 4) or array.shape[-1] != int(shapes[-2]) or 0 in array.shape:
             self.fail(f"{key} must have nonempty shape {shapes}, got {array.shape}")
         return array
 
     def names(self, key: str, kind: str | None, count: int) -> list[str]:
-        """Return ``count`` names; with a kind, the default is ``person0``, ``person1``, …"""
+        """Return ``count`` names; if the key is missing, ``kind`` followed by 0, 1, …"""
         if kind is not None and key not in self.keys:
             return [f"{kind}{index}" for index in range(count)]
         array = self.array(key)
@@ -188,7 +188,7 @@ class Archive:
         return array.tolist()
 
     def word(self, key: str, default: str) -> str:
-        """Return the string of ``key``, ``default`` if it is missing."""
+        """Return the string of ``key``, or ``default`` if the key is missing."""
         if key not in self.keys:
             return default
         array = self.array(key)
@@ -212,7 +212,7 @@ class Archive:
             return Skeleton(names, [int(parent) for parent in parents], radii)
 
     def turn_to_y_up(self) -> np.ndarray | None:
-        """Return the rotation from the file's world to Y up, None for the identity."""
+        """Return the rotation from the file's axes to Y up; None for the identity."""
         up = self.word("up_axis", "y").lower()
         if up not in ("y", "z"):
             self.fail(f"up_axis must be 'y' or 'z', got {shortened(up)}")
@@ -221,7 +221,7 @@ class Archive:
         return _Z_UP_TO_Y_UP if up == "z" else None
 
     def kinematics(self, frames: int, n_joints: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return rotations and rest offsets, None if the file has none."""
+        """Return rotations and rest offsets; both are None if the file has no rotations."""
         if "rotations" not in self.keys:
             return None, None
         rotations, rest_offsets = self.numbers("rotations"), self.numbers("rest_offsets")

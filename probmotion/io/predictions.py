@@ -1,4 +1,4 @@
-"""Reader of 3D motions predicted by another program, as an ``.npz`` archive.
+"""Reader of 3D motions predicted by another program, from ``.npz`` archives.
 
 =================  =========================  =====================================================
 key                shape                      meaning
@@ -33,11 +33,11 @@ def read_predictions(
     Parameters
     ----------
     path : str or Path
-        Archive with the keys of the module docstring.
+        An ``.npz`` archive with the keys listed in the module docstring.
     skeleton : Skeleton
         Skeleton of the J joints to return, matched by name or canonical name.
     frames : int, optional
-        Split every motion into windows of this length and drop the remainder; by default,
+        Length of the windows into which motions are split; the remainder is dropped. By default,
         motions are not split.
     fps : float, optional
         Frames per second to resample to before splitting; the file's rate by default.
@@ -76,7 +76,7 @@ def read_predictions(
 
 
 def _motions(archive: Archive) -> list[Motion]:
-    """Return the file's motions, Y up, on a skeleton without bones."""
+    """Return the motions of the file, Y up, on a skeleton without bones."""
     positions = archive.points("positions", "(L, J, 3) or (N, L, J, 3)")
     n_joints = positions.shape[-2]
     boneless = Skeleton(archive.names("joint_names", None, n_joints), [-1] * n_joints)

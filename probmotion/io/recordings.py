@@ -1,7 +1,7 @@
 """Reader of multi-camera recordings of one person, triangulated for denoising.
 
-Detections and their errors are real. The ground truth is unknown; the filtered 3D joints of the
-recording, computed from the same detections, are provided for comparison.
+Detections and their errors are real, and the ground truth is unknown. For comparison, a recording
+contains filtered 3D joints, computed from the same detections.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["Recording", "read_recording"]
 
-_FIXED_POINT_STEPS = 5
+_FIXED_POINT_STEPS = 5  # of the inversion of lens distortion
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class Recording:
     def seen(self) -> np.ndarray:
         """Mask of triangulated joints, (L, J).
 
-        Detection confidence does not indicate their quality: its correlation with the distance
-        between triangulated and filtered joints is -0.02.
+        Detection confidence does not indicate the quality of joints: its correlation with the
+        distance between triangulated and filtered joints is -0.02.
         """
         return np.isfinite(self.joints).all(axis=-1)
 
@@ -71,11 +71,11 @@ def read_recording(
     Parameters
     ----------
     path : str or Path
-        An ``.npz`` with ``keypoints`` (V, L, J, 2), ``confidence`` (V, L, J), ``positions`` and the
-        cameras' ``K``, ``R``, ``t`` and ``distortion``.
+        An ``.npz`` with ``keypoints`` (V, L, J, 2), ``confidence`` (V, L, J), filtered
+        ``positions`` (L, J, 3) and the cameras' parameters ``K``, ``R``, ``t``, ``distortion``.
     skeleton : Skeleton, optional
-        Joints to return, ``person14`` by default; a missing pelvis or neck is replaced by the
-        midpoint of the hips or shoulders.
+        Skeleton of the joints to return, ``person14`` by default; the midpoint of the hips or
+        shoulders replaces a missing pelvis or neck.
     fps : float, optional
         Frames per second to resample to; None for the file's rate.
     threshold : float
@@ -116,7 +116,7 @@ def read_recording(
 def _weights(
     archive: Archive, keypoints: np.ndarray, confidence: np.ndarray, threshold: float
 ) -> np.ndarray:
-    """Return the confidences of at least ``threshold``, (V, L, J), 0 elsewhere."""
+    """Return the confidences (V, L, J), with 0 for those below ``threshold``."""
     if not np.isfinite(confidence).any():
         archive.fail("confidence must contain numbers, got only NaN")
     weights = np.where(confidence >= threshold, confidence, 0.0)
@@ -131,7 +131,7 @@ def _weights(
 
 
 def _calibration(archive: Archive, n_views: int) -> tuple[Cameras, np.ndarray, np.ndarray]:
-    """Return the cameras, K and distortion."""
+    """Return the cameras, the intrinsics K (V, 3, 3) and the distortion (V, 4)."""
     shapes = {"K": (3, 3), "R": (3, 3), "t": (3,), "distortion": (4,)}
     K, R, t, distortion = (archive.numbers(key) for key in shapes)
     with errors_in(f"{archive.path}: K, R, t and distortion must describe cameras"):
@@ -143,9 +143,9 @@ def _calibration(archive: Archive, n_views: int) -> tuple[Cameras, np.ndarray, n
 
 
 def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarray) -> np.ndarray:
-    """Return the points (L, J, 3) of keypoints (V, L, J, 2) in at least two cameras, NaN elsewhere.
+    """Triangulate keypoints (V, L, J, 2) seen by at least two cameras; other points are NaN.
 
-    Keypoints of weight 0, (V, L, J), are ignored.
+    Returns points (L, J, 3). Keypoints with weight 0 in ``weights`` (V, L, J) are ignored.
     """
     seen = (weights > 0).sum(axis=0) >= 2
     points = np.full((*seen.shape, 3), np.nan)
@@ -158,14 +158,14 @@ def triangulate_seen(keypoints: np.ndarray, cameras: Cameras, weights: np.ndarra
 def undistorted(
     keypoints: np.ndarray, K: np.ndarray, distortion: np.ndarray, cameras: Cameras
 ) -> np.ndarray:
-    """Return pixels (V, L, J, 2) as projected by pinhole cameras with the intrinsics of `cameras`.
+    """Remove lens distortion: return pixels (V, L, J, 2) of the pinhole ``cameras``.
 
-    A lens with intrinsics K (V, 3, 3) and coefficients k₁, k₂, p₁, p₂ (V, 4) maps normalised
-    coordinates (x, y), with r² = x² + y², to
+    A lens with coefficients k₁, k₂, p₁, p₂ (V, 4) maps normalised x, with r² = x² + y², to
 
-        x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²), and with y and x, p₁ and p₂ exchanged,
+        x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²),
 
-    which is inverted by fixed-point iteration. Source: OpenCV's documentation of the pinhole model.
+    and likewise y, with p₁ and p₂ exchanged (OpenCV's documentation of the pinhole model).
+    Intrinsics ``K`` (V, 3, 3) normalise keypoints; fixed-point iteration inverts the map.
     """
     assert cameras.centre is not None
     focal, centre = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
@@ -185,7 +185,7 @@ def undistorted(
 def _converted(
     joints: np.ndarray, source: Skeleton, target: Skeleton, rate: float, new_rate: float
 ) -> np.ndarray:
-    """Return joints (L, J, 3), NaN where occluded, on another skeleton and at another rate."""
+    """Retarget joints (L, J, 3), NaN where occluded, and resample them to another frame rate."""
     weights = np.isfinite(joints).all(axis=-1).astype(np.float64)
     joints, weights = joints_on_skeleton(joints, weights, source, target)
     return joints if new_rate == rate else joints_at_rate(joints, weights, rate, new_rate)[0]

@@ -16,10 +16,10 @@ __all__ = [
 
 
 def joint_errors(motions: Array, truth: Array) -> Array:
-    """Return distances per frame and joint, ``(…, L, J, 3), (L, J, 3) → (…, L, J)``.
+    """Return the error of each joint in each frame, ``(…, L, J, 3), (L, J, 3) → (…, L, J)``.
 
-    Their mean is the G-MPJPE; after :func:`aligned_by_root`, it is the MPJPE, and after
-    :func:`aligned_by_similarity`, the PA-MPJPE.
+    The mean of these distances is the global MPJPE (G-MPJPE) without alignment, the MPJPE after
+    :func:`aligned_by_root`, and the PA-MPJPE after :func:`aligned_by_similarity`.
     """
     xp = array_namespace(motions, truth)
     check_shape("motions", motions, ("…", *truth.shape))
@@ -48,9 +48,9 @@ def aligned_by_root(motions: Array, root: int = 0) -> Array:
 
 
 def aligned_by_similarity(motions: Array, truth: Array) -> Array:
-    """Return each frame aligned to the truth by a similarity, no reflection (Umeyama 1991).
+    """Align each frame to the truth by a similarity without reflection (Umeyama 1991).
 
-    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. If all joints coincide, they are only translated.
+    ``(…, L, J, 3), (L, J, 3) → (…, L, J, 3)``. Frames with coincident joints are only translated.
     """
     xp = array_namespace(motions, truth)
     check_shape("motions", motions, ("…", *truth.shape))
@@ -69,9 +69,9 @@ def aligned_by_similarity(motions: Array, truth: Array) -> Array:
 
 
 def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
-    """Return the mean error of the accelerations, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
+    """Return the mean acceleration error, m/s²: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
-    Accelerations are second differences and need at least three frames.
+    Accelerations are second differences in time, which require at least three frames.
     """
     check_positive("fps", fps)
     _check_frames(motions, truth)
@@ -81,8 +81,8 @@ def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
 def acceleration_ratio(motions: Array, truth: Array) -> Array:
     """Return the mean acceleration relative to the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
-    Plausible values are 0.5 to 2 (paper 001, appendix H.1): lower means oversmoothed, higher
-    means jittery. Raises ``ValueError`` below three frames or if the truth has no acceleration.
+    Plausible ratios are 0.5 to 2 (paper 001, appendix H.1); lower ones indicate oversmoothing,
+    higher ones jitter. ``ValueError``: fewer than three frames, or a truth without acceleration.
     """
     _check_frames(motions, truth)
     size = float(_mean_bend(truth))

@@ -14,12 +14,12 @@ __all__ = [
     "rhat_of_independent",
 ]
 
-# Above this dimension, only the principal coordinates are monitored.
+# Above this dimension, only principal coordinates are monitored.
 _FEW = 32
-_PRINCIPAL = 10
+_PRINCIPAL = 10  # number of principal coordinates
 # Relative standard deviation below which a coordinate counts as constant.
 _NOTHING = 1e-9
-# Minimum draws per chain for the ESS: shorter chains cannot reveal autocorrelation.
+# Minimum draws per chain for the effective sample size (ESS): fewer do not show autocorrelation.
 _TO_CORRELATE = 10
 # Number of simulated runs from which a quantile of R-hat is computed.
 _RUNS = 100
@@ -28,14 +28,13 @@ _RUNS = 100
 def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> dict[str, float]:
     """Return convergence diagnostics of a run; empty for independent draws.
 
-    ``rhat`` is the largest and ``ess_bulk`` and ``ess_tail`` are the smallest over ``values``
-    (chain, draw, n), by default :func:`monitored_coordinates` (Vehtari et al. 2021, ArviZ); R-hat
-    is NaN below 4 draws per chain; ESS is omitted below 10. ``acceptance`` is the mean and
-    ``divergent`` the number of divergent transitions.
+    ``rhat`` is the largest R-hat, ``ess_bulk`` and ``ess_tail`` are the smallest effective sample
+    sizes (ESS) over ``values`` (chain, draw, n), by default :func:`monitored_coordinates` (Vehtari
+    et al. 2021, ArviZ). With fewer than 4 draws per chain, R-hat is NaN; with fewer than 10, ESS is
+    omitted. ``acceptance`` is the mean acceptance rate, ``divergent`` counts divergent transitions.
 
-    Walkers of an ensemble are coupled, so ``ess_bulk`` is computed from the stored
-    ``autocorrelation_time`` (omitted if NaN). Only R-hat, with each ensemble as one chain, detects
-    ensembles in different modes.
+    The ``ess_bulk`` of an ensemble sampler, whose walkers are coupled, is computed from the stored
+    ``autocorrelation_time`` (omitted if NaN). Only R-hat detects ensembles in different modes.
     """
     if draws.independent:
         return {}
@@ -64,10 +63,10 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
 
 
 def principal_coordinates(values: np.ndarray) -> np.ndarray:
-    """Return the leading principal coordinates over all chains, at most 10.
+    """Return the leading principal coordinates of all chains together, at most 10.
 
-    ``(chain, draw, n) → (chain, draw, k)``, by decreasing variance; constant coordinates other than
-    the first are dropped.
+    ``(chain, draw, n) → (chain, draw, k)``, in order of decreasing variance. Constant coordinates
+    after the first are dropped.
     """
     flat = values.reshape(-1, values.shape[-1])
     left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
@@ -79,9 +78,9 @@ def principal_coordinates(values: np.ndarray) -> np.ndarray:
 def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: int = 0) -> float:
     """Return the ``level`` quantile of R-hat over converged runs.
 
-    R-hat is the largest over 33 coordinates, the maximum that is monitored, in 100 simulated runs
-    of ``chains`` chains with ``draws`` (at least 4) independent draws each. For short chains the
-    quantile is well above 1.
+    100 runs are simulated, each of ``chains`` chains with ``draws`` (at least 4) independent draws.
+    R-hat of a run is the largest over 33 coordinates, the most that are monitored. For short
+    chains, the quantile is well above 1.
     """
     from arviz_stats.base import array_stats
 
@@ -97,8 +96,8 @@ def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: i
 def monitored_coordinates(draws: MotionDraws) -> np.ndarray:
     """Return the coordinates that diagnostics monitor, (chain, draw, n).
 
-    θ, or the positions if θ is not stored, and the log density if stored. Above 32 dimensions, θ is
-    replaced by 10 principal coordinates, since the largest R-hat of many is always high.
+    They are θ, or positions if θ is not stored, and the log density if stored. Above 32 dimensions,
+    at most 10 principal coordinates replace θ, as the largest R-hat of many coordinates is high.
     """
     data = draws.dataset
     shape = (data.sizes["chain"], data.sizes["draw"])

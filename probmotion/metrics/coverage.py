@@ -12,7 +12,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["coverage", "nearest_draw_distances"]
 
-# Draws per block; their graphs fit in the cache of a core.
+# Draws per block; their interaction graphs fit in the cache of a core.
 _BLOCK = 256
 
 
@@ -22,19 +22,19 @@ def coverage(
     measure: str = "cartesian",
     counts: Sequence[int] | None = None,
 ) -> float | np.ndarray:
-    """Return C(G; S) = (1/|G|) Σ_g min_{s ∈ S} D(g, s) (eq. 13): lower is better.
+    """Return coverage ``C(G; S) = (1/|G|) Σ_g min_{s ∈ S} D(g, s)`` (eq. 13); lower is better.
 
     Parameters
     ----------
     ground_truth : ndarray, (G, J, 3)
-        Real poses, metres.
+        Real poses g, metres.
     draws : ndarray, (S, J, 3)
-        Draws, metres; may be a memory map. Repeated poses are evaluated once.
+        Draws s, metres; may be a memory map. Repeated poses are evaluated once.
     measure : str
-        Distance after the best rigid alignment of the two poses, one of
+        Distance D after the best rigid alignment of both poses, one of
         :data:`probmotion.interaction.geometry.pose_distances.MEASURES`.
     counts : sequence of int, optional
-        Numbers of leading draws, in any order, for which to compute the coverage.
+        Numbers of leading draws, in any order, for each of which coverage is computed.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def coverage(
 def nearest_draw_distances(
     ground_truth: np.ndarray, draws: np.ndarray, measure: str, counts: Sequence[int]
 ) -> np.ndarray:
-    """Return min_{s ≤ count} D(g, s), (len(counts), G); arguments as in :func:`coverage`."""
+    """Return min_{s ≤ count} D(g, s), (len(counts), G); for parameters, see :func:`coverage`."""
     check_measure(measure)
     ground_truth = np.asarray(ground_truth, dtype=np.float64)
     check_shape("ground_truth", ground_truth, ("G", "J", 3))
@@ -81,7 +81,7 @@ def nearest_draw_distances(
 
 
 def _first_seen(poses: np.ndarray, seen: set[bytes]) -> list[int]:
-    """Return the indices of new poses and add their 128-bit digests to ``seen``."""
+    """Return the indices of poses not in ``seen`` and add their 128-bit digests to it."""
     new = []
     for index, pose in enumerate(poses):
         digest = hashlib.blake2b(pose.tobytes(), digest_size=16).digest()

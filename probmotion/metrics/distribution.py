@@ -1,4 +1,4 @@
-"""Distances between draws and reference draws, flattened motions (n, D) in metres."""
+"""Distances between draws and reference draws, both flattened motions (n, D) in metres."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = [
 
 
 def random_directions(rng: np.random.Generator, n: int, dim: int) -> np.ndarray:
-    """Return n directions uniform on the sphere, (n, dim)."""
+    """Return n unit vectors, uniform on the sphere, (n, dim)."""
     check_count("n", n)
     directions = rng.standard_normal((n, dim))
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -30,8 +30,8 @@ def random_directions(rng: np.random.Generator, n: int, dim: int) -> np.ndarray:
 def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
     """Return the sliced 2-Wasserstein distance of two sets of equal size (Bonneel et al. 2015).
 
-    It is the root mean square, over ``directions`` (P, D), of the 2-Wasserstein distances of the
-    projections: ``(n, D), (n, D) → ()``, in any array library.
+    ``(n, D), (n, D) → ()``, in any array library: the root mean square of the 2-Wasserstein
+    distances between projections onto ``directions`` (P, D).
     """
     xp = array_namespace(x, y)
     check_shape("x", x, ("n", directions.shape[-1]))
@@ -44,9 +44,9 @@ def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
 def sliced_wasserstein_ratio(
     draws: Array, references: Sequence[Array], directions: np.ndarray
 ) -> float:
-    """Return the sliced Wasserstein distance to exact draws relative to that of two exact sets.
+    """Return the sliced Wasserstein distance to exact draws, relative to that of two exact sets.
 
-    A ratio of 1 means indistinguishable from exact draws.
+    The ratio is 1 for draws that cannot be distinguished from exact ones.
 
     Parameters
     ----------
@@ -66,14 +66,14 @@ def sliced_wasserstein_ratio(
 
 
 def trace_ratio(draws: Array, reference: Array) -> Array:
-    """Return tr Cov[draws] / tr Cov[reference], ``(n, D), (m, D) → ()``; < 1: overconfident."""
+    """Return tr Cov[draws] / tr Cov[reference], ``(n, D), (m, D) → ()``; overconfident if < 1."""
     return _total_variance(draws) / _total_variance(reference)
 
 
 def mean_error(draws: Array, reference: Array) -> Array:
     """Return ‖mean(draws) − mean(reference)‖ / √tr Cov[reference], ``(n, D), (m, D) → ()``.
 
-    It is about √(1/n + 1/m) for independent exact draws.
+    For independent exact draws, the error is about √(1/n + 1/m).
     """
     xp = array_namespace(draws, reference)
     difference = xp.mean(draws, axis=0) - xp.mean(reference, axis=0)
@@ -85,9 +85,9 @@ def precision_recall(
 ) -> tuple[float, float]:
     """Return precision and recall of k-nearest-neighbour manifolds (Kynkäänniemi et al. 2019).
 
-    Precision is the fraction of draws closer to any reference draw than its k-th neighbour, and
-    recall exchanges the roles. Both sets, (n, D) and (m, D), must have more than ``neighbours`` = k
-    points.
+    Precision is the fraction of draws that are closer to some reference draw than its k-th nearest
+    reference draw is. Recall exchanges the roles of the two sets, (n, D) and (m, D). Both sets must
+    have more than k = ``neighbours`` points.
     """
     for name, points in (("draws", draws), ("reference", reference)):
         if len(points) <= neighbours:
@@ -107,7 +107,7 @@ def _total_variance(points: Array) -> Array:
 
 
 def _radii(points: np.ndarray, neighbours: int) -> np.ndarray:
-    """Return the distance of each point to its k-th nearest neighbour, (n,)."""
+    """Return the distance of each point to its ``neighbours``-th nearest neighbour, (n,)."""
     distances = _distances(points, points)
     np.fill_diagonal(distances, math.inf)
     return np.partition(distances, neighbours - 1, axis=1)[:, neighbours - 1]

@@ -18,8 +18,8 @@ Angles = Literal["all", "side", "reference-code-side"]
 def random_azimuths(rng: np.random.Generator, n: int, angles: Angles = "all") -> np.ndarray:
     """Return the azimuths of n cameras, radians, (n,).
 
-    ``all``: uniform on the circle; ``side``: uniform on (π/4, 3π/4) (MAS, section 6.3);
-    ``reference-code-side``: π/2, as in the authors' code.
+    ``all``: uniform on the circle. ``side``: uniform on (π/4, 3π/4) (MAS, section 6.3).
+    ``reference-code-side``: always π/2, as in the code of the MAS authors.
     """
     check_count("n", n)
     if angles == "all":
@@ -42,14 +42,14 @@ def film_motions(
 ) -> np.ndarray:
     """Return one perspective view of each motion: ``(N, L, J, 3) → (N, L, J, 2)``.
 
-    Views are centred on the root in every frame, in metres at its depth, x right and y down.
+    Views have the root at the origin in every frame, x right and y down, metres at root depth.
 
     Parameters
     ----------
     positions : ndarray, (N, L, J, 3)
         Motions, metres.
     rng : Generator
-        Random generator of the azimuths, one per motion.
+        Random generator of the azimuths; one azimuth is drawn per motion.
     elevation : float
         Elevation of the cameras, radians.
     distance : float

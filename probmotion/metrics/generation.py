@@ -25,9 +25,9 @@ __all__ = [
     "frechet_distance",
 ]
 
-# Recall below which a generator counts as collapsed (MAS, table 2).
+# Recall below which a generator is considered collapsed (MAS, table 2).
 COLLAPSED_BELOW = 0.1
-_CHAMFER_FRAMES = 10  # as published
+_CHAMFER_FRAMES = 10  # frames per window (Sun et al. 2024)
 # Mean and standard deviation over repeats of each score.
 Scores = dict[str, tuple[float, float]]
 
@@ -45,21 +45,21 @@ class EncodesViews(Protocol):
         """Maximum number of frames of a motion."""
 
     def features(self, views: np.ndarray, lengths: np.ndarray | None = None) -> np.ndarray:
-        """Return features: ``(N, L, J, 2) → (N, D)``; views in metres, centred on the root."""
+        """Return features of views in metres, root at the origin: ``(N, L, J, 2) → (N, D)``."""
 
 
 def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
     """Return the squared Fréchet distance of the fitted Gaussians (Heusel et al. 2017, eq. 6).
 
-    ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½) of features (N, D) and (M, D). With C = RᵀR, the
-    last trace is the sum of the singular values of R_a R_bᵀ, stable even for fewer motions than
-    features. The bias of small sets is about tr C (D + 5) / (4 N) each, so compare generators at
-    equal sizes.
+    ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½) for features (N, D) and (M, D) of means μ and
+    covariances C = RᵀR. The trace of (C_a C_b)^½ is the sum of the singular values of R_a R_bᵀ,
+    also stable for fewer motions than features. Each set of N motions adds a bias of about
+    tr C (D + 5) / (4 N), so compare generators at equal sizes.
 
     Raises
     ------
     ValueError
-        If shapes disagree, a set has fewer than two motions or a number is not finite.
+        If shapes disagree, a set has fewer than two motions or a feature is not finite.
     """
     check_shape("a", a, ("N", "D"))
     check_shape("b", b, ("M", a.shape[1]))
@@ -76,15 +76,15 @@ def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _covariance_root(features: np.ndarray) -> np.ndarray:
-    """Return R with RᵀR the covariance."""
+    """Return R such that RᵀR is the covariance of the features."""
     centred = (features - features.mean(axis=0)) / math.sqrt(len(features) - 1)
     return np.linalg.qr(centred).R
 
 
 def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) -> float:
-    """Return the mean distance of ``pairs`` random pairs of motions, from features (N, D), N ≥ 2.
+    """Return the mean feature distance of random pairs of motions, from features (N, D), N ≥ 2.
 
-    Defined as in the MAS authors' code (200 pairs); the paper calls it the variance.
+    The definition is that of the MAS authors' code (200 pairs); the paper calls it the variance.
     """
     check_count("pairs", pairs)
     if len(features) < 2:
@@ -105,8 +105,8 @@ class GenerationReference:
     held_out_features : ndarray, (M, D)
         Features of real motions outside the training sets of generator and evaluator.
     learnt_features : ndarray, (M, D), optional
-        Features of the training clips. With few clips, held-out ones differ so much that no
-        generator scores well; see :meth:`of_learnt`.
+        Features of the training clips. With few training clips, held-out clips differ so much
+        that no generator scores well against them; see :meth:`of_learnt`.
     elevation : float
         Elevation of the cameras that view generated motions, radians.
     distance : float
@@ -135,7 +135,7 @@ class GenerationReference:
             check_finite("learnt_features", self.learnt_features)
 
     def of_learnt(self) -> GenerationReference:
-        """Return the reference with the training clips as real motions."""
+        """Return a reference with the training clips instead of held-out motions."""
         if self.learnt_features is None:
             raise ValueError("learnt_features must be given, got None")
         return replace(self, held_out_features=self.learnt_features)
@@ -151,31 +151,31 @@ class GenerationReference:
     ) -> Scores:
         """Return mean and standard deviation of the scores of 3D motions, (N, L, J, 3) metres.
 
-        - ``fid``: Fréchet distance of features; 0 is ideal
-        - ``diversity``: mean distance of two motions; ideally that of real motions
+        - ``fid``: squared Fréchet distance of features; 0 is ideal
+        - ``diversity``: mean feature distance of two motions; ideally that of real motions
         - ``precision``: fraction of generated motions on the manifold of real ones; 1 is best
         - ``recall``: fraction of real motions on the manifold of generated ones; 1 is best
 
-        Every repeat films up to ``samples`` motions from new azimuths; repeat r does not depend on
-        ``repeats``. The standard deviation (ddof 1) is that of one repeat and covers azimuths and
-        subsets, not training or the choice of held-out motions. (The MAS authors' code prints the
-        95 % interval of the mean, 1.96 standard deviations / √repeats.)
+        Every repeat films up to ``samples`` motions from new azimuths. The first repeats are the
+        same for any ``repeats``. The standard deviation (ddof 1) between repeats covers azimuths
+        and subsets, not training or the choice of held-out motions. (The MAS authors' code prints
+        the 95 % interval of the mean, 1.96 standard deviations / √repeats.)
 
-        Scores from the ``side`` require motions whose azimuth 0 is not a fixed body direction, such
-        as motions lifted from random views; if all motions face +Z, even real ones score badly.
+        Scores for ``angles="side"`` require motions with random headings, such as motions lifted
+        from random views. If all motions face +Z, even real motions have poor scores.
         """
         return self._score(positions, partial(self._film, angles=angles), seed, samples, repeats)
 
     def score_views(
         self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10
     ) -> Scores:
-        """Return the scores of 2D motions, (N, L, J, 2) metres, from subsets of ``samples``."""
+        """Return the scores of 2D motions, (N, L, J, 2) metres, in subsets of size ``samples``."""
         return self._score(views, lambda chosen, rng: chosen, seed, samples, repeats)
 
     def chamfer(self, positions: np.ndarray, *, seed: int) -> MotionChamfer:
         """Return the Motion Chamfer Distance of one view of each motion, (N, L, J, 3) metres.
 
-        Windows have 10 frames, or all frames of shorter motions. Requires ``held_out_views``.
+        Windows have 10 frames, or fewer if motions are shorter. Requires ``held_out_views``.
         """
         if self.held_out_views is None:
             raise ValueError("held_out_views must be given, got None")

@@ -1,7 +1,7 @@
 """Confidence intervals over seeds, and samplers statistically tied with the best.
 
-Samplers are compared on the same problem, reference draws and directions, seed by seed, so paired
-differences remove the variation between seeds.
+For each seed, samplers are compared on the same problem, reference draws and directions, so paired
+differences are free of the variation between seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TWO_ROUNDINGS = 1 / math.sqrt(6)
 
 
 def t_interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tuple[float, float]:
-    """Return Student's confidence interval of the mean of independent normal values.
+    """Return Student's confidence interval for the mean of independent normal values.
 
     Parameters
     ----------
@@ -56,29 +56,29 @@ def best_and_tied(
 ) -> tuple[str, set[str]]:
     """Return the best sampler and the set of samplers statistically tied with it, itself included.
 
-    The best has the lowest mean error over seeds. A sampler is worse if Student's interval of its
-    paired differences to the best, over common seeds, is above 0, at Holm's levels (Holm 1979):
-    the most significant of m at 1 − .05/m, the next at 1 − .05/(m − 1), and so on to the first that
-    includes 0. With one seed, all are tied. The standard deviation of differences is at least that
-    of two rounding errors of size ``step``.
+    The best has the lowest mean error over seeds. A sampler is worse if the Holm-corrected Student
+    interval of its paired differences to the best, over common seeds, is above 0 (Holm 1979). The
+    most significant of m differences has level 1 − .05/m, the next 1 − .05/(m − 1), and so on until
+    an interval includes 0. With one seed, all samplers are tied. The standard deviation of
+    differences is at least that of the difference of two values rounded to ``step``.
 
-    The truly best sampler is in the set with probability ≥ .95; among several equal samplers, the
-    set has only one with probability ≤ .05. Because the best is selected from the same values, the
-    probability that any of ten equal samplers is excluded is about .1.
+    The set contains the truly best sampler with probability ≥ .95. If several samplers are equal,
+    it contains only one with probability ≤ .05. Since the best is selected from the same values,
+    the probability that any of ten equal samplers is excluded is about .1.
 
     Parameters
     ----------
     values : mapping of str to sequence of float
         One value per seed for each sampler, seeds in the same order; NaN for a failed run. Samplers
-        without values or with an infinite error are excluded; one without all seeds is not best.
+        without values or with an infinite error are excluded. The best has no more NaN than others.
     target : float or None
-        Ideal value; the error is the distance to it. If None, the error is the value.
+        Ideal value; the error is the distance from it. If None, the value is the error.
     ratio : bool
-        Whether the distance is abs(log(value/target)).
+        Whether the distance is abs(log(value/target)) instead of abs(value − target).
     lower_is_better : bool
-        Direction of a measure without a target.
+        Whether lower values are better, if ``target`` is None.
     level : float
-        Joint confidence level.
+        Joint confidence level; the probabilities above are for .95.
     step : float
         Rounding step of the values; 0 if they are not rounded.
     """
@@ -132,7 +132,7 @@ def _errors(
 
 
 def _tail(differences: np.ndarray, least_spread: float) -> float:
-    """Return the one-sided p-value of the differences being above 0."""
+    """Return the p-value of the one-sided t-test that the mean difference is above 0."""
     from scipy import stats
 
     n = len(differences)

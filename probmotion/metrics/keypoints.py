@@ -1,6 +1,6 @@
 """Errors of predicted 2D keypoints (Sun et al. 2024, "Ponymation", sections 4.2.2 and 4.3).
 
-Keypoints are in any image unit, x right and y down.
+Keypoints have x right and y down, in any image unit.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def percentage_of_correct_keypoints(
     predicted, truth : ndarray, (…, L, J, 2)
         Keypoints; invisible ones may be NaN in the truth.
     size : float or ndarray
-        max(h, w) of the image in the keypoints' unit: one number, or one per sequence (…) or frame
-        (…, L); :func:`image_extent` for tracks without an image.
+        max(height, width) of the image in the unit of the keypoints: one value, or one per sequence
+        (…) or frame (…, L). For tracks without an image, use :func:`image_extent`.
     visible : ndarray of bool, (…, L, J), optional
         Mask of visible keypoints; all by default.
     threshold : float
@@ -64,7 +64,7 @@ def percentage_of_correct_keypoints(
 def image_extent(keypoints: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
     """Return the longer side of the bounding box of each sequence: ``(…, L, J, 2) → (…)``.
 
-    The box contains the visible keypoints of all frames; one side must be above 0.
+    The box contains the visible keypoints of all frames; its longer side must be above 0.
     """
     seen = _check_keypoints(keypoints, keypoints, visible, ("keypoints", "keypoints"))[..., None]
     low = np.where(seen, keypoints, np.inf).min(axis=(-3, -2))
@@ -83,9 +83,9 @@ def velocity_error(
 ) -> float:
     """Return the relative error of the keypoints' displacements between frames.
 
-    (1/T) Σ_t ‖δ̂_t − δ_t‖ / ‖δ_t‖ (section 4.2.2), averaged over sequences, where δ_t stacks the
-    displacements of all keypoints visible in both frames. Frames with δ_t = 0 are skipped. A static
-    prediction has error 1.
+    It is (1/T) Σ_t ‖δ̂_t − δ_t‖ / ‖δ_t‖ (section 4.2.2), averaged over sequences. δ̂_t and δ_t stack
+    the predicted and true displacements of all keypoints visible in both frames. Frames with
+    δ_t = 0 are skipped. A static prediction has error 1.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def fit_linear_map(
 ) -> np.ndarray:
     """Return weights W that map predicted joints to the keypoints of another skeleton.
 
-    W minimises Σ ‖W u − k‖² over visible keypoints, the same for x and y and all frames (section
-    4.2.2: "a linear transformation"). Apply it to views with the same centring: ``W @ u``.
+    W minimises Σ ‖W u − k‖² over frames with joints u and visible keypoints k (section 4.2.2: "a
+    linear transformation" of x and y). Apply ``W @ u`` only to views centred in the same manner.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def fit_linear_map(
     Returns
     -------
     ndarray, (K, J)
-        W; 0 for a joint that is at the origin in every frame.
+        Weights W, 0 for joints at the origin in every frame.
 
     Raises
     ------

@@ -32,52 +32,51 @@ _LIBRARIES = (
     "sklearn.model_selection", "sklearn.svm",
 )  # fmt: skip
 
-_DIRECTIONS = 256
-# Target number of exact draws, and maximum number of sets, each as large as the run.
+_DIRECTIONS = 256  # of the sliced Wasserstein distance
+# Target number of exact draws, and maximum number of sets of exact draws, each as large as a run.
 _ENOUGH, _MOST_SETS = 4000, 8
-_MILLIMETRES = 1000.0
-_SQUARE_CENTIMETRES = 1e4
-_MOST_DEGENERATE = 100
-_MOST_STEIN = 500
-_REAL_PAIRS = 5000
+_MILLIMETRES = 1000.0  # per metre
+_SQUARE_CENTIMETRES = 1e4  # per square metre
+_MOST_DEGENERATE = 100  # approximate maximum of draws tested for degenerate views
+_MOST_STEIN = 500  # maximum number of draws for the kernel Stein discrepancy
+_REAL_PAIRS = 5000  # pairs for the diversity of real motions
 
 
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
-    """Return every applicable metric, by name.
+    """Return all metrics that apply to a problem and a run, by name.
 
-    Against reference draws (exact or stored; aligned first if the problem requires it, except for
-    densities, styles and the manifold):
+    Comparison with reference draws, exact or stored. If the problem requires it, motions are
+    aligned first, except for densities, styles and the manifold:
 
     - ``swd_ratio``: sliced Wasserstein distance relative to that of two exact sets; 1 is ideal
     - ``variance_ratio``: trace of the covariance relative to the exact one; < 1: overconfident
     - ``mean_error_sd``: error of the mean in posterior standard deviations; 0 is ideal
     - ``off_manifold_ratio``: variance off the prior's manifold relative to exact draws; 1 is ideal
     - ``log_density_gap``: mean log density minus that of exact draws, nats; 0 is ideal
-    - ``mode_proportion_<style>`` and ``mode_proportions_tv``: proportion of each style, and total
-      variation distance from those of exact draws
-    - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3
+    - ``mode_proportion_<style>``: proportion of a style; ``mode_proportions_tv``: total variation
+      distance of the proportions from those of exact draws
+    - ``precision``, ``recall``: k-nearest-neighbour manifolds, k = 3; 1 is best
     - ``mmd``: squared maximum mean discrepancy, unbiased; 0 is ideal
     - ``c2st``: accuracy of a classifier between draws and reference draws; 0.5 is ideal
 
-    Against a differentiable density in θ, ``ksd``: squared kernel Stein discrepancy; 0 is ideal,
-    NaN if most draws are equal or the gradient is not finite.
+    Comparison with held-out real 2D motion (MAS, section 6.3), as means over random views:
 
-    In 2D, against held-out real motion (MAS, section 6.3), mean over random views: ``fid``,
-    ``diversity_ratio`` (relative to real motion), ``view_precision``, ``view_recall``; from the
-    side ``fid_side``, ``view_recall_side``; against the training clips ``fid_learnt``,
-    ``view_recall_learnt``; ``mcd_cm2``: Motion Chamfer Distance of 10-frame windows, cm², which
-    decreases with the number of draws.
+    - ``fid``, ``view_precision``, ``view_recall``, ``diversity_ratio`` (relative to real motion)
+    - ``fid_side``, ``view_recall_side``: side views; ``fid_learnt``, ``view_recall_learnt``:
+      comparison with the training clips
+    - ``mcd_cm2``: Motion Chamfer Distance of 10-frame windows, cm²; decreases with more draws
 
-    Against held-out poses ``coverage_interaction``, ``coverage_cartesian`` and
-    ``coverage_shape-context``: mean distance to the nearest draw
-    (:func:`~probmotion.metrics.coverage.coverage`). ``at_cap`` and ``near_floor``: fractions of
-    draws at the bounds of a truncated density; ``degenerate``: fraction of views of annotated draws
-    without a unique triangulation.
+    Other metrics:
 
-    Against the truth: :func:`accuracy_of`; in the images of 2D observations ``pck`` (at a tenth of
-    the image extent, %) and ``velocity_error`` of :mod:`probmotion.metrics.keypoints`, NaN if a
-    draw is behind a camera. Chains: :func:`~probmotion.metrics.chains.chain_diagnostics`. Cost:
-    ``seconds`` and evaluations.
+    - ``ksd``: squared kernel Stein discrepancy from a differentiable density in θ; 0 is ideal,
+      NaN if most draws are equal or the gradient is not finite
+    - ``coverage_<measure>``: mean distance of held-out poses to the nearest draw
+    - ``at_cap``, ``near_floor``: fractions of draws at the bounds of a truncated density
+    - ``degenerate``: fraction of views of annotated draws without a unique triangulation
+    - ``pck`` (at a tenth of the image extent, %), ``velocity_error``: 2D errors against the truth,
+      see :mod:`probmotion.metrics.keypoints`; NaN if a draw is behind a camera
+    - errors against the 3D truth (:func:`accuracy_of`), ``seconds``, evaluations and, for chains,
+      :func:`~probmotion.metrics.chains.chain_diagnostics`
 
     Parameters
     ----------
@@ -262,12 +261,12 @@ def accuracy_of(
 ) -> dict[str, float]:
     """Return errors against the truth, millimetres (accelerations: m/s²).
 
-    - ``mpjpe_mm``: mean over draws, after root alignment in every frame
-    - ``mpjpe_mean_mm``: of the mean draw; ``mpjpe_best_mm``: of the best draw
-    - ``mpjpe_visible_mm``, ``mpjpe_occluded_mm``: over observed or occluded joints
-    - ``g_mpjpe_mm``, ``g_mpjpe_mean_mm``, each also ``_visible``, ``_occluded``: without alignment
-    - ``pa_mpjpe_mm``: after similarity alignment per frame
-    - ``acceleration_error``; ``acceleration_ratio``: relative to the truth's, plausible 0.5 to 2
+    - ``mpjpe_mm``: mean joint error over draws, after root alignment in every frame
+    - ``mpjpe_mean_mm``: error of the mean of draws; ``mpjpe_best_mm``: error of the best draw
+    - ``mpjpe_visible_mm``, ``mpjpe_occluded_mm``: mean error of observed or occluded joints
+    - ``g_mpjpe_mm``, ``g_mpjpe_mean_mm``, each also ``_visible``, ``_occluded``: unaligned errors
+    - ``pa_mpjpe_mm``: mean joint error over draws, after similarity alignment of every frame
+    - ``acceleration_error``, ``acceleration_ratio`` (to the true acceleration; plausible 0.5 to 2)
     """
     root = posterior.skeleton.roots[0]
     target = accuracy.aligned_by_root(truth, root)
@@ -305,7 +304,7 @@ def accuracy_of(
 def _image_errors(
     positions: np.ndarray, truth: np.ndarray, posterior: MotionPosterior
 ) -> dict[str, float]:
-    """Return 2D errors against the projected truth."""
+    """Return the 2D errors of projected draws against the projected truth."""
     if not isinstance(posterior.likelihood, Keypoints2D):
         return {}
     cameras = posterior.likelihood.cameras
@@ -334,6 +333,6 @@ def visible_joints(posterior: MotionPosterior) -> np.ndarray | None:
 
 
 def load_libraries() -> None:
-    """Import the libraries of the metrics in advance, to exclude import times from run times."""
+    """Import the libraries of the metrics, so that timings of runs exclude imports."""
     for name in _LIBRARIES:
         import_module(name)

@@ -1,7 +1,7 @@
 """Motion Chamfer Distance between sets of 2D sequences.
 
-Sun et al. 2024 ("Ponymation", section 4.3 and appendix C): 1400 generated sequences of 10 frames,
-projected to 2D, against annotated ones.
+Sun et al. 2024 ("Ponymation", section 4.3 and appendix C) compare 1400 generated sequences of 10
+frames, projected to 2D, with annotated sequences.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["MotionChamfer", "motion_chamfer_distance"]
 
-# Products are padded to this size, so that rounding does not depend on the number of sequences.
+# Matrix products are padded to this size; rounding is then independent of the number of sequences.
 _BLOCK = 256
 
 
 class MotionChamfer(NamedTuple):
     """Both directions of a Motion Chamfer Distance, in squared keypoint units.
 
-    ``of_generated`` is the mean error from generated sequences to the nearest real one (fidelity),
-    ``of_real`` is the reverse (coverage).
+    ``of_generated`` is the mean error of generated sequences to the nearest real one (fidelity).
+    ``of_real`` is the mean error of real sequences to the nearest generated one (coverage).
     """
 
     of_generated: float
@@ -47,12 +47,12 @@ def motion_chamfer_distance(
 
         d(g, r) = 1/|T_r| Σ_{t ∈ T_r} 1/|V_rt| Σ_{j ∈ V_rt} ‖g_tj − r_tj‖²
 
-    with V_rt the keypoints of r visible in frame t, and T_r the frames with at least one.
-    Sequences are not aligned: centre and scale both sets in the same manner.
+    for a generated sequence g and a real one r. V_rt are the keypoints of r visible in frame t, T_r
+    the frames with visible keypoints. Centre and scale both sets alike; nothing is aligned here.
 
-    Sequences are split into windows of ``frames`` frames. All real windows form one set; the
-    distance is averaged over the window positions of the generated ones (appendix C), so that
-    longer sequences do not enlarge their set.
+    Sequences are split into windows of ``frames`` frames. All real windows form one set. The
+    generated windows at each position form one set, and distances are averaged over positions
+    (appendix C), so that longer sequences do not enlarge the set.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def motion_chamfer_distance(
 
 
 def _weights(seen: np.ndarray) -> np.ndarray:
-    """Return keypoint weights (M, L, J) that sum to 1 in every sequence."""
+    """Return the weights (M, L, J) of keypoints in d(g, r); they sum to 1 in every sequence."""
     in_frame = seen.sum(axis=2, keepdims=True)
     in_sequence = (in_frame > 0).sum(axis=1, keepdims=True)
     if not in_sequence.all():
@@ -107,7 +107,7 @@ def _weights(seen: np.ndarray) -> np.ndarray:
 def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
     """Return the mean nearest-neighbour errors in both directions.
 
-    The error of a pair is Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖², computed in blocks.
+    The error of a pair, Σ w ‖g‖² − 2 Σ w g·r + Σ w ‖r‖² with weights w, is computed in blocks.
     """
     of_generated, of_real = np.full(len(generated), np.inf), np.full(len(real), np.inf)
     constant = (weights * (real**2).sum(axis=-1)).sum(axis=(1, 2))
@@ -122,7 +122,7 @@ def _chamfer(generated: np.ndarray, real: np.ndarray, weights: np.ndarray) -> tu
             columns = slice(column, min(column + _BLOCK, len(real)))
             block = left @ _padded(right[columns]).T
             block = block[: rows.stop - row, : columns.stop - column] + constant[columns]
-            # Rounding errors may be negative for copies.
+            # Errors of identical sequences may be negative by rounding.
             block = np.maximum(block, 0.0)
             of_generated[rows] = np.minimum(of_generated[rows], block.min(axis=1))
             of_real[columns] = np.minimum(of_real[columns], block.min(axis=0))

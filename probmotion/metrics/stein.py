@@ -1,7 +1,7 @@
 """Kernel Stein discrepancy: goodness of fit of draws to an unnormalised density.
 
-It requires only the gradient of the log density. It is local: it does not detect wrong weights of
-well-separated modes.
+The discrepancy requires only the gradient of the log density. It is local: it does not detect wrong
+weights of well-separated modes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = ["NoGradient", "kernel_stein_discrepancy", "score_of"]
 
-_BATCH = 256
+_BATCH = 256  # draws per gradient evaluation
 
 
 class NoGradient(ValueError):  # noqa: N818 (a condition, not a fault)
@@ -30,25 +30,25 @@ def kernel_stein_discrepancy(
 ) -> float:
     """Return the squared kernel Stein discrepancy of draws from a density, unbiased; 0 is ideal.
 
-    It is the mean over pairs of different draws of (Liu et al. 2016, eqs. 9 and 14)
+    It is the mean, over pairs θ ≠ θ' of draws, of (Liu et al. 2016, eqs. 9 and 14)
 
-        s·s' k + s·∇'k + s'·∇k + tr ∇∇'k,    s = ∇ log p(θ), s' = ∇ log p(θ'),
+        h(θ, θ') = s·s' k + s·∇'k + s'·∇k + tr ∇∇'k,    s = ∇ log p(θ), s' = ∇ log p(θ'),
 
-    with the inverse multiquadric kernel k = (1 + ‖θ − θ'‖²/ℓ²)^(−1/2); a Gaussian kernel would not
+    with the inverse multiquadric kernel k = (1 + ‖θ − θ'‖²/ℓ²)^(−1/2). A Gaussian kernel would not
     detect divergent draws in three dimensions or more (Gorham and Mackey 2017, theorems 6 and 8).
-    It is computed on θ/ℓ, so it is invariant to the unit of θ.
+    The computation uses θ/ℓ, so the result does not depend on the unit of θ.
 
-    This is the U-statistic, with mean 0 for exact draws; it may be negative. The V-statistic has
-    mean E h(θ, θ)/n, which grows with the dimension.
+    This U-statistic has mean 0 for exact draws and may be negative. The V-statistic, which includes
+    θ = θ', would have mean E h(θ, θ)/n, which grows with the dimension.
 
     Parameters
     ----------
     theta : ndarray, (n, d)
         Draws, n ≥ 2.
     score : ndarray, (n, d)
-        ∇ log p at the draws (:func:`score_of`).
+        Gradients ∇ log p at the draws (:func:`score_of`).
     length_scale : float, optional
-        ℓ, in units of θ; by default the median distance between draws.
+        Length scale ℓ, in units of θ; by default the median distance between draws.
     """
     check_shape("score", score, np.shape(theta))
     check_finite("score", score)
@@ -70,7 +70,7 @@ def kernel_stein_discrepancy(
 
 
 def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    """Return ∇ log p(θ | y) by automatic differentiation with torch, else JAX.
+    """Return ∇ log p(θ | y) by automatic differentiation with torch, or JAX if torch fails.
 
     ``(n, dim) → (n, dim)``, float64.
 
@@ -94,7 +94,7 @@ def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
 
 
 def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    """Return the gradient by the first library that can differentiate the density."""
+    """Return the gradient, computed by the first library that can differentiate the density."""
     reasons = []
     for name, gradient in (("torch", _torch_gradient), ("JAX", _jax_gradient)):
         try:

@@ -1,6 +1,6 @@
-"""Two-sample tests of independent draws (n, D), flattened motions in metres.
+"""Two-sample tests of independent draws: flattened motions (n, D) in metres.
 
-Thin Markov chains first: the tests mistake autocorrelation for a difference.
+Thin Markov chains first, since the tests mistake autocorrelation for a difference.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ __all__ = [
     "squared_distances",
 ]
 
-_FOLDS = 5
-_MOST_COORDINATES, _POINTS_PER_COORDINATE = 40, 10
-_ROUNDING = 1e-9
+_FOLDS = 5  # of cross-validation
+_MOST_COORDINATES, _POINTS_PER_COORDINATE = 40, 10  # maximum features, minimum points per feature
+_ROUNDING = 1e-9  # relative rounding error
 
 
 def squared_distances(points: np.ndarray, centre: np.ndarray | None = None) -> np.ndarray:
     """Return pairwise squared distances, ``(n, D) → (n, n)``.
 
-    Precision decreases away from ``centre`` (D,), by default the mean.
+    Distances are most precise close to ``centre`` (D,), by default the mean of the points.
     """
     from sklearn.metrics import euclidean_distances
 
@@ -48,17 +48,17 @@ def maximum_mean_discrepancy(
 ) -> float:
     """Return the squared maximum mean discrepancy, unbiased; 0 is ideal.
 
-    MMD² = E k(x, x') + E k(y, y') − 2 E k(x, y) with k(x, y) = exp(−‖x − y‖²/2ℓ²), means over pairs
-    of different points (Gretton et al. 2012, eq. 3). It has mean 0 for exact draws and may be
-    negative; see :func:`discrepancy_p_value` for its significance.
+    MMD² = E k(x, x') + E k(y, y') − 2 E k(x, y) with k(x, y) = exp(−‖x − y‖²/2ℓ²). E are means over
+    pairs of different points (Gretton et al. 2012, eq. 3). For exact draws, the estimate has mean 0
+    and may be negative; see :func:`discrepancy_p_value` for a test.
 
     Parameters
     ----------
     draws, reference : ndarray, (n, D) and (m, D)
         Draws to evaluate and exact draws, at least two each.
     length_scale : float, optional
-        ℓ; by default the median distance of the *reference* draws (Gretton et al. 2012, section 8),
-        which does not depend on the sampler.
+        Length scale ℓ, by default the median distance of *reference* draws, which does not depend
+        on the sampler (Gretton et al. 2012, section 8).
     """
     _check_sets(draws, reference)
     n = len(draws)
@@ -75,17 +75,17 @@ def maximum_mean_discrepancy(
 def discrepancy_p_value(
     draws: np.ndarray, reference: np.ndarray, seed: int, *, permutations: int = 200
 ) -> float:
-    """Return the permutation p-value of MMD², at least 1/(P + 1).
+    """Return the permutation p-value of MMD², at least 1/(P + 1) for P permutations.
 
-    Valid for independent draws (Gretton et al. 2012, section 6; Phipson and Smyth 2010); p-values
-    of Markov chains are too small.
+    The test is valid for independent draws (Gretton et al. 2012, section 6; Phipson and Smyth
+    2010). For Markov chains, p-values are too small.
 
     Parameters
     ----------
     draws, reference : ndarray, (n, D) and (m, D)
         Draws to evaluate and exact draws.
     seed : int
-        Seed of the relabellings.
+        Seed of the permutations.
     permutations : int
         Number of permutations P.
     """
@@ -93,7 +93,7 @@ def discrepancy_p_value(
     _check_sets(draws, reference)
     n = len(draws)
     squared = squared_distances(np.concatenate([draws, reference]))
-    # The length scale must be invariant to relabelling.
+    # The length scale must be invariant to permutations, so it is that of both sets together.
     kernel = _kernel(squared, _median(squared))
     labels = np.zeros((len(kernel), 1 + permutations))
     labels[:n] = 1
@@ -108,12 +108,11 @@ def discrepancy_p_value(
 def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -> float:
     """Return the accuracy of the classifier two-sample test (C2ST): 0.5 is ideal, 1 is worst.
 
-    The 5-fold cross-validated accuracy of a support vector machine with a Gaussian kernel
-    (scikit-learn's defaults; Lopez-Paz and Oquab 2017, section 3). For exact draws the mean is .5
-    and the standard deviation about 1/√(8n): .025 at n = 200.
+    The classifier is a support vector machine with a Gaussian kernel and scikit-learn's defaults;
+    accuracy is 5-fold cross-validated (Lopez-Paz and Oquab 2017, section 3). For exact draws, it
+    has mean .5 and standard deviation about 1/√(8n), which is .025 at n = 200.
 
-    Features are the leading :func:`principal_coordinates` of both sets together, a tenth of 2n and
-    at most 40.
+    Features are the n/5, at most 40, leading :func:`principal_coordinates` of both sets together.
 
     Parameters
     ----------
@@ -141,8 +140,8 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
 def principal_coordinates(points: np.ndarray, most: int) -> np.ndarray:
     """Return standardised principal coordinates, ``(n, D) → (n, k) or (n, k + 1)``.
 
-    The k = ``most`` leading coordinates and, if the data have more dimensions, the log squared
-    distance from their subspace, which reveals errors off the manifold.
+    Returns the at most ``most`` leading coordinates and, if the points have more dimensions, the
+    log squared distance from the subspace of these coordinates, to detect errors off the manifold.
     """
     from sklearn.decomposition import PCA
 
@@ -162,7 +161,7 @@ def principal_coordinates(points: np.ndarray, most: int) -> np.ndarray:
 
 
 def _kernel(squared: np.ndarray, length_scale: float) -> np.ndarray:
-    """Return exp(−‖x − y‖²/2ℓ²), with a zero diagonal."""
+    """Return the Gaussian kernel exp(−‖x − y‖²/2ℓ²), with a zero diagonal."""
     kernel = np.exp(-0.5 * squared / length_scale**2)
     np.fill_diagonal(kernel, 0)
     return kernel
@@ -176,7 +175,7 @@ def _median(squared: np.ndarray) -> float:
 
 
 def _squared_discrepancies(kernel: np.ndarray, in_draws: np.ndarray) -> np.ndarray:
-    """Return MMD² for each column of labels, 1 for draws and 0 for reference: (N, P) → (P,)."""
+    """Return MMD² for each column of labels, 1 for draws, 0 for reference: (n + m, P) → (P,)."""
     n = in_draws[:, 0].sum()
     m = len(kernel) - n
     to_draws = kernel @ in_draws

@@ -1,8 +1,8 @@
 """Test of uniformity on [0, 1] with simultaneous bands of the empirical distribution function.
 
-Säilynoja, Bürkner & Vehtari (2022), "Graphical test for discrete uniformity and its applications in
-goodness-of-fit evaluation and multiple sample comparison", section 3. The probability of leaving a
-band is computed exactly, as in Steck (1971).
+Source: Säilynoja, Bürkner & Vehtari (2022), "Graphical test for discrete uniformity and its
+applications in goodness-of-fit evaluation and multiple sample comparison", section 3. The
+probability that the function leaves a band is computed exactly (Steck 1971).
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["adjusted_p_values", "ecdf_band", "evaluation_points", "uniformity_p_value"]
 
-_MOST_POINTS = 100
-# Tails equal by symmetry may differ by rounding errors.
+_MOST_POINTS = 100  # maximum number of evaluation points, plus 1
+# Tolerance of comparisons of tail probabilities: those equal by symmetry differ by rounding.
 _EQUAL = 1 + 1e-9
-_HALVINGS = 40
+_HALVINGS = 40  # bisection steps
 
 
 def evaluation_points(n: int) -> np.ndarray:
-    """Return the evaluation points 1/m, 2/m, …, (m − 1)/m of n numbers, with m = min(n, 100)."""
+    """Return the evaluation points 1/m, 2/m, …, (m − 1)/m for n values, with m = min(n, 100)."""
     check_count("n", n, least=2)
     m = min(n, _MOST_POINTS)
     return np.arange(1, m) / m
 
 
 def uniformity_p_value(values: np.ndarray) -> float:
-    """Return the p-value of the test that n numbers in [0, 1] are uniform, (n,) → ().
+    """Return the p-value of the test that n values in [0, 1] are uniform, (n,) → ().
 
-    The statistic γ is twice the smallest tail probability of F(z) = #{u ≤ z} ~ Binomial(n, z) over
-    the points z (eq. 7), with exact distribution. p < α if and only if F leaves :func:`ecdf_band`
-    of level 1 − α.
+    The statistic γ is twice the smallest tail probability of the counts #{u ≤ z} ~ Binomial(n, z)
+    over :func:`evaluation_points` z (eq. 7); its distribution is exact. p < α if and only if the
+    empirical distribution function leaves :func:`ecdf_band` of level 1 − α.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def uniformity_p_value(values: np.ndarray) -> float:
 
 
 def ecdf_band(n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Return the simultaneous band of F(z) for n uniform numbers.
+    """Return the simultaneous band of the empirical distribution function F of n uniform values.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def ecdf_band(n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
 def adjusted_p_values(p_values: np.ndarray) -> np.ndarray:
     """Return p-values (m,) adjusted for multiple testing under any dependence (Holm 1979).
 
-    The smallest is the p-value of the joint hypothesis.
+    The smallest adjusted p-value is that of the joint hypothesis.
     """
     check_shape("p_values", p_values, ("m",))
     order = np.argsort(p_values, kind="stable")
@@ -92,7 +92,7 @@ def adjusted_p_values(p_values: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _tails(n: int) -> np.ndarray:
-    """Return twice the smaller tail of every count at every point, (m − 1, n + 1)."""
+    """Return twice the smaller tail probability of each count at each point, (m − 1, n + 1)."""
     z = evaluation_points(n)[:, None]
     counts = np.arange(n + 1)
     # P(X ≥ 0) is 1; bdtrc(k, …) is P(X > k).
@@ -101,10 +101,10 @@ def _tails(n: int) -> np.ndarray:
 
 
 def _probability_of_leaving(n: int, gamma: float) -> float:
-    """Return P(the tail is γ or less at any point) for n uniform numbers.
+    """Return P(twice the smaller tail is at most γ at some point) for n uniform values.
 
-    Counts between points are Poisson with mean n/m, conditioned on their sum n. Summing over the
-    first exit is accurate for small probabilities.
+    Counts between points are Poisson with mean n/m, conditioned on their sum n. The sum over the
+    first point outside the band is accurate even for small probabilities.
     """
     step, finish = _poisson(n)
     inside = np.zeros(n + 1)
@@ -119,7 +119,7 @@ def _probability_of_leaving(n: int, gamma: float) -> float:
 
 @lru_cache(maxsize=8)
 def _poisson(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return P(count between points), (n + 1,), and P(rest) / P(sum n), (m − 1, n + 1)."""
+    """Return P(count between points), (n + 1,), and P(rest) / P(sum = n), (m − 1, n + 1)."""
     points = evaluation_points(n)
     counts = np.arange(n + 1)
     rest = poisson.pmf(n - counts, n * (1 - points[:, None]))
@@ -128,7 +128,7 @@ def _poisson(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=64)
 def _gamma(n: int, level: float) -> float:
-    """Return the largest γ with probability of leaving at most 1 − level."""
+    """Return the largest γ whose band is left with probability at most 1 − ``level``."""
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

@@ -1,8 +1,8 @@
 """World motion from camera-space poses and 2D detections (SPIN-t).
 
 A single-image estimator provides the pose of each frame in the camera's axes, without translation
-and with an approximate orientation. Both are optimised given the detections and the smoothness of
-the motion (source: paper 001, appendix F, equation 12; robust function: Geman and McClure 1987).
+and with an approximate orientation. Translations and orientations are fitted to detections and
+smooth motion (paper 001, appendix F, equation 12; robust function: Geman and McClure 1987).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ __all__ = ["CameraTrajectory", "fit_trajectory", "geman_mcclure"]
 _NEAR = 0.1
 """Depth in metres below which 1/z is replaced by its tangent."""
 _SCHEDULE = (8.0, 4.0, 2.0, 1.0)
-"""Successive multiples of the robust scale. At 1 only, one-sided outliers trap the
-optimiser in the minimum closest to the linear solution."""
+"""Successive multiples of the robust scale. With 1 alone, one-sided outliers trap the optimiser in
+the minimum closest to the linear solution."""
 _SMALL = 1e-3
-"""Squared angle below which series are used; the omitted terms are below 3e-14."""
+"""Squared angle below which Jacobians use series; omitted terms are below 3e-14."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +37,15 @@ class CameraTrajectory:
     positions : ndarray, (L, J, 3)
         Joints in the world, metres.
     translations : ndarray, (L, 3)
-        r, position of the local origin in the camera's axes, metres.
+        Positions r of the local origin in the camera's axes, metres.
     orientations : ndarray, (L, 3)
-        φ, rotation vectors applied to the local poses, in the camera's axes, radians.
+        Rotation vectors φ applied to the local poses, in the camera's axes, radians.
     cost : float
         Final value of equation 12.
     iterations : int
-        L-BFGS iterations over all scales.
+        Total number of L-BFGS iterations at all scales of ρ.
     converged : bool
-        Whether the last optimisation converged.
+        Whether the optimisation at the last scale converged.
     """
 
     positions: np.ndarray
@@ -57,7 +57,7 @@ class CameraTrajectory:
 
 
 def geman_mcclure(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ρ = c² e²/(c² + e²) and its derivative by e², given e² and c = ``scale``."""
+    """Return ρ = c² e²/(c² + e²) and dρ/d(e²), given e² = ``square`` and c = ``scale``."""
     ratio = scale**2 / (scale**2 + square)
     return ratio * square, ratio**2
 
@@ -77,25 +77,25 @@ def fit_trajectory(
 
         Σ_tj σ_tj ρ(‖Π(v_tj) − y_tj‖) + λ Σ_t ‖v_t − v_{t−1}‖².
 
-    It starts from φ = 0 and the per-frame linear solution for the translations, interpolated where
-    the detections do not determine it. The scale of ρ decreases from 8 times ``scale``, so that
-    distant outliers do not determine the minimum.
+    The initial values are φ = 0 and the linear solution for r in each frame, interpolated in frames
+    where detections do not determine it. The scale of ρ decreases from 8 ``scale`` to ``scale``, so
+    that distant outliers do not determine the minimum.
 
     Parameters
     ----------
     local : ndarray, (L, J, 3)
         Poses relative to the root, metres, in the camera's axes: x right, y down, z forward.
     track : KeypointTrack
-        y and σ, detections of these joints in the camera's image units. Entries of confidence 0 are
-        ignored.
+        Detections y of these joints in the camera's image units, and their confidences σ. Entries
+        with confidence 0 are ignored.
     camera : Cameras
         One static perspective camera.
     scale : float, optional
-        c of the Geman-McClure ρ, image units; much larger errors are treated as outliers. Default:
-        focal/40, which is 12.5 cm at 5 m.
+        Scale c of the Geman-McClure ρ, image units; much larger errors are treated as outliers. The
+        default is focal/40, which is 12.5 cm at 5 m.
     smoothness_weight : float, optional
-        λ, image unit²/m²: about (detection error / movement of a joint between frames)². Default:
-        (focal/30 m)².
+        Weight λ, (image unit)²/m², about (detection error / movement of a joint between frames)².
+        The default is (focal/30 m)².
     max_iterations : int
         Maximum L-BFGS iterations at each scale.
 
@@ -153,12 +153,12 @@ class _Objective:
     smoothness_weight: float
 
     def points(self, translations: np.ndarray, orientations: np.ndarray) -> np.ndarray:
-        """Return v in the camera's axes: ``(L, 3), (L, 3) → (L, J, 3)``."""
+        """Return the joints v in the camera's axes: ``(L, 3), (L, 3) → (L, J, 3)``."""
         rotated = self.local @ np.swapaxes(vector_to_matrix(orientations), -1, -2)
         return rotated + translations[:, None]
 
     def cost_and_gradient(self, parameters: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
-        """Return equation 12 and its gradient, ``(6 L,) → (), (6 L,)``."""
+        """Return the value of equation 12 and its gradient, ``(6 L,) → (), (6 L,)``."""
         translations, orientations = np.split(parameters.reshape(-1, 6), 2, axis=1)
         points = self.points(translations, orientations)
         inverse, slope = _inverse_depth(points[..., 2])
@@ -180,14 +180,14 @@ class _Objective:
 
 
 def _inverse_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1/z, continued linearly below ``_NEAR``, and its derivative."""
+    """Return 1/z, continued linearly below ``_NEAR``, and its derivative by z."""
     safe = np.maximum(depth, _NEAR)
     slope = -1 / safe**2
     return 1 / safe + slope * (depth - safe), slope
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:
-    """Return J = I + (1 − cos θ)/θ² K + (θ − sin θ)/θ³ K², ``(L, 3) → (L, 3, 3)``."""
+    """Return J = I + (1 − cos θ)/θ² K + (θ − sin θ)/θ³ K² for K x = φ × x and θ = ‖φ‖."""
     square = (vector**2).sum(axis=-1)[:, None, None]
     small = square < _SMALL
     angle = np.sqrt(np.where(small, 1.0, square))
@@ -204,11 +204,11 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
 def _minimum(
     objective: _Objective, scale: float, max_iterations: int
 ) -> tuple[np.ndarray, float, int, bool]:
-    """Return (r_t, φ_t), the cost, the iterations and whether the last optimisation converged."""
+    """Return (r_t, φ_t), cost, iteration count and whether the last optimisation converged."""
     start = _initial_translations(objective)
     parameters = np.concatenate([start, np.zeros_like(start)], axis=1).ravel()
     iterations = 0
-    # L-BFGS tolerances are absolute below 1; the cost is divided by this unit to be scale-free.
+    # L-BFGS tolerances are absolute below 1. Division by this unit makes the cost scale-free.
     unit = (objective.focal / 1000) ** 2
 
     def scaled(parameters: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
@@ -230,10 +230,10 @@ def _minimum(
 
 
 def _initial_translations(objective: _Objective) -> np.ndarray:
-    """Return r of each frame for φ = 0 by confidence-weighted linear least squares, (L, 3).
+    """Return r (L, 3) for φ = 0 by confidence-weighted linear least squares in each frame.
 
-    Each detection requires f (X + r_x) = u (Z + r_z), and likewise in y. Frames with fewer than
-    two detections, or a solution behind the camera, are interpolated.
+    A detection (u, v) of local joint (X, Y, Z) requires f (X + r_x) = u (Z + r_z) and likewise for
+    v. Frames with fewer than two detections or a solution behind the camera are interpolated.
     """
     local, image, focal = objective.local, objective.detections, objective.focal
     L, J, _ = local.shape

@@ -1,6 +1,6 @@
 """Distances between sets of 3D motions, invariant to heading.
 
-Motions are compared with the root at the origin, at the rotation about the vertical that minimises
+Motions are compared with roots at the origin, after the rotation about the vertical that minimises
 their distance. Mirror images are different motions, since depth inversion is the typical error of
 lifting from 2D.
 """
@@ -17,7 +17,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["mirrored_fraction", "nearest_distances", "windows", "yaw_aligned_distances"]
 
-# Products are padded to this shape, so that rounding does not depend on the number of motions.
+# Matrix products are padded to this size; rounding is then independent of the number of motions.
 _BLOCK = 256
 
 
@@ -25,9 +25,9 @@ class NearestDistances(NamedTuple):
     """Both directions of a Chamfer distance between sets of motions, metres."""
 
     of_draws: float
-    """Mean over draws of the distance to the nearest real motion: fidelity."""
+    """Mean distance of draws to the nearest real motion (fidelity)."""
     of_real: float
-    """Mean over real motions of the distance to the nearest draw: coverage."""
+    """Mean distance of real motions to the nearest draw (coverage)."""
 
 
 def yaw_aligned_distances(
@@ -36,7 +36,7 @@ def yaw_aligned_distances(
     """Return the distances between two sets of motions: ``(N, L, J, 3), (M, …) → (N, M)``, metres.
 
     The distance is the root mean square over joints and frames, with roots at the origin in every
-    frame, minimised over one rotation about the vertical per pair. With h = x + iz and heights y::
+    frame, minimised over one rotation about the vertical per pair. With h = x + iz and height y::
 
         d² = (‖a‖² + ‖b‖² − 2 y_a·y_b − 2 |Σ h̄_a h_b|) / (L J)
 
@@ -64,8 +64,8 @@ def yaw_aligned_distances(
 def nearest_distances(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> NearestDistances:
     """Return the mean distance from draws to the nearest real motion, and the reverse.
 
-    Both directions are needed, since all draws may copy one real motion. Both decrease with the
-    size of the other set: compare samplers at equal sizes.
+    Fidelity alone is not sufficient, since all draws may copy one real motion. Both means decrease
+    with the size of the other set, so compare samplers at equal sizes.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
     """Return the fraction of draws that are farther from real motion than their depth mirror image.
 
     Mirroring inverts depth but does not exchange joint names, so knees bend backwards. Orthographic
-    cameras at elevation 0 cannot distinguish the two, so the expected fraction is 0.5.
+    cameras at elevation 0 do not distinguish mirror images, so the expected fraction is 0.5.
 
     Parameters
     ----------
     draws, real, root
-        As in :func:`nearest_distances`.
+        Parameters of :func:`nearest_distances`.
     """
     unmirrored, _ = _nearest(draws, real, root, mirrored=False)
     mirrored, _ = _nearest(draws, real, root, mirrored=True)
@@ -100,7 +100,7 @@ def mirrored_fraction(draws: np.ndarray, real: np.ndarray, *, root: int = 0) -> 
 
 
 def windows(positions: np.ndarray, frames: int, stride: int = 1) -> np.ndarray:
-    """Return windows of a clip every ``stride`` frames: ``(L, J, 3) → (n, frames, J, 3)``.
+    """Return windows of a clip that start every ``stride`` frames: (L, J, 3) → (n, frames, J, 3).
 
     Raises
     ------
@@ -167,7 +167,7 @@ def _blocks(a: _Flat, b: _Flat, mirrored: bool) -> Iterator[tuple[slice, slice, 
             inner += upright @ _padded(b.heights[columns]).T
             inner = inner[: rows.stop - row, : columns.stop - column]
             squares = a.squares[rows, None] + b.squares[columns] - 2 * inner
-            # Squared distances of copies may be negative by rounding.
+            # Squared distances of identical motions may be negative by rounding.
             yield rows, columns, np.sqrt(np.maximum(squares, 0.0) / horizontal.shape[1])
 
 

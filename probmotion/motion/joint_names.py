@@ -3,12 +3,12 @@
 Canonical names are ``pelvis lower_spine spine chest neck upper_neck head head_top nose tail`` and,
 with the prefix ``left_`` or ``right_``, ``eye ear collar shoulder elbow wrist palm hand fingers
 thumb hip_joint hip knee ankle heel foot big_toe small_toe toe front_paw back_paw``. ``foot`` is
-the ball of the foot, as in SMPL, and ``toe`` its tip.
+the ball of the foot, as in SMPL, and ``toe`` is the tip of the foot.
 
-Names are ambiguous. A BVH joint is named after the bone that starts there (``LeftLeg`` is
-a knee), an ASF joint after the bone that ends there (``ltibia`` is an ankle). ``left_foot`` is the
-ankle of a skeleton without ``left_ankle``, and the ball of the foot otherwise. All joints of a
-skeleton are therefore named together.
+Joint names in files are ambiguous. A BVH joint is named after the bone that starts there
+(``LeftLeg`` is a knee), an ASF joint after the bone that ends there (``ltibia`` is an ankle).
+``left_foot`` is the ankle if the skeleton has no ``left_ankle``, else the ball of the foot. The
+canonical names of all joints of a skeleton are therefore determined together.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _SIDED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("frontpaw", "fpaw"), ("front_paw",)),
     **dict.fromkeys(("backpaw", "hindpaw", "bpaw"), ("back_paw",)),
 }
-# Names in CMU's ASF files, where a joint is the end of the bone.
+# Canonical names for CMU's ASF files, which name a joint after the bone that ends there.
 _ASF_CENTRAL = {
     "root": "pelvis", "lowerback": "lower_spine", "upperback": "spine", "thorax": "chest",
     "lowerneck": "neck", "upperneck": "upper_neck", "head": "head",
@@ -67,17 +67,17 @@ _ASF_SIDED = {
     "fingers": "fingers", "thumb": "thumb",
 }  # fmt: skip
 _ASF_MARKS = frozenset(side + bone for side in "lr" for bone in ("femur", "tibia", "humerus"))
-# Names of joints called ``…_end``, by the parent joint.
+# Canonical names of joints called ``…_end``, by the canonical name of the parent.
 _END_OF = {
     "ankle": "foot", "foot": "toe", "head": "head_top", "fingers": "finger_tips",
     "thumb": "thumb_tip",
 }  # fmt: skip
-_PAW_OF = {"fingers": "front_paw", "foot": "back_paw"}
+_PAW_OF = {"fingers": "front_paw", "foot": "back_paw"}  # if the skeleton has a tail
 
 _PERSON = re.compile(r"^(?P<person>[^:]*):(?P<joint>.+)$")
 _MIXAMO = re.compile(r"^mixamorig\d*[:_]")
 _END = re.compile(r"^(?P<joint>.+?)[_ .]?(?:[_ .]end(?: ?site)?|End|Nub)$", re.IGNORECASE)
-_TRUNK = re.compile(r"^(?P<word>abdomen|spine|chest|upperchest)(?P<number>\d*)$")
+_TRUNK = re.compile(r"^(?P<word>abdomen|spine|chest|upperchest)(?P<number>\d*)$")  # spine1, …
 _SIDES = (
     re.compile(r"^(?P<side>left|right)[_ .-]*(?P<part>.+)$", re.IGNORECASE),
     re.compile(r"^(?P<part>.+)[_ .-](?P<side>left|right|l|r)$", re.IGNORECASE),
@@ -114,13 +114,13 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _person_of(name: str) -> str:
-    """Return the ``person`` prefix of a joint name, ``""`` if missing."""
+    """Return the ``person`` prefix of a joint name, or ``""`` if it has none."""
     match = _PERSON.match(_MIXAMO.sub("", name))
     return match["person"] if match else ""
 
 
 def mirrored_name(name: str) -> str | None:
-    """Return the right counterpart of a left joint's name in the same scheme, or None.
+    """Return the name of a left joint's right counterpart in the same naming scheme, or None.
 
     ``left_knee`` → ``right_knee``, ``lShin`` → ``rShin``, ``lowerback`` → None.
     """
@@ -141,7 +141,7 @@ def _names_of_one(names: list[str]) -> list[str]:
         meanings[index] = (meaning,)
     result = list(names)
     used: set[str] = set()
-    # Unambiguous words first, then canonical names, then by name, regardless of joint order.
+    # Unambiguous names are assigned first, then canonical ones. Joint order is irrelevant.
     for index in sorted(
         range(len(names)),
         key=lambda i: (len(meanings[i]), meanings[i][:1] != (names[i],), _word(names[i])),
@@ -178,7 +178,7 @@ def _meanings(name: str) -> tuple[str, ...]:
 
 
 def _trunk(names: list[str]) -> dict[int, str]:
-    """Return the meanings of the numbered joints between pelvis and neck."""
+    """Return the canonical names of the numbered joints between pelvis and neck, by index."""
     order = ("abdomen", "spine", "chest", "upperchest")
     joints = []
     for index, name in enumerate(names):

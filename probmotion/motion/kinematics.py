@@ -15,9 +15,9 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["fit_rotations", "forward_kinematics"]
 
-# Iterations of the alternating fit of rest offsets and rotations.
+# Number of iterations of the alternating fit of rest offsets and rotations.
 _FITS = 3
-# Relative weight of the parent's rotation, which affects only the undetermined twist.
+# Relative weight of the parent's rotation in a fit; it affects only undetermined twists.
 _TIE = 1e-12
 
 
@@ -26,8 +26,8 @@ def forward_kinematics(
 ) -> tuple[Array, Array]:
     """Return joint positions and global rotations from local rotations.
 
-    ``G_j = G_parent R_j`` and ``p_j = p_parent + G_parent o_j``; for a root, ``G_j = R_j`` and p_j
-    is its translation. Accepts NumPy, torch and JAX arrays.
+    Joint j with local rotation R_j and rest offset o_j has global rotation ``G_j = G_parent R_j``
+    and position ``p_j = p_parent + G_parent o_j``; for a root, ``G_j = R_j`` and p_j is given.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def forward_kinematics(
         Root positions in the order of ``skeleton.roots``, metres.
     rest_offsets : Array, (…, J, 3)
         Offset of each joint from its parent in the rest pose, metres; ignored for roots. Batch axes
-        broadcast.
+        broadcast. All arrays may be NumPy, torch or JAX arrays.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def forward_kinematics(
 
 
 def _levels(skeleton: Skeleton) -> list[list[int]]:
-    """Return the joints grouped by their number of bones from a root."""
+    """Return the joints grouped by the number of bones between joint and root."""
     depths = [len(skeleton.ancestors(joint)) for joint in range(skeleton.n_joints)]
     return [
         [joint for joint, depth in enumerate(depths) if depth == level]
@@ -103,9 +103,9 @@ def fit_rotations(
     """Return joint rotations and a rest pose that reproduce positions in the least-squares sense.
 
     With the root positions as translations, :func:`forward_kinematics` of the result reproduces the
-    positions exactly if bone lengths and the angles between siblings are constant. Otherwise bones
-    have their mean length, and joints with several children their least-squares rotation (Kabsch
-    1976). Errors do not accumulate: each bone starts at the fitted end of the previous one.
+    positions exactly if bone lengths and the angles between siblings are constant. Otherwise, bones
+    have their mean length, and joints with several children have their least-squares rotation
+    (Kabsch 1976). Errors do not accumulate, since each bone starts at the fitted end of its parent.
 
     Positions do not determine the twist about a bone. A joint with at most one child, or with
     collinear children, is rotated minimally relative to its parent.
@@ -117,7 +117,7 @@ def fit_rotations(
     positions : ndarray, (L, J, 3)
         Joint positions, metres.
     rest_offsets : ndarray, (J, 3), optional
-        Rest pose. By default it is fitted, close to the first frame.
+        Rest pose, metres. By default, it is fitted, in an orientation close to the first frame.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def fit_rotations(
 
 
 def _rest_offsets(bones: np.ndarray) -> np.ndarray:
-    """Return the rigid set of bones (C, 3) that best fits those of all frames (L, C, 3)."""
+    """Return the rigid set of bones (C, 3) that best fits the bones (L, C, 3) of all frames."""
     lengths = np.linalg.norm(bones, axis=-1).mean(axis=0)
     rest = _of_lengths(bones[0], lengths)
     identity = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
@@ -186,7 +186,7 @@ def _of_lengths(vectors: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.ndarray:
     """Return the rotations (L, 3, 3) that best align ``rest`` (C, 3) with ``bones`` (L, C, 3).
 
-    Undetermined rotations follow the parent's rotations ``above``, (L, 3, 3).
+    Where bones do not determine a rotation, it follows that of the parent, ``above`` (L, 3, 3).
     """
     if len(rest) == 0:
         return above.copy()

@@ -14,17 +14,17 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 __all__ = ["KeypointTrack", "Motion"]
 
 
-_MAX_CONFIDENCE = 2
+_MAX_CONFIDENCE = 2  # largest COCO visibility flag
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Joint positions of one clip.
+    """3D motion of one clip: joint positions over time.
 
     Parameters
     ----------
     positions : ndarray, (L, J, 3)
-        Metres, world Y up, right-handed.
+        Joint positions, metres, in right-handed world axes with Y up.
     skeleton : Skeleton
         Names and parents of the J joints.
     fps : float
@@ -34,7 +34,7 @@ class Motion:
     rest_offsets : ndarray, (J, 3), optional
         Offset of each joint from its parent in the rest pose, metres; required with ``rotations``.
     name : str
-        Name of the clip in tables; file readers set it to the file's stem.
+        Name of the clip in tables; by default, file readers use the stem of the file name.
 
     Raises
     ------
@@ -84,7 +84,7 @@ class Motion:
         return (self.frames - 1) / self.fps
 
     def window(self, start: int, frames: int) -> Motion:
-        """Return ``frames`` frames from frame ``start``."""
+        """Return the ``frames`` frames that begin with frame ``start``."""
         check_count("frames", frames)
         if not 0 <= start <= self.frames - frames:
             raise ValueError(
@@ -97,7 +97,7 @@ class Motion:
     def resample(self, fps: float) -> Motion:
         """Resample the clip to another frame rate by linear interpolation in time.
 
-        Local rotations are interpolated along the geodesic; see
+        Interpolated local rotations lie on geodesics; see
         :func:`~probmotion.motion.resampling.resample`.
 
         Raises

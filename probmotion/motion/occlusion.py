@@ -1,7 +1,7 @@
-"""Retargeting and resampling of joints with occlusion.
+"""Retargeting and resampling of joint positions with occlusion.
 
-:class:`~probmotion.motion.motion.Motion` accepts no NaN; these functions replace its
-``retarget`` and ``resample`` for arrays with missing joints.
+:class:`~probmotion.motion.motion.Motion` does not accept NaN. These functions replace its methods
+``retarget`` and ``resample`` for arrays with occluded joints.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _MIDPOINTS = {"pelvis": ("left_hip", "right_hip"), "neck": ("left_shoulder", "ri
 def joints_on_skeleton(
     joints: np.ndarray, confidence: np.ndarray, source: Skeleton, target: Skeleton
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Retarget joints to another skeleton by their own or, failing that, canonical names.
+    """Retarget joints to another skeleton by their own names, else by canonical names.
 
-    A missing ``pelvis`` is replaced by the midpoint of the hips, a missing ``neck`` by the midpoint
-    of the shoulders. With precisions w/σ² of the two joints, a midpoint has confidence
-    4 w_a w_b / (w_a + w_b), or 0 if either is occluded. Error correlations are ignored.
+    The midpoint of the hips replaces a missing ``pelvis``, the midpoint of the shoulders a missing
+    ``neck``. Joints a and b of confidences w have precisions w/σ², so their midpoint has confidence
+    4 w_a w_b / (w_a + w_b), or 0 if a or b is occluded. Error correlations are ignored.
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres; NaN where occluded.
+        Joint positions, metres; NaN where occluded.
     confidence : ndarray, (L, J)
-        0 where occluded.
+        Confidence of each joint, 0 where occluded.
     source, target : Skeleton
-        Skeletons of the input and of the result.
+        Skeletons of the given and of the returned joints.
 
     Returns
     -------
     joints : ndarray, (L, J', 3)
-        NaN where occluded.
+        Joint positions, metres; NaN where occluded.
     confidence : ndarray, (L, J')
-        0 where occluded.
+        Confidence of each joint, 0 where occluded.
 
     Raises
     ------
@@ -77,25 +77,25 @@ def joints_at_rate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Resample joints to another frame rate by linear interpolation between frames.
 
-    Frame times are as in :func:`~probmotion.motion.resampling.resample`. A joint is occluded if
-    it is occluded in a frame of nonzero weight. For weights 1 − a and a of frames with precisions
-    w/σ², the confidence is 1 / ((1 − a)²/w₁ + a²/w₂).
+    Frame times are those of :func:`~probmotion.motion.resampling.resample`. A joint is occluded if
+    it is occluded in a frame of nonzero weight. Interpolation between frames of precisions w₁/σ²
+    and w₂/σ² with weights 1 − a and a results in confidence 1 / ((1 − a)²/w₁ + a²/w₂).
 
     Parameters
     ----------
     joints : ndarray, (L, J, 3)
-        Metres; ignored where occluded.
+        Joint positions, metres; ignored where occluded.
     confidence : ndarray, (L, J)
-        0 where occluded.
+        Confidence of each joint, 0 where occluded.
     fps, new_fps : float
-        Frames per second of the input and of the result.
+        Frames per second of the given and of the returned joints.
 
     Returns
     -------
     joints : ndarray, (L', J, 3)
-        NaN where occluded.
+        Joint positions, metres; NaN where occluded.
     confidence : ndarray, (L', J)
-        0 where occluded.
+        Confidence of each joint, 0 where occluded.
     """
     frames = len(confidence)
     clock = np.arange(frames, dtype=np.float64)[:, None, None]

@@ -21,20 +21,20 @@ class Preset(NamedTuple):
 
 # Joints ``name:parent`` in the order of the data set or detector; roots have no parent.
 _TREES = {
-    # AlphaPose's 16-joint model, the joints of MPII.
+    # AlphaPose's 16-joint model, with the joints of MPII.
     "alphapose16": """
         right_ankle:right_knee right_knee:right_hip right_hip:pelvis left_hip:pelvis
         left_knee:left_hip left_ankle:left_knee pelvis thorax:pelvis upper_neck:thorax
         head_top:upper_neck right_wrist:right_elbow right_elbow:right_shoulder
         right_shoulder:thorax left_shoulder:thorax left_elbow:left_shoulder
         left_wrist:left_elbow""",
-    # Quadrupeds of AP-10K and APT-36K.
+    # Quadruped joints of AP-10K and APT-36K.
     "apt36k17": """
         left_eye:nose right_eye:nose nose:neck neck:tail tail left_shoulder:neck
         left_elbow:left_shoulder left_front_paw:left_elbow right_shoulder:neck
         right_elbow:right_shoulder right_front_paw:right_elbow left_hip:tail left_knee:left_hip
         left_back_paw:left_knee right_hip:tail right_knee:right_hip right_back_paw:right_knee""",
-    # OpenPose's BODY_25.
+    # OpenPose's BODY_25 model.
     "body25": """
         nose:neck neck:pelvis right_shoulder:neck right_elbow:right_shoulder
         right_wrist:right_elbow left_shoulder:neck left_elbow:left_shoulder left_wrist:left_elbow
@@ -42,7 +42,7 @@ _TREES = {
         left_knee:left_hip left_ankle:left_knee right_eye:nose left_eye:nose right_ear:right_eye
         left_ear:left_eye left_big_toe:left_ankle left_small_toe:left_ankle left_heel:left_ankle
         right_big_toe:right_ankle right_small_toe:right_ankle right_heel:right_ankle""",
-    # OpenPose's BODY_25B, without pelvis: the hips are children of the neck.
+    # OpenPose's BODY_25B model. It has no pelvis, so the hips are children of the neck.
     "body25b": """
         nose:neck left_eye:nose right_eye:nose left_ear:left_eye right_ear:right_eye
         left_shoulder:neck right_shoulder:neck left_elbow:left_shoulder
@@ -59,7 +59,7 @@ _TREES = {
         upperneck:lowerneck head:upperneck lhumerus:lclavicle lradius:lhumerus lwrist:lradius
         lhand:lwrist lthumb:lwrist lfingers:lhand rhumerus:rclavicle rradius:rhumerus
         rwrist:rradius rhand:rwrist rthumb:rwrist rfingers:rhand""",
-    # COCO's keypoints, without pelvis and neck: the shoulders are children of the nose.
+    # COCO's keypoints. There is no pelvis and no neck, so the shoulders are children of the nose.
     "coco17": """
         nose left_eye:nose right_eye:nose left_ear:left_eye right_ear:right_eye
         left_shoulder:nose right_shoulder:nose left_elbow:left_shoulder
@@ -72,7 +72,7 @@ _TREES = {
         left_knee:left_hip left_ankle:left_knee spine:pelvis neck:spine nose:neck head:nose
         left_shoulder:neck left_elbow:left_shoulder left_wrist:left_elbow right_shoulder:neck
         right_elbow:right_shoulder right_wrist:right_elbow""",
-    # Halpe's full body.
+    # Halpe's 26 body keypoints.
     "halpe26": """
         nose:neck left_eye:nose right_eye:nose left_ear:left_eye right_ear:right_eye
         left_shoulder:neck right_shoulder:neck left_elbow:left_shoulder
@@ -81,7 +81,7 @@ _TREES = {
         right_ankle:right_knee head_top:neck neck:pelvis pelvis left_big_toe:left_ankle
         right_big_toe:right_ankle left_small_toe:left_ankle right_small_toe:right_ankle
         left_heel:left_ankle right_heel:right_ankle""",
-    # OpenPose's COCO model.
+    # OpenPose's COCO model with 18 keypoints.
     "openpose18": """
         nose:neck neck right_shoulder:neck right_elbow:right_shoulder right_wrist:right_elbow
         left_shoulder:neck left_elbow:left_shoulder left_wrist:left_elbow right_hip:neck
@@ -93,14 +93,14 @@ _TREES = {
         right_shoulder:neck right_elbow:right_shoulder right_wrist:right_elbow left_hip:pelvis
         left_knee:left_hip left_ankle:left_knee right_hip:pelvis right_knee:right_hip
         right_ankle:right_knee""",
-    # One person as in motion capture: trunk and limbs, no face (Yin et al. 2018).
+    # Motion-capture joints of a person: trunk and limbs, no face (Yin et al. 2018).
     "person17": """
         pelvis spine:pelvis chest:spine neck:chest head:neck left_shoulder:chest
         left_elbow:left_shoulder left_wrist:left_elbow right_shoulder:chest
         right_elbow:right_shoulder right_wrist:right_elbow left_hip:pelvis left_knee:left_hip
         left_ankle:left_knee right_hip:pelvis right_knee:right_hip right_ankle:right_knee""",
-    # Quadruped as in motion capture, a superset of apt36k17 without nose and eyes. tail is the base
-    # of the tail, head the joint between skull and neck, wrist the carpus, ankle the hock.
+    # Motion-capture joints of a quadruped: those of apt36k17 except nose and eyes, and others. tail
+    # is the base of the tail, head the joint of skull and neck, wrist the carpus, ankle the hock.
     "quadruped21": """
         pelvis tail:pelvis chest:pelvis neck:chest head:neck left_shoulder:chest
         left_elbow:left_shoulder left_wrist:left_elbow left_front_paw:left_wrist
@@ -118,10 +118,10 @@ _TREES = {
         right_wrist:right_elbow""",
 }
 
-# Metres, thinner than real limbs: with anatomical radii (forearm 3.5 cm, trunk 10 cm) real salsa
-# pairs have a median penetration of 0.17 m, mostly between arms and their own trunk. These radii
-# are tuned so that penetration is under 3 mm in 90 % of frames of real pairs within 1.2 m, but
-# several decimetres for overlapping people. The root's value is unused.
+# Bone radii, metres. Anatomical radii (forearm 3.5 cm, trunk 10 cm) result in a median penetration
+# of 0.17 m for real salsa pairs, mostly between arms and trunk of a person. With these smaller
+# tuned radii, it is under 3 mm in 90 % of the frames of real pairs within 1.2 m, but several
+# decimetres for overlapping people. The radius of the root is unused.
 _PERSON_RADII = {
     "pelvis": 0.05, "spine": 0.045, "chest": 0.035, "neck": 0.02, "head": 0.06,
     "shoulder": 0.025, "elbow": 0.02, "wrist": 0.01, "hip": 0.05, "knee": 0.045, "ankle": 0.03,
@@ -144,7 +144,7 @@ def _presets() -> dict[str, Preset]:
         [*person.parents, *(parent if parent < 0 else parent + 17 for parent in person.parents)],
         radii * 2,
     )
-    # A person and a ball (MAS, section 5).
+    # A gymnast with COCO's keypoints, and a ball (MAS, section 5).
     presets["gymnast-ball"] = Preset([*coco.joint_names, "ball"], [*coco.parents, -1])
     return dict(sorted(presets.items()))
 

@@ -9,9 +9,9 @@ from probmotion.validation import check_positive
 
 __all__ = ["resample"]
 
-_HIGHEST_FPS = 10_000
-# Tolerance in frames at the end of a clip. Without it, frame times rounded in files (0.0083333 s)
-# would drop the last frame.
+_HIGHEST_FPS = 10_000  # highest accepted frame rate
+# Tolerance in frames at the end of a clip. Without it, resampling would drop the last frame if the
+# frame time is rounded in the file (0.0083333 s).
 _ROUNDING = 1e-3
 
 
@@ -21,7 +21,7 @@ def resample(
     """Resample positions (L, J, 3) and rotations (L, J, 3, 3) to another frame rate.
 
     Positions are interpolated linearly and rotations along the geodesic. The first frame is
-    unchanged and nothing is extrapolated; the duration decreases by less than one new frame.
+    unchanged. Nothing is extrapolated, so the clip is shortened by less than one new frame.
 
     Raises
     ------

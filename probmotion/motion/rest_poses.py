@@ -4,10 +4,10 @@ A camera at azimuth φ projects a bone (X, Y, Z) to
 
     x = X cos φ + Z sin φ,    y = Y.
 
-For uniform azimuths, E[y] is the mean of Y, and 2 E[x_a x_b] = X_a X_b + Z_a Z_b for two bones of a
-rigid body. Articulation adds a covariance, mostly for a = b. Bilateral symmetry separates the mean
-pose from this covariance: X is odd under mirroring and proportional to the width of hips and
-shoulders; Z is even.
+For uniform azimuths, E[y] is the mean of Y, and 2 E[x_a x_b] = X_a X_b + Z_a Z_b for bones a and b
+of a rigid body. Articulation adds a covariance, mostly for a = b. Bilateral symmetry separates the
+mean pose from this covariance: X is odd under mirroring, and its covariance with the width of hips
+and shoulders determines it; Z is even.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from probmotion.motion.skeleton import Skeleton
 __all__ = ["estimate_rest_pose", "is_four_legged", "joint_positions"]
 
 _MAX_ITERATIONS = 5000
-"""Maximum number of principal-factor iterations; about 1000 are needed if one bone moves most."""
+"""Maximum principal-factor iterations; about 1000 are needed if one bone moves most."""
 _TOLERANCE = 1e-8
-"""Relative change of the diagonal at convergence."""
+"""Change of the diagonal at convergence, relative to its largest entry."""
 _AMBIGUOUS = 0.01
 """Forward offset in metres below which the forward direction is ambiguous."""
 _SHORT = 1e-6
 """Length in metres below which a bone has no direction."""
-_HEADS = ("nose", "head_top", "head", "neck")
+_HEADS = ("nose", "head_top", "head", "neck")  # the first that exists is a quadruped's front
 _AHEAD = (("foot", "ankle"), ("toe", "ankle"), ("big_toe", "ankle"), ("nose", "neck"))
-"""Pairs of human joints, the first in front of the second."""
+"""Pairs of human joints; the first joint is in front of the second."""
 
 
 def estimate_rest_pose(
     tracks: Sequence[KeypointTrack], threshold: float = 0.3, front: str | None = None
 ) -> np.ndarray:
-    """Estimate the rest pose, with mean bone directions, from 2D tracks.
+    """Estimate the rest pose, which has mean bone directions, from 2D tracks.
 
-    2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. The vertical
+    This is the 2D counterpart of :func:`~probmotion.models.bodies.body_states.rest_pose`. Vertical
     components of bones are means over frames. X and Z are factors of 2 E[x_a x_b] (see the module
     docstring), Z from pairs of different bones only. The squared length is 2 E[x²] + E[y²].
 
-    Not modelled: camera elevation, which shortens heights by its cosine (2 % at π/16); perspective;
-    detection errors, which add six times the coordinate variance to the squared length; and the
-    finite number N of azimuths, an error of about 1/√(2N) of a length.
+    Four effects are not modelled. Camera elevation shortens heights by its cosine (2 % at π/16).
+    Perspective is ignored. Detection errors add six times their coordinate variance to the squared
+    length. N azimuths cause a relative error of about 1/√(2N) in a length.
 
-    Depth is determined up to a reflection that exchanges front and back. Knees, toes and noses of
-    people and heads of quadrupeds define the front; other bodies require ``front``. A body without
-    left-right pairs may be returned as its mirror image, with the outermost joint at +X.
+    Tracks determine depth up to a reflection that exchanges front and back. Knees, toes and noses
+    of people and heads of quadrupeds define the front; other bodies require ``front``. A body
+    without left-right pairs may be returned as its mirror image, with the outermost joint at +X.
 
     Parameters
     ----------
@@ -58,20 +58,20 @@ def estimate_rest_pose(
     threshold : float
         Minimum confidence of a joint in a frame.
     front : str, optional
-        A joint in front of the root in the mean pose.
+        Name of a joint that is in front of the root in the mean pose.
 
     Returns
     -------
     ndarray, (J, 3)
-        Offset of each joint from its parent, metres, 0 for the root; +Y is up, the body faces +Z
-        and its left is at +X. Left and right are symmetric.
+        Offset of each joint from its parent, metres, 0 for the root. +Y is up, the body faces +Z
+        and its left side is at +X. Left and right are symmetric.
 
     Raises
     ------
     ValueError
-        If there are no tracks, skeletons differ, have several roots or are not bilaterally
-        symmetric, bones are never detected or have no length or direction, or the front is
-        ambiguous.
+        If there are no tracks, skeletons differ, a skeleton has several roots or is not bilaterally
+        symmetric, a pair of bones is never detected together, a bone has no length or direction, or
+        the front is ambiguous.
     """
     skeleton = _shared_skeleton(tracks)
     across, up, seen = _projected_bones(tracks, skeleton, threshold)
@@ -104,7 +104,7 @@ def estimate_rest_pose(
 
 
 def joint_positions(skeleton: Skeleton, offsets: np.ndarray) -> np.ndarray:
-    """Return joint positions relative to the root, given offsets from parents, (J, 3)."""
+    """Return joint positions relative to the root (J, 3), given offsets from parents (J, 3)."""
     positions = np.zeros_like(offsets)
     for joint in skeleton.topological_order:
         if skeleton.parents[joint] >= 0:
@@ -113,7 +113,7 @@ def joint_positions(skeleton: Skeleton, offsets: np.ndarray) -> np.ndarray:
 
 
 def is_four_legged(skeleton: Skeleton) -> bool:
-    """Return whether a skeleton has joint names of a quadruped."""
+    """Return whether a skeleton has a tail or paws."""
     return any(name == "tail" or name.endswith("_paw") for name in skeleton.canonical_names)
 
 
@@ -142,7 +142,7 @@ def _shared_skeleton(tracks: Sequence[KeypointTrack]) -> Skeleton:
 def _projected_bones(
     tracks: Sequence[KeypointTrack], skeleton: Skeleton, threshold: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y (up) and visibility of the bones of all frames, (frames, bones) each."""
+    """Return x, y (upwards) and visibility of all bones in all frames, (frames, bones) each."""
     joints, parents = map(list, zip(*skeleton.bones, strict=True))
     keypoints = np.concatenate([track.keypoints for track in tracks])
     confidence = np.concatenate([track.confidence for track in tracks])
@@ -153,7 +153,7 @@ def _projected_bones(
 
 
 def _check_seen(together: np.ndarray, skeleton: Skeleton) -> None:
-    """Raise if two bones have no common frame, given counts of frames (bones, bones)."""
+    """Raise if two bones have no common frame, given frame counts (bones, bones) of pairs."""
     if (together == 0).any():
         bones = skeleton.bones
         first, second = (skeleton.joint_names[bones[at][0]] for at in np.argwhere(together == 0)[0])
@@ -192,8 +192,8 @@ def _halves(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return X and ±Z of the bones of a symmetric body.
 
-    X is proportional to the covariance with the trunk's width; a factor analysis of the odd parts
-    would also capture legs in antiphase.
+    X is proportional to the covariance with the width of the trunk. A factor analysis of the odd
+    combinations would also capture legs that move in antiphase.
     """
     half = odd / 2
     odds = half @ gram @ half.T
@@ -211,7 +211,7 @@ def _halves(
 def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
     """Return principal factors F (n, rank): F Fᵀ fits the off-diagonal entries of ``gram``.
 
-    The diagonal of ``gram``, which includes movement of single bones, is an upper bound.
+    The diagonal of ``gram`` includes the movement of single bones, so it is an upper bound.
     """
     filled, bound = gram.copy(), np.diag(gram)
     for _ in range(_MAX_ITERATIONS):
@@ -222,7 +222,7 @@ def _factor(gram: np.ndarray, rank: int) -> np.ndarray:
         np.fill_diagonal(filled, diagonal)
         if change <= _TOLERANCE * bound.max():
             break
-    # With fewer bones than axes, the remaining axes are 0.
+    # With fewer bones than factors, the remaining factors are 0.
     return np.pad(factor, ((0, 0), (0, rank - factor.shape[1])))
 
 
@@ -247,7 +247,7 @@ def _facing(rest: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarr
 
 
 def _ahead(positions: np.ndarray, skeleton: Skeleton, front: str | None) -> np.ndarray:
-    """Return X and Z of the forward direction, (2,), metres; 0 if ambiguous."""
+    """Return X and Z of a forward vector, (2,), metres; close to 0 if ambiguous."""
     names, horizontal = list(skeleton.canonical_names), positions[:, [0, 2]]
     if front is not None:
         if front not in {*skeleton.joint_names, *names}:

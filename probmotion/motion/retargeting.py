@@ -12,8 +12,8 @@ __all__ = ["common_skeleton", "counterpart", "matching_joints"]
 def matching_joints(source: Skeleton, target: Skeleton) -> list[int]:
     """Return the index in ``source`` of each joint of ``target``.
 
-    Joints are matched by their own names if the source has all of them, and by canonical names
-    (:mod:`probmotion.motion.joint_names`) otherwise.
+    Joints are matched by their own names if ``source`` has all names of ``target``, and otherwise
+    by canonical names (:mod:`probmotion.motion.joint_names`).
     """
     if set(target.joint_names) <= set(source.joint_names):
         return [source.joint_names.index(name) for name in target.joint_names]
@@ -32,8 +32,8 @@ def matching_joints(source: Skeleton, target: Skeleton) -> list[int]:
 def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
     """Return the skeleton of the joints common to all skeletons.
 
-    Joints are matched by canonical names and ordered as in the first skeleton; a missing
-    parent is replaced by the nearest common ancestor.
+    Joints are matched by canonical names and ordered as in the first skeleton. A parent that is not
+    common to all skeletons is replaced by its nearest ancestor that is.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def common_skeleton(skeletons: Sequence[Skeleton]) -> Skeleton:
 
 
 def counterpart(source: Skeleton, name: str, canonical: str) -> int | None:
-    """Return the index in ``source`` of the counterpart of a joint, or ``None``."""
+    """Return the index in ``source`` of the counterpart of a joint, or ``None`` if missing."""
     canonicals = source.canonical_names
     for key, names in ((canonical, canonicals), (name, canonicals), (name, source.joint_names)):
         if names.count(key) > 1:

@@ -1,7 +1,6 @@
 """Skeletons: named joints with parents, left-right pairs and bone radii.
 
-Several bodies, such as a pair of people or a gymnast and a ball, form one skeleton with several
-roots.
+Several bodies, such as two people or a gymnast and a ball, form one skeleton with a root per body.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ __all__ = ["Skeleton"]
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Names and topology of J joints.
+    """Names and parents of J joints, with optional bone radii.
 
     Parameters
     ----------
@@ -28,7 +27,7 @@ class Skeleton:
     parents : sequence of int
         Index of each joint's parent, -1 for a root. Parents may come after their children.
     radii : sequence of float, optional
-        Radius of each joint's bone to its parent, metres; used for contact and penetration.
+        Radius of the bone from each joint to its parent, metres, for contact and penetration.
 
     Raises
     ------
@@ -72,7 +71,7 @@ class Skeleton:
 
     @classmethod
     def preset(cls, name: str) -> Skeleton:
-        """Return a skeleton of :data:`probmotion.motion.presets.PRESETS` by name.
+        """Return the skeleton of this name in :data:`probmotion.motion.presets.PRESETS`.
 
         Raises
         ------
@@ -118,7 +117,7 @@ class Skeleton:
 
     @cached_property
     def mirrored_order(self) -> tuple[int, ...]:
-        """Index of each joint's left-right counterpart; its own if it has none."""
+        """Index of each joint's left-right counterpart, or of the joint itself if it has none."""
         order = list(range(self.n_joints))
         for left, right in self.mirrored_pairs:
             order[left], order[right] = right, left
@@ -126,7 +125,7 @@ class Skeleton:
 
     @cached_property
     def canonical_names(self) -> tuple[str, ...]:
-        """Canonical name of each joint (``left_knee``), or its own name if unknown."""
+        """Canonical name of each joint, such as ``left_knee``; unknown names are unchanged."""
         return canonical_names(self.joint_names)
 
     def index(self, joint_name: str) -> int:
@@ -155,7 +154,7 @@ class Skeleton:
         return tuple(chain)
 
     def subset(self, joints: Sequence[int]) -> Skeleton:
-        """Return the skeleton of ``joints``, each a child of its nearest ancestor among them."""
+        """Return the skeleton of ``joints``; parents are nearest ancestors among ``joints``."""
         chosen, parents = list(joints), []
         for joint in chosen:
             if not 0 <= joint < self.n_joints:

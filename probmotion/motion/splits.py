@@ -1,7 +1,7 @@
 """Random splits of clips into training, validation and test sets.
 
-Clips are split as units, so that windows or views of a clip are never in two sets. Names are sorted
-first, so that a split does not depend on the order of a file listing.
+Clips are never divided, so that all windows and views of a clip are in the same set. Names are
+sorted first, so that a split does not depend on the order of a file listing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["Split", "clip_of", "name_within_clip", "split_clips", "tracks_of_cli
 
 @dataclass(frozen=True)
 class Split:
-    """Sorted names of the clips of each disjoint set."""
+    """Sorted clip names of disjoint training, validation and test sets."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -26,7 +26,7 @@ class Split:
 
 
 def clip_of(name: str) -> str:
-    """Return the clip name of a track: the part before the last ``/``, or the full name."""
+    """Return the clip name of a track: the part before the last ``/``, else the full name."""
     return name.rpartition("/")[0] or name
 
 
@@ -46,16 +46,16 @@ def split_clips(
     Parameters
     ----------
     names : iterable of str
-        Names of clips, or of tracks (:func:`clip_of`). Order and duplicates are ignored.
+        Names of clips or tracks (see :func:`clip_of`). Order and duplicates are ignored.
     validation, test : float
-        Fractions of the clips, rounded to integer counts, above 0 and together below 1.
+        Fractions of clips in each set, above 0, with a sum below 1. Counts are rounded.
     seed : int
         Seed of the split.
 
     Returns
     -------
     split : Split
-        Sets with at least one clip each.
+        Training, validation and test sets, each with at least one clip.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Browser animations of skeletons, with a canvas per sampler and synchronised playback.
+"""Browser animations of skeletons, with a canvas per row of motions and synchronised playback.
 
-The HTML is self-contained.
+The HTML pages are self-contained.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = [
     "Animation", "animate_skeletons", "animation_html", "animation_script", "animation_style",
 ]  # fmt: skip
 
-# Width of a motion's cell and minimum width of the page, pixels.
+# Width of the cell of a motion and minimum width of the page, pixels.
 _PLACE, _CONTROLS = 180, 420
 _LEFT_ON_DARK, _RIGHT_ON_DARK = "#5BB3E8", "#F58A4B"
 
@@ -67,23 +67,23 @@ def animate_skeletons(
 ) -> Animation:
     """Return an HTML animation of skeletons.
 
-    Dragging or the arrow keys rotate all skeletons, the space bar pauses and resumes, and the
-    slider selects a frame. The left side of the body is blue and the right red. Bodies are centred
-    in their cells and have the same scale.
+    Dragging or the arrow keys rotate all skeletons, the space bar pauses and resumes playback, and
+    the slider selects a frame. The left side of the body is blue, the right side is red. Bodies are
+    centred in their cells and have the same scale.
 
     Parameters
     ----------
     rows : mapping of str to ndarray, (n, L, J, 3)
-        Motions in metres by label, from top to bottom, all of equal length. The first row
-        determines the scale; larger motions are clipped.
+        Motions in metres, by label of the row, from top to bottom. All motions have equal length.
+        The first row determines the scale; larger motions are clipped.
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     path : str or Path, optional
         HTML file to write.
     fps : float
         Frames per second.
     draws : int
-        Number of motions per row, starting with the first.
+        Number of motions to show per row, starting with the first.
     title : str
         Title above the skeletons.
 
@@ -137,7 +137,7 @@ def animation_html(
     further_cards: Sequence[str] = (),
     attributes: str = 'aria-label="Animated skeletons"',
 ) -> str:
-    """Return controls, canvases and data of an animation as HTML, without global names or ids.
+    """Return the controls, canvases and data of an animation as HTML without ids.
 
     ``captions`` maps row labels to captions, ``further_cards`` are HTML cards without motions, and
     ``attributes`` are HTML attributes of the group of canvases.
@@ -179,7 +179,7 @@ truth</label>
 
 
 def animation_script() -> str:
-    """Return the JavaScript function that animates one element of class ``animation``."""
+    """Return the JavaScript function that animates an element of class ``animation``."""
     return _text("animation.js")
 
 

@@ -1,4 +1,4 @@
-"""Histograms of log densities of real poses, draws and the seed pose."""
+"""Histograms of the log densities of real poses, draws and the seed pose."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def draw_calibration(
     Parameters
     ----------
     levels : mapping of mapping of ndarray, (n,)
-        Log densities in nats by kind of pose (real, draws, seed) and term of the density, the same
-        terms for every kind. A single pose is drawn as a line. Values below the 1 %
-        quantile, including −∞, are drawn in the lowest bin.
+        Log densities in nats, by kind of pose (real, draws, seed), then by term of the density. All
+        kinds have the same terms. A single pose is drawn as a line. Values below the lowest bin,
+        which starts at about the 1 % quantile of all finite values, are drawn in this bin.
     path : str or Path, optional
         PNG file to write.
 

@@ -1,4 +1,4 @@
-"""Coverage of real poses by draws: embedding, and coverage against the number of draws."""
+"""Figures of the coverage of real poses by draws: embeddings and coverage curves."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ _TITLES = {
 
 
 def classical_scaling(distances: np.ndarray, dim: int = 2) -> np.ndarray:
-    """Return the points of classical multidimensional scaling (Torgerson 1952).
+    """Embed points by classical multidimensional scaling of their distances (Torgerson 1952).
 
-    The coordinates are scaled leading eigenvectors of the doubly centred squared distances. They
-    are exact up to a rigid motion for points in ``dim`` dimensions. Negative eigenvalues are set to
-    0, and the sign of each axis makes its largest entry positive.
+    The coordinates are scaled leading eigenvectors of the doubly centred squared distances. For
+    points in ``dim`` dimensions, they are exact up to a rigid motion or reflection. Negative
+    eigenvalues are set to 0. The entry of largest magnitude on each axis is positive.
 
     Parameters
     ----------
     distances : ndarray, (n, n)
         Dissimilarities; d_ij and d_ji are averaged.
     dim : int
-        Number of dimensions of the points.
+        Number of dimensions of the embedding.
 
     Returns
     -------
@@ -93,12 +93,12 @@ def draw_embedding(
     points : ndarray, (n, 2)
         Result of :func:`classical_scaling`.
     kinds : sequence of str, (n,)
-        ``"real"``, ``"prior"``, ``"posterior"`` or ``"seed"``.
+        Kind of each pose: ``"real"``, ``"prior"``, ``"posterior"`` or ``"seed"``.
     path : str or Path, optional
         PNG file to write.
     counts : mapping of str to int, optional
-        Number of prior draws and of posterior draws in each panel, by panel title; one panel with
-        all draws by default.
+        Number of draws of the prior, and of the posterior, in each panel, by title of the panel.
+        By default, one panel shows all draws.
 
     Raises
     ------
@@ -129,13 +129,13 @@ def draw_embedding(
 def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure:
     """Return a figure of coverage against the number of draws (Yin et al. 2018, figure 9).
 
-    The figure has a panel per dissimilarity and a line per density.
+    The figure has a panel per distance measure and a line per density.
 
     Parameters
     ----------
     table : DataFrame
-        Columns ``measure``, ``density``, ``draws`` and ``coverage``. Repeated rows, such as seeds,
-        are drawn as their mean with an error bar from minimum to maximum.
+        Columns ``measure``, ``density``, ``draws`` and ``coverage``. Rows that differ only in
+        coverage, such as seeds, are drawn as their mean with an error bar from minimum to maximum.
     path : str or Path, optional
         PNG file to write.
 

@@ -1,4 +1,4 @@
-"""Error decomposition of a sampler as stacked bars."""
+"""Figures of the error decomposition of a sampler, as stacked bars."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_error_decomposition"]
 
-_FLOOR, _WHOLE = "floor", "whole"
+_FLOOR, _WHOLE = "floor", "whole"  # table rows of exact draws and of the sum of parts
 _COLOURS = {
     part: CYCLE[place]
     for part, place in (
@@ -24,9 +24,9 @@ _COLOURS = {
         ("guidance", 5), ("network", 1),
     )
 }  # fmt: skip
-_PALE, _FULL = 0.35, 0.95
-_WIDTH = 0.8
-_LETTERS = 26
+_PALE, _FULL = 0.35, 0.95  # opacities
+_WIDTH = 0.8  # of the stack
+_LETTERS = 26  # maximum line length of panel titles
 
 
 def draw_error_decomposition(
@@ -38,9 +38,9 @@ def draw_error_decomposition(
 ) -> Figure:
     """Return a figure of the error decomposition of one setting, with a panel per metric.
 
-    Parts are stacked above the error of exact draws at 0, positive parts upwards and negative
-    parts downwards; a black line marks their sum. Beside the stack, each part is drawn with its
-    interval. Parts whose interval contains 0 are pale.
+    The error of exact draws is at 0. Positive parts are stacked upwards from 0 and negative parts
+    downwards; a black line marks the total. Beside the stack, each part is drawn with its interval.
+    Parts with an interval that contains 0 are pale.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def draw_error_decomposition(
     path : str or Path, optional
         PNG file to write.
     words : mapping of str to str, optional
-        Titles of the metrics; their names by default.
+        Titles of the panels, by name of the metric; the names by default.
     notes : sequence of str
         Notes below the figure.
 

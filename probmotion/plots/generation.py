@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_generation"]
 
-# Marker, colour and fill by direction of the views.
+# Marker, colour and fill colour by direction of the views.
 _VIEWS = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
 
 
@@ -43,14 +43,14 @@ def draw_generation(
     Parameters
     ----------
     table : DataFrame
-        Row per generator, with columns ``name``, the metrics and optionally ``<metric>_sd``,
-        ``<metric>_side`` and ``<metric>_side_sd``. NaN values are not drawn.
+        One row per generator, with a column ``name``, a column per metric and, optionally, columns
+        ``<metric>_sd``, ``<metric>_side`` and ``<metric>_side_sd``. NaN values are not drawn.
     measures : mapping of str to str
-        Titles of the panels by metric.
+        Titles of the panels, by name of the metric.
     path : str or Path, optional
         PNG file to write.
     logarithmic : sequence of str
-        Metrics with a logarithmic axis.
+        Names of the metrics with a logarithmic axis.
 
     Raises
     ------

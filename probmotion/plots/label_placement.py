@@ -9,6 +9,7 @@ __all__ = ["Box", "place_labels"]
 Box = tuple[float, float, float, float]
 """Box (left, top, right, bottom); (left, bottom, right, top) if the vertical axis is upwards."""
 
+# Candidate directions (across, down) and distances of labels from their markers.
 _AROUND = ((1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, 0), (-1, -1), (-1, 1))
 _DISTANCES = (3.0, 16.0, 30.0)
 
@@ -19,9 +20,7 @@ def place_labels(
     """Return the box of each label and whether it needs a line to its marker.
 
     Labels are placed in order, each at the position with the least overlap with markers, earlier
-    labels and the area outside ``room``.
-
-    ``sizes`` are (width, height) of the labels; ``room`` is the area available to them.
+    labels and the area outside ``room``. ``sizes`` contains the (width, height) of each label.
     """
     occupied = list(markers.values())
     boxes = {}

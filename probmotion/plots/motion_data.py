@@ -16,7 +16,7 @@ from probmotion.plots.skeletons import face_heading, joint_sides
 
 __all__ = ["Shown", "choose_draws", "motion_numbers"]
 
-# Heading of bodies without observations, radians.
+# Common heading of bodies without observations or truth, radians.
 _HEADING = np.pi / 2 - 0.35
 _LARGEST = np.iinfo(np.int16).max
 # Largest elevation of the view, radians, at which a body is not clipped.
@@ -27,10 +27,10 @@ _SIDES = {"middle": "ink", "left": "left", "right": "right"}
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Motions of an animation: every ``step``-th frame of rows (n, L, J, 3) in metres.
+    """Motions of an animation: ``rows`` (n, L, J, 3) by label, metres, every ``step``-th frame.
 
-    The first row determines the scale. With ``turned``, motions without observations and truth are
-    rotated to a common heading, and poses are aligned with the first pose.
+    The first row determines the scale. If ``turned`` and the problem has no observations or truth,
+    motions are rotated to a common heading and single poses are aligned with the first pose.
     """
 
     problem: StoredProblem
@@ -50,9 +50,9 @@ def choose_draws(motions: np.ndarray, n: int) -> np.ndarray:
 
 
 def motion_numbers(shown: Shown) -> dict[str, Any]:
-    """Return the JSON-serialisable data of animation.js.
+    """Return the JSON-serialisable input of animation.js.
 
-    With observations or a truth, all bodies of a frame are moved by the same translation, so that
+    With observations or a truth, all bodies of a frame are translated equally, so that
     position errors remain visible. Otherwise each body is centred.
     """
     problem, step = shown.problem, shown.step
@@ -138,7 +138,7 @@ def _camera(camera: Cameras, keypoints: np.ndarray | None, step: int) -> dict[st
 
 
 def _encoded(motion: np.ndarray) -> dict[str, Any]:
-    """Return a motion in 16-bit multiples of a unit, one millimetre unless values overflow."""
+    """Return a motion as 16-bit multiples of a unit: 1 mm, or more if values would overflow."""
     unit = max(1, int(np.ceil(1000 * np.abs(motion).max() / _LARGEST)))
     return {"unit": unit, "numbers": _base64(np.rint(1000 * motion / unit).astype("<i2"))}
 

@@ -45,11 +45,11 @@ def draw_pairs(
         Pose-pairs in metres by label, from top to bottom. 3D pairs are drawn on a ground
         line; 2D annotations, with y up and NaN for occluded joints, have dashed bones.
     skeleton : Skeleton
-        The J joints; each tree is a character.
+        Skeleton of the J joints; each of its trees is a character.
     path : str or Path, optional
         PNG file to write.
     columns : int
-        Number of pose-pairs per row, starting with the first.
+        Maximum number of pose-pairs per row, counted from the first.
     azimuth, elevation : float
         Direction of the camera for 3D pairs in radians, as in :meth:`Cameras.ring`.
     title : str
@@ -90,7 +90,7 @@ class _Row(NamedTuple):
 def _project(
     camera: Cameras, name: str, poses: np.ndarray, skeleton: Skeleton
 ) -> tuple[np.ndarray, bool]:
-    """Return 2D poses centred at x = 0 with the lowest joint at y = 0."""
+    """Return 2D poses, centred at x = 0 with lowest joint at y = 0, and whether they were 3D."""
     is_3d = poses.shape[-1:] == (3,)
     check_shape(name, poses, ("n", skeleton.n_joints, 3 if is_3d else 2))
     if len(poses) == 0:

@@ -1,4 +1,4 @@
-"""Quality against cost of each sampler, with a panel per problem."""
+"""Figure of the quality and cost of samplers, with a panel per problem."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_quality_against_cost", "quality_points"]
 
-_LETTERS = 46
+_LETTERS = 46  # characters per line of the vertical axis label
 
-# Seconds and quality, (seeds,) each.
+# Seconds and quality of a sampler's runs, (seeds,) each.
 Point = tuple[np.ndarray, np.ndarray]
-# Colour and marker.
+# Colour and marker of a sampler.
 Style = tuple[str, str]
 
 
@@ -165,7 +165,7 @@ def _label_points(axes: Axes, points: Mapping[str, Point], styles: Mapping[str, 
 
 
 def _marker_box(axes: Axes, point: Point) -> Box:
-    """Return the box of a point's marker and bars in pixels."""
+    """Return the box of a point's marker and error bars in pixels."""
     cost, quality = point
     corners = [(cost.min(), quality.min()), (cost.max(), quality.max())]
     (left, bottom), (right, top) = axes.transData.transform(corners)

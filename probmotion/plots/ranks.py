@@ -1,6 +1,6 @@
-"""Ranks of simulated truths among draws: histograms, distribution functions and coverage.
+"""Figures of ranks of simulated truths: histograms, distribution functions and coverage.
 
-After Talts et al. (2018), figures 1 and 2, and Säilynoja et al. (2022), figure 3.
+The figures follow Talts et al. (2018), figures 1 and 2, and Säilynoja et al. (2022), figure 3.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_ranks"]
 
-_LEVEL = 0.95
-_MOST_BINS, _PER_BIN = 20, 10
-_ACROSS = 5
-_LETTERS = 130
+_LEVEL = 0.95  # probability that uniform ranks lie within a grey band
+_MOST_BINS, _PER_BIN = 20, 10  # maximum number of bins and minimum of ranks per bin
+_ACROSS = 5  # histograms per row
+_LETTERS = 130  # characters per line of a title
 # Inches: width of the figure; space above a block, per title line and below; height of a row.
 _WIDTH, _HEADER, _LINE, _FOOT, _PANEL = 15.5, 0.35, 0.22, 0.55, 1.2
 
@@ -96,7 +96,7 @@ def _draw_histograms(
     colours: Mapping[str, str],
     place: Mapping[str, float],
 ) -> None:
-    """Draw a histogram per quantity with a simultaneous band (Bonferroni)."""
+    """Draw a histogram per quantity with a Bonferroni-corrected band."""
     columns = min(_ACROSS, len(ranks))
     spacing = {"hspace": 0.4, "wspace": 0.3, **place}
     lines = -(-len(ranks) // columns)
@@ -157,7 +157,7 @@ def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping
 
 
 def _draw_band(axes: Axes, n: int, less: float) -> None:
-    """Draw the band of the distribution function of uniform ranks minus ``less`` × level."""
+    """Draw the band of the distribution function F(z) of uniform ranks, minus ``less`` × z."""
     points = evaluation_points(n)
     lower, upper = ecdf_band(n, _LEVEL)
     shift = less * points

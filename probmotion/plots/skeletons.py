@@ -43,17 +43,17 @@ def draw_skeletons(
     rows : mapping of str to ndarray, (n, L, J, 3)
         Motions in metres by label, from top to bottom. The first row determines the scale.
     skeleton : Skeleton
-        The J joints.
+        Skeleton of the J joints.
     path : str or Path, optional
         PNG file to write.
     draws : int
-        Number of motions per row, starting with the first.
+        Maximum number of motions per row, counted from the first.
     moments : int
         Number of evenly spaced frames per motion.
     azimuth, elevation : float
         Direction of the camera in radians, as in :meth:`Cameras.ring`.
     heading : float, optional
-        Mean heading, in radians from +Z towards +X, to which motions are rotated; none by default.
+        Mean heading, in radians from +Z towards +X, to which motions are rotated, if given.
     truth : ndarray, (L, J, 3), optional
         Motion drawn in grey behind every strip, at its position relative to the motion.
     title : str
@@ -134,7 +134,7 @@ def _compose(
     slot, low, high = _extent(strips, truth)
     strip_width = max(2.35, 7.0 / columns)
     strip_height = strip_width * (high - low) / (slot * moments)
-    # A character of this size is about 0.09 inches wide.
+    # A letter of a row label is about 0.09 inches wide.
     label_width, top_margin = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
     width = label_width + columns * (strip_width + 0.1)
     height = top_margin + len(strips) * (strip_height + 0.08) + 0.05
@@ -160,7 +160,7 @@ def _compose(
 
 
 def _anchor(motion: np.ndarray, truth: np.ndarray | None) -> np.ndarray:
-    """Return the horizontal centre of each frame's slot, (moments,)."""
+    """Return the horizontal coordinate at the centre of each frame's slot, (moments,)."""
     body = motion if truth is None else truth
     return np.median(body[..., 0], axis=-1)
 

@@ -22,12 +22,12 @@ __all__ = [
     "plain_axes", "style_of",
 ]  # fmt: skip
 
-LEFT = "#0072B2"
-RIGHT = "#D55E00"
-INK = "#333333"
-GREY = "#C4C4C4"
+LEFT = "#0072B2"  # left limbs
+RIGHT = "#D55E00"  # right limbs
+INK = "#333333"  # text and dark lines
+GREY = "#C4C4C4"  # ticks, grids and bands
 
-# Colours and markers of samplers in order; markers distinguish them without colour.
+# Colours and markers of samplers, in order; markers distinguish samplers without colour.
 CYCLE = (
     "#000000", "#0072B2", "#D55E00", "#009E73", "#B8578F", "#B07A00", "#3D9BD6", "#6B4F2A",
     "#7A7A7A",
@@ -37,7 +37,7 @@ _DOTS_PER_INCH = 150
 
 
 def style_of(place: int) -> tuple[str, str]:
-    """Return the colour and marker of the sampler at index ``place``; 90 are distinct."""
+    """Return the colour and marker of the sampler at index ``place``; the first 90 differ."""
     return CYCLE[place % len(CYCLE)], _MARKERS[place % len(_MARKERS)]
 
 
@@ -57,7 +57,7 @@ def plain_axes(
 
 
 def check_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
-    """Raise ``ValueError`` unless a table has rows and all columns."""
+    """Raise ``ValueError`` unless a table has rows and all of ``columns``."""
     missing = [name for name in columns if name not in table]
     if missing or len(table) == 0:
         problem = f"no columns {', '.join(missing)}" if missing else "no row"

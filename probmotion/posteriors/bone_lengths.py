@@ -1,4 +1,4 @@
-"""Estimation of bone lengths from noisy joints: β of *Motion-DVAE*."""
+"""Estimation of bone lengths from noisy joints (β in *Motion-DVAE*)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["bone_lengths"]
 
-# Minimum number of simulated bones per median, for a fifth of the standard error of 300 frames.
+# Minimum number of simulated bones; their median has a fifth of the standard error of 300 frames.
 _SIMULATED = 8000
 _HALVINGS = 16  # bisection steps, to a hundredth of a millimetre
 
@@ -45,7 +45,7 @@ def bone_lengths(
     joints : ndarray, (L, J, 3)
         Metres. Entries with confidence 0 are ignored and may be NaN.
     confidence : ndarray, (L, J), or None
-        Multiplier of the precision; 0 marks an occluded joint, ``None`` is 1 everywhere.
+        Multiplier of the precision; 0 marks an occluded joint. ``None`` means 1 everywhere.
     skeleton : Skeleton
         Skeleton of the joints.
     noise : float

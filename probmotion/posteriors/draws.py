@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 __all__ = ["MotionDraws", "library_versions", "settings_of"]
 
-_VERSION = 1
+_VERSION = 1  # of the file format
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDraws:
-    """Draws over (chain, draw, frame, joint, axis), with statistics and provenance.
+    """Draws of a sampler over (chain, draw, frame, joint, axis), with statistics and provenance.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ class MotionDraws:
 
         Parameters
         ----------
-        sampler : Sampler
-            Dataclass with a ``name``; its fields are stored as the settings.
+        posterior, sampler
+            Target and sampler; the fields of the sampler, a dataclass, are stored as the settings.
         positions : ndarray, (chains, draws, L, J, 3)
             Metres.
         seed, seconds
@@ -70,12 +70,12 @@ class MotionDraws:
         theta : ndarray, (chains, draws, dim), optional
             Draws in the posterior's coordinates.
         log_density : ndarray, (chains, draws), optional
-            log p(θ) + log p(y | θ) at each draw.
+            log p(θ) + log p(y | θ) of each draw.
         statistics : mapping of ndarray, optional
             Arrays over (chain,) or (chain, draw): ``acceptance``, ``divergent``, …
         counts : mapping of int, optional
-            Numbers of evaluations of ``denoiser``, ``density`` and ``gradient``, each of one motion
-            (2D denoiser: of one view).
+            Numbers of evaluations of ``denoiser``, ``density`` and ``gradient``, counted per
+            motion (2D denoiser: per view).
         state : mapping of ndarray, optional
             Sampler state from which the run can be continued.
         independent : bool

@@ -1,7 +1,7 @@
 """Likelihoods of observed 2D keypoints and noisy 3D joints.
 
-With orthographic cameras, y = A X + c + noise, entry by entry. A confidence multiplies the
-precision; 0 marks an occluded entry.
+With orthographic cameras, each observed joint is y = A X + c + noise. The confidence of a joint
+multiplies the precision of its noise; 0 marks an occluded joint.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class LinearObservation(NamedTuple):
     Attributes
     ----------
     axes : ndarray, (V, M, 3)
-        Matrices A, with M rows per view.
+        Matrices A_v, with M rows each.
     target : ndarray, (V, L, J, M)
-        y minus the projection of the origin; 0 where occluded.
+        Observed y_v minus the projection of the origin; 0 where occluded.
     precision : ndarray, (V, L, J)
-        1 / variance of each of the M entries; 0 where occluded.
+        w_v = 1 / variance of each of the M entries; 0 where occluded.
     """
 
     axes: np.ndarray
@@ -215,7 +215,7 @@ class Keypoints2D(_Entries):
         return replace(self, keypoints=seen)
 
     def linear(self) -> LinearObservation:
-        """Return the linear Gaussian form; raise ``NotConjugate`` for perspective or Student-t."""
+        """Return the linear form; raise ``NotConjugate`` for perspective cameras or Student-t."""
         self.entries.require_gaussian()
         if not self.cameras.orthographic:
             raise NotConjugate("the cameras are perspective, not orthographic")

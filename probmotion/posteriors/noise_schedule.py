@@ -1,6 +1,6 @@
 """Noise schedule and DDPM posterior, for training and sampling.
 
-x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε; level 0 is clean, level T almost pure noise.
+x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε with ε ~ N(0, I). Level 0 is clean; level T is almost pure noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _OFFSET = 0.008  # prevents β_t from vanishing at small t
 
 
 class PosteriorStep(NamedTuple):
-    """DDPM posterior q(x_s | x_t, x₀) = N(``clean`` x₀ + ``noisy`` x_t, ``deviation``² I)."""
+    """DDPM posterior q(x_s | x_t, x₀): mean ``clean`` x₀ + ``noisy`` x_t, sd ``deviation``."""
 
     clean: float
     noisy: float
@@ -54,7 +54,7 @@ class NoiseSchedule:
 
     @classmethod
     def cosine(cls, steps: int, *, power: int = 2) -> NoiseSchedule:
-        """Return the cosine schedule of Nichol and Dhariwal (2021), equation 17; β_t ≤ 0.999.
+        """Return the cosine schedule of Nichol and Dhariwal (2021), equation 17, with β_t ≤ 0.999.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class NoiseSchedule:
     def posterior(self, t: int) -> PosteriorStep:
         """Return q(x_{t−1} | x_t, x₀), t = 1..T (Ho et al. 2020, equations 6 and 7).
 
-        ``deviation`` is √β̃_t, β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t), and 0 at the last step.
+        ``deviation`` is √β̃_t, where β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t); it is 0 at t = 1.
         """
         if not 1 <= t <= self.steps:
             raise ValueError(f"t must be between 1 and {self.steps}, got {t}")

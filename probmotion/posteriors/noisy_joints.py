@@ -15,13 +15,13 @@ from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["noisy_joints"]
 
-# Mean cosine with an axis above which a body counts as aligned with it.
+# Minimum component of the mean direction along an axis of a body that is aligned with the axis.
 _UPRIGHT = 0.8
 # Plausible lengths of the longest chain of bones, metres; pelvis to ankle is 0.5 for a
 # three-year-old, pelvis to wrist 1.15 for an adult.
 _SIZES = (0.5, 3.0)
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "kilometres": 1000.0}
-# Quantile of the lowest joints' height, robust to noise, and its maximum distance from the floor.
+# Quantile over frames of the lowest joint's height; its maximum distance from the floor, metres.
 _LOW, _FAR = 0.05, 0.5
 # Relative tolerance: accepts rounded frame times (0.03333 s), but separates 29.97 and 30 fps.
 _SAME_RATE = 5e-4
@@ -42,7 +42,7 @@ def noisy_joints(
     """Return the likelihood of recorded joints, with the prior's skeleton and frame rate.
 
     NaN joints count as occluded. Joints are never translated or rescaled, and only resampled on
-    request. If the prior has a floor (Motion-DVAE: Y = 0), the recording's must be at that height.
+    request. The floor of the prior, if any (Motion-DVAE: Y = 0), should be that of the recording.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def noisy_joints(
     fps : float
         Frames per second.
     prior : MotionPrior
-        Prior with the target ``skeleton``, ``fps`` and ``frames``; the recording may be longer.
+        Prior with the target ``skeleton`` and ``fps``; the recording may have more frames.
     noise : float
         Standard deviation (Student-t: scale) of a coordinate of confidence 1, metres.
     confidence : ndarray, (L, J), optional
@@ -64,7 +64,7 @@ def noisy_joints(
     resample : bool
         Resample to the prior's frame rate with :func:`~probmotion.motion.occlusion.joints_at_rate`.
     longest_gap : int, optional
-        Number of consecutive fully occluded frames that is rejected, at the prior's rate; by
+        Least number of consecutive fully occluded frames, at the prior's rate, to reject; by
         default the window of the prior's networks or, without networks, its ``frames``.
 
     Warns
@@ -180,7 +180,7 @@ def _check_floor(joints: np.ndarray, confidence: np.ndarray, floor: float) -> No
 
 
 def _check_upright(joints: np.ndarray, confidence: np.ndarray, skeleton: Skeleton) -> None:
-    """Warn if the body is aligned with an axis other than +Y in all frames."""
+    """Warn if the body's mean direction is aligned with an axis other than +Y."""
     names = skeleton.canonical_names
     if not {"neck", "left_ankle", "right_ankle"} <= set(names):
         return

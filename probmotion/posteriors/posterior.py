@@ -94,7 +94,7 @@ class MotionPosterior:
 
     @property
     def dim(self) -> int:
-        """Length of θ."""
+        """Dimension of θ."""
         return self.prior.dim
 
     @property
@@ -206,7 +206,7 @@ class MotionPosterior:
     # Methods overridden by TruncatedPosterior.
 
     def _log_measure(self, theta: np.ndarray) -> np.ndarray:
-        """Return the log density of the base measure."""
+        """Return the log density of the base measure, 0 unless the subclass uses the prior's."""
         return np.zeros(theta.shape[:-1])
 
     def _needs_likelihood(self, log_prior: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
@@ -214,7 +214,7 @@ class MotionPosterior:
         return log_prior > -np.inf
 
     def _shaped(self, log_density: np.ndarray, log_measure: np.ndarray) -> np.ndarray:
-        """Return the log density of the target."""
+        """Return the log density, truncated in the subclass."""
         return log_density
 
     def log_likelihood(self, theta: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Test problems: a posterior with its true motion and reference draws."""
+"""Test problems: posteriors with true motions and reference draws."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Problem:
 
     @property
     def has_reference(self) -> bool:
-        """Whether reference draws, exact or stored, are available."""
+        """Whether exact or stored reference draws are available."""
         return self.stored is not None or self.exact_source is not None
 
     @property
@@ -113,7 +113,7 @@ class Problem:
     def reference(self, seed: int, n: int) -> np.ndarray:
         """Return n independent reference draws, (n, L, J, 3), metres.
 
-        Exact draws if available, else stored draws chosen without replacement. Raises
+        The draws are exact if possible, else stored draws chosen without replacement. Raises
         ``ValueError`` if fewer than n draws are available.
         """
         check_count("n", n)

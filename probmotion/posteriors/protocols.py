@@ -1,7 +1,7 @@
 """Protocols of priors, likelihoods and inference networks.
 
-Samplers list their required protocols; priors implement their supported protocols. Diffusion
-uses normalised units: metres divided by the prior's ``scale``.
+A sampler lists the protocols that it requires of a prior. Denoisers of motions and views use
+normalised units: metres divided by the prior's ``scale``.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ class ComparesViews(Protocol):
 
 @runtime_checkable
 class MotionPrior(Protocol):
-    """Distribution of motions of one skeleton and L frames; θ is unconstrained, (dim,)."""
+    """Distribution of motions of one skeleton and L frames, with unconstrained parameters θ."""
 
     @property
     def skeleton(self) -> Skeleton:
-        """The J joints."""
+        """Skeleton of the J joints."""
 
     @property
     def frames(self) -> int:
@@ -91,7 +91,7 @@ class MotionPrior(Protocol):
 
     @property
     def dim(self) -> int:
-        """Length of θ."""
+        """Dimension of θ."""
 
     def motion(self, theta: Array) -> Array:
         """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
@@ -99,7 +99,7 @@ class MotionPrior(Protocol):
 
 @runtime_checkable
 class Samplable(Protocol):
-    """A prior with independent draws."""
+    """A prior that can be sampled independently."""
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n motions, (n, L, J, 3), metres."""
@@ -150,7 +150,7 @@ class ChecksObservations(Protocol):
 class Marginalises(Protocol):
     """A prior that marginalises variables not in θ (a style, a yaw, small noise).
 
-    Its likelihood depends on a distribution of motions, and ``complete`` draws a motion given θ.
+    θ determines a distribution of motions; ``complete`` draws one, given θ and the observations.
     """
 
     def log_likelihood(self, theta: Array, likelihood: Likelihood) -> Array:
@@ -221,12 +221,12 @@ class Denoises3D(Protocol):
 
 @runtime_checkable
 class DenoisesCoordinates(HasLogDensity, Protocol):
-    """Denoiser of θ: posterior mean given θ_t, √ᾱ θ_t if θ ~ N(0, I), and a log density in θ."""
+    """A prior with a denoiser of θ and a log density in θ."""
 
     def denoise_coordinates(self, theta_t: Array, alpha_bar: float) -> Array:
         """Return E[θ | θ_t], θ_t = √ᾱ θ + √(1−ᾱ) ε: ``(…, dim) → (…, dim)``.
 
-        NumPy or torch arrays; ᾱ is in (0, 1].
+        Accepts NumPy or torch arrays; ᾱ is in (0, 1]. The mean is √ᾱ θ_t if θ ~ N(0, I).
         """
 
 
@@ -251,7 +251,7 @@ class DenoiserCovariance3D(Protocol):
 
 
 class ExactPosterior(Protocol):
-    """A distribution over motions in closed form."""
+    """A closed-form distribution over motions."""
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n independent draws, (n, L, J, 3), metres."""
@@ -267,16 +267,16 @@ class MotionInference(Protocol):
         """Return the torch parameters to optimise."""
 
     def loss(self, rng: np.random.Generator, *, initial_entropy: bool, latent_weight: float) -> Any:
-        """Return a one-draw estimate of the negative ELBO, summed over windows: a tensor."""
+        """Return the negative ELBO, summed over windows and estimated from one draw: a tensor."""
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return draws (n, L, J, 3), metres, and their θ (n, dim) if available.
+        """Return n draws (n, L, J, 3), metres, and their θ (n, dim) if available.
 
         The i-th draw uses only the i-th rows of the arrays that ``streams`` returns.
         """
 
     def predict(self, rng: np.random.Generator, *, average: bool) -> np.ndarray:
-        """Return the predicted motion (L, J, 3), metres: average motion, or motion at q's means."""
+        """Return the average motion, or else the motion at the means of q: (L, J, 3), metres."""
 
 
 @runtime_checkable

@@ -1,8 +1,8 @@
 """Reference draws of long runs, stored with a certificate.
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
-``certificate.json``. Its fingerprint is the posterior's log density at the first draws or, if only
-θ has a density, at initial points; it is reproducible across machines, unlike a hash of the prior.
+``certificate.json``. The certificate contains a fingerprint of the posterior (see
+``fingerprint_of``) that is reproducible across machines, unlike a hash of the prior.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from probmotion.validation import check_finite, check_shape
 __all__ = ["HasPositionDensity", "StoredReference", "fingerprint_of", "log_density_at"]
 
 _DRAWS, _CERTIFICATE = "draws.npz", "certificate.json"
-_PROBES = 4
-_TOLERANCE = 1e-5
+_PROBES = 4  # points at which a fingerprint is evaluated
+_TOLERANCE = 1e-5  # relative tolerance of fingerprints
 _NEEDED = ("problem", "draws", "exact", "sampler", "settings", "agreement", "seed", "fingerprint")
 
 
@@ -96,7 +96,7 @@ class StoredReference:
             )
 
     def save(self, folder: str | Path) -> Path:
-        """Write both files into ``folder``; an ``OSError`` preserves an earlier reference."""
+        """Write both files into ``folder``; if writing fails, an earlier reference is preserved."""
         folder = Path(folder)
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
@@ -138,7 +138,7 @@ def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[fl
 
     The fingerprint is the log density at the first draws or, without a density of positions, the
     log density at four initial θ and the mean distance of their joints from the origin, metres. The
-    levels of a truncated posterior are appended.
+    truncation levels of a truncated posterior are appended.
     """
     prior = posterior.prior
     if isinstance(prior, HasPositionDensity) or not isinstance(prior, HasLogDensity):

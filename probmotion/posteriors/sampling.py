@@ -40,7 +40,7 @@ class Sampler(Protocol):
     """
 
     name: ClassVar[str]
-    # Any: a sampler without unions may annotate tuple[type, ...].
+    # Any permits samplers to annotate tuple[type, ...] if they use no unions.
     requires: ClassVar[tuple[Any, ...]]
 
     def sample(
@@ -53,7 +53,7 @@ class Sampler(Protocol):
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` draws."""
+        """Return ``draws`` draws from each of ``chains`` chains."""
 
 
 class UnsupportedPosterior(ValueError):  # noqa: N818 (public name)
@@ -70,7 +70,7 @@ class UnsupportedPosterior(ValueError):  # noqa: N818 (public name)
 
 
 class Interrupted(KeyboardInterrupt):
-    """Interruption of a sampler by Ctrl-C; ``draws`` are the finished draws, as many per chain.
+    """Interruption of a sampler by Ctrl-C; ``draws`` are those finished by all chains.
 
     Continue a chain sampler with ``sampler.sample(posterior, …, initial=interrupted.draws)``.
     """
@@ -122,7 +122,7 @@ def suited(posterior: MotionPosterior) -> list[str]:
 
 
 def importable_samplers() -> dict[str, type[Any]]:
-    """Return the classes of all registered samplers with default settings, by name.
+    """Return the classes of all registered samplers that have default settings, by name.
 
     Samplers that cannot be imported or constructed are skipped with a warning.
     """
@@ -191,7 +191,7 @@ def load_sampler(name: str) -> type[Any]:
 
 
 def default_sampler(name: str) -> Any:
-    """Return a registered sampler with its default settings; raise ``ValueError`` otherwise."""
+    """Return a registered sampler with its default settings; raise ``ValueError`` on failure."""
     kind = load_sampler(name)
     try:
         return kind()

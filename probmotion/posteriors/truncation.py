@@ -1,4 +1,4 @@
-"""Truncated posterior: a density bounded below and above relative to its seed (eq. 11)."""
+"""Posterior with a density truncated relative to its value at a seed (eq. 11)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _NEAR = 1.0  # distance to the floor, nats, below which a draw is flagged
 
 @dataclass(frozen=True, eq=False)
 class TruncatedPosterior(MotionPosterior):
-    """Density f*: 0 where f < f₀/c, c f₀ where f > c f₀, else f, with f₀ = f(seed) (eq. 11).
+    """Posterior with density 0 where f < f₀/c, c f₀ where f > c f₀, and f elsewhere (eq. 11).
 
-    f is the density relative to the prior's ``log_measure``, if it has one. The likelihood is not
-    evaluated where its upper bound cannot raise f above f₀/c.
+    f is the density relative to the prior's ``log_measure``, if any, and f₀ = f(seed). The
+    likelihood is not evaluated where its upper bound cannot raise f above f₀/c.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class TruncatedPosterior(MotionPosterior):
 def limit_for_dimension(dim: int) -> float:
     """Return a limit c that includes the typical set of a Gaussian in ``dim`` dimensions.
 
-    log f is dim/2 nats below the mode on average, with standard deviation √(dim/2); log c is the
-    mean plus three standard deviations.
+    On average, log f is dim/2 nats below its mode, with standard deviation √(dim/2); log c is this
+    mean difference plus three standard deviations.
     """
     return math.exp(0.5 * dim + 3 * math.sqrt(0.5 * dim))

@@ -28,7 +28,7 @@ __all__ = [
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
 _OTHERS = {**CLIP_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
-_SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")
+_SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")  # e.g. gait(frames=20)
 
 
 def problem_names() -> list[str]:
@@ -48,7 +48,7 @@ def available_problems() -> tuple[list[str], dict[str, str]]:
 
 
 def problem_descriptions() -> dict[str, str]:
-    """Return a one-sentence description of every problem, by name, without loading it."""
+    """Return one-sentence descriptions of all problems by name, without loading them."""
     gaits = {name: problem.description for name, problem in _GAITS.items()}
     return gaits | {name: description for name, (description, _) in _OTHERS.items()}
 
@@ -68,10 +68,10 @@ def load_problem(name: str, **scale: Any) -> Problem:
     Raises
     ------
     ValueError
-        If the problem or a parameter is unknown, or the stored reference draws are of another
-        posterior.
+        If the problem or a parameter is unknown, or the stored reference draws belong to
+        another posterior.
     FileNotFoundError
-        If its data are missing; the message explains how to obtain them.
+        If the problem's data are missing; the message explains how to obtain them.
     """
     return _load(*_resolve(name, scale))
 
@@ -81,7 +81,7 @@ def problem_without_reference(name: str) -> Problem:
     return _load_without_reference(*_resolve(name, {}))
 
 
-Scale = tuple[tuple[str, Any], ...]
+Scale = tuple[tuple[str, Any], ...]  # changed parameters of a problem
 
 
 def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:

@@ -17,7 +17,7 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["CLIP_PROBLEMS", "clips_problem"]
 
-_WINDOWS = 1000
+_WINDOWS = 1000  # approximate number of windows to which a prior is fitted
 _HELD_OUT = "cmu_02_02"
 
 
@@ -44,9 +44,9 @@ def clips_problem(
     motions : sequence of Motion
         At least two clips with any skeletons.
     frames : int
-        Frames L of the motions.
+        Number of frames L of the motions.
     fps : float, optional
-        Frame rate to resample to; required if the clips' rates differ.
+        Frame rate to which clips are resampled; required if their rates differ.
     rank : int
         Latent dimensions per style.
     styles : int
@@ -59,7 +59,7 @@ def clips_problem(
     held_out : int or str
         Index or name of the held-out clip.
     seed : int
-        Seed of clustering and keypoint noise.
+        Seed of the clustering and the keypoint noise.
     name : str
         Name of the problem in tables.
 

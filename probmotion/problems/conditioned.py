@@ -1,4 +1,4 @@
-"""Conditioned priors with exact denoisers, a reference for guidance."""
+"""Priors conditioned on observations, whose exact denoisers are a reference for guidance."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["Conditions", "conditioned"]
 
 @runtime_checkable
 class Conditions(Protocol):
-    """A prior with denoisers conditioned on observations."""
+    """A prior that can be conditioned on observations."""
 
     def given(self, likelihood: Likelihood) -> MotionPrior:
         """Return the conditioned prior."""
 
 
 def conditioned(posterior: MotionPosterior) -> MotionPosterior:
-    """Return the same posterior, with a prior conditioned on the observations.
+    """Return the posterior as a prior conditioned on the observations, without likelihood.
 
-    Raises ``ValueError`` if there are observations and the prior is neither a Gaussian mixture nor
-    has ``given``; ``NotConjugate`` if a mixture's likelihood is not linear in the positions with
-    Gaussian noise.
+    Raises ``ValueError`` if there are observations, but the prior is no Gaussian mixture and has no
+    ``given``. Raises ``NotConjugate`` if a mixture's observations are not linear in the positions
+    with Gaussian noise.
     """
     prior, likelihood = posterior.prior, posterior.likelihood
     if likelihood is None:

@@ -31,7 +31,7 @@ __all__ = [
     "limb_occlusions",
 ]
 
-_CLIP = "cmu_02_02"
+_CLIP = "cmu_02_02"  # held-out clip
 
 
 def body_prior(name: str = "body-dvae") -> MotionDVAE:
@@ -61,7 +61,7 @@ def denoising_problem(
     truth : Motion
         Motion of any length with the prior's skeleton and frame rate, metres.
     prior : MotionDVAE
-        Prior; adapted to the number of frames of ``truth`` and the observed bone lengths.
+        Prior, which is adapted to the frames of ``truth`` and to the estimated body.
     noise : float
         Standard deviation (scale of Student-t noise) per coordinate, metres.
     degrees_of_freedom : float, optional
@@ -85,7 +85,7 @@ def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
     """Return the body estimated from noisy joints, as rest offsets (J, 3), metres.
 
     Bone lengths are estimated from the observations, and bone directions at joints with several
-    children from Kalman-smoothed joints. If a joint is never visible, the prior's are used.
+    children from Kalman-smoothed joints. If a joint is never visible, directions are the prior's.
     """
     from probmotion.data.joint_filters import kalman_smooth
 
@@ -109,9 +109,9 @@ def body_of(likelihood: Joints3D, prior: MotionDVAE) -> np.ndarray:
 
 
 def gaussian_noise(likelihood: Joints3D) -> float:
-    """Return an equivalent Gaussian noise scale for smoothers, metres.
+    """Return the standard deviation of the noise for smoothers that assume Gaussian noise, metres.
 
-    For Student-t noise: its standard deviation, or three times its scale if ν ≤ 2.25.
+    For Student-t noise with ν ≤ 2.25 degrees of freedom, return three times the scale instead.
     """
     freedom = likelihood.entries.degrees_of_freedom
     if freedom is None:

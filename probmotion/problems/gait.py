@@ -1,7 +1,7 @@
-"""Problems with an exact prior on procedural gaits and observations of a prior draw.
+"""Gait problems: an exact prior on synthetic gaits and simulated observations of a prior draw.
 
-Truths are drawn from the prior, so exact posterior draws are calibrated. :data:`GAIT_PROBLEMS`
-defines the defaults of the parameters:
+Truths are drawn from the prior, so exact posterior draws are calibrated. The problems have these
+parameters, with defaults in :data:`GAIT_PROBLEMS`:
 
 - ``frames``: number of frames L
 - ``components``: number of mixture components, styles × azimuths; values up to the number of styles
@@ -38,12 +38,12 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["GAIT_OUTLIER_PROBLEMS", "GAIT_PROBLEMS", "GaitProblem"]
 
-_PEOPLE = {"walk": 0.5, "run": 0.3, "march": 0.2}
-_QUADRUPEDS = {"quadruped-walk": 0.6, "quadruped-trot": 0.4}
-_RANK, _SEED = 10, 0
-_AZIMUTHS = 36
-_FREEDOM = 3.0
-_DENSE = {"joints": 17, "noise": 0.02, "hidden": 0.0}
+_PEOPLE = {"walk": 0.5, "run": 0.3, "march": 0.2}  # weights of the styles
+_QUADRUPEDS = {"quadruped-walk": 0.6, "quadruped-trot": 0.4}  # weights of the styles
+_RANK, _SEED = 10, 0  # latent dimensions per style, seed of clips, truth and observations
+_AZIMUTHS = 36  # components per style
+_FREEDOM = 3.0  # degrees of freedom of Student-t noise
+_DENSE = {"joints": 17, "noise": 0.02, "hidden": 0.0}  # all joints in all frames
 
 Coordinates = Literal["latent", "positions"]
 Observed = Literal["nothing", "keypoints", "one frame", "joints"]
@@ -53,8 +53,8 @@ Observed = Literal["nothing", "keypoints", "one frame", "joints"]
 class GaitProblem:
     """Factory of a gait problem with the default parameters ``defaults``.
 
-    ``observes`` selects no observations, 2D keypoints from one camera in all frames or the middle
-    frame, or 3D joints with Student-t noise (3 degrees of freedom).
+    ``observes`` selects the observations: none, 2D keypoints from one camera in all frames or in
+    the middle frame, or 3D joints with Student-t noise (3 degrees of freedom).
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Problems with priors learnt from 2D tracks.
 
-Generation is scored against held-out 2D motion; posterior sampling uses observations of a prior
-draw.
+Generation is scored against held-out 2D motion. In problems with observations, the truth is a
+draw from the prior.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LEARNT_PROBLEMS", "learnt_problem", "observed_draw_problem"]
 
-_NOISE = 0.02
+_NOISE = 0.02  # standard deviation of keypoints, metres
 
 
 def learnt_problem(name: str, description: str, kind: str) -> Problem:
@@ -55,7 +55,7 @@ def observed_draw_problem(name: str, description: str, prior: str, how: str) -> 
     ``how`` is as for :func:`~probmotion.problems.observations.observe`.
     """
     vae = models.MotionVAE.load(prior)
-    # The rigid path is known here.
+    # Treat the prior's rigid path as known instead of estimating it from the keypoints.
     vae = vae.placed(vae.rigid)
     truth = vae.motion(vae.initial(seeds.generator(0, name), 1))[0]
     likelihood = observe(Motion(truth, vae.skeleton, vae.fps, name=name), how, _NOISE, 0)

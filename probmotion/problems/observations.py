@@ -22,8 +22,8 @@ __all__ = [
     "one_camera_keypoints",
 ]
 
-_ELEVATION = math.pi / 12
-_SPARSE_JOINTS = 6
+_ELEVATION = math.pi / 12  # of the camera, radians
+_SPARSE_JOINTS = 6  # visible joints of the pattern "sparse"
 
 
 def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | None:
@@ -43,7 +43,7 @@ def observe(motion: Motion, how: str, noise: float, seed: int) -> Keypoints2D | 
 def one_camera_keypoints(
     motion: Motion, noise: float, seed: int, hidden: np.ndarray
 ) -> Keypoints2D:
-    """Return noisy keypoints from the camera of :func:`observe`; ``hidden`` (L, J): occluded."""
+    """Return noisy keypoints of :func:`observe`'s camera; ``hidden`` (L, J) marks occlusion."""
     camera = Cameras.ring(1, elevation=_ELEVATION)
     return Keypoints2D.observe(motion, camera, noise, seed, hidden=hidden)
 
@@ -87,7 +87,7 @@ def _all_but_central_joints(motion: Motion) -> np.ndarray:
 
 
 def _longest_limb(skeleton: Skeleton) -> list[int]:
-    """Return the longest chain of joints from a leaf up to a branching joint or root, exclusive."""
+    """Return the longest chain of joints from a leaf to below a branching joint or root."""
     children = np.bincount([p for p in skeleton.parents if p >= 0], minlength=skeleton.n_joints)
     limbs = []
     for leaf in np.flatnonzero(children == 0):

@@ -1,7 +1,7 @@
 """Problems on close interaction: annotated 2D pairs and one 3D seed.
 
-There is no exact posterior. Runs are scored by how well their draws cover the 3D pose pairs of
-held-out clips. Annotations and the seed are from the other clips.
+The posterior has no closed form. Samplers are scored by how well their draws cover the 3D pose
+pairs of held-out clips. The annotations and the 3D seed are from the other clips.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def pairs_problem(
 ) -> Problem:
     """Return the problem of covering the pose pairs of held-out clips.
 
-    Dance frames of the other clips are annotated in random 2D views; their medoid is the 3D seed.
+    Dance frames of the other clips are annotated in random views; the medoid 3D pose is the seed.
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ def pairs_problem(
     n_annotations : int
         Maximum number of annotated frames.
     n_held_out : int
-        Number of evenly spaced pose pairs of the held-out clips to cover.
+        Maximum number of evenly spaced pose pairs of the held-out clips to cover.
     settings : PairSettings, optional
         Settings of the posterior.
     seed : int
-        Seed of frames, views and the likelihood's views.
+        Random seed of annotated frames, their views and the likelihood's views.
     name, description : str
         Name and description of the problem in tables.
     """

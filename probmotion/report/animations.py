@@ -1,4 +1,4 @@
-"""Animated draws in the report, with a canvas per sampler and a common clock."""
+"""Animations of draws for the report, with one canvas per sampler and a common clock."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BUDGET", "animation", "shown_problems"]
 
-_MOST = 4
-_MOST_POSES = 6
+_MOST = 4  # Maximum number of draws per sampler.
+_MOST_POSES = 6  # Maximum number of draws per sampler if motions have one frame.
 BUDGET = 9_000_000
 """Maximum size of motions and images in bytes, before base64 encoding."""
 _HELD_OUT = "held-out poses"
@@ -28,7 +28,7 @@ _REFERENCE = "reference draws"
 def shown_problems(comparison: GridResults, budget: int = BUDGET) -> dict[str, Shown]:
     """Return the motions to show for each problem, at most 4 draws or 6 poses of each sampler.
 
-    Draws, then frames, are omitted until their size is within the budget in bytes. Problems without
+    Draws, then frames, are omitted until the motions fit into ``budget`` bytes. Problems without
     motions are omitted.
     """
     problems = {}
@@ -106,7 +106,7 @@ def _counted(label: str, n: int, problem: StoredProblem) -> str:
 
 
 def _description(shown: Shown) -> str:
-    """Return a description of the observations and of omitted content."""
+    """Return a description of the observations, missing reference draws and omitted frames."""
     problem = shown.problem
     parts = []
     for observed, words in ((problem.keypoints, "keypoints"), (problem.joints, "noisy 3D joints")):

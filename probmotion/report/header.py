@@ -36,7 +36,7 @@ def facts(comparison: GridResults) -> str:
 
 
 def _versions(comparison: GridResults) -> str:
-    """Return the library versions, which are the same for all draws."""
+    """Return the library versions of the first draws; empty if every run failed."""
     for result in comparison.results:
         if result.failure is None:
             draws = comparison.draws(result.problem, result.sampler, result.seed)
@@ -55,7 +55,7 @@ def contents(comparison: GridResults, with_calibration: bool) -> str:
 
 
 def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
-    """Return explanations of metrics, highlights and controls as HTML."""
+    """Return explanations of metrics, highlights and animation controls as HTML."""
     legends = "".join(f"<p>{escape(legend)}</p>" for legend in table.legends())
     highlights = (
         "With one seed no sampler can be distinguished from another, so none is highlighted."
@@ -91,7 +91,7 @@ def note_ids(comparison: GridResults) -> dict[tuple[str, str], str]:
 
 
 def notes(comparison: GridResults) -> str:
-    """Return the notes as HTML."""
+    """Return the section with the notes of the comparison as HTML."""
     items = "".join(
         f'<li id="note-{i}">{escape(sentence)}</li>' for i, sentence in enumerate(comparison.notes)
     )

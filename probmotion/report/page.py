@@ -50,7 +50,7 @@ def write_report(
     Parameters
     ----------
     comparison : GridResults
-        Results; unfinished runs are omitted.
+        Results to report; unfinished runs are marked in the tables.
     path : str or Path
         HTML file to write.
     calibration : Calibration, optional
@@ -93,7 +93,7 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     title = " on ".join(
         f"{n} {kind}{'s' * (n != 1)}" for n, kind in zip(count, ("sampler", "problem"), strict=True)
     )
-    # Block external resources.
+    # The policy blocks external resources.
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
     policy += "script-src 'unsafe-inline'"
     return f"""\
@@ -157,7 +157,7 @@ def _section(
 def _outcome(
     comparison: GridResults, problem: str, sampler: str, ids: Mapping[tuple[str, str], str]
 ) -> Outcome:
-    """Return the reasons for missing draws; runs without a result count as unfinished."""
+    """Return the number of seeds without draws, and the reasons."""
     seeds = comparison.plan.seeds
     results = [r for r in comparison.results if (r.problem, r.sampler) == (problem, sampler)]
     failures = [result.failure for result in results if result.failure is not None]

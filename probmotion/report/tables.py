@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "overview", "problem_tables"]
 
-_FAILURES = ("unsupported", "failed")
+_FAILURES = ("unsupported", "failed")  # Metrics that mark runs without draws.
 _MARKERS = {
     "o": "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0z",
     "s": "M-4.5-4.5h9v9h-9z",
@@ -42,10 +42,10 @@ _MARKERS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a sampler on a problem: seeds without draws, and the reason.
+    """Number of seeds without draws of a sampler on a problem, and the reason.
 
-    ``word`` and ``sentences`` are the short and the long reason, ``note`` the id of its note, and
-    ``failed`` the number of ``seeds`` without draws.
+    ``word`` is the short reason, ``sentences`` the long reason, and ``note`` the HTML id of the
+    note with the reason. ``failed`` of the ``seeds`` runs have no draws.
     """
 
     word: str = ""
@@ -63,7 +63,7 @@ class Outcome:
 def overview(plan: Plan, table: pd.DataFrame, outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
     """Return the headline metrics of all problems and samplers as an HTML table.
 
-    Empty for a single problem; ``outcomes`` are by problem and sampler.
+    The result is empty for a single problem. ``outcomes`` are indexed by problem and sampler.
     """
     if len(plan.problems) < 2:
         return ""
@@ -173,7 +173,7 @@ def _name(place: int, sampler: str) -> str:
 
 
 def _value(values: pd.Series | None, sampler: str, best: tuple[str | None, set[str]]) -> str:
-    """Return a sampler's number as an HTML cell, highlighted if it is the best or tied with it."""
+    """Return the values of a metric as an HTML cell, highlighted if best or tied with the best."""
     if values is None:
         return '<td><span class="quiet" title="not applicable or not measured">–</span></td>'
     text = mean_and_sd(values)

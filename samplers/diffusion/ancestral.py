@@ -52,7 +52,7 @@ class Denoiser(Protocol):
 
 @dataclass
 class MotionState:
-    """State of one noisy motion per draw, (B, L, J, 3) or (B, L, J, 2); ``shape`` excludes B.
+    """State with one noisy motion per draw, (B, L, J, 3) or (B, L, J, 2); ``shape`` excludes B.
 
     ``guide`` conditions the estimate of the clean motion on the observations. ``noise_factor`` maps
     σ to a matrix F, (3, 3), for noise F ε, or to ``None`` for the identity.
@@ -83,7 +83,7 @@ class MotionState:
         return self.guide(x_t, alpha_bar, clean, self.schedule.posterior(t))
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
-        """Return the motions."""
+        """Return the motions unchanged."""
         return motions
 
 
@@ -104,9 +104,9 @@ def ancestral(
     """Return one motion per stream, (B, L, J, 3): the estimate at level ``stop``.
 
     ``tick`` is called after every level. With ``variance_for_deviation`` the noise is multiplied
-    by β̃_t, as printed in algorithm 1 of MAS, instead of √β̃_t. ``corrector`` is applied to every
-    new state. ``watch`` is called with every estimate and the unit noise added to it: first with
-    (None, initial noise), last with (result, None).
+    by the variance β̃_t, as printed in algorithm 1 of MAS, instead of √β̃_t. ``corrector`` is
+    applied to every new state. ``watch`` is called with (None, initial noise), then with the
+    estimate and the unit noise of every step, and last with (result, None).
     """
     schedule = state.schedule
     x = state.noise(streams, schedule.steps)
@@ -132,13 +132,13 @@ def ancestral(
 
 
 def sigma(schedule: NoiseSchedule, t: int) -> float:
-    """Return the noise level σ = √((1−ᾱ)/ᾱ)."""
+    """Return the noise level σ = √((1−ᾱ)/ᾱ) at level t."""
     alpha_bar = float(schedule.alpha_bar[t])
     return float(np.sqrt((1 - alpha_bar) / alpha_bar))
 
 
 class NoiseLevels:
-    """Base of frozen dataclasses with settings of the noise schedule."""
+    """Base class of frozen dataclasses with settings of the noise schedule."""
 
     steps: int
     trained_steps: int | None

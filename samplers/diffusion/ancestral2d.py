@@ -28,7 +28,7 @@ __all__ = ["Ancestral2D"]
 
 @dataclass(frozen=True)
 class Ancestral2D(NoiseLevels):
-    """DDPM ancestral sampling of one view with a 2D denoiser: the upper bound in table 2 of MAS.
+    """DDPM ancestral sampling of one view with a 2D denoiser, the upper bound in table 2 of MAS.
 
     Returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
 
@@ -68,7 +68,7 @@ class Ancestral2D(NoiseLevels):
         posterior : MotionPosterior
             Posterior without observations.
         draws : int
-            Number of draws; does not affect individual draws.
+            Number of draws; individual draws do not depend on it.
         seed : int
             Seed of the noise.
         camera : Cameras, optional
@@ -116,7 +116,7 @@ class Ancestral2D(NoiseLevels):
 
 
 class _ViewDenoiser:
-    """Denoiser E[x₀ | x_t] of one view."""
+    """2D denoiser E[x₀ | x_t] of one view, with a count of evaluations."""
 
     def __init__(self, prior: Denoises2D, camera: Cameras) -> None:
         self.prior = prior

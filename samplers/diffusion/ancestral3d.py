@@ -18,8 +18,8 @@ __all__ = ["Ancestral3D"]
 class Ancestral3D(AncestralSampler):
     """DDPM ancestral sampling (Ho et al. 2020, algorithm 2) with a 3D denoiser.
 
-    The difference from `mas` with the same number of steps is the error due to conditioning on
-    single views.
+    With the same number of steps, draws of ``mas`` differ from those of this sampler by the error
+    due to conditioning on single views.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Ancestral3D(AncestralSampler):
     schedule_power : int
         Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
     guidance : AnyGuidance
-        Conditioning on the observations.
+        Method of conditioning on the observations.
     batch : int
         Maximum batch size; does not affect the draws.
     """

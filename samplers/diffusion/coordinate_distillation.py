@@ -1,12 +1,12 @@
 """Score distillation in the coordinates of a prior, with or without observations.
 
-Let θ_t = √ᾱ θ + √(1−ᾱ) ε and ε_φ = (θ_t − √ᾱ E[θ | θ_t])/√(1−ᾱ). Each iteration descends
+For noise ε, θ_t = √ᾱ θ + √(1−ᾱ) ε and ε_φ = (θ_t − √ᾱ E[θ | θ_t])/√(1−ᾱ), an iteration descends
 
     w(t) (ε_φ − ε) − g(t) ∇ log p(y | θ),    g(t) = w(t) √(ᾱ(1−ᾱ)).
 
-By Tweedie's formula E_ε[ε_φ − ε] = −√(1−ᾱ) E_ε[∇ log p_t(θ_t)], which for θ ~ N(0, I) is
-√(ᾱ(1−ᾱ)) θ = −√(ᾱ(1−ᾱ)) ∇ log p(θ). With this g(t), prior and likelihood have the same weight at
-every level, so the iterates converge to a mode of the posterior.
+By Tweedie's formula E_ε[ε_φ − ε] = −√(1−ᾱ) E_ε[∇ log p_t(θ_t)], which for the prior N(0, I) is
+√(ᾱ(1−ᾱ)) θ = −√(ᾱ(1−ᾱ)) ∇ log p(θ). Prior and likelihood then have equal weights at every level,
+so the iterates converge to a mode of the posterior; w(t) is a positive weight of level t.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["coordinate_distillation_gradient", "no_gradient", "posterior_gradien
 def posterior_gradient(
     posterior: MotionPosterior, theta: np.ndarray, noise: np.ndarray, alpha_bar: float
 ) -> np.ndarray:
-    """Return ε_φ − ε − √(ᾱ(1−ᾱ)) ∇ log p(y | θ), all arrays (n, dim).
+    """Return ε_φ − ε − √(ᾱ(1−ᾱ)) ∇ log p(y | θ); all arrays are (n, dim).
 
     Raises :class:`UnsupportedPosterior` if torch cannot differentiate the log likelihood, and
     ``ValueError`` if its gradient is not finite.

@@ -72,7 +72,7 @@ class LinearObservations:
 
     @property
     def confidence(self) -> np.ndarray:
-        """Precision relative to the largest, (V, L, J)."""
+        """Precision divided by the largest precision, (V, L, J)."""
         top = self.precision.max(initial=0.0)
         return self.precision / top if top > 0 else self.precision
 
@@ -91,7 +91,7 @@ class LinearObservations:
 
 @dataclass(frozen=True)
 class MomentMatched:
-    """Moment matching: N(D, C) conditioned on y, with C from the denoiser's Jacobian.
+    """Mean of N(D, C) conditioned on y, with C from the denoiser's Jacobian (moment matching).
 
         D + C Aᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D)
 
@@ -101,8 +101,8 @@ class MomentMatched:
     Parameters
     ----------
     steps : int
-        Maximum number of conjugate-gradient steps, with one product with C each. A draw stops
-        earlier if C is detectably not a covariance, as may occur with learnt denoisers.
+        Maximum number of conjugate-gradient steps, each with one product with C. Steps of a draw
+        stop early if C is detectably not a covariance, which may occur with learnt denoisers.
     """
 
     kind: str = field(default="moment-matched", init=False)
@@ -128,7 +128,7 @@ class MomentMatched:
                 return root * observations.observe(motions)
 
             residual = root * (observations.target - observations.observe(clean))
-            # Symmetric weighting by W^½, because W⁻¹ does not exist for missing entries.
+            # Weight both sides by W^½, because W⁻¹ does not exist for missing entries.
             guided = clean + conjugate_gradients(spread, whiten, residual, self.steps)
             if not np.isfinite(guided).all():
                 raise ValueError(
@@ -142,9 +142,9 @@ class MomentMatched:
 
 @dataclass(frozen=True)
 class DPS:
-    """Diffusion posterior sampling: a gradient step on ‖y − A D(X_t)‖ per denoising step.
+    """Diffusion posterior sampling: one gradient step on ‖y − A D(X_t)‖ per denoising step.
 
-    Chung et al. (2023, algorithm 1) with ζ_i = ζ/‖y − A D‖.
+    This is algorithm 1 of Chung et al. (2023) with step sizes ζ_i = ζ/‖y − A D‖.
 
     Parameters
     ----------
@@ -183,8 +183,8 @@ class DPS:
 class Replacement:
     """Replacement of the observed coordinates of the estimate by the observations.
 
-    Used in motion editing (Tevet et al. 2023, section 4.3). Observations are treated as exact;
-    inconsistent observations are averaged, weighted by precision.
+    Tevet et al. (2023, section 4.3) edit motions by replacement. Observations are treated as exact;
+    inconsistent observations are averaged with weights proportional to their precision.
     """
 
     kind: str = field(default="replacement", init=False)
@@ -198,7 +198,7 @@ class Replacement:
 
 @dataclass(frozen=True)
 class WeightedTriangulation:
-    """Triangulation M⁻¹ Σ P_vᵀ x̂_v with the observations as additional views.
+    """Least-squares triangulation of the view estimates, with observations as additional views.
 
     Parameters
     ----------
@@ -293,8 +293,8 @@ def conjugate_gradients(
     return solution
 
 
-_ROUNDING = 1e-9
-_CONJUGATE = 0.3
+_ROUNDING = 1e-9  # Relative rounding error of inner products.
+_CONJUGATE = 0.3  # Maximum cosine between directions that count as conjugate.
 
 
 def _of_covariance(
@@ -306,8 +306,8 @@ def _of_covariance(
 ) -> np.ndarray:
     """Return whether A = I + K is consistent with a covariance K, for every system, (B,).
 
-    If K is positive semidefinite, d · A d ≥ |d|²; if it is symmetric, the previous direction is
-    conjugate, d′ · A d = 0. Otherwise conjugate gradients may diverge.
+    If K is positive semidefinite, the direction d satisfies d · A d ≥ ‖d‖². If K is symmetric, the
+    previous direction d′ satisfies d′ · A d = 0. Otherwise conjugate gradients may diverge.
     """
     square = _products(direction, direction)
     rounding = _ROUNDING * np.sqrt(square * _products(image, image))

@@ -42,8 +42,8 @@ class MultiViewAncestral(AncestralSampler):
     elevation : float
         Elevation of all views, radians.
     perspective : bool
-        Use perspective views; the noise is projected orthographically (section 4.2). Exact
-        denoisers do not support them.
+        Use perspective views, with orthographic projection of the noise (section 4.2). Exact
+        denoisers do not support perspective views.
     distance : float
         Distance of perspective views from the origin, metres.
     shared_noise : bool
@@ -55,12 +55,12 @@ class MultiViewAncestral(AncestralSampler):
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the authors' code.
     stop_level : int
-        Last noise level; its estimate is returned. 2 in the authors' code.
+        Last noise level, whose estimate is returned; 2 in the authors' code.
     variance_for_deviation : bool
         Multiply the noise by the variance of the DDPM posterior, as printed in line 8 of
         algorithm 1, instead of its standard deviation.
     guidance : AnyGuidance
-        Conditioning on the observations.
+        Method of conditioning on the observations.
     batch : int
         Maximum batch size; does not affect the draws.
 
@@ -163,10 +163,10 @@ class MultiViewTrace:
     ----------
     sampler : MultiViewAncestral
         Settings of the run.
-    estimates : ndarray, (T − stop + 1, B, L, J, 3)
-        X⁽ⁱ⁾, the triangulated estimate at each level from T down, normalised units.
-    noises : ndarray, (T − stop + 1, B, L, J, 3)
-        ε₃D⁽ⁱ⁾: the initial noise, then the noise added after each estimate except the last.
+    estimates : ndarray, (T − stop_level + 1, B, L, J, 3)
+        X⁽ⁱ⁾: triangulated estimates at levels T to stop_level, in normalised units.
+    noises : ndarray, (T − stop_level + 1, B, L, J, 3)
+        ε₃D⁽ⁱ⁾: initial noise, then the noise added after each estimate except the last.
     scale : float
         Metres per normalised unit.
     """

@@ -1,7 +1,7 @@
 """Multi-view predictor-corrector sampling.
 
 MAS averages the estimates of single views, so the state is off-manifold if views favour different
-modes. Langevin steps at every level make the views consistent:
+modes. Langevin steps with step size ε at high noise levels make the views consistent:
 
     D(X, t) = M⁻¹ Σ_v P_vᵀ E[x₀ | P_v X, t],   M = Σ_v P_vᵀ P_v,   Λ = V M⁻¹,   σ = √((1−ᾱ)/ᾱ)
     predictor  X ← DDPM posterior step with D(X, t), noise ~ N(0, Λ^γ(σ))
@@ -9,8 +9,8 @@ modes. Langevin steps at every level make the views consistent:
 
 √ᾱ D(X) − X = (1−ᾱ) M⁻¹ ∇ Σ_v log p_v(P_v X), so for γ = 1 the corrector is Langevin dynamics
 preconditioned by Λ with stationary density Π_v p_v(P_v X)^(1/V), the logarithmic pool of the noisy
-2D marginals. With γ > 0, sampling is not exact for an isotropic Gaussian. Hence γ = ½ at high
-noise, where the mode is determined, and γ = 0 at low noise.
+2D marginals. With γ > 0, sampling is not exact for an isotropic Gaussian. By default, γ is
+therefore ½ only at high noise, where the mode is determined, and 0 at low noise.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
     schedule_power : int
         Power of the cosine schedule: 2 as published, 4 in the code of MAS.
     guidance : AnyGuidance
-        Conditioning on the observations.
+        Method of conditioning on the observations.
     batch : int
         Maximum batch size; does not affect the draws.
     """
@@ -121,7 +121,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
         return {"corrector": self._correct} if self.corrector_steps else {}
 
     def _noise_factor(self, views: Views) -> Callable[[float], np.ndarray | None]:
-        """Return σ → Λ^(γ(σ)/2), or ``None`` for the identity."""
+        """Return the function σ → Λ^(γ(σ)/2), with ``None`` for the identity."""
         covariance = views.n_views * np.linalg.inv(views.gram)
 
         @cache

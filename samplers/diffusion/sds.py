@@ -1,7 +1,7 @@
 """Score distillation sampling (SDS) as adapted from DreamFusion in MAS.
 
-Every iteration projects the motion to a random view, adds noise, estimates the noise with the 2D
-denoiser, and descends w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
+Every iteration adds noise ε to a random view p(X) of motion X, estimates ε with a 2D denoiser,
+and descends w(t) (ε_φ(x_t) − ε) ∂p/∂X (MAS, sections 5 and 6.3; Poole et al. 2022).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ScoreDistillation(IndependentSampler):
     Draws have independent starting points and noise, but all draws of a run share the level t and
     the views of an iteration. Priors without a 2D denoiser are optimised in their coordinates, with
     or without observations (:mod:`~probmotion.samplers.diffusion.coordinate_distillation`); the
-    counts then include likelihood gradients and final log densities.
+    evaluation counts then include likelihood gradients and final log densities.
 
     Parameters
     ----------
@@ -55,13 +55,13 @@ class ScoreDistillation(IndependentSampler):
     arc : float
         Range of the azimuths from 0, radians; the full circle by default. 2D denoisers only.
     shared_noise : bool
-        Project one 3D noise array to the views of an iteration instead of independent noise;
-        2D denoisers only.
+        Project one 3D noise array to all views of an iteration, instead of drawing independent
+        noise per view; 2D denoisers only.
     levels : {"uniform", "annealed"}
         Noise level t ~ U{1..T−1}, or decreasing from T − 1 to 1 over the iterations.
     weighting : {"constant", "variance", "residual"}
-        w(t): 1, 1 − ᾱ_t (DreamFusion) or √(1−ᾱ_t)/√ᾱ_t, for which the gradient is the residual
-        p(X) − x̂₀, as in the loss of MAS (appendix B).
+        Weight w(t): 1, 1 − ᾱ_t (DreamFusion) or √(1−ᾱ_t)/√ᾱ_t. With the last weight the gradient
+        is the residual p(X) − x̂₀, as in the loss of MAS (appendix B).
     learning_rate : float
         Learning rate of Adam, in normalised units or units of θ.
     steps : int
@@ -106,7 +106,7 @@ class ScoreDistillation(IndependentSampler):
     def reference_code(cls) -> ScoreDistillation:
         """Return the settings of the released code of MAS.
 
-        Azimuths are uniform on [0, 1) radians, a sixth of the circle.
+        Azimuths are restricted to [0, 1) radians, a sixth of the circle.
         """
         return cls(iterations=1000, weighting="residual", arc=1.0, schedule_power=4)
 
@@ -200,7 +200,7 @@ class ScoreDistillation(IndependentSampler):
         seed: int,
         tick: Callable[[], Any],
     ) -> None:
-        """Optimise values in place by their gradient at (ᾱ, azimuth indices)."""
+        """Optimise ``values`` in place with ``gradient``, a function of ᾱ and azimuth indices."""
         alpha_bars = self.schedule.alpha_bar
         adam = Adam(values, self.learning_rate)
         for t, indices in zip(*self.plan(seed), strict=True):
@@ -214,7 +214,7 @@ def score_distillation_gradient(
 ) -> np.ndarray:
     """Return Σ_v (ε_φ(x_t) − ε) ∂p/∂X for x_t = √ᾱ p(X) + √(1−ᾱ) ε = √ᾱ x̂₀ + √(1−ᾱ) ε_φ.
 
-    Motions X have shape (B, L, J, 3), in normalised units, and noise ε (B, V, L, J, 2).
+    Motions X are (B, L, J, 3), in normalised units, and the noise ε is (B, V, L, J, 2).
     """
     signal, noise_scale = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
     noisy = signal * views.project(motions) + noise_scale * noise

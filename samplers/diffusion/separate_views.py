@@ -1,4 +1,4 @@
-"""State of MAS with perspective views or independent noise per view."""
+"""Sampling state of MAS with perspective views or independent noise per view."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["SeparateViews"]
 
 @dataclass
 class SeparateViews:
-    """State of V noisy views per draw, (B, V, L, J, 2), normalised; ``shape`` is (L, J, 3).
+    """State with V noisy views per draw, (B, V, L, J, 2); ``shape`` is (L, J, 3).
 
-    Shared noise is projected to ``views``, the orthographic counterparts of ``cameras``.
+    All arrays are in normalised units. Shared noise is projected orthographically to ``views``.
     """
 
     prior: Denoises2D
@@ -31,7 +31,7 @@ class SeparateViews:
     shape: tuple[int, ...]
     shared_noise: bool
     counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
-    _last: np.ndarray | None = None
+    _last: np.ndarray | None = None  # Previous triangulation, the next initial value.
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
         """Return unit noise in every view; level T starts a new batch."""

@@ -79,7 +79,7 @@ class Views:
 def views_around(
     n_views: int, elevation: float, *, distance: float = 7.0, perspective: bool = False
 ) -> Cameras:
-    """Return V views evenly spaced in azimuth from 0.
+    """Return the cameras of V views evenly spaced in azimuth from 0.
 
     Two views are 120° apart (MAS, table 2), since opposite views do not determine the depth.
     """
@@ -89,7 +89,7 @@ def views_around(
 
 
 class MotionDenoiser:
-    """E[X₀ | X_t] and Cov[X₀ | X_t] of a prior with a 3D denoiser; counts evaluations."""
+    """3D denoiser of a prior, with E[X₀ | X_t], Cov[X₀ | X_t] and counts of evaluations."""
 
     covariance_protocol = DenoiserCovariance3D
 
@@ -106,16 +106,16 @@ class MotionDenoiser:
     def covariance_product(
         self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
     ) -> np.ndarray:
-        """Return Cov[X₀ | X_t] v, all arrays (B, L, J, 3)."""
+        """Return the product of Cov[X₀ | X_t] and ``vectors``; all arrays are (B, L, J, 3)."""
         assert isinstance(self.prior, DenoiserCovariance3D)
         _count(self.counts, "covariance", len(x_t))
         return self.prior.motion_covariance_product(x_t, alpha_bar, vectors)
 
 
 class MultiViewDenoiser:
-    """D(X, t) = M⁻¹ Σ_v w_v P_vᵀ E[x₀ | P_v X, t], the approximation of E[X₀ | X_t] in MAS.
+    """3D denoiser of MAS, D(X, t) = M⁻¹ Σ_v w_v P_vᵀ E[x₀ | P_v X, t], from a 2D denoiser.
 
-    Each term conditions on a single view instead of X_t.
+    D approximates E[X₀ | X_t]: each term conditions on a single view instead of X_t.
     """
 
     covariance_protocol = DenoiserCovariance2D
@@ -135,10 +135,10 @@ class MultiViewDenoiser:
     def covariance_product(
         self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
     ) -> np.ndarray:
-        """Return C v with C = M^(-½) (Σ_v w_v P_vᵀ Cov[x₀ | P_v X_t] P_v) M^(-½).
+        """Return C u with C = M^(-½) (Σ_v w_v P_vᵀ Cov[x₀ | P_v X_t] P_v) M^(-½), u = ``vectors``.
 
-        By Tweedie's formula the Jacobian of D times (1−ᾱ)/√ᾱ is M⁻¹ Σ_v w_v P_vᵀ Cov_v P_v; C is
-        the symmetric matrix similar to it.
+        By Tweedie's formula the Jacobian of D times (1−ᾱ)/√ᾱ is M⁻¹ Σ_v w_v P_vᵀ Cov_v P_v, which
+        is similar to the symmetric matrix C.
         """
         assert isinstance(self.prior, DenoiserCovariance2D)
         _count(self.counts, "covariance", len(x_t) * self.views.n_views)

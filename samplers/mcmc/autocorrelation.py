@@ -13,7 +13,7 @@ _WINDOW = 5
 def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation time of every coordinate.
 
-    Sokal's estimator (1989) with the automatic window of equation C.2, averaged over walkers.
+    Uses Sokal's estimator (1989) with the automatic window of equation C.2, averaged over walkers.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, (dim,)
-        Time in iterations; 1 for independent iterations, NaN for a constant coordinate.
+        Times in iterations; 1 for independent iterations, NaN for a constant coordinate.
 
     Notes
     -----
@@ -38,6 +38,6 @@ def autocorrelation_time(trace: np.ndarray) -> np.ndarray:
     correlation = covariance / np.where(covariance[0] == 0, np.nan, covariance[0])
     times = 2 * np.cumsum(correlation, axis=0) - 1
     long_enough = np.arange(n // 2)[:, None] >= _WINDOW * times
-    # If the run is too short for the window, the largest sum is the conservative estimate.
+    # If the run is too short for the window, use the largest estimate, which is conservative.
     windowed = np.take_along_axis(times, long_enough.argmax(axis=0)[None], axis=0)[0]
     return np.where(long_enough.any(axis=0), windowed, times.max(axis=0))

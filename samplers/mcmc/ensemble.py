@@ -28,18 +28,18 @@ _LEAST_TIMES = 3
 class Ensemble:
     """Ensemble sampler with stretch moves (Goodman and Weare 2010) of emcee.
 
-    A chain is one ensemble; its draws are all walkers of each recorded iteration in turn. Walkers
+    A chain is one ensemble; its draws are all walkers, in order of recorded iterations. Walkers
     of an ensemble depend on each other, so R-hat and ESS of a chain are not valid; the
     autocorrelation time is reported instead. See Foreman-Mackey et al. (2013) for emcee.
 
     Parameters
     ----------
     walkers : int, optional
-        Number of walkers per ensemble, at least 2 dim; 4 dim by default.
+        Number of walkers per ensemble, at least twice the dimension; four times by default.
     warmup : int
-        Iterations before the first draw.
+        Number of iterations before the first draw.
     thin : int
-        Iterations per recorded iteration.
+        Number of iterations per recorded iteration.
     largest_dim : int
         Maximum dimension of the posterior. In high dimensions the stretch move mixes poorly, which
         diagnostics may not detect (Huijser et al. 2015).
@@ -85,7 +85,7 @@ class Ensemble:
         UnsupportedPosterior
             If the posterior has no density or too many dimensions.
         ValueError
-            If the number of walkers is below 2 dim.
+            If the number of walkers is below twice the dimension.
         Interrupted
             On Ctrl-C, with the finished draws.
         """
@@ -156,7 +156,7 @@ class Ensemble:
 
 
 class _State(NamedTuple):
-    """Ensembles after an iteration; the last ``unused`` walkers are the next draws."""
+    """State of all ensembles after an iteration; its last ``unused`` walkers are the next draws."""
 
     coordinates: np.ndarray
     log_density: np.ndarray
@@ -241,9 +241,10 @@ class _Run:
         """Return the acceptance rate and autocorrelation time of every ensemble.
 
         The time is the maximum over coordinates, in recorded iterations, at least 1. If the run is
-        shorter than three times the estimate, it is at least the number of recorded iterations: the
-        run counts as one iteration, with walkers independent under the target (Goodman and Weare
-        2010). With fewer than four trace entries, it is NaN and the acceptance rate is omitted.
+        shorter than three times the estimate, the time is at least the number of recorded
+        iterations, so that the run counts as one iteration of walkers, which are independent under
+        the target (Goodman and Weare 2010). With fewer than four trace entries, the time is NaN and
+        the acceptance rate is omitted.
         """
         if len(self.trace) < 4:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
@@ -258,15 +259,12 @@ class _Run:
 
     @property
     def _stride(self) -> int:
-        """Iterations per entry of the trace."""
+        """Number of iterations per entry of the trace."""
         return max(1, self.thin // 10)
 
 
 def _words(state: Any) -> np.ndarray:
-    """Return the state of a RandomState as signed 32-bit words, for netCDF.
-
-    The cached normal variate is omitted; the stretch move of emcee uses none.
-    """
+    """Return the state of a RandomState, without cached normal variate, as signed 32-bit words."""
     _, key, position, *_ = state
     return np.append(key.view(np.int32), np.int32(position))
 

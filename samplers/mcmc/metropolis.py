@@ -36,7 +36,7 @@ class MetropolisHastings:
     candidates : int
         Number of prior draws per chain; the starting point is resampled from them by likelihood.
     pseudo_marginal : bool
-        Estimate the likelihood of every proposal from random views and store the estimate
+        Estimate the likelihood of every proposed point from random views and store the estimate
         with the state, so that chains target the integral over views (Andrieu and Roberts 2009).
         By default the views of the likelihood are fixed.
     """
@@ -78,7 +78,7 @@ class MetropolisHastings:
         Raises
         ------
         UnsupportedPosterior
-            If the posterior has no density, or no views although the settings require them.
+            If the posterior has no density, or the settings require views that it does not have.
         Interrupted
             On Ctrl-C, with the finished draws.
         """
@@ -155,7 +155,7 @@ _Draw = tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]
 
 @dataclass
 class _Walk:
-    """Current states of all chains, which are independent of each other."""
+    """Current states of all chains; the chains are independent of each other."""
 
     sampler: MetropolisHastings
     density: Density
@@ -202,7 +202,7 @@ class _Walk:
             "log_density": self.log_density,
             # netCDF cannot store arrays with zero columns.
             **({"guide": self.guide} if self.proposal.guided else {}),
-            # A deterministic value identifies the posterior; an estimate does not.
+            # A deterministic density identifies the posterior; an estimate does not.
             **({"fixed": self.density(self.theta)} if self.sampler.pseudo_marginal else {}),
             "random": np.stack([seeds.state_words(rng) for rng in self.generators]),
             "draws": np.array(self.draws, dtype=np.int32),
@@ -243,4 +243,4 @@ class _Walk:
         return (self.generators if self.sampler.pseudo_marginal else None), self.proposal.guided
 
 
-_PREFIX = "proposal_"
+_PREFIX = "proposal_"  # Prefix of the adaptive arrays of the proposal in the stored state.

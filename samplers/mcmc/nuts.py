@@ -1,4 +1,4 @@
-"""No-U-Turn sampler of NumPyro."""
+"""No-U-Turn sampling with NumPyro."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class NUTS:
     Parameters
     ----------
     warmup : int
-        Iterations of step-size and diagonal mass-matrix adaptation before the first draw.
+        Number of iterations before the first draw, which adapt step size and diagonal mass matrix.
     target_acceptance : float
         Target mean acceptance probability of step-size adaptation.
     max_tree_depth : int
         Maximum number of trajectory doublings (at most 2^max_tree_depth − 1 steps).
     thin : int
-        Number of iterations per draw. ``acceptance`` of a draw is their mean acceptance,
-        ``divergent`` whether any diverged, and ``steps`` their total number of leapfrog steps.
+        Number of iterations per draw. Statistics of a draw are their mean ``acceptance``, whether
+        any was ``divergent``, and their total number of leapfrog ``steps``.
     candidates : int
         Number of prior draws per chain; the starting point is resampled from them by likelihood.
 
@@ -169,7 +169,7 @@ class _Run:
         return 0 if self.earlier is None else int(self.earlier["draws"])
 
     def sample(self, draws: int, progress: bool) -> None:
-        """Warm up new chains, then draw from all chains in alternating chunks."""
+        """Warm up new chains, then draw chunks from all chains in turn."""
         chains, thin = len(self.points), self.sampler.thin
         warmup = self.sampler.warmup if self.earlier is None else 0
         with progress_bar(chains * (warmup + draws * thin), self.sampler.name, progress) as bar:

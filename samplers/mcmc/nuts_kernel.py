@@ -1,4 +1,4 @@
-"""Compiled No-U-Turn kernel of NumPyro."""
+"""Compiled kernel of NumPyro's No-U-Turn sampler."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def compiled(
 
 
 class NutsKernel:
-    """NumPyro's NUTS on the log density of a posterior."""
+    """NumPyro's NUTS kernel for the log density of a posterior."""
 
     def __init__(
         self, posterior: MotionPosterior, warmup: int, target_acceptance: float, max_tree_depth: int
@@ -89,7 +89,7 @@ class NutsKernel:
         return jax.tree.unflatten(structure, restored)
 
     def leaves(self, state: Any) -> list[np.ndarray]:
-        """Return a state as arrays for netCDF."""
+        """Return a state as a list of arrays that netCDF can store."""
         import jax
 
         out = []
@@ -108,7 +108,7 @@ class NutsKernel:
         return self.kernel.init(key, self.warmup, start)
 
     def _advance(self, state: Any, draws: Any, thin: Any) -> tuple[Any, dict[str, Any]]:
-        """Return the state after ``draws`` ≤ CHUNK draws, and their values in CHUNK rows."""
+        """Return the state after ``draws`` ≤ CHUNK draws, and arrays of draws with CHUNK rows."""
         import jax
         import jax.numpy as jnp
 

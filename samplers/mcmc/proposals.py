@@ -74,7 +74,7 @@ class _Symmetric:
         proposed_guide: np.ndarray,
         state: ProposalState,
     ) -> np.ndarray:
-        """Return 0."""
+        """Return zeros, because the proposal is symmetric."""
         return np.zeros(len(theta))
 
 
@@ -134,10 +134,10 @@ class Isotropic(_AdaptiveScale, _Symmetric):
 
 @dataclass(frozen=True)
 class AdaptiveCovariance(_Symmetric):
-    """Random-walk proposal θ' = θ + s C ε, C Cᵀ the warm-up covariance (Haario et al. 2001).
+    """Random-walk proposal θ' = θ + s C ε with warm-up covariance C Cᵀ (Haario et al. 2001).
 
     Warm-up is divided into windows of 50, 100, 200, … steps. At the end of each window, C is set to
-    the Cholesky factor of the regularised covariance of its states and s to 2.38/√dim (Gelman et
+    the Cholesky factor of the regularised covariance of the window and s to 2.38/√dim (Gelman et
     al. 1996). Within windows, s is adapted towards the target acceptance rate (Andrieu and Thoms
     2008, algorithm 4).
 
@@ -209,10 +209,10 @@ class AdaptiveCovariance(_Symmetric):
 
 @dataclass(frozen=True)
 class VelocityBiased(_AdaptiveScale):
-    """Proposal N(θ, s² diag(σ₀² + b V(θ))), wider along fast coordinates (Yin et al. 2018).
+    """Proposal N(θ, s² diag σ²(θ)), which is wider along fast coordinates (Yin et al. 2018).
 
-    V(θ), the guide, is the mean squared speed of each coordinate in the annotations closest to θ
-    (eq. 12, with b = 1). It depends on θ, so the proposal is not symmetric.
+    Variances are σ²(θ) = σ₀² + b V(θ), with b = 1 in eq. 12. The guide V(θ) is the mean squared
+    speed of each coordinate in the annotations closest to θ, so the proposal is not symmetric.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ class VelocityBiased(_AdaptiveScale):
         proposed_guide: np.ndarray,
         state: ProposalState,
     ) -> np.ndarray:
-        """Return log N(θ; θ', σ²(θ')) − log N(θ'; θ, σ²(θ))."""
+        """Return log N(θ; θ', s² σ²(θ')) − log N(θ'; θ, s² σ²(θ)), (chains,)."""
         forward, backward = (self._variances(g, state) for g in (guide, proposed_guide))
         square = (proposed - theta) ** 2
         terms = np.log(forward / backward) + square / forward - square / backward
@@ -264,7 +264,7 @@ class VelocityBiased(_AdaptiveScale):
         return s**2 * (self.base**2 + self.bias * guide)
 
 
-_FIRST_WINDOW = 50
+_FIRST_WINDOW = 50  # Number of warm-up steps in the first window.
 
 
 def _shrunk(scatter: np.ndarray, n: float) -> np.ndarray:
@@ -277,7 +277,7 @@ def _shrunk(scatter: np.ndarray, n: float) -> np.ndarray:
 
 
 def _adapted(log_scale: np.ndarray, surplus: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return log s after one Robbins-Monro step of size n^(−0.6)."""
+    """Return log s after one Robbins-Monro step of size n^(−0.6), with n = ``steps``."""
     return log_scale + surplus * steps**-0.6
 
 

@@ -35,8 +35,8 @@ __all__ = ["AmortisedPosterior", "AmortisedSettings"]
 _FIRST = 12_000
 # Fraction of pairs held out to estimate the covariance of the decoder.
 _HELD_OUT = 0.1
-_WARMUP = 100
-# Initial weight of KL(r ‖ p), and the fraction of steps in which it increases to 1.
+_WARMUP = 100  # Number of steps in which the learning rate increases linearly.
+# Initial weight of the KL divergence, and the fraction of steps in which it increases to 1.
 _FIRST_WEIGHT, _ANNEALED = 0.05, 0.3
 
 
@@ -57,7 +57,7 @@ class AmortisedSettings:
     latent, components, experts, hidden : int
         Sizes of the network (:class:`ConditionalVAE`).
     learning_rate : float
-        Maximum learning rate of Adam, with cosine decay to 0.
+        Maximum learning rate of AdamW, with linear warm-up and cosine decay to 0.
     """
 
     steps: int = 4000
@@ -82,7 +82,7 @@ class AmortisedSettings:
         return self.learning_rate * decay * min(1.0, step / _WARMUP)
 
     def weight(self, step: int) -> float:
-        """Return the weight of KL(r ‖ p) at a step; small at first to avoid posterior collapse."""
+        """Return the weight of the KL divergence; small at first to avoid posterior collapse."""
         progress = min(1.0, step / (_ANNEALED * self.steps))
         return _FIRST_WEIGHT + (1 - _FIRST_WEIGHT) * progress
 
@@ -133,7 +133,7 @@ class AmortisedPosterior:
             condition = torch.from_numpy(y)
             mixture = self.network.prior(condition[:1])
             log_weight, means, log_scales = (part[0].numpy() for part in mixture)
-            # Omit the last sum, which may round to less than 1.
+            # Omit the last cumulative weight, which may round to less than 1.
             cumulative = np.cumsum(np.exp(log_weight))[:-1]
             k = np.searchsorted(cumulative, uniform, side="right")
             z = torch.from_numpy(means[k] + np.exp(log_scales[k]) * z_noise)

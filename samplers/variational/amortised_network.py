@@ -2,9 +2,9 @@
 
     p(x, z | y) = p(z | y) N(x; μ(z, y), S),   r(z | x, y) = N(z; a(x, y), b(x, y)²)
 
-x and y are the coordinates of a motion and of its observations. p(z | y) is a Gaussian mixture with
-one or more components per mode; μ is a mixture of linear maps plus a neural network. Training
-maximises E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015).
+x and y are the coordinates of a motion and of its observations, and r is the encoder. p(z | y) is a
+Gaussian mixture that can represent several modes; μ is a mixture of linear maps plus a neural
+network. Training maximises E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Yan 2015).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ConditionalVAE(nn.Module):
         self.log_scale = nn.Parameter(torch.zeros(coordinates))
 
     def encode(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return a and log b of r(z | x, y): ``(B, C), (B, E) → (B, latent)`` twice."""
+        """Return a and log b of r(z | x, y), (B, latent) each, from x, (B, C), and y, (B, E)."""
         mean, log_scale = self.encoder(torch.cat([x, y], dim=1)).chunk(2, dim=1)
         return mean, log_scale.clamp(_LEAST, _MOST)
 
@@ -69,7 +69,7 @@ class ConditionalVAE(nn.Module):
     ) -> torch.Tensor:
         """Return −E[log N(x; μ, S)] + ``weight`` · KL(r ‖ p) up to a constant, averaged over pairs.
 
-        S is diagonal; both expectations are estimated from one sample z = a + b · ``noise``.
+        S is diagonal here; both terms are estimated from one sample z = a + b · ``noise``.
         """
         mean, log_scale = self.encode(x, y)
         z = mean + log_scale.exp() * noise
@@ -103,7 +103,7 @@ class _MixtureOfGaussians(nn.Module):
             )  # fmt: skip
 
     def forward(self, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return log π, means and log scales: (B, K), (B, K, latent) twice."""
+        """Return log π, (B, K), and means and log scales, (B, K, latent) each."""
         log_weight, mean, log_scale = (
             part.expand(len(y), *part.shape)
             for part in (self.log_weight, self.mean, self.log_scale)
@@ -123,7 +123,7 @@ class _MixtureOfGaussians(nn.Module):
 
 
 class _MixtureOfLinearMaps(nn.Module):
-    """Mixture of linear maps f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v); g and h share a network."""
+    """Mixture of linear maps, f(v) = Σ_e g_e(v) (A_e v + b_e) + h(v); g and h share a network."""
 
     def __init__(self, inputs: int, outputs: int, experts: int, hidden: int) -> None:
         super().__init__()

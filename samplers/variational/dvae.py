@@ -46,10 +46,10 @@ _CLIP = 30.0
 class DVAEInference(IndependentSampler):
     """Variational inference with inference networks (Motion-DVAE, appendices B to E).
 
-    Uses ``network`` or the inference network of the prior; without observations, a prior with an
-    inference network is sampled directly. Otherwise a network is first trained on pairs simulated
-    from the prior and likelihood (:mod:`~probmotion.samplers.variational.amortised`) and used
-    unchanged. Draws have θ and log densities if the motion fits into one window of the network.
+    A prior with an inference network is sampled directly if there are no observations. Otherwise
+    the sampler uses ``network`` or the prior's network or, if there is none for the observations,
+    trains one on simulated pairs (:mod:`~probmotion.samplers.variational.amortised`).
+    Draws have θ and log densities if the motion fits into one window of an inference network.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class DVAEInference(IndependentSampler):
     latent_weight : float
         Weight of the motion prior in the optimisation; 0 for the ablation "no prior".
     overlap : int
-        Number of frames shared by consecutive windows of a long motion, less than a window.
+        Number of frames shared by consecutive windows of a long motion, less than their length.
     training_steps, training_pairs : int
         Numbers of gradient steps and simulated pairs if a network is trained.
     batch : int
@@ -112,14 +112,14 @@ class DVAEInference(IndependentSampler):
 
     @classmethod
     def paper(cls) -> DVAEInference:
-        """Return the published settings: robust noise, no entropy of the first pose."""
+        """Return the published settings: optimisation, robust noise, no initial entropy."""
         return cls(
             mode="optimization", iterations=50, degrees_of_freedom=4.0, initial_entropy=False
         )
 
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
-        """Return whether a network supports the observations or can be trained on them."""
+        """Return whether a network supports the observations or can be trained for them."""
         network = getattr(posterior.prior, "inference_network", None)
         if posterior.likelihood is None or (network and network.reads(posterior.likelihood)):
             return True
@@ -138,7 +138,7 @@ class DVAEInference(IndependentSampler):
             return self._draw_function(posterior, seed, counts, thetas, progress)
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
-            # The first batch includes training and optimisation in the timed run.
+            # Train and optimise in the first batch, so that the run time includes both.
             tick()
             with one_thread():
                 return fitted()(streams)
@@ -153,7 +153,7 @@ class DVAEInference(IndependentSampler):
         average: bool = True,
         progress: bool = True,
     ) -> Motion:
-        """Return a point estimate: mean observed and decoded joints (appendix D, equation 11).
+        """Return the mean motion over draws of an inference network (appendix D, equation 11).
 
         Parameters
         ----------

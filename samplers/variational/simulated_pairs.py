@@ -20,14 +20,14 @@ __all__ = [
     "simulate_pairs",
 ]  # fmt: skip
 
-_CHUNK = 2000
+_CHUNK = 2000  # Number of pairs simulated at once.
 # Minimum variance of a coordinate relative to the largest; smaller ones are rounding errors.
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPairs:
-    """n motions, (n, L, J, 3), metres, and their observations, (n, L, M)."""
+    """Simulated pairs of n motions, (n, L, J, 3), metres, and observations, (n, L, M)."""
 
     positions: np.ndarray
     observed: np.ndarray
@@ -36,13 +36,13 @@ class SimulatedPairs:
 def observed_entries(likelihood: Likelihood | None, frames: int) -> np.ndarray:
     """Return the observations of L frames, (L, M), 0 for missing entries.
 
-    They are ``keypoints`` (V, L, J, 2) or ``joints`` (L, J, 3) of the likelihood; M = 0 for
-    ``None``.
+    Observations are ``keypoints``, (V, L, J, 2), or ``joints``, (L, J, 3), of the likelihood; M = 0
+    without a likelihood.
 
     Raises
     ------
     UnsupportedPosterior
-        If the likelihood has neither, or its noise has infinite variance.
+        If the likelihood has neither keypoints nor joints, or noise with infinite variance.
     """
     if likelihood is None:
         return np.zeros((frames, 0))
@@ -95,7 +95,7 @@ class PrincipalCoordinates:
 
     @classmethod
     def of(cls, values: np.ndarray, most: int) -> PrincipalCoordinates:
-        """Compute at most ``most`` coordinates, of non-zero variance, from arrays ``(n, …)``."""
+        """Compute at most ``most`` coordinates with non-zero variance from arrays ``(n, …)``."""
         from scipy.linalg import eigh
 
         flat = values.reshape(len(values), -1)
@@ -118,7 +118,7 @@ class PrincipalCoordinates:
         return self.mean + (coordinates * self.deviation) @ self.axes.T
 
     def without(self, flat: np.ndarray) -> np.ndarray:
-        """Return ``(n, D)`` without its component along the axes."""
+        """Return flattened arrays, (n, D), without their components along the axes."""
         return flat - flat @ self.axes @ self.axes.T
 
 
@@ -168,7 +168,7 @@ class MotionCoordinates:
         )
         remainder = remainder - np.einsum("nlm,lmj->nlj", unexplained, gain, optimize=True)
         covariance = np.einsum("nli,nlj->lij", remainder, remainder, optimize=True) / n
-        # Correction for the component along the axes, which is removed from every draw.
+        # Correct for the component along the axes, which is removed from every draw.
         dim, axes = basis.axes.shape
         variance, directions = np.linalg.eigh(covariance * dim / max(1, dim - axes))
         root = directions * np.sqrt(np.maximum(variance, 0.0))[:, None, :]

@@ -1,10 +1,10 @@
-"""Equal budgets: sampler settings of equal cost on a problem.
+"""Budgets, and sampler settings that use the same budget on a problem.
 
 A sampler class lists the settings that determine its cost in ``effort``: the first is tuned, the
 others are scaled in proportion, and ``least_effort`` is the smallest useful value of the first.
 Pilot runs, each with 2 to 8 times the effort of the previous one, measure the cost, which is linear
 in the effort for all samplers of this package except NUTS. With a budget in seconds the first pilot
-runs twice, to exclude compilation, and pilots with nonlinear costs are repeated.
+runs twice, to exclude compilation, and pilots are repeated if their costs are not linear.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["Budget", "affordable", "effort_of"]
 
-# Costs other than 1: a gradient also computes the value, at about the same cost.
+# Costs of evaluations that are not 1: a gradient costs 2, because it also computes the value.
 _WEIGHTS = {"gradient": 2}
-# Pilots stop above the first fraction of the budget; the second is their target cost.
+# Pilots stop once they cost more than the first fraction of the budget; they aim at the second.
 _ENOUGH, _TARGET = 0.25, 0.3
 # Minimum and maximum growth factor of the effort between pilots.
 _GROWTH = 2, 8
-# The effort costs nothing if the cost has not increased at this multiple of the given effort.
+# The effort is not tuned if the cost has not increased at this multiple of the given effort.
 _MULTIPLE = 64
-# Relative noise of seconds; evaluation counts have none.
+# Relative noise of measured times; evaluation counts are exact.
 _NOISE = 0.1
 # Maximum relative deviation of the last pilot from the line through the previous two.
 _DEVIATION = 0.15
@@ -41,9 +41,9 @@ class Budget:
     Parameters
     ----------
     evaluations : int, optional
-        Number of evaluations of the denoiser, its covariance, the density (1 each) and gradients
-        (2 each), for one motion, or for one view with a 2D denoiser. A training step of a network
-        counts as one gradient.
+        Number of evaluations of the denoiser, its covariance or the density, for one motion (one
+        view of a 2D denoiser). A gradient counts as two evaluations, a training step of a network
+        as one gradient.
     seconds : float, optional
         Wall-clock time on the machine that runs the grid.
 
@@ -103,7 +103,7 @@ def effort_of(sampler: Sampler) -> tuple[str, ...]:
 def affordable(
     budget: Budget, sampler: Sampler, pilot: Callable[[Sampler], float]
 ) -> dict[str, int]:
-    """Return the settings at which a sampler uses a budget; empty without an effort setting.
+    """Return the settings with which a sampler uses a budget; empty if no effort affects its cost.
 
     The effort is the largest whose cost, extrapolated from the last two pilots, is within the
     budget.
@@ -111,11 +111,11 @@ def affordable(
     Parameters
     ----------
     budget : Budget
-        The budget of a run.
+        Budget of a run.
     sampler : Sampler
-        The sampler with its original settings.
+        Sampler with its original settings.
     pilot : callable
-        Runs a sampler and returns its cost in the unit of the budget.
+        Function that runs a sampler and returns its cost in the unit of the budget.
 
     Raises
     ------

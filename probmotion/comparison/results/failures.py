@@ -9,22 +9,22 @@ from probmotion.posteriors.sampling import UnsupportedPosterior
 
 __all__ = ["Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied"]
 
-# Out-of-memory errors of libraries, besides MemoryError.
+# Class names and messages of out-of-memory errors other than MemoryError.
 _MEMORY_KINDS = ("OutOfMemoryError",)
 _MEMORY_SIGNS = ("RESOURCE_EXHAUSTED", "can't allocate memory", "Unable to allocate")
-_NAN_SIGN = "NaN or infinite"
+_NAN_SIGN = "NaN or infinite"  # part of the messages of this package
 
 
 class ResultNotWritten(OSError):  # noqa: N818
-    """The result of a run or pilot could not be written."""
+    """Error for a result of a run or pilot that could not be written."""
 
 
 class NonFiniteDraws(ValueError):  # noqa: N818
-    """Draws are NaN, infinite or too large for the metrics."""
+    """Error for draws that are NaN, infinite or too large for the metrics."""
 
 
 class TimeLimitExceeded(RuntimeError):  # noqa: N818
-    """A run took longer than ``seconds``."""
+    """Error for a run that took longer than ``seconds``."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__(f"took longer than time_limit, {seconds:g} seconds")
@@ -35,7 +35,7 @@ class TimeLimitExceeded(RuntimeError):  # noqa: N818
 
 
 class WorkerDied(RuntimeError):  # noqa: N818
-    """The worker process of a run died; ``killed`` if by SIGKILL, often for lack of memory."""
+    """Error for a worker process that died; ``killed``: by SIGKILL, often for lack of memory."""
 
     def __init__(self, killed: bool) -> None:
         super().__init__("a worker process died during this run, possibly out of memory")
@@ -49,7 +49,7 @@ class Failure:
     Parameters
     ----------
     word : str
-        ``memory``, ``time``, ``nan``, ``died``, the word of an
+        Reason in one word: ``memory``, ``time``, ``nan``, ``died``, the word of an
         :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` such as ``budget``, or the
         class of the error.
     message : str

@@ -27,6 +27,7 @@ from probmotion.posteriors.draws import library_versions
 
 __all__ = ["fingerprint"]
 
+# Random generators, which have no fingerprint because their state changes with every draw.
 _RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
 _RECORDED_PACKAGES = {"sklearn", *(name.replace("-", "_") for name in library_versions())}
@@ -126,8 +127,7 @@ def _add(digest: Any, value: Any, above: tuple[int, ...]) -> None:
 def _is_named(value: Any) -> bool:
     if isinstance(value, type | ModuleType | FunctionType | MethodType):
         return True
-    # Callable objects of Python classes may have a function's name, but are identified by their
-    # attributes.
+    # Callable objects may have a function's name, but are identified by their attributes.
     if not callable(value) or isinstance(type(value).__call__, FunctionType):
         return False
     return hasattr(value, "__qualname__")
@@ -159,7 +159,7 @@ def _closure_value(cell: CellType) -> list[Any]:
 
 
 def _without_marker(value: Any) -> Any:
-    """Return the value, or the class of a bare object, a common marker for "not given"."""
+    """Return the value, or the class of a bare ``object()``, a marker for missing arguments."""
     return object if type(value) is object else value
 
 

@@ -1,4 +1,4 @@
-"""Stored results of a grid: table, draws and failures."""
+"""Stored results of an experiment grid: table, draws and failures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TABLE, _FAILURES = "table.csv", "failures.json"
 
 
 class GridResults:
-    """Draws and metrics of every sampler on every problem.
+    """Results of an experiment grid: draws and metrics of every sampler on every problem.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class GridResults:
     plan : Plan
         Plan of the grid; unfinished runs are omitted.
     temporary : bool
-        Whether to delete the folder together with this object.
+        Whether to delete the folder when this object is garbage-collected.
     """
 
     def __init__(self, folder: Path, plan: Plan, temporary: bool = False) -> None:
@@ -66,7 +66,7 @@ class GridResults:
 
     @property
     def notes(self) -> list[str]:
-        """Notes to the table: budget, long reference runs, changed settings, failures."""
+        """Notes below the table: budget, long reference runs, changed settings and failures."""
         notes = [*self.plan.notes, *self.plan.references]
         if used := used_of_budget(self.results):
             notes.append(
@@ -99,7 +99,7 @@ class GridResults:
         """Return the tidy data frame with columns problem, sampler, seed, metric, value.
 
         A run without draws has a single metric, ``unsupported`` or ``failed``, equal to 1.
-        It prints as mean ± standard deviation over seeds, with one block per problem.
+        The table prints mean ± standard deviation over seeds, with one block per problem.
         """
         from probmotion.comparison.results.table import ComparisonTable
 
@@ -144,7 +144,7 @@ class GridResults:
         )
 
     def write(self, folder: str | Path) -> None:
-        """Write ``table.csv`` and ``failures.json``; copy the runs to another folder."""
+        """Write ``table.csv`` and ``failures.json``; copy the runs if ``folder`` is another one."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if folder.resolve() != self.folder.resolve():

@@ -22,10 +22,10 @@ HEADLINE_METRICS: Mapping[str, str] = {
 }
 """Descriptions by metric, in order of preference."""
 
-_RATIO: Mapping[str, Any] = {"target": 1.0, "ratio": True}
-_LESS: Mapping[str, Any] = {"target": None}
-_MORE: Mapping[str, Any] = {"target": None, "lower_is_better": False}
-
+_RATIO: Mapping[str, Any] = {"target": 1.0, "ratio": True}  # ideal value 1, log scale
+_LESS: Mapping[str, Any] = {"target": None}  # lower is better
+_MORE: Mapping[str, Any] = {"target": None, "lower_is_better": False}  # higher is better
+# Arguments of best_and_tied() by metric.
 _RULES: Mapping[str, Mapping[str, Any]] = {
     "swd_ratio": _RATIO,
     "variance_ratio": _RATIO,
@@ -48,8 +48,8 @@ _RULES: Mapping[str, Mapping[str, Any]] = {
     "view_recall_side": _MORE,
     "view_recall_learnt": _MORE,
 }
-_LESS_PREFIXES, _LESS_SUFFIXES = ("coverage_", "fid"), ("_mm", "_cm2")
-# Metrics that are proportions, with the number of sets of draws in their denominator.
+_LESS_PREFIXES, _LESS_SUFFIXES = ("coverage_", "fid"), ("_mm", "_cm2")  # lower is better
+# Metrics that are proportions; the denominator is this multiple of the number of draws.
 _PROPORTIONS = {"precision": 1, "recall": 1, "mode_proportions_tv": 1, "c2st": 2}
 _DISTANCES_TO_TRUTH = ("acceleration_error", "velocity_error", "pck")
 
@@ -82,7 +82,7 @@ def best_of(
     fewer than two samplers or two seeds; and for distances of single draws to the truth if there
     are references, because overconfident draws are closer to the truth.
 
-    ``values`` contains values over seeds by sampler, ``measured`` all metrics of the problem;
+    ``values`` contains the values of each sampler by seed, ``measured`` all metrics of the problem;
     ``draws`` is the number of draws per value.
     """
     rule = _RULES.get(metric)

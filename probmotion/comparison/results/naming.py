@@ -1,4 +1,4 @@
-"""Names of the problems and samplers of a grid, given as names, objects or mappings."""
+"""Naming of problems and samplers that are given as names, objects or mappings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AnySampler = str | Sampler
 
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
-    """Return problems by table name; registered problems have their full names."""
+    """Return problems by their names in tables, with full names for registered problems."""
     named: dict[str, str | Problem] = {}
     for label, given in _labelled(problems, AnyProblem):
         if isinstance(given, str):
@@ -43,7 +43,7 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
 
 
 def _registered_name(problem: Problem) -> str | None:
-    """Return the name of a registered problem, for loading in workers, or None."""
+    """Return the name by which workers load a registered problem; None for other problems."""
     name = problem.name
     if name.partition("(")[0] not in problem_names():
         return None
@@ -55,7 +55,7 @@ def _registered_name(problem: Problem) -> str | None:
 
 
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
-    """Return samplers by table name; all registered samplers for None."""
+    """Return samplers by their names in tables; all registered samplers for None."""
     named: dict[str, Sampler] = {}
     for label, given in _labelled(
         list(importable_samplers()) if samplers is None else samplers, AnySampler

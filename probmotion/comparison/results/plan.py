@@ -1,4 +1,4 @@
-"""Plan of a grid: problems, samplers and numbers of draws, chains and seeds."""
+"""Plan of an experiment grid: problems, samplers and numbers of draws, chains and seeds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FORMAT = 2
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of a grid.
+    """Plan of a grid, stored in its folder.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Plan:
     samplers : dict of dict
         Settings that differ from the defaults, by sampler name.
     draws, chains, seeds : int
-        As given to :func:`~probmotion.comparison.compare`.
+        Arguments of :func:`~probmotion.comparison.compare`.
     notes : tuple of str
         Notes on the budget.
     references : tuple of str
@@ -59,7 +59,7 @@ class Plan:
         budget: Budget | None = None,
         per: str = "run",
     ) -> Plan:
-        """Return the plan of a grid; ``per`` is the unit of the budget in notes."""
+        """Return the plan of a grid; notes state the budget ``per`` run or simulation."""
         loaded = {
             name: load_problem(source) if isinstance(source, str) else source
             for name, source in problems.items()
@@ -146,7 +146,7 @@ def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler], per: str) -> 
 
 
 def _changed_settings(sampler: Any) -> dict[str, str]:
-    """Return the settings of a dataclass that differ from the defaults, as text."""
+    """Return the settings of a sampler that differ from the defaults, as text."""
     if not is_dataclass(sampler):
         return {}
     kind: Any = type(sampler)
@@ -162,7 +162,7 @@ def _changed_settings(sampler: Any) -> dict[str, str]:
 
 
 def _equal(value: Any, usual: Any) -> bool:
-    """Whether two settings are equal; arrays, which compare elementwise, by their fingerprint."""
+    """Whether two settings are equal; arrays are compared by their fingerprints."""
     try:
         return bool(value == usual)
     except (ValueError, RuntimeError):

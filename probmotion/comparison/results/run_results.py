@@ -1,4 +1,4 @@
-"""Stored result of one run and its draws."""
+"""Stored results of runs: metrics, failures and draws."""
 
 from __future__ import annotations
 

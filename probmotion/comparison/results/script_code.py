@@ -1,4 +1,4 @@
-"""Code of scripts and notebooks, which may change between runs of the same package version."""
+"""Content of user code in scripts and notebooks, which no package version identifies."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def is_user_code(module: str | None) -> bool:
 def class_content(kind: type) -> dict[str, Any]:
     """Return methods and simple attributes of a user's class and its user-defined bases.
 
-    Fields and generated methods of dataclasses are omitted; the fields belong to the instances.
+    Fields and generated methods of dataclasses are omitted, because instances store the fields.
     """
     content: dict[str, Any] = {}
     for each in reversed(kind.__mro__):
@@ -54,9 +54,9 @@ def class_content(kind: type) -> dict[str, Any]:
 def globals_read(function: FunctionType) -> dict[str, Any]:
     """Return the global variables that a user's function reads, directly or indirectly.
 
-    Contains user functions and classes (their code and simple defaults), numbers, strings, arrays
-    and tuples of them by qualified name. Lists and mappings, which functions may modify, and other
-    objects are omitted.
+    Keys are qualified names. Values are user functions and classes (their code and simple
+    defaults), numbers, strings, arrays, and tuples of these. Other objects are omitted, such as
+    lists and mappings, which functions may modify.
     """
     variables: dict[str, Any] = {}
     waiting = [function] if is_user_code(function.__module__) else []

@@ -41,7 +41,7 @@ class StoredProblem:
     held_out : ndarray, (n, L, J, 3), optional
         Held-out real motions, metres.
     camera : Cameras, optional
-        First camera, a batch of one.
+        First camera, as a batch of one.
     keypoints : ndarray, (L, J, 2), optional
         Keypoints of that camera in image units; NaN where occluded.
     joints : ndarray, (L, J, 3), optional

@@ -1,4 +1,4 @@
-"""Table of a grid: a tidy data frame that prints as mean ± standard deviation."""
+"""Comparison table: tidy data frame of metrics, printed as mean ± standard deviation."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class ComparisonTable(pd.DataFrame):
         samplers: Sequence[str],
         seeds: Sequence[int],
     ) -> dict[str, str]:
-        """Return the symbol after each sampler's number; empty if the metric has no best value."""
+        """Return the symbol after each sampler's value; empty if the metric has no best value."""
         by_sampler = {name: values[name, metric] for name in samplers if (name, metric) in values}
         measured = {other for _, other in values}
         best, tied = best_of(metric, by_sampler, seeds, measured, self.attrs.get("draws"))
@@ -213,7 +213,7 @@ def mean_and_sd(values: pd.Series | None) -> str:
     mean, sd = mean / size, sd / size
     if len(values) == 1 or not math.isfinite(sd):
         return f"{mean:.{_decimals(mean, 3)}f}{letter}"
-    # Two digits of the standard deviation, and as many decimal places of the mean.
+    # Two significant digits of the standard deviation, and the same decimal places of the mean.
     places = _decimals(sd, 2) if sd > 0 else _decimals(mean, 3)
     return f"{mean:.{places}f} ± {sd:.{places}f}{letter}"
 
@@ -226,7 +226,7 @@ def _unit(value: float) -> tuple[float, str]:
 
 
 def _decimals(value: float, digits: int) -> int:
-    """Return the number of decimal places for some significant digits, at most three."""
+    """Return the number of decimal places, at most 3, for ``digits`` significant digits."""
     if value == 0 or (float(value).is_integer() and abs(value) >= 100):
         return 0
     return min(3, max(0, digits - 1 - math.floor(math.log10(abs(value)))))

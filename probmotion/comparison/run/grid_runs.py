@@ -1,4 +1,4 @@
-"""Runs of a grid: one sampler on one problem with one seed, stored in a folder.
+"""Runs of an experiment grid, each of one sampler on one problem with one seed.
 
 A folder is written under a temporary name and then renamed, so that it is always complete.
 """
@@ -31,14 +31,14 @@ from probmotion.threads import one_thread
 __all__ = ["GridRun", "forget_unfinished"]
 
 _UNFINISHED = ".unfinished-"
-_FARTHEST = 1e100
+_FARTHEST = 1e100  # largest valid coordinate, metres
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GridRun(GridTask):
     """Run of one sampler on one problem with one seed; ``path`` is the folder of its result.
 
-    With a budget, ``settings`` or ``pilot_failure`` is the result of the pilot.
+    With a budget, ``settings`` are those chosen by the pilot, or ``pilot_failure`` is its failure.
     """
 
     stores_draws: ClassVar[bool] = True
@@ -162,7 +162,7 @@ class GridRun(GridTask):
             shutil.rmtree(unfinished, ignore_errors=True)
             raise ResultNotWritten(error.strerror or str(error)) from error
         except Exception as error:
-            # The draws of the sampler cannot be saved.
+            # Record a failure, because the draws of the sampler cannot be saved.
             shutil.rmtree(unfinished, ignore_errors=True)
             if draws is None:
                 raise

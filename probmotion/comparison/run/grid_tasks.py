@@ -1,4 +1,4 @@
-"""Tasks of a grid: one sampler on one problem; pilots choose the settings for a budget."""
+"""Tasks of an experiment grid: base class, and pilots that choose sampler settings."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ __all__ = ["GridTask", "Pilot", "PilotResult"]
 
 @dataclass(frozen=True)
 class PilotResult:
-    """Settings chosen for a budget, or the failure of the pilot.
+    """Result of a pilot: sampler settings that fit the budget, or the failure.
 
-    ``settings`` are empty if the sampler has no effort setting.
+    ``settings`` is empty after a failure and if the sampler has no effort setting.
     """
 
     fingerprint: str
@@ -37,10 +37,10 @@ class PilotResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GridTask:
-    """Task of one sampler on one problem; ``problem`` and ``sampler`` seed the random numbers.
+    """Task that runs one sampler on one problem, with seeds derived from their names.
 
-    ``path`` is the file or folder of the result, ``source`` the problem or its registered name, for
-    loading in a worker, and ``limit`` the time limit in seconds after loading.
+    ``path`` is the file or folder of the result, ``source`` the problem or its registered name,
+    ``with_sampler`` the sampler, and ``limit`` the time limit in seconds after loading.
     """
 
     path: Path
@@ -55,7 +55,7 @@ class GridTask:
     budget: Budget | None = None
 
     def result(self) -> RunResult | PilotResult | None:
-        """Return the stored result, possibly for other inputs, or None."""
+        """Return the stored result, which may belong to other inputs, or None."""
         raise NotImplementedError
 
     def has_result(self) -> bool:
@@ -80,11 +80,11 @@ class GridTask:
         raise NotImplementedError
 
     def fail(self, error: BaseException) -> None:
-        """Store a failure."""
+        """Store an error as the failure of the task."""
         raise NotImplementedError
 
     def load(self) -> Problem:
-        """Return the problem."""
+        """Return the problem; load it if ``source`` is a name."""
         return load_problem(self.source) if isinstance(self.source, str) else self.source
 
     def prepare(self) -> None:
@@ -94,7 +94,7 @@ class GridTask:
     def sample(
         self, sampler: Sampler, posterior: MotionPosterior, seed: int, progress: bool
     ) -> MotionDraws:
-        """Return draws of a sampler."""
+        """Return ``draws`` draws of a sampler, divided equally among the chains."""
         draws = self.draws // self.chains
         return sampler.sample(
             posterior, draws=draws, chains=self.chains, seed=seed, progress=progress
@@ -103,7 +103,7 @@ class GridTask:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pilot(GridTask):
-    """Pilot of a sampler on a problem; chooses the settings for all seeds."""
+    """Pilot task that chooses the settings of a sampler on a problem for all seeds."""
 
     def __str__(self) -> str:
         return f"{self.problem}/{self.sampler}"

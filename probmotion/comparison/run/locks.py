@@ -1,4 +1,4 @@
-"""Locks that allow one grid at a time per problem and folder."""
+"""File locks that let only one process at a time run a problem in a results folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["locked"]
 
 @contextmanager
 def locked(folder: Path, problems: Iterable[str]) -> Iterator[None]:
-    """Lock the problems of a folder during the block.
+    """Lock ``problems`` in a results folder while the block runs.
 
     Grids of different problems may share a folder, for example in a job array. The operating
     system releases the locks when the process ends, even if it is killed.

@@ -1,4 +1,4 @@
-"""Peak memory of a run as reported by the operating system."""
+"""Measurement of the peak memory of a run as reported by the operating system."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class PeakMemory:
     """Peak memory of a block, set by :func:`watched_memory`."""
 
     mebibytes: float | None = None
-    """Increase over the memory before the block, including new libraries; None if unknown."""
+    """Peak minus the memory before the block, including newly loaded libraries; None if unknown."""
 
 
 @contextmanager
 def watched_memory() -> Iterator[PeakMemory]:
-    """Measure the peak memory of a block on Linux in the main thread.
+    """Measure the peak memory of a block, only on Linux and in the main thread.
 
-    Freed memory is first returned to the system so that reusing it counts. Memory that cannot be
-    returned is not counted when the block reuses it: free lists of Python, partly used pages,
-    pools of libraries such as torch's on a GPU, and the entire heap without glibc.
+    Freed memory is first returned to the system, so that it counts if the block reuses it. Memory
+    that cannot be returned does not count: free lists of Python, partly used pages, memory pools
+    of libraries (such as torch's on a GPU), and the entire heap without glibc.
     """
     peak = PeakMemory()
     before = _begin() if threading.current_thread() is threading.main_thread() else None

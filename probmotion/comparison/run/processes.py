@@ -1,7 +1,7 @@
-"""Worker processes for tasks; the crash of a process fails only its current task.
+"""Worker processes for grid tasks; a crash of a process fails only its current task.
 
-Processes are spawned without importing the caller's script or notebook. Its classes and functions
-are sent by value, so that a script needs no ``if __name__ == "__main__"``.
+Processes are spawned without importing the caller's script or notebook. The classes and
+functions of the script are sent by value, so that it needs no ``if __name__ == "__main__"``.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ __all__ = ["Done", "run_in_processes"]
 
 
 Done = Callable[[Any, BaseException | None], None]
-"""Callback for every ended task, with the error unless the task has stored it."""
+"""Callback after each task, with its error, or None if the task stored its result or failure."""
 
-# Starting a process changes settings of all threads of this process.
+# Allows one process start at a time, because it replaces ``__main__`` for all threads.
 _START_LOCK = threading.Lock()
-_READY, _STARTED = b"ready", b"started"
-# A task in compiled code is killed after this factor times the limit plus these seconds.
+_READY, _STARTED = b"ready", b"started"  # messages from a worker to its parent
+# (factor, seconds): a task that does not stop by itself is killed after factor * limit + seconds.
 _GRACE = 1.2, 1.0
 
 
@@ -57,7 +57,7 @@ class _Worker:
         self.until: float | None = None
 
     def send(self, task: GridTask) -> None:
-        """Send a task; each problem is sent once, so that its tasks share its caches."""
+        """Send a task; its problem is sent only once, so that its tasks share its caches."""
         key = id(task.source)  # unique while tasks refer to the problem
         problem = None if key in self.known else cloudpickle.dumps(task.source)
         # multiprocessing's pickler would share the memory of tensors and send classes by name.
@@ -87,7 +87,7 @@ class _Worker:
 
 
 def run_in_processes(tasks: Sequence[GridTask], workers: int, done: Done) -> None:
-    """Run every task in one of ``workers`` spawned processes.
+    """Run each task in one of ``workers`` spawned processes and call ``done`` when it ends.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def _hand_out(pool: list[_Worker], waiting: deque[GridTask], done: Done) -> None
 
 
 def _listen(pool: list[_Worker], done: Done) -> None:
-    """Wait for a message or a time limit of a worker and handle it."""
+    """Wait until a worker sends a message or exceeds its time limit, and handle the event."""
     active = [worker for worker in pool if worker.task is not None or not worker.ready]
     if not active:
         return
@@ -192,7 +192,7 @@ def _work(connection: Connection) -> None:
                 task.prepare()
             connection.send_bytes(_STARTED)
             task.run(False)
-        # Workers ignore Ctrl-C, so the sampler raised a KeyboardInterrupt.
+        # Workers ignore Ctrl-C, so a KeyboardInterrupt was raised by the sampler.
         except (Exception, KeyboardInterrupt) as caught:
             error = caught
         connection.send_bytes(_pickled(error))

@@ -1,4 +1,4 @@
-"""Tasks of a grid: its runs and, with a budget, the preceding pilots."""
+"""Tasks of an experiment grid: the runs and, with a budget, the pilots that precede them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["Grid", "check_grid_options", "refuse_other_settings", "run_grid"]
 
-_FEWEST_DRAWS = 10
+_FEWEST_DRAWS = 10  # minimum number of draws per run
 
 
 def check_grid_options(
@@ -44,9 +44,9 @@ def check_grid_options(
 
 @dataclass(eq=False)
 class Grid:
-    """Tasks of a comparison with results in ``folder``.
+    """Experiment grid: the tasks of a comparison, with results in ``folder``.
 
-    ``budget`` applies to each run, ``limit`` (seconds) to each task.
+    ``budget`` is the budget of each run, ``limit`` the time limit of each task in seconds.
     """
 
     run_class: ClassVar[type[GridRun]] = GridRun
@@ -68,7 +68,7 @@ class Grid:
         self._versions = library_versions()
 
     def pilots(self) -> list[Pilot]:
-        """Return the pilots; none without a budget."""
+        """Return the pilots, an empty list without a budget."""
         if self.budget is None:
             return []
         return [
@@ -134,14 +134,14 @@ def _fingerprint(name: str, value: Any) -> str:
 def run_grid(
     grid: Grid, workers: int, executor: Executor | None, progress: bool, label: str = "runs"
 ) -> None:
-    """Run the unfinished pilots and runs; arguments as in :func:`run_tasks`.
+    """Run the unfinished pilots and runs of a grid; other arguments as in :func:`run_tasks`.
 
     Raises
     ------
     OSError
         If a result cannot be written.
     KeyboardInterrupt
-        At Ctrl-C. Both messages state how many runs are finished and stored.
+        If the user presses Ctrl-C. Both messages state how many runs are finished and stored.
     """
     forget_unfinished(grid.folder, grid.problems)
     options = (workers, executor, progress)
@@ -151,7 +151,7 @@ def run_grid(
             run_tasks(pilots, *options, label="pilots")
             run_tasks([run for run in grid.runs() if not run.finished()], *options, label=label)
     finally:
-        # Killed workers may leave incomplete files; those of an executor may still be writing.
+        # Killed workers may leave incomplete files; workers of an executor may still be writing.
         if executor is None:
             forget_unfinished(grid.folder, grid.problems)
 

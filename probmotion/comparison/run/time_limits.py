@@ -1,4 +1,4 @@
-"""Time limit of a block."""
+"""Time limit for a block of code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["time_limit"]
 
 
 class _Alarm(BaseException):
-    """Interruption of a block; not an ``Exception``, so that samplers do not catch it."""
+    """Exception that ends a block; not an ``Exception``, so that samplers do not catch it."""
 
 
 @contextmanager

@@ -18,7 +18,7 @@ __all__ = ["run_tasks"]
 def run_tasks(
     tasks: Sequence[GridTask], workers: int, executor: Executor | None, progress: bool, label: str
 ) -> None:
-    """Run every task, which stores its own result or failure, with a labelled progress bar.
+    """Run tasks with a progress bar; each task stores its own result or failure.
 
     Tasks run on the executor if given, otherwise in ``workers`` processes, or in this process if
     ``workers`` is 0.
@@ -26,7 +26,7 @@ def run_tasks(
     Raises
     ------
     KeyboardInterrupt
-        At Ctrl-C.
+        If the user presses Ctrl-C.
     ResultNotWritten
         If a result cannot be written, for example on a full disk.
     """

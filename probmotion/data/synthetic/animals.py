@@ -1,4 +1,4 @@
-"""Four-legged animals: four recorded gait cycles of a dog and procedural quadrupeds.
+"""Clips of four-legged animals: four recorded cycles of a dog, and procedural quadrupeds.
 
 All clips use :data:`ANIMAL_SKELETON`, in metres, with constant bone lengths; in the first frame the
 trunk points to +Z and the left side to +X.
@@ -25,15 +25,15 @@ _FPS = 30.0
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "quadruped")
 
 ANIMAL_SKELETON = Skeleton.preset("quadruped21")
-"""Joints of the recorded dog, without the tips of paws and tail. Procedural gaits have no hock."""
+"""Skeleton of all clips: the joints of the recorded dog without the tips of paws and tail."""
 
 DOG_CLIPS: Mapping[str, tuple[str, ...]] = {
     "train": tuple(f"deepmimic_dog/dog3d_{name}" for name in ("canter", "pace", "spin")),
     "validation": (),
     "test": ("deepmimic_dog/dog3d_trot",),
 }
-"""Recorded cycles by part. The trot is held out because the synthetic animals trot as well; four
-cycles are too few for a recorded validation set."""
+"""Recorded cycles of the dog by part of the split. The trot is held out because the synthetic
+animals trot as well. Four cycles are too few for a recorded validation part."""
 
 
 def animal_clips(
@@ -41,9 +41,9 @@ def animal_clips(
 ) -> dict[str, list[Motion]]:
     """Return animal clips in the parts "train", "validation" and "test", at 30 fps.
 
-    ``n``, ``seconds`` and ``seed`` are the number of synthetic training clips, their duration and
-    seed; validation and test have n / 5 each, at least 2. With ``folder``, recorded dog clips
-    (:func:`dog_clips`) are included.
+    The training part has ``n`` synthetic clips of ``seconds`` s; validation and test have n / 5
+    each, at least 2. ``seed`` is the seed of these clips. If ``folder`` is given, its recorded dog
+    clips (:func:`dog_clips`) are added.
     """
     check_count("n", n)
     frames = _frames(seconds)
@@ -60,9 +60,9 @@ def animal_clips(
 def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Motion]]:
     """Return the dog's cycles of each part, repeated for ``seconds``, at 30 fps.
 
-    ``folder`` contains the cycles of :data:`DOG_CLIPS` (0.4 to 0.7 s) as ``.npz``; a missing file
-    raises ``FileNotFoundError``; a file that is not a cycle (``loop`` other than "wrap") or has
-    another frame rate raises ``ValueError``.
+    ``folder`` contains the cycles of :data:`DOG_CLIPS` (0.4 to 0.7 s) as ``.npz``. Raises
+    ``FileNotFoundError`` if a file is missing, and ``ValueError`` if a file is not a cycle
+    (``loop`` other than "wrap") or has another frame rate.
     """
     frames = _frames(seconds)
     return {
@@ -108,9 +108,9 @@ def _dog_clip(path: Path, frames: int) -> Motion:
     return replace(clip, positions=clip.positions - start)
 
 
-# Proportions of the recorded dog, metres. Legs are slightly longer than those of the gaits, so that
-# they are never fully straight. The angle of carpus or hock, degrees at zero and full extension,
-# increases with the extension of the leg, so that its inverse kinematics are unique.
+# Proportions of the recorded dog, metres. Legs are slightly longer than in make_gait, so that they
+# are never fully straight. _FORE and _HIND are bone lengths and the angle of carpus or hock at zero
+# and full extension of the leg, degrees; the angle depends on the extension alone.
 _TRUNK_FRACTION = 0.2375 / (0.2375 + 0.2813)
 _TAIL = np.array([0.0, -0.04, -0.077])
 _LEG_LENGTH = 0.60
@@ -156,9 +156,9 @@ def _leg(
     bend: tuple[float, float],
     side: float,
 ) -> tuple[np.ndarray, ...]:
-    """Return the four joints of a leg, (L, 3) each; the first joint bends backwards for ``side`` 1.
+    """Return the four joints of a leg, (L, 3) each; the second points backwards for ``side`` 1.
 
-    The extension of the leg determines the lower angle, so that two bones act as a single one.
+    The extension of the leg determines the angle of the lower two bones, which act as one bone.
     """
     upper, middle, lower = bones
     stretch = np.linalg.norm(paw - top, axis=-1) / bones.sum()

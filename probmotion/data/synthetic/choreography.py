@@ -8,15 +8,15 @@ import numpy as np
 
 __all__ = ["HOLDS", "Dance", "Figure", "draw_dance", "level", "rise"]
 
-_FIGURE = 8  # beats
-# Minimum and maximum distance between the partners' roots, metres.
+_FIGURE = 8  # duration of a figure, beats
+# Minimum and maximum distance between the partners' roots by hold, metres.
 HOLDS = {"open": (0.60, 0.78), "closed": (0.46, 0.56), "one hand": (0.62, 0.85)}
-_TURN_DISTANCE = 0.5  # metres
+_TURN_DISTANCE = 0.5  # distance between the roots during a turn, metres
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Eight-beat figure of a dance: hold, distance (m), displacement (m) and turns."""
+    """Eight-beat figure: hold, distance of the partners (m), displacement (m) and turns."""
 
     hold: str
     distance: float
@@ -30,8 +30,8 @@ class Figure:
 class Dance:
     """Parameters of one dance; methods are smooth functions of the time (n,), seconds.
 
-    Angles in radians, ``beat`` in seconds, ``start`` in beats, ``turning`` in rad/s, ``sway`` and
-    ``hands`` (height offset) in metres; ``bend`` is the hip height as a fraction of straight legs.
+    Angles are in radians, ``beat`` is in s, ``start`` in beats, ``turning`` in rad/s, ``sway`` and
+    ``hands`` (height offset) in m; ``bend`` is the hip height as a fraction of straight legs.
     """
 
     figures: tuple[Figure, ...]
@@ -48,11 +48,11 @@ class Dance:
     waves: np.ndarray  # (channels, 3, 2): sine and cosine of three slow frequencies
 
     def beats(self, time: np.ndarray) -> np.ndarray:
-        """Return the number of beats since the start of the first figure."""
+        """Return the time in beats since the start of the first figure."""
         return self.start + time / self.beat
 
     def wander(self, channel: int, time: np.ndarray) -> np.ndarray:
-        """Return a slow random function with mean square 1."""
+        """Return the slow random function of a channel, with mean square 1."""
         angle = 2 * np.pi * np.multiply.outer(time, [0.11, 0.23, 0.41])
         sine, cosine = self.waves[channel].T
         return (np.sin(angle) @ sine + np.cos(angle) @ cosine) / np.sqrt(3)
@@ -64,7 +64,7 @@ class Dance:
         return started - np.vstack([started[1:], np.zeros_like(started[:1])])
 
     def raised(self, time: np.ndarray, person: int) -> np.ndarray:
-        """Return the raising of the hands for turns of ``person``, from 0 to 1."""
+        """Return how far the hands are raised for turns of ``person``, from 0 to 1."""
         turns = self._turns(time, person)
         lifts = (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in turns)
         return sum(lifts, np.zeros_like(time))
@@ -95,7 +95,7 @@ class Dance:
         x, z = self.wander(1, time), self.wander(2, time)
         centre = 0.15 * np.stack([x, np.zeros_like(time), z], axis=-1)
         centre += forward[:, None] * facing + aside[:, None] * level(heading + np.pi / 2)
-        # Partners are offset to their left and sway over the supporting foot.
+        # Each partner is offset to the left and sways over the supporting foot.
         closed = np.array([figure.hold == "closed" for figure in self.figures]) @ weights
         left = 0.05 * closed + self.sway * np.sin(np.pi * self.beats(time))
         yaw = heading + np.pi * person
@@ -107,7 +107,7 @@ class Dance:
 def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
     """Return a random dance longer than ``duration`` seconds.
 
-    A longer dance from an equally seeded generator starts with the same figures.
+    With equally seeded generators, a longer dance starts with the figures of a shorter one.
     """
     beat = rng.uniform(0.44, 0.56)
     style = {
@@ -122,7 +122,7 @@ def draw_dance(rng: np.random.Generator, duration: float) -> Dance:
     bend = rng.uniform(0.955, 0.975, size=2)
     lean = rng.normal((0.03, 0.0), 0.03)
     waves = rng.normal(size=(11, 3, 2))
-    # One extra figure on either side: foot placement uses earlier and later positions.
+    # One extra figure at both ends, because foot placement uses earlier and later positions.
     figures = tuple(_draw_figure(rng) for _ in range(int(duration / beat / _FIGURE) + 4))
     return Dance(figures, beat, heights=heights, bend=bend, lean=lean, waves=waves, **style)
 

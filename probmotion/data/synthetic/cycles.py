@@ -15,12 +15,12 @@ __all__ = ["repeated_cycle"]
 
 
 def repeated_cycle(cycle: Motion, frames: int) -> Motion:
-    """Return a periodic motion of ``frames`` frames, repeated from one cycle.
+    """Return a motion of ``frames`` frames that repeats one cycle.
 
-    The last frame of a cycle is the first of the next one, transformed by the cycle's translation
-    and its rotation about the vertical. The remaining mismatch of the pose is distributed evenly
-    over the cycle by rotating rigid groups of bones, which preserves bone lengths. Raises
-    ``ValueError`` if the cycle has fewer than 3 frames or several roots.
+    Each repetition starts where the previous one ends, translated horizontally and rotated about
+    the vertical. The remaining mismatch between first and last pose is distributed evenly over the
+    cycle by rotating rigid groups of bones, which preserves bone lengths. Raises ``ValueError`` if
+    the cycle has fewer than 3 frames or several roots.
     """
     check_count("frames", frames)
     if len(cycle.skeleton.roots) != 1:
@@ -54,7 +54,7 @@ def _turn_about_vertical(first: np.ndarray, last: np.ndarray, root: int) -> np.n
 
 
 def _closed(cycle: Motion, turn: np.ndarray) -> np.ndarray:
-    """Return joint offsets (L, J, 3), corrected so that the last equals the rotated first."""
+    """Return offsets from parents (L, J, 3), corrected so that the last equal the rotated first."""
     skeleton, positions = cycle.skeleton, cycle.positions
     parents = np.array(skeleton.parents)
     offsets = positions - positions[:, np.maximum(parents, 0)]
@@ -67,7 +67,7 @@ def _closed(cycle: Motion, turn: np.ndarray) -> np.ndarray:
 
 
 def _rigid_groups(skeleton: Skeleton) -> list[list[int]]:
-    """Return the joints grouped by parent; the trunk is a separate group at the root."""
+    """Return groups of joints that share a parent; at the root, the trunk is a separate group."""
     root = skeleton.roots[0]
     groups: dict[tuple[int, bool], list[int]] = {}
     for joint, parent in skeleton.bones:

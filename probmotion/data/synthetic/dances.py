@@ -1,8 +1,8 @@
 """Procedural couple dances: steps, turns under raised arms and changes of hold.
 
-A dance is a sequence of eight-beat figures. Position, heading and distance of the couple are
-smooth functions of time. Each step plants a foot below the hip at mid-stance; the hold determines
-the hands. Bones have constant lengths, and elbows and knees bend anatomically.
+A dance is a sequence of eight-beat figures. Position and heading of the couple and the distance of
+the partners are smooth functions of time. Feet step to points below the hip at mid-stance; the hold
+places the hands. Bones have constant lengths, and elbows and knees bend anatomically.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _SIDES = {"left": 1.0, "right": -1.0}
 _UP = np.array([0.0, 1.0, 0.0])
 
 _SWING = 0.8  # duration of a step, beats
-_WRIST_TO_GRIP = 0.05
-# Limits of extension (fraction of the length) and flexion (angle).
+_WRIST_TO_GRIP = 0.05  # metres
+# Largest extension (fraction of the length), softness of limits (m), cosine of the least angle.
 _STRAIGHTEST = 0.99
 _SOFTNESS = 0.01
 _FOLD = np.cos(np.deg2rad(30.0))
 Joints = dict[str, np.ndarray]
-"""Positions (L, 3) by joint, and the orientation (L, 3, 3) of the chest as ``frame``."""
+"""Positions (L, 3) by joint; key ``frame`` is the orientation (L, 3, 3) of the chest."""
 
 
 def synthetic_dances(
@@ -98,7 +98,7 @@ def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
 
 
 def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarray:
-    """Return the target of an ankle, (L, 3): planted or swinging to the next position."""
+    """Return the target of an ankle, (L, 3), which is planted or swings to the next foothold."""
     height = dance.heights[person]
     odd = float((sign > 0) == (person == 0))  # the feet step on alternate beats
     beats = dance.beats(time)
@@ -106,7 +106,7 @@ def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarra
     progress = rise((beats - stepped) / _SWING)
     footholds = []
     for step in (stepped - 2, stepped):
-        # Below the hip at mid-stance.
+        # The foothold is below the hip at mid-stance.
         middle = (step + 1 + _SWING / 2 - dance.start) * dance.beat
         root, yaw = dance.place(middle, person)
         footholds.append(root + (sign * (_HIP[0] + 0.01) * height) * level(yaw + np.pi / 2))
@@ -197,8 +197,8 @@ def bent_limb(
     """Return the middle joint and the end of a two-bone limb from ``start`` towards ``target``.
 
     Points are (…, 3), metres. The upper and the lower bone have exactly the given ``lengths``;
-    ``pole`` is the direction of the elbow or knee, whose component along the limb is ignored. The
-    end lies on the line to the target; its distance is limited smoothly for unreachable targets.
+    ``pole`` is the direction of the elbow or knee; its component along the limb is ignored. The end
+    lies on the line to the target; its distance from ``start`` is limited smoothly.
     """
     upper, lower = lengths
     longest = _STRAIGHTEST * (upper + lower)

@@ -1,7 +1,7 @@
 """Procedural gaits: walking, running and marching people, walking and trotting quadrupeds.
 
 Joint angles are smooth functions of a phase; speed, stride, lean, turning and other parameters
-vary between clips. Bodies face +Z with their left on +X and have constant bone lengths.
+vary between clips. Bodies initially face +Z, left side to +X, and have constant bone lengths.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["GAITS", "make_gait", "make_gaits"]
 
 @dataclass(frozen=True)
 class Gait:
-    """Parameters of a gait style, as (mean, standard deviation) over clips.
+    """Parameters of a gait style, each as (mean, standard deviation) over clips.
 
     Angles are in radians, ``cadence`` in cycles/s, ``bounce`` in metres, ``turning`` in rad/s.
     """
@@ -38,7 +38,7 @@ class Gait:
     wander: float = 0.09
     """Root mean square of the random variation of each joint angle, radians."""
     footfall: tuple[float, float, float, float] = (0.0, 0.5, 0.75, 0.25)
-    """Phases of left hind, right hind, left fore and right fore leg, cycles (quadrupeds)."""
+    """Phases of the left hind, right hind, left fore and right fore leg of quadrupeds, cycles."""
 
 
 GAITS: Mapping[str, Gait] = {
@@ -54,7 +54,7 @@ GAITS: Mapping[str, Gait] = {
                            (0.15, 0.04), (0.35, 0.05), (0.03, 0.005),
                            wander=0.06, footfall=(0.0, 0.5, 0.5, 0.0)),
 }  # fmt: skip
-"""Styles by name."""
+"""Gait styles by name."""
 
 
 def make_gaits(
@@ -65,14 +65,14 @@ def make_gaits(
     fps: float = 30.0,
     seed: int = 0,
 ) -> list[Motion]:
-    """Return about ``n`` clips of ``frames`` frames at ``fps`` frames per second.
+    """Return ``n`` clips, up to rounding per style, of ``frames`` frames at ``fps`` frames/s.
 
     Parameters
     ----------
     n, frames, fps, seed
         Number of clips, frames per clip, frames per second and random seed.
     styles : mapping of str to float, optional
-        Relative frequency of styles of one body; walk 0.5, run 0.3, march 0.2 by default.
+        Relative frequencies of styles with the same body; walk 0.5, run 0.3, march 0.2 by default.
 
     Raises
     ------
@@ -126,12 +126,12 @@ def make_gait(
 
 
 def _direction(angle: np.ndarray) -> np.ndarray:
-    """Return the unit vector at ``angle`` forwards from straight down, (…) → (…, 3)."""
+    """Return the unit vector at ``angle`` (forwards) from straight down, ``(…) → (…, 3)``."""
     return _in_plane(-np.cos(angle), np.sin(angle))
 
 
 def _in_plane(y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return vectors (…, 3) in the plane x = 0."""
+    """Return vectors (0, y, z), of shape (…, 3)."""
     return np.stack([np.zeros_like(y), y, z], axis=-1)
 
 
@@ -142,7 +142,7 @@ def _across(yaw: np.ndarray, lean: np.ndarray) -> np.ndarray:
 
 
 def _wander(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """Return a smooth random function of time with mean square 1, 0.5 to 2 Hz."""
+    """Return a smooth random function of time: frequencies 0.5 to 2 Hz, mean square 1."""
     frequency = np.array([0.5, 1.0, 1.5, 2.0])
     amplitude = rng.normal(size=(2, 4)) / 2
     angle = 2 * np.pi * np.outer(time, frequency)
@@ -232,7 +232,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 Body = Callable[
     [np.ndarray, Mapping[str, float], Gait, Callable[[], np.ndarray]], dict[str, np.ndarray]
 ]
-_BODIES: Mapping[str, tuple[Body, float, str]] = {
+_BODIES: Mapping[str, tuple[Body, float, str]] = {  # function, leg length (m), skeleton
     "person": (_person, 0.85, "h36m17"),
     "quadruped": (_quadruped, 0.52, "apt36k17"),
 }

@@ -27,7 +27,7 @@ WALK_CLIPS: Mapping[str, tuple[str, ...]] = {
     "validation": ("cmu_single/cmu_02_02",),
     "test": ("deepmimic_human/humanoid3d_long_walk3", "deepmimic_human/humanoid3d_stealthy_walk"),
 }
-"""Clips by part, 3352 frames at 30 fps. Excerpts of other clips (humanoid3d_walk,
+"""Clips by part of the split, 3352 frames at 30 fps. Excerpts of other clips (humanoid3d_walk,
 humanoid3d_zombie_walk), styles with a single clip (zombie) and runs are excluded."""
 
 
@@ -55,7 +55,7 @@ def synthetic_walks(
     """Return ``n`` procedural walks of ``seconds`` s at ``fps`` frames per second.
 
     The body is a person, or a quadruped if the person lacks a joint of ``skeleton``. Raises
-    ``ValueError`` if both lack one.
+    ``ValueError`` if the quadruped lacks a joint too.
     """
     required = set() if skeleton is None else set(skeleton.canonical_names)
     for style in _STYLES:
@@ -69,10 +69,10 @@ def synthetic_walks(
 
 
 def shared_skeleton(skeleton: Skeleton) -> Skeleton | None:
-    """Return the sub-skeleton shared with a body of :func:`synthetic_walks`.
+    """Return the part of a skeleton that a body of :func:`synthetic_walks` also has.
 
     Joints are matched by canonical names with the body, person or quadruped, that shares more
-    bones. A joint whose parent is dropped becomes a root. None if no bone is shared.
+    bones. A joint whose parent is dropped becomes a root. Returns None if no bone is shared.
     """
     bodies = [make_gait(style).skeleton.canonical_names for style in _STYLES]
     known = [[name in body for name in skeleton.canonical_names] for body in bodies]

@@ -1,7 +1,7 @@
 """Filters of 2D tracks: uncertain detections, outliers, and short, crowded or low-quality tracks.
 
 Source: *MAS*, section 6.1 ("filtering short motions, crowd motions, and motions of low quality"),
-which states no limits; the defaults are ours, except the confidence thresholds (section 6.2).
+which states no limits. Defaults are hand-chosen, except confidence thresholds (section 6.2).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def mask_outliers(
     check_positive("distance", distance)
     check_positive("window", window)
     hidden = [
-        # A single joint has size 0.
+        # Tracks of a single joint have size 0 and no limit.
         _off_median(track, round(window * track.fps / 2)) > (distance * track_size(track) or np.inf)
         for track in tracks
     ]
@@ -77,9 +77,9 @@ def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step
 def drop_low_quality(
     tracks: Sequence[KeypointTrack], *, threshold: float = 0.3, share: float = 0.6
 ) -> Step:
-    """Drop tracks in which under ``share`` of the entries have confidence ``threshold`` or more.
+    """Drop tracks with a fraction below ``share`` of entries of confidence ``threshold`` or more.
 
-    The share, in (0, 1], is a fraction of all joints in all frames of a track.
+    Entries are all joints in all frames of a track; ``share`` is in (0, 1].
     """
     check_positive("threshold", threshold)
     _check_fraction("share", share)
@@ -96,14 +96,14 @@ def drop_crowds(
 ) -> Step:
     """Drop tracks that lie largely inside another track's bounding box in the same video.
 
-    The overlap with another track is the fraction of the track's box inside the other's,
-    averaged over the frames in which the track is seen. A small person behind a large one is
-    dropped, but not the large one.
+    The overlap of a track with another is the fraction of its box inside the other's box, averaged
+    over the frames in which the track is seen. Of a small person behind a large one, only the track
+    of the small person is dropped.
 
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Uncut tracks; all tracks of a video must have the same number of frames.
+        Tracks before segmentation; all tracks of a video must have the same number of frames.
     overlap : float
         Maximum overlap with any other track, in (0, 1].
     videos : sequence of str, optional

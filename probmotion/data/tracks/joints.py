@@ -34,7 +34,7 @@ def with_joint(
     keypoints : ndarray, (L, 2)
         Positions, in the track's unit; ignored where the confidence is 0.
     confidence : ndarray, (L,)
-        Confidences.
+        Confidences of the positions, 0 for unseen ones.
     parent : str, optional
         Name of the parent joint; by default the new joint is a root.
 
@@ -61,9 +61,9 @@ def with_joint(
 def with_midpoint(
     track: KeypointTrack, name: str, joints: Sequence[str], parent: str | None = None
 ) -> KeypointTrack:
-    """Return the track with a joint ``name`` at the mean and least confidence of ``joints``.
+    """Return the track with an additional joint ``name`` at the mean position of ``joints``.
 
-    Raises ``ValueError`` if a joint is unknown, there are fewer than two, or the name exists.
+    The confidence is the minimum over ``joints``. Raises ``ValueError`` if an argument is invalid.
     """
     if isinstance(joints, str) or len(joints) < 2:
         raise ValueError(f"joints must name at least two joints, got {joints!r}")
@@ -113,8 +113,8 @@ def nearest_object(
     track : KeypointTrack
         Track of the athlete.
     boxes : sequence of ndarray, (n, 5)
-        Finite boxes detected in each frame: left, top, right, bottom, in the track's unit, and
-        confidence.
+        Boxes detected in each frame: left, top, right and bottom in the track's unit, and
+        confidence; all finite.
 
     Returns
     -------

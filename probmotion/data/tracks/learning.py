@@ -1,4 +1,4 @@
-"""Training data sets of 2D tracks: projected from 3D clips or read from files, split by clip."""
+"""Data sets of 2D tracks for training: projected from 3D clips or read from files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class LearningTracks:
-    """Prepared 2D tracks in metres, centred on the root and split by clip."""
+    """Prepared 2D tracks, centred on the root and split by clip."""
 
     train: list[KeypointTrack]
     validation: list[KeypointTrack]
@@ -77,7 +77,7 @@ def film_clips(
 
 
 def certain(tracks: Sequence[KeypointTrack], threshold: float = 0.3) -> list[KeypointTrack]:
-    """Return tracks with confidence 1 at or above the threshold and 0 below it.
+    """Return tracks with confidences set to 1 at or above the threshold and to 0 below it.
 
     Confidences of synthetic detections only indicate missing joints and should not weight errors.
     """
@@ -89,8 +89,8 @@ def film_windows(
 ) -> np.ndarray:
     """Return n random complete windows of projected clips, ``(n, frames, J, 2)``, metres.
 
-    The detector is noisy but misses no joint; incomplete windows are dropped. All windows of all
-    clips in 64 views are equally likely, and mirrored with probability 1/2, as in training.
+    The detector is noisy but misses no joint; incomplete windows are dropped. Windows are drawn
+    uniformly from 64 views of all clips and mirrored with probability 1/2, as in training.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def read_tracks(
     sizes: Mapping[str, float] | None = None,
     shortest: float = 1.0,
 ) -> PreparedTracks:
-    """Read and prepare 2D tracks from files of keypoints, in metres.
+    """Read and prepare 2D tracks from files of keypoints, in metres or body lengths.
 
     Without known bone sizes (neither ``sizes`` nor :func:`body_sizes`) the unit is the body length:
     the median :func:`~probmotion.data.tracks.scales.body_extent` of the tracks is 1
@@ -144,7 +144,7 @@ def read_tracks(
     paths : iterable of str or Path
         Files with unique names, or patterns. A track is named ``"<file>/<name>"``.
     skeleton : Skeleton, optional
-        Target skeleton; None: the skeleton of the tracks, which must all have the same one.
+        Target skeleton; if None, the skeleton of the tracks, which must be the same for all.
     fps : float
         Frames per second of the data set.
     file_fps : float, optional
@@ -175,10 +175,10 @@ def read_tracks(
         archive = path.suffix.lower() == ".npz"
         options = (None, None, None) if archive else (file_fps, layout, people)
         for track in read_keypoints(path, *options):
-            # The clip's name ends at the last slash; image names may contain one.
+            # The clip's name ends at the last slash, so slashes in the track's name are replaced.
             name = f"{path.stem}/{track.name.replace('/', '_')}"
             raw.append(replace(track, name=name))
-            # Tracks are named "file video person".
+            # Track names are "video person"; without the person they identify the video.
             video = f"{path} {track.name.rpartition(' ')[0]} {track.frames}"
             videos.append(name if archive else video)
     target = raw[0].skeleton if skeleton is None and raw else skeleton
@@ -206,9 +206,9 @@ def unique_files(paths: Iterable[str | Path]) -> dict[str, Path]:
 def body_sizes(skeleton: Skeleton) -> dict[str, float]:
     """Return the apparent bone sizes of an adult body, metres, by joint.
 
-    These are the :func:`~probmotion.data.tracks.scales.bone_sizes` of projected synthetic walks,
-    for the bones shared with a person or a quadruped
-    (:func:`~probmotion.data.synthetic.walks.shared_skeleton`); empty if none is shared.
+    The sizes are the :func:`~probmotion.data.tracks.scales.bone_sizes` of projected synthetic walks
+    for the bones shared with a person or a quadruped. If no bone is shared
+    (:func:`~probmotion.data.synthetic.walks.shared_skeleton`), the mapping is empty.
     """
     return dict(_body_sizes(skeleton))
 
@@ -236,15 +236,15 @@ def split_tracks(
     tracks : sequence of KeypointTrack
         Prepared tracks.
     validation, test : sequence of str
-        Names of clips, for both or neither; a random tenth of the clips each by default.
+        Names of clips, for both parts or neither; by default a random tenth of the clips each.
     seed : int
         Seed of the random split.
 
     Raises
     ------
     ValueError
-        If only one of the two is given, a clip is in both or has no track, or no clip remains for
-        training.
+        If only ``validation`` or only ``test`` is given, a clip is in both or has no track, or no
+        clip remains for training.
     """
     clips = {clip_of(track.name) for track in tracks}
     split = split_names(clips, validation=validation, test=test, seed=seed)

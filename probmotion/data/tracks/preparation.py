@@ -1,23 +1,23 @@
 """Preparation of raw 2D tracks as a data set, with a report per step.
 
-Source: *MAS*, section 6.1. The steps, with the reason for their order:
+The steps follow *MAS*, section 6.1. The table gives the reason for their order:
 
 ============  ==================================================================================
 step          reason
 ============  ==================================================================================
-uncertain     first: later steps only distinguish seen and unseen detections
+uncertain     first, because later steps only distinguish seen and unseen detections
 crowds        requires uncut tracks over the same frames, with all joints
 joints        before quality, which is computed over the joints used
 segments      before interpolation, which must not cross jumps
-outliers      per segment, before gaps are filled
-quality       per segment, from detections only: before gaps are filled
+outliers      per segment, before gaps are filled from neighbouring detections
+quality       per segment and before gaps are filled, so that only detections count
 gaps          before smoothing, which requires runs, and centring, which requires the root
 smooth        before resampling, which would alias jitter
 resample      to the frame rate of the data set
-short         after all steps that change durations
-scale         to metres: one factor per track
-centre        after smoothing: jitter of the root would move every joint
-quality       again: centring marks frames without a root as unseen
+short         after all steps that change the duration of a track
+scale         to metres, with one factor per track
+centre        after smoothing, because jitter of the root would move every joint
+quality       again, because centring marks frames without a root as unseen
 ============  ==================================================================================
 """
 
@@ -49,7 +49,7 @@ __all__ = ["PreparedTracks", "prepare_tracks"]
 
 @dataclass(frozen=True, eq=False)
 class PreparedTracks:
-    """Data set of at least one track with one skeleton and frame rate, and a report per step."""
+    """Prepared tracks, all with the same skeleton and frame rate, and a report per step."""
 
     tracks: tuple[KeypointTrack, ...]
     reports: tuple[StepReport, ...]
@@ -96,7 +96,7 @@ def prepare_tracks(
         Frames per second of the data set.
     skeleton : Skeleton, optional
         Target skeleton, with pelvis and neck derived if missing
-        (:func:`~probmotion.data.tracks.joints.retarget_track`); the tracks' own by default.
+        (:func:`~probmotion.data.tracks.joints.retarget_track`); by default that of the tracks.
     sizes : mapping of str to float, optional
         Bone sizes to scale tracks to (:func:`~probmotion.data.tracks.scales.scale_to_bones`); no
         scaling by default.

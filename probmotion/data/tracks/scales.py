@@ -1,7 +1,7 @@
-"""Scaling of 2D tracks to metres by bone lengths, or to body lengths.
+"""Scaling of 2D tracks to metres or body lengths by apparent bone sizes.
 
-A bone's projection has full length if the bone is perpendicular to the view, and is shorter
-otherwise. The 90 % quantile over a motion therefore estimates its length robustly.
+The projection of a bone has full length if the bone is perpendicular to the view, and is shorter
+otherwise. The 90 % quantile of projected lengths therefore estimates the bone's length robustly.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _QUANTILE = 0.9
 def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     """Return the apparent size of each bone: the 90 % quantile of its projected length.
 
-    Keys are names of the bones' lower joints; sizes are in the tracks' unit, over the frames in
+    Keys are names of the bones' child joints. Sizes are in the tracks' unit, over the frames in
     which both ends are seen. Bones that are never seen are omitted. Raises ``ValueError`` if
     there is no track, or the tracks have several skeletons.
     """
@@ -87,7 +87,7 @@ def per_track_scales(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     """Return bone sizes for scaling a body of unknown size, with the body length as the unit.
 
     Proportions are the median over tracks of each bone's size relative to the track's
-    :func:`body_extent`. Scaled by :func:`scale_to_bones`, the tracks have a median extent of 1.
+    :func:`body_extent`. :func:`scale_to_bones` then scales the tracks to a median extent of 1.
     Raises ``ValueError`` if no track shows a bone.
     """
     ratios: dict[str, list[float]] = {}

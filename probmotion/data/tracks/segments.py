@@ -43,7 +43,7 @@ def split_discontinuities(
         if not len(frames):
             n_unseen += 1
             continue
-        # A single joint has size 0.
+        # Tracks of a single joint have size 0 and no limit.
         jumped = _displacements(track, frames) > (jump * track_size(track) or np.inf)
         long = np.diff(frames) - 1 > unseen * track.fps
         cuts = np.flatnonzero(jumped | long)

@@ -16,15 +16,15 @@ from probmotion.validation import check_positive
 __all__ = ["fill_gaps", "resample_tracks", "smooth_tracks"]
 
 _HIGHEST_FPS = 10_000
-_ROUNDING = 1e-3  # as in probmotion.motion.resampling
-_SAME_TIME = 1e-6  # frames
-_DEGREE = 2
+_ROUNDING = 1e-3  # tolerance of durations, frames, as in probmotion.motion.resampling
+_SAME_TIME = 1e-6  # tolerance of equal times, frames
+_DEGREE = 2  # of the Savitzky–Golay filter
 
 
 def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step:
-    """Fill gaps of at most ``longest`` seconds of each joint by PCHIP interpolation.
+    """Fill gaps of each joint, up to ``longest`` seconds, by monotone cubic interpolation (PCHIP).
 
-    The confidence of a filled entry is the minimum at the ends of its gap. Nothing is extrapolated.
+    Filled entries have the lower confidence of the two ends of the gap. Nothing is extrapolated.
     """
     check_positive("longest", longest)
     filled = []
@@ -50,8 +50,8 @@ def fill_gaps(tracks: Sequence[KeypointTrack], *, longest: float = 0.25) -> Step
 def smooth_tracks(tracks: Sequence[KeypointTrack], *, window: float = 0.25) -> Step:
     """Smooth each joint over its runs of seen frames (Savitzky–Golay, degree 2).
 
-    ``window``, in seconds, is rounded to an odd number of frames within the run; windows of fewer
-    than 5 frames have no effect.
+    ``window``, in seconds, is rounded to an odd number of frames, at most the length of the run;
+    windows of fewer than 5 frames have no effect.
     """
     check_positive("window", window)
     smoothed = []
@@ -75,7 +75,7 @@ def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
     """Resample tracks to ``fps`` frames per second, at most 10 000, by linear interpolation.
 
     The first frame is preserved; no frame lies after the original end. An entry between two
-    frames is seen if both are, with interpolated confidence.
+    frames is seen if it is seen in both; its confidence is interpolated.
     """
     check_positive("fps", fps)
     if fps > _HIGHEST_FPS:
@@ -91,7 +91,7 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
     frames = int(np.floor(last / track.fps * fps + _ROUNDING)) + 1
     time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
     nearest = np.round(time)
-    # Frames at the time of an original frame must not depend on a neighbour, possibly unseen.
+    # Frames at the time of an original frame must not depend on a neighbour, which may be unseen.
     time = np.where(np.abs(time - nearest) < _SAME_TIME, nearest, time)
     before, after = time.astype(int), np.ceil(time).astype(int)
     weight = (time - before)[:, np.newaxis]

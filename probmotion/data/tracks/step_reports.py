@@ -1,4 +1,4 @@
-"""Reports of preparation steps of 2D tracks, and helpers shared by the steps."""
+"""Reports on preparation steps of 2D tracks, and helpers shared by the steps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Step", "StepReport", "boxes_of", "entries_of", "masked", "seen"]
 
 @dataclass(frozen=True)
 class StepReport:
-    """Input, output and dropped data of one step.
+    """Report on one preparation step: amounts of input, output, dropped and changed data.
 
     ``entries_changed`` counts detections (joints of single frames) that were removed, filled or
     moved; ``frames_dropped`` includes the frames of dropped tracks.
@@ -65,7 +65,7 @@ class StepReport:
 
 
 Step = tuple[list[KeypointTrack], StepReport]
-"""Tracks and report returned by a step."""
+"""Return type of a preparation step: the resulting tracks and a report."""
 
 
 def seen(track: KeypointTrack) -> np.ndarray:
@@ -88,7 +88,7 @@ def masked(track: KeypointTrack, hidden: np.ndarray) -> KeypointTrack:
 
 
 def boxes_of(track: KeypointTrack) -> np.ndarray:
-    """Return the minimum and maximum x and y per frame, (L, 2, 2); NaN if no joint is seen."""
+    """Return the least and greatest (x, y) of seen joints per frame, (L, 2, 2); NaN if none."""
     visible = seen(track)[..., np.newaxis]
     least = np.where(visible, track.keypoints, np.inf).min(axis=1)
     greatest = np.where(visible, track.keypoints, -np.inf).max(axis=1)

@@ -1,6 +1,6 @@
 """2D annotations of several people in video frames.
 
-Image axes are x right and y up, in metres at the scale of the people.
+Image coordinates are in metres at the scale of the people, with x right and y up.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ __all__ = ["Annotations"]
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """n annotated frames of K people, with the joints of one skeleton of K trees.
+    """Set of n annotated frames of K people, whose skeleton has K trees and J joints.
 
     Parameters
     ----------
     keypoints : ndarray, (n, J, 2)
-        Metres, x right, y up. Occluded joints are set to 0 and ignored.
+        2D positions, metres, x right, y up. Values of occluded joints are ignored and set to 0.
     visible : ndarray, (n, J), bool
-        Mask of annotated joints; at least one per person.
+        Mask of annotated joints, with at least one per person in every frame.
     skeleton : Skeleton
         Names and parents of the J joints.
     neighbours : ndarray, (n, 2, J, 2)
-        Joints in the previous and next frame of the same video; NaN at cuts, ends and
-        occlusions.
+        2D positions in the previous and the next frame of the same video, metres; NaN at cuts, at
+        the ends of the video and for occluded joints.
     fps : float
         Frames per second of the videos.
     views : ndarray, (n, 2), optional
-        Views (φ, θ), radians, NaN if unknown. Estimate them with
-        :func:`~probmotion.interaction.annotations.backbones.annotation_views` if None.
+        Camera views (φ, θ) of eq. 4, radians, NaN if unknown. They can be estimated with
+        :func:`~probmotion.interaction.annotations.backbones.annotation_views`.
     sources : sequence of str, optional
         Name of the video of each annotation.
     dropped : mapping of str to int
@@ -165,8 +165,8 @@ class Annotations:
     def local_differences(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the change of each bone's image direction and length per frame (Δp in eq. 12).
 
-        Uses half the difference of the neighbours if both exist, else the one-sided difference,
-        else 0. A bone of length 0 has direction 0.
+        The change is half the difference of the neighbours if both exist, the one-sided difference
+        if one exists, and otherwise 0. The direction of a bone of length 0 is the zero vector.
 
         Returns
         -------
@@ -243,7 +243,7 @@ class Annotations:
 
 
 def _change(values: np.ndarray) -> np.ndarray:
-    """Return the norm of the change per frame, ``(3, …, d) → (…)``."""
+    """Return the norm of the change per frame from three frames, ``(3, …, d) → (…)``."""
     before, current, after = values
     result = np.zeros(current.shape[:-1])
     # In order of increasing preference; a difference is NaN if either frame is missing.

@@ -3,12 +3,12 @@
 The torso of the seed pose (pelvis, spine, chest, neck, head, shoulders and hips) is fitted to the
 annotation as a rigid body (:mod:`probmotion.interaction.annotations.torso_fits`).
 
-The depth between two people is not observable in an orthographic projection. It is estimated from
-the offset D between their roots in the seed, rotated by each torso's R_k:
+The relative depth Δz of two people is not observable in an orthographic projection. It is estimated
+from the offset D between their roots in the seed, rotated by the rotation R_k of each torso k:
 
     Δz = Σ_k w_k (R_k D)_z,   w_k ∝ exp(−‖(R_k D)_xy − observed offset‖² / (2 τ²)),  τ = ‖D‖/2.
 
-Errors on real salsa pairs in random views, median and 90 % quantile in degrees (medoid seed):
+Median and 90 % quantile of the error, degrees, on salsa recordings in random views (medoid seed):
 
     ===================  =========  ========
     keypoints            backbones  views
@@ -18,7 +18,7 @@ Errors on real salsa pairs in random views, median and 90 % quantile in degrees 
     30 % occluded        3, 9       8, 32
     ===================  =========  ========
 
-With Δz = 0 the view errors are 30-34 and 64-72 degrees.
+With Δz = 0, the median view error is 30-34 degrees and the 90 % quantile is 64-72 degrees.
 """
 
 from __future__ import annotations
@@ -48,26 +48,26 @@ __all__ = ["TORSO", "BackboneEstimate", "annotation_views", "lift_torsos"]
 # Minimum number of visible torso joints per person; two would leave a rotation undetermined.
 _LEAST_JOINTS = 3
 
-TORSO = {"pelvis", "spine", "chest", "neck", "head"}
+TORSO = {"pelvis", "spine", "chest", "neck", "head"}  # canonical names of the torso joints
 TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
 
 
 @dataclass(frozen=True, eq=False)
 class BackboneEstimate:
-    """Torsos of K people in n annotations, in image axes with z towards the viewer.
+    """Estimated torsos of K people in n annotations, in image axes with z towards the viewer.
 
     Attributes
     ----------
     backbones : ndarray, (n, K, 3)
-        Chest minus root, metres.
+        Vectors from the root to the chest, metres.
     rotations : ndarray, (n, K, 3, 3)
         Rotations from the seed's axes to the image axes.
     roots : ndarray, (n, K, 3)
-        Root joints, metres; z relative to the first person.
+        Positions of the root joints, metres; z is relative to the first person.
     residuals : ndarray, (n, K)
         Root-mean-square residual of the visible torso joints, metres.
     lifted : ndarray, (n,)
-        Whether every person has at least three visible torso joints; other rows are NaN.
+        Mask of rows in which all people have at least three visible torso joints; others are NaN.
     """
 
     backbones: np.ndarray
@@ -157,7 +157,7 @@ def annotation_views(annotations: Annotations, seed: np.ndarray) -> np.ndarray:
 
 
 def _depths(roots: np.ndarray, rotations: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return Δz of each root relative to the first, (n, K); ``offsets`` (K, 3) from the seed."""
+    """Return Δz of each root relative to the first, (n, K), from the seed's ``offsets`` (K, 3)."""
     depths = np.zeros(rotations.shape[:2])
     for other in range(1, len(offsets)):
         # The seed's offset rotated by the first torso and by the other torso.

@@ -1,8 +1,8 @@
 """Local frames of pairs of people (Yin et al. 2018, eq. 3).
 
-The columns are
+The columns of a frame are
 
-    i = N(r₂ − r₁),   j = N(Σ_k N(B_k)),   k = i × j,
+    i = N(r₂ − r₁),   j = N(Σ_k N(B_k)),   k = i × j,   N(v) = v / ‖v‖,
 
 with roots r and backbones B = chest − root. The frame is not orthogonal and k is not a unit vector.
 """
@@ -29,8 +29,8 @@ SMALLEST_SINE = 1e-6
 def local_frames(roots: np.ndarray, backbones: np.ndarray) -> np.ndarray:
     """Return the local frames (eq. 3) with columns i, j, k, (…, 3, 3).
 
-    ``roots`` and ``backbones`` (…, K, 3) of K ≥ 2 people; the first two roots define i. An
-    undefined column (roots coincide, backbones cancel) is 0; see :func:`valid_frames`.
+    ``roots`` and ``backbones`` are (…, K, 3) for K ≥ 2 people; the first two roots define i. A
+    column is 0 if undefined (the roots coincide or the backbones cancel); see :func:`valid_frames`.
     """
     check_shape("roots", roots, ("…", "K", 3))
     check_shape("backbones", backbones, roots.shape)
@@ -101,5 +101,5 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a × b over the last axis; faster than NumPy's for few vectors."""
+    """Return a × b over the last axis; faster than ``numpy.cross`` for few vectors."""
     return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]

@@ -34,9 +34,9 @@ class DrawnAnnotations:
     world_views : ndarray, (n, 2)
         Azimuth and elevation of the cameras, radians.
     clips, frames : ndarray of int, (n,)
-        Index of the motion and of its frame.
+        Index of each annotation's motion, and of the frame within the motion.
     positions : ndarray, (n, J, 3)
-        Pose-pairs, metres.
+        3D pose-pairs, metres.
     """
 
     annotations: Annotations
@@ -72,14 +72,14 @@ def draw_annotations(
         Mask of the frames to draw from in each clip; all by default.
     world_views : ndarray, (n, 2), optional
         Azimuth (0: camera on the +Z side, π/2: +X side) and elevation of each camera, radians. By
-        default uniform on the circle and on :data:`ELEVATIONS`.
+        default, azimuths are uniform on the circle and elevations on :data:`ELEVATIONS`.
     known_views : bool
         Whether the annotations include their true views.
     noise : float
-        Standard deviation of the noise of every coordinate, including neighbours, metres.
+        Standard deviation of the Gaussian noise of all coordinates and neighbours, metres.
     hidden : float
-        Fraction of each person's joints that are occluded, below 1, drawn for each annotation and
-        shared by its neighbours.
+        Fraction of each person's joints that are occluded, below 1. The joints are drawn for each
+        annotation, and also occluded in its neighbours.
     """
     skeleton, fps = _common(motions)
     check_count("n", n)
@@ -182,7 +182,7 @@ def _with_neighbours(
 
 
 def _visible(n: int, skeleton: Skeleton, hidden: float, rng: np.random.Generator) -> np.ndarray:
-    """Return a visibility mask with the same number of occluded joints per person: ``(n, J)``."""
+    """Return a visibility mask (n, J) with a fixed number of occluded joints per person."""
     if not 0 <= hidden < 1:
         raise ValueError(f"hidden must be at least 0 and below 1, got {hidden!r}")
     visible = np.ones((n, skeleton.n_joints), dtype=bool)

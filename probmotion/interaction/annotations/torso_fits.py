@@ -1,12 +1,13 @@
 """Rotation of a rigid body from orthographic projections, vectorised over projections.
 
-Least squares over rotations R and image translations c,
+The rotation R and the image translation c solve the least-squares problem
 
     min Σ_m ‖x_m − P R t_m − c‖²,   P = the first two rows of I,
 
-over the visible points m. The in-plane rotation has a closed form for each viewing direction, so
-the initial rotation is found by a grid search over directions and refined by Levenberg-Marquardt.
-A nearly flat body has a second minimum, its reflection in the image plane; both are refined.
+where x_m is the projection of the body's visible point t_m. The in-plane rotation has a closed form
+for each viewing direction. A grid search over directions gives the initial rotation, which
+Levenberg-Marquardt steps refine. A nearly flat body has a second minimum, its reflection in the
+image plane; both minima are refined.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from probmotion.interaction.annotations.local_frames import cross
 
 __all__ = ["BodyFit", "fit_body"]
 
-_DIRECTIONS = 200  # about 14 degrees apart
-_STEPS = 20
+_DIRECTIONS = 200  # number of viewing directions in the grid, about 14 degrees apart
+_STEPS = 20  # number of Levenberg-Marquardt steps
 _DAMPING = 1e-3  # initial damping relative to the mean curvature
-_LEAST_DAMPING = 1e-12
-_ROWS = 1024
+_LEAST_DAMPING = 1e-12  # minimum damping relative to the mean curvature
+_ROWS = 1024  # number of projections per block
 
 
 class BodyFit(NamedTuple):
@@ -67,7 +68,7 @@ def _fit(points: np.ndarray, visible: np.ndarray, body: np.ndarray) -> BodyFit:
 
 @lru_cache(maxsize=1)
 def _directions() -> np.ndarray:
-    """Return rotations (G, 3, 3) with third rows on a spherical spiral."""
+    """Return rotations (G, 3, 3) whose third rows, the viewing directions, lie on a spiral."""
     index = np.arange(_DIRECTIONS) + 0.5
     z = 1 - 2 * index / _DIRECTIONS
     azimuth = np.pi * (1 + np.sqrt(5)) * index
@@ -80,7 +81,7 @@ def _directions() -> np.ndarray:
 
 
 def _best_start(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the best rotation (n, 3, 3) over all directions and in-plane rotations."""
+    """Return the best rotation (n, 3, 3) over all directions A and in-plane rotations Q."""
     grid = _directions()
     axes = grid[:, :2]
     # Σ‖x − Q A t‖² = Σ‖x‖² + ⟨AᵀA, Σ t tᵀ⟩ − 2 ⟨Q, Σ x (A t)ᵀ⟩; the last term is a cos + b sin.
@@ -95,7 +96,7 @@ def _best_start(x: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _mirrored(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return D R S with reflections D in the image plane and S in the body's flattest plane."""
+    """Return D R S with reflections D in the image plane and S in the body's best-fit plane."""
     _, axes = np.linalg.eigh(np.einsum("nmi,nmj->nij", t, t))
     normal = axes[..., 0]
     reflection = np.eye(3) - 2 * normal[:, :, np.newaxis] * normal[:, np.newaxis, :]
@@ -105,8 +106,7 @@ def _mirrored(rotations: np.ndarray, t: np.ndarray) -> np.ndarray:
 def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations after Levenberg-Marquardt steps, and their sums of squares.
 
-    Gauss-Newton would overshoot for a flat body in frontal view, where tilt has no first-order
-    effect.
+    Gauss-Newton would overshoot for flat bodies in frontal view: tilt has no first-order effect.
     """
     residual, squares = _residuals(rotations, x, t)
     damping = np.full(len(x), _DAMPING)

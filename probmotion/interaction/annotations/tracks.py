@@ -7,7 +7,7 @@ limbs are used and the other joints are interpolated:
   fraction as the projection of the seed's joint onto the seed's line;
 - head at the midpoint of the ears, else midway from the neck to the top of the head, else the nose.
 
-An interpolated joint is occluded if any of its keypoints is.
+An interpolated joint is occluded if any of the keypoints it is computed from is occluded.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ def annotations_of_tracks(
     tracks : sequence of KeypointTrack
         One track per person, in the order of the seed, over the same frames.
     seed : ndarray, (J, 3)
-        Pose-pair of ``pair17``, metres, for bone lengths and the joints of the trunk.
+        Pose-pair of ``pair17``, metres; defines bone lengths and the positions of trunk joints.
     metres_per_pixel : float, optional
-        Scale of the image. By default the median over limb bones of the seed's length divided by
-        the 95 % quantile of the projected length.
+        Scale of the image. Default: the median over limb bones of the bone's length in the seed
+        divided by the 95 % quantile of its length in the image.
     least_confidence : float
         Minimum confidence; keypoints below it count as occluded.
 
     Returns
     -------
     annotations : Annotations
-        ``dropped`` counts the frames in which a person has no visible joint.
+        Annotations; ``dropped`` counts the frames in which a person has no visible joint.
     """
     skeleton, person = Skeleton.preset("pair17"), Skeleton.preset("person17")
     seed = np.asarray(seed, dtype=np.float64)
@@ -132,7 +132,7 @@ def _trunk(
 
 
 def _head(joints: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the head from the first visible source in each frame."""
+    """Return the head in each frame: from the ears, else neck and top of the head, else nose."""
     missing = np.full_like(joints["left_hip"], np.nan)
     neck = joints.get("upper_neck", joints.get("neck", missing))
     sources = [

@@ -1,6 +1,6 @@
 """Camera views in a pair's local frame, their distribution and projections (Yin et al. 2018).
 
-A viewing direction d, from the scene towards the viewer, is [i j k] (a, b, c)ᵀ in the frame of
+A viewing direction from the scene towards the viewer is [i j k] (a, b, c)ᵀ in the local frame of
 :mod:`probmotion.interaction.annotations.local_frames`. The view is (eq. 4)
 
     φ = atan2(c, a),   θ = arccos(b / √(a² + b² + c²)).
@@ -28,7 +28,7 @@ from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["ViewDistribution", "image_axes", "project_to_views", "view_angles", "view_vectors"]
 
-_MAX_ELEMENTS = 1 << 20  # largest temporary array
+_MAX_ELEMENTS = 1 << 20  # maximum number of elements of a temporary array
 _DEVIATIONS = 9.0  # bandwidths beyond which a kernel is below machine precision
 
 
@@ -38,15 +38,15 @@ class ViewDistribution:
 
     Kernels are wrapped around the circle in φ and reflected at the poles: (φ, −θ) and (φ, 2π − θ)
     are the view (φ + π, θ). The density is normalised with respect to dφ dθ on [−π, π) × [0, π],
-    and :meth:`sample` is exact.
+    and :meth:`sample` draws from it exactly.
 
     Parameters
     ----------
     views : ndarray, (n, 2)
-        φ (modulo 2π) and θ in [0, π] of each annotation, radians; NaN if unknown. At least one
-        must be known.
+        Views v(pᵢ) of the annotations: φ (modulo 2π) and θ in [0, π], radians; NaN if unknown. At
+        least one must be known.
     bandwidth : float
-        σ_v, radians.
+        Bandwidth σ_v, radians.
     """
 
     views: np.ndarray
@@ -93,7 +93,7 @@ class ViewDistribution:
         return log_f.reshape(views.shape[:-1])
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Draw n views, (n, 2): a uniformly drawn annotation plus kernel noise."""
+        """Draw n views, (n, 2): those of uniformly drawn annotations plus kernel noise."""
         check_count("n", n)
         chosen = self.known[rng.integers(len(self.known), size=n)]
         phi, theta = (self.views[chosen] + self.bandwidth * rng.standard_normal((n, 2))).T
@@ -104,9 +104,9 @@ class ViewDistribution:
         return np.stack([phi, theta], axis=-1)
 
     def near(self, views: np.ndarray, n: int) -> np.ndarray:
-        """Return the n annotations with the smallest angle to each view (:func:`view_vectors`).
+        """Return the n annotations whose :func:`view_vectors` are closest to that of each view.
 
-        ``(V, 2) → (V, min(n, m))``, nearest first; the lower index breaks ties.
+        ``(V, 2) → (V, min(n, m))`` for m known views, nearest first; the lower index breaks ties.
         """
         check_count("n", n)
         check_shape("views", views, ("V", 2))
@@ -150,7 +150,7 @@ def view_angles(frames: np.ndarray, direction: np.ndarray) -> np.ndarray:
     frames : ndarray, (…, 3, 3)
         Local frames, columns i, j, k; must not be degenerate.
     direction : ndarray, (…, 3)
-        From the scene towards the viewer, of any length above 0; broadcast against the frames.
+        Direction from the scene towards the viewer, of any length above 0; broadcasts to frames.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def view_angles(frames: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def view_vectors(views: np.ndarray) -> np.ndarray:
-    """Return (sin θ cos φ, cos θ, sin θ sin φ): ``(…, 2) → (…, 3)``, unit vectors."""
+    """Return the unit vectors (sin θ cos φ, cos θ, sin θ sin φ): ``(…, 2) → (…, 3)``."""
     views = np.asarray(views, dtype=np.float64)
     check_shape("views", views, ("…", 2))
     phi, theta = views[..., 0], views[..., 1]
@@ -186,9 +186,9 @@ def view_vectors(views: np.ndarray) -> np.ndarray:
 def image_axes(frames: np.ndarray, views: np.ndarray) -> np.ndarray:
     """Return the image axes of every pose in every view; finite for degenerate frames too.
 
-    ``(B, 3, 3), (V, 2) → (B, 3, V, 2)``: the unit vectors e₁ (right) and e₂ (up) are in the last
-    axis, and e₁ × e₂ points to the viewer. Up is the projection of j, or of i at the poles θ = 0
-    and π.
+    ``(B, 3, 3), (V, 2) → (B, 3, V, 2)``: the last axis indexes the unit vectors e₁ (right) and e₂
+    (up), and e₁ × e₂ points to the viewer. The up vector is the projection of j, or of i at the
+    poles θ = 0 and π.
     """
     towards = unit(np.matmul(view_vectors(views), np.swapaxes(frames, -1, -2)))
     up = _across(frames[:, np.newaxis, :, 1], towards)
@@ -200,7 +200,7 @@ def image_axes(frames: np.ndarray, views: np.ndarray) -> np.ndarray:
 
 
 def project_to_views(positions: np.ndarray, views: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return the orthographic projections Θ_v of pose-pairs to views in their frames (eq. 6).
+    """Return the orthographic projections Θ_v of pose-pairs to views in local frames (eq. 6).
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def project_to_views(positions: np.ndarray, views: np.ndarray, skeleton: Skeleto
     views = np.asarray(views, dtype=np.float64)
     check_shape("views", views, ("V", 2))
     axes = image_axes(pair_frames(positions, skeleton), views)
-    # One matrix product per pose: one per view would dominate the run time.
+    # One matrix product per pose; separate products for the views would dominate the run time.
     projections = np.matmul(positions, axes.reshape(len(positions), 3, 2 * len(views)))
     projections = projections.reshape(len(positions), skeleton.n_joints, len(views), 2)
     return np.ascontiguousarray(np.swapaxes(projections, 1, 2))

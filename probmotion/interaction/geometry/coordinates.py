@@ -1,6 +1,6 @@
 """Interaction coordinates of pose-pairs and their dissimilarity (Yin et al. 2018, eqs. 7-8).
 
-Edges come from :mod:`probmotion.interaction.geometry.graphs`; the number of people is arbitrary.
+The edges are those of :mod:`probmotion.interaction.geometry.graphs`, for any number of people.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def align_rigidly(source: Array, target: Array, visible: Array | None = None) ->
     Returns
     -------
     Array, (…, J, D)
-        Metres.
+        Aligned joints, metres.
     """
     _check_pairs(source, target, visible)
     xp = array_namespace(source, target)
@@ -89,8 +89,8 @@ def dissimilarity(
 ) -> Array:
     """Return the dissimilarity of two pose-pairs in interaction coordinates (eq. 8), metres.
 
-    ``d = Σ_{T₁} w₁ ‖u₁ − u₂‖ / W₁ + Σ_{T₂} w₂ ‖u₁ − u₂‖ / W₂`` with weights ``w_k = 1 / max(ε,
-    ‖u_k‖)`` and their sums ``W_k``. The pairs are not aligned; see :func:`align_rigidly`.
+    ``d = Σ_{T₁} w₁ ‖u₁ − u₂‖ / W₁ + Σ_{T₂} w₂ ‖u₁ − u₂‖ / W₂``, with edges T_k, coordinates u_k
+    (eq. 7) and weights ``w_k = 1 / max(ε, ‖u_k‖)`` of sum W_k of pair k. Pairs are not aligned.
 
     Parameters
     ----------
@@ -99,14 +99,14 @@ def dissimilarity(
     first_edges, second_edges : Array of int, (E, 2)
         Edges of each pair's graph; E may differ.
     epsilon : float
-        ε, metres.
+        Minimum edge length ε in the weights, metres.
     visible : Array of bool, (…, J), optional
-        Mask of visible joints. Edges with an occluded end are excluded from the sums and W.
+        Mask of visible joints. Edges with an occluded end are excluded from all sums.
 
     Returns
     -------
     Array, (…)
-        Metres; infinite if a graph has no visible edge.
+        Dissimilarities, metres; infinite if a graph has no visible edge.
     """
     _check_pairs(first, second, visible)
     check_positive("epsilon", epsilon)
@@ -160,7 +160,7 @@ def interaction_distance(
 def cartesian_distance(first: Array, second: Array, visible: Array | None = None) -> Array:
     """Return the root-mean-square joint distance after rigid alignment, metres.
 
-    The Cartesian baseline of the paper; infinite if no joint is visible.
+    This is the Cartesian baseline of the paper. The distance is infinite if no joint is visible.
 
     Parameters
     ----------

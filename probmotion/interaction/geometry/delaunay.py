@@ -1,9 +1,9 @@
-"""Compiled 2D Delaunay triangulation of a few dozen joints (Bowyer and Watson 1981).
+"""Compiled 2D Delaunay triangulation of a few dozen joints (Bowyer 1981, Watson 1981).
 
 Joints are inserted one at a time: triangles with the new joint in their circumcircle form a cavity,
 and the boundary of the cavity is connected to the joint. Each hull edge has a ghost triangle with a
-vertex at infinity, so that joints outside the hull need no special case. Reference code:
-:mod:`probmotion.interaction.geometry.graphs`.
+vertex at infinity, so that joints outside the hull need no special case. The reference
+implementation is :mod:`probmotion.interaction.geometry.graphs`.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ def max_planar_edges(n_joints: int) -> int:
 
 @numba.njit(cache=True)
 def write_delaunay(points: np.ndarray, offsets: np.ndarray, edges: np.ndarray) -> tuple[int, bool]:
-    """Write the triangulation's edges; return their number and whether it was degenerate.
+    """Write the triangulation's edges; return their number and whether joints were degenerate.
 
-    ``points`` and joggle ``offsets`` (J, 2); ``edges`` uint16, :func:`max_planar_edges` rows.
+    ``points`` and joggle ``offsets`` are (J, 2); ``edges`` has :func:`max_planar_edges` rows.
     """
     n_joints = points.shape[0]
     if n_joints == 2:
@@ -100,7 +100,7 @@ def _into_unit_box(points: np.ndarray, unit: np.ndarray) -> None:
 def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
     """Write the edges and return their number, or 0 if the sign of a determinant was uncertain.
 
-    With ``exact`` (for joggled joints), determinants of differences of any size are accepted.
+    For joggled joints (``exact``), determinants of coordinate differences of any size are accepted.
     Otherwise each triangle stores the plane through its joints lifted to the paraboloid
     z = x² + y²; a joint below the plane is inside the circumcircle.
     """
@@ -135,7 +135,7 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
             if not exact and abs(inside[t]) < _TIE:
                 if corner[t, 2] != ghost:
                     return 0
-                # Collinear with a hull edge: include the ghost if the joint splits the edge.
+                # The joint is collinear with a hull edge: include the ghost if it splits the edge.
                 within = is_obtuse(unit, corner[t, 0], corner[t, 1], joint)
             if within:
                 cavity[n_cavity] = t
@@ -152,7 +152,7 @@ def _triangulate(unit: np.ndarray, exact: bool, edges: np.ndarray) -> int:
 
 @numba.njit(cache=True)
 def _first_triangle(unit: np.ndarray, order: np.ndarray, exact: bool) -> bool:
-    """Write the insertion order, first a large counter-clockwise triangle; False if none."""
+    """Write the insertion order, a large triangle first; return False if there is no triangle."""
     n_joints = unit.shape[0]
     second, farthest = 0, -1.0
     for joint in range(1, n_joints):
@@ -195,7 +195,7 @@ def is_obtuse(points: np.ndarray, a: int, b: int, vertex: int) -> bool:
 def _set_triangle(
     unit: np.ndarray, corner: np.ndarray, plane: np.ndarray, slot: int, a: int, b: int, c: int
 ) -> None:
-    """Write a triangle, its ghost vertex last, and its lifted plane."""
+    """Write a triangle, with a ghost vertex last, and the plane through its lifted joints."""
     ghost = unit.shape[0]
     if a == ghost:
         a, b, c = b, c, a
@@ -262,7 +262,7 @@ def _boundary(
 
 @numba.njit(cache=True)
 def _collect(corner: np.ndarray, n_triangles: int, n_joints: int, edges: np.ndarray) -> int:
-    """Write each edge once; it occurs in two triangles, once in each direction."""
+    """Write each edge once, although two triangles contain it; return the number of edges."""
     n_edges = 0
     for t in range(n_triangles):
         for side in range(3):

@@ -10,7 +10,7 @@ from probmotion.interaction.geometry.graphs import GRAPHS, N_NEIGHBOURS
 
 __all__ = ["graphs_of_visible", "max_edges", "write_graph"]
 
-_DELAUNAY, _NEAREST_NEIGHBOURS, _GABRIEL, _COMPLETE = range(len(GRAPHS))
+_DELAUNAY, _NEAREST_NEIGHBOURS, _GABRIEL, _COMPLETE = range(len(GRAPHS))  # indices into GRAPHS
 
 
 @numba.njit(cache=True)
@@ -25,9 +25,9 @@ def write_graph(
 ) -> tuple[int, bool]:
     """Write a graph's edges; return their number and whether joints were joggled.
 
-    ``points`` and joggle ``offsets`` (J, 2); ``graph``, index into
-    :data:`~probmotion.interaction.geometry.graphs.GRAPHS`; ``edges`` (E, 2) uint16 with at least
-    :func:`max_edges` rows.
+    ``points`` and joggle ``offsets`` are (J, 2), ``graph`` is the index into
+    :data:`~probmotion.interaction.geometry.graphs.GRAPHS`, and ``edges`` (E, 2), uint16, has at
+    least :func:`max_edges` rows.
     """
     if graph == _DELAUNAY:
         return write_delaunay(points, offsets, edges)
@@ -78,8 +78,8 @@ def graphs_of_visible(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the graphs over the visible joints of n pose-pairs and the weights of eq. 8.
 
-    Of ``points`` (n, J, 2) and ``visible`` (n, J): the numbers of edges (n,), the edges (n, E, 2)
-    uint16 and their weights (n, E), which sum to 1 for each graph.
+    ``points`` are (n, J, 2) and ``visible`` is (n, J). The results are the numbers of edges (n,),
+    the edges (n, E, 2) uint16 and their weights (n, E), which sum to 1 for each graph.
     """
     n, n_joints = visible.shape
     most = max_edges(n_joints, graph)

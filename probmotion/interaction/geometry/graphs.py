@@ -18,7 +18,7 @@ __all__ = [
 ]  # fmt: skip
 
 GRAPHS = ("delaunay", "nearest-neighbours", "gabriel", "complete")
-N_NEIGHBOURS = 6
+N_NEIGHBOURS = 6  # number of nearest joints in the nearest-neighbour graph
 JOGGLE = 1e-5
 """Displacement of degenerate joints, in units of their extent."""
 
@@ -31,9 +31,9 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
 
     - ``delaunay``: the Delaunay triangulation (Qhull). Degenerate joints
       (:func:`is_degenerate`) are first joggled: moved by small fixed offsets.
-    - ``nearest-neighbours``: i–j if either is one of the other's six nearest joints.
-    - ``gabriel``: i–j if no joint lies strictly inside the ball with diameter i–j; a subgraph of
-      the Delaunay triangulation.
+    - ``nearest-neighbours``: edge i–j if either is one of the other's six nearest joints.
+    - ``gabriel``: edge i–j if no joint lies strictly inside the ball with diameter i–j; a subgraph
+      of the Delaunay triangulation.
     - ``complete``: all pairs of joints.
 
     Parameters
@@ -46,7 +46,7 @@ def graph_edges(points: np.ndarray, graph: str = "delaunay") -> np.ndarray:
     Returns
     -------
     ndarray of int, (E, 2)
-        i < j, rows in lexicographic order.
+        Edges (i, j) with i < j, rows in lexicographic order.
     """
     points = _checked(points)
     check_graph(graph)
@@ -128,7 +128,7 @@ def _in_unit_box(points: np.ndarray) -> np.ndarray:
 
 
 def _has_ties(unit: np.ndarray, triangulation: Delaunay) -> bool:
-    """Return whether a joint lies on the circumcircle (sphere) of a neighbouring triangle."""
+    """Return whether a joint lies on the circumcircle (3D: circumsphere) of a neighbour."""
     simplices, neighbours = triangulation.simplices, triangulation.neighbors
     simplex, side = np.nonzero(neighbours >= 0)
     other = simplices[neighbours[simplex, side]]

@@ -1,6 +1,6 @@
-"""Nearest annotation of a 2D projection (Yin et al. 2018, eqs. 8-9).
+"""Search for the nearest annotation of a 2D projection (Yin et al. 2018, eqs. 8-9).
 
-Compiled counterpart of :mod:`probmotion.interaction.geometry.coordinates` and
+The code is the compiled counterpart of :mod:`probmotion.interaction.geometry.coordinates` and
 :mod:`probmotion.interaction.geometry.shape_context`.
 """
 
@@ -28,7 +28,7 @@ MEASURES = ("interaction", "cartesian", "shape-context")
 
 
 class PairComparer:
-    """Distances of 2D projections to a fixed set of annotated pose-pairs.
+    """Distance computation between 2D projections and a fixed set of annotated pose-pairs.
 
     A projection is first rigidly aligned to the visible joints of the annotation (no reflection).
 
@@ -40,20 +40,20 @@ class PairComparer:
     Parameters
     ----------
     keypoints : ndarray, (n, J, 2)
-        Annotations, metres; occluded joints are ignored.
+        Annotated joints, metres; occluded joints are ignored.
     visible : ndarray of bool, (n, J)
         Mask of annotated joints.
     measure : str
-        One of :data:`MEASURES`.
+        Distance, one of :data:`MEASURES`.
     graph : str
-        One of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`, for ``interaction``.
+        Graph for ``interaction``, one of :data:`~probmotion.interaction.geometry.graphs.GRAPHS`.
     epsilon : float
         ε of eq. 8, metres.
 
     Attributes
     ----------
-    prepared
-        Data and options for compiled code.
+    prepared : Prepared
+        Precomputed data and options for the compiled code.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class PairComparer:
     def nearest(
         self, projections: np.ndarray, candidates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance and index of the nearest candidate annotation.
+        """Return the distance and index of each projection's nearest candidate annotation.
 
         Results are bit-identical for any batch size and thread count (``numba.set_num_threads``).
 
@@ -98,15 +98,15 @@ class PairComparer:
         projections : ndarray, (B, V, J, 2)
             Projections of pose-pairs to V views, metres.
         candidates : ndarray of int, (V, N)
-            Annotations to compare in each view, at least one.
+            Indices of the annotations to compare in each view, at least one.
 
         Returns
         -------
         distances : ndarray, (B, V)
-            Infinite if no candidate shares an edge (for measures without a graph: a joint) with the
-            projection.
+            Distances; infinite if no candidate shares an edge (``cartesian``: a joint,
+            ``shape-context``: two joints) with the projection.
         indices : ndarray of int, (B, V)
-            The first candidate in case of ties.
+            Indices of the annotations; the first candidate in case of ties.
         """
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])

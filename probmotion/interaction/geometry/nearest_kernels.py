@@ -19,7 +19,7 @@ __all__ = [
     "prepare_projection",
 ]  # fmt: skip
 
-INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)
+INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)  # indices into nearest.MEASURES
 _SMALLEST = 1e-300  # avoids division by 0 if there are no edges
 
 
@@ -34,9 +34,9 @@ class Prepared(NamedTuple):
     n_visible: np.ndarray  # (n,)
     square: np.ndarray  # (n,), sums of squared coordinates
     edge_start: np.ndarray  # (n + 1,)
-    edges: np.ndarray  # (2, E), uint16
+    edges: np.ndarray  # (2, E), uint16, joint indices
     weights: np.ndarray  # (E,), w_ij / W of eq. 8
-    contexts: np.ndarray  # (n, J, 60), uint8
+    contexts: np.ndarray  # (n, J, 60), uint8, shape contexts
     shared: np.ndarray  # shape_context.shared_table of the contexts
     offsets: np.ndarray  # (J, 2), joggle offsets
     measure: int  # index into nearest.MEASURES
@@ -45,7 +45,7 @@ class Prepared(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """A prepared projection: centred joints (2, J), its weighted graph, or its polar bins."""
+    """Prepared projection: centred joints (2, J), and the weighted graph or the polar bins."""
 
     joints: np.ndarray
     edges: np.ndarray
@@ -60,7 +60,7 @@ class Projection(NamedTuple):
 def nearest_in_batch(
     projections: np.ndarray, candidates: np.ndarray, prepared: Prepared
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance and index of the nearest candidate for (B, V, J, 2) and (V, N)."""
+    """Return the distance and index of each projection's nearest candidate, (B, V) each."""
     n, n_views = projections.shape[:2]
     distances, indices = np.empty((n, n_views)), np.empty((n, n_views), np.int64)
     for flat in range(n * n_views):
@@ -88,7 +88,7 @@ def nearest_in_batch_on_threads(
 
 @numba.njit(cache=True)
 def all_distances(projections: np.ndarray, prepared: Prepared) -> np.ndarray:
-    """Return the distances of (B, J, 2) to all n annotations, (B, n)."""
+    """Return the distances of projections (B, J, 2) to all n annotations, (B, n)."""
     n_items, n_annotations = projections.shape[0], prepared.joints.shape[0]
     out, candidates = np.empty((n_items, n_annotations)), np.arange(n_annotations)
     for item in range(n_items):
@@ -117,7 +117,7 @@ def nearest_candidate(
         left[position] = (visible_square + prepared.square[k] - 2.0 * product) / max(n_visible, 1)
     difference, terms = np.empty_like(joints), np.empty(projection.edges.shape[1])
     best, where = within, n_candidates
-    # The candidate with the best alignment is likely nearest; starting there stops others early.
+    # The best-aligned candidate is likely nearest; if it is first, the others stop early.
     for position in np.argsort(left):
         cosine, sine, k = turns[0, position], turns[1, position], candidates[position]
         distance = _distance(projection, k, cosine, sine, prepared, best, difference, terms)
@@ -143,7 +143,7 @@ def distances_to(
 def annotation_graph_distance(
     joints: np.ndarray, k: int, prepared: Prepared, difference: np.ndarray, terms: np.ndarray
 ) -> float:
-    """Return eq. 8 with annotation k's graph used for the projection as well."""
+    """Return the dissimilarity (eq. 8) with annotation k's graph also used for the projection."""
     cosine, sine, _ = _rotation(joints, prepared.joints[k])
     _residual(joints, prepared.joints[k], cosine, sine, difference)
     return 2.0 * _annotation_sum(difference, k, prepared, terms)
@@ -190,7 +190,7 @@ def prepare_projection(points: np.ndarray, prepared: Prepared) -> Projection:
 
 @numba.njit(cache=True)
 def _rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
-    """Return cosine and sine of the least-squares rotation, and Σ target · (rotated source).
+    """Return the cosine and sine of the least-squares rotation and Σ target · (rotated source).
 
     ``target`` must be centred and 0 where occluded; ``source`` need not be centred.
     """
@@ -279,7 +279,7 @@ def _projection_sum(
 
 @numba.njit(cache=True)
 def _sum(terms: np.ndarray, n_terms: int) -> float:
-    """Return a sum with four accumulators, for instruction-level parallelism."""
+    """Return the sum of the terms; four accumulators allow instruction-level parallelism."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     unrolled = n_terms - n_terms % 4
     for k in range(0, unrolled, 4):
@@ -291,7 +291,7 @@ def _sum(terms: np.ndarray, n_terms: int) -> float:
 
 @numba.njit(cache=True)
 def _root_mean_square(difference: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
-    """Return the root-mean-square distance of the visible joints, mean difference removed."""
+    """Return the RMS distance of the visible joints after removal of the mean difference."""
     if n_visible == 0:
         return np.inf
     sum_x, sum_y, square = 0.0, 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Compiled 2D shape contexts of projections, rotated by adding an angle."""
+"""Compiled 2D shape contexts of projections; a rotation adds an angle to the polar bins."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from probmotion.interaction.geometry.shape_context import N_ANGLES, RING_EDGES
 __all__ = ["context_cost", "polar_bins"]
 
 _EDGES = np.array(RING_EDGES)
-_PER_RADIAN = N_ANGLES / (2 * math.pi)
+_PER_RADIAN = N_ANGLES / (2 * math.pi)  # angular bins per radian
 
 
 @numba.njit(cache=True)
 def polar_bins(joints: np.ndarray) -> np.ndarray:
-    """Return the first bin of the ring and the angle in bins of joint j around i, (2, J, J).
+    """Return the first bin of the ring of joint j around i, and its angle in bins, (2, J, J).
 
     ``joints`` is (2, J), metres.
     """
@@ -63,7 +63,7 @@ def context_cost(
         for j in range(n_joints):
             if seen[j] > 0 and j != i:
                 sector = np.int64(np.floor(bins[1, i, j] + turned))
-                # Both angles are in [−π, π], so one turn brings their sum into [0, N).
+                # Both angles are in [−π, π], so one turn brings their sum into [0, N_ANGLES).
                 if sector < 0:
                     sector += N_ANGLES
                 elif sector >= N_ANGLES:

@@ -70,7 +70,7 @@ def _along(
 ) -> float:
     """Add one graph's sum of eq. 8, Σ w_ij ‖a_i − a_j‖, to ``total``; stop beyond ``limit``.
 
-    a is the difference of the aligned poses.
+    The vectors a_i are the joint differences of the aligned poses.
     """
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]

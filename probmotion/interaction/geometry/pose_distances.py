@@ -2,7 +2,7 @@
 
 The second pose is first rigidly aligned to the first by least squares (no reflection).
 
-- ``"interaction"`` (D_IC): eq. 8 over the Delaunay tetrahedra of both poses, metres.
+- ``"interaction"`` (D_IC): eq. 8 over the edges of both poses' Delaunay tetrahedra, metres.
 - ``"cartesian"`` (D_C): root-mean-square distance of corresponding joints, metres.
 - ``"shape-context"`` (D_S): mean χ² cost of corresponding 3D shape contexts, 0 to 1, about the
   vertical of the first pose; symmetric only if both poses are upright after alignment.

@@ -7,8 +7,8 @@ import numpy as np
 
 __all__ = ["align", "residual"]
 
-_NEWTON_STEPS = 60
-_CONVERGED = 1e-15
+_NEWTON_STEPS = 60  # maximum number of Newton steps
+_CONVERGED = 1e-15  # relative size of the last Newton step
 _FLAT = 1e-6
 """Smallest slope of the characteristic polynomial relative to λ³: below it the largest eigenvalue
 is nearly degenerate (collinear or mirrored poses)."""
@@ -18,13 +18,13 @@ is nearly degenerate (collinear or mirrored poses)."""
 def align(first: np.ndarray, second: np.ndarray, rotation: np.ndarray, horn: np.ndarray) -> float:
     """Write the least-squares rotation of ``second`` onto ``first``; return Σ‖difference‖².
 
-    Horn's (1987) quaternion, the leading eigenvector of a traceless symmetric 4×4 matrix. The
-    eigenvalue comes from Newton's method on the characteristic polynomial, the eigenvector from
-    the adjugate (Theobald 2005). The returned sum has an error of about 1e-16 of the sum of
-    squares of the poses (J, 3), which must be centred. ``horn`` (4, 4) is a workspace.
+    The rotation is Horn's (1987) quaternion, the leading eigenvector of a traceless symmetric 4×4
+    matrix. The eigenvalue λ comes from Newton's method on the characteristic polynomial, the
+    eigenvector from the adjugate (Theobald 2005). The poses (J, 3) must be centred. The returned
+    sum has an error of about 1e-16 of their sum of squares. ``horn`` (4, 4) is a workspace.
     """
     square = _fill(first, second, horn)
-    # λ⁴ + c₂ λ² + c₁ λ + c₀.
+    # The characteristic polynomial is λ⁴ + c₂ λ² + c₁ λ + c₀.
     c2 = 0.0
     for i in range(4):
         for k in range(4):
@@ -100,7 +100,7 @@ def _linear_coefficient(horn: np.ndarray) -> float:
 
 @numba.njit(cache=True)
 def _minors(m: np.ndarray, i: int, k: int) -> tuple[float, float, float, float, float, float]:
-    """Return the 2×2 minors of rows i and k, of columns 01, 02, 03, 12, 13 and 23."""
+    """Return the 2×2 minors of rows i and k and columns 01, 02, 03, 12, 13 and 23."""
     return (
         m[i, 0] * m[k, 1] - m[i, 1] * m[k, 0],
         m[i, 0] * m[k, 2] - m[i, 2] * m[k, 0],

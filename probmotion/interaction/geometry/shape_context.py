@@ -1,8 +1,8 @@
 """Shape contexts of joints in 2D and 3D (Belongie et al. 2002; Körtgen et al. 2003).
 
 The shape context of a joint is a histogram of the distances and directions of the other joints. In
-2D, directions are angles to the image's x axis. In 3D, they are elevations and azimuths about the
-vertical, hence invariant to the heading. Joints are labelled, so no matching is needed.
+2D, directions are angles to the image's x axis. In 3D, they are elevations, and azimuths relative
+to the pair's heading. The correspondence of joints is known, so no matching is needed.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ N_BANDS, N_SECTORS = 4, 8
 def shape_contexts(points: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
     """Return each joint's histogram of the other visible joints, as counts.
 
-    5 rings × 12 angles in 2D; 5 rings × 4 bands × 8 sectors in 3D. Sectors are relative to the
-    heading, the horizontal direction from the mean of the first half of the joints to the mean of
-    the second half, i.e. from one person to the other.
+    Histograms have 5 rings × 12 angles in 2D and 5 rings × 4 bands × 8 sectors in 3D. Sectors are
+    relative to the heading, the horizontal direction from the mean of the first half of the joints
+    to the mean of the second half, i.e. from one person to the other.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def shape_context_distance(
 ) -> np.ndarray:
     """Return the mean χ² cost of corresponding shape contexts, in [0, 1].
 
-    The cost of two normalised histograms is ``½ Σ_k (h_k − g_k)² / (h_k + g_k)`` (Belongie et al.
+    The cost of normalised histograms h, g is ``½ Σ_k (h_k − g_k)² / (h_k + g_k)`` (Belongie et al.
     2002, eq. 2).
 
     Parameters
@@ -98,7 +98,7 @@ def shape_context_distance(
 
 
 def shared_table(most: int) -> np.ndarray:
-    """Return ``2 h g / (h + g)`` for counts up to ``most``, shape (most + 1, most + 1).
+    """Return ``2 h g / (h + g)`` for counts h, g up to ``most``, shape (most + 1, most + 1).
 
     For histograms of N counts each, the χ² cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
     """

@@ -68,7 +68,7 @@ def shape_minima(
 
 @numba.njit(cache=True)
 def _gains(most: int) -> np.ndarray:
-    """Return the decrease of the cost by the k-th joint in a bin with h in the other pose."""
+    """Return the cost decrease [h, k] by the k-th joint in a bin with h of the other pose."""
     gains = np.zeros((most + 1, most + 1))
     for h in range(1, most + 1):
         for k in range(1, most + 1):
@@ -81,7 +81,7 @@ def _gains(most: int) -> np.ndarray:
 def _ring_costs(
     first: np.ndarray, second: np.ndarray, gains: np.ndarray, after: np.ndarray
 ) -> float:
-    """Return the cost of the ring counts; write the part due to the joints after each one."""
+    """Return the cost of the ring counts; write to ``after`` the part of the joints after i."""
     n_joints = first.shape[0]
     total = 0.0
     for i in range(n_joints - 1, -1, -1):
@@ -104,7 +104,7 @@ def _cost(
     counts: np.ndarray,
     bins: np.ndarray,
 ) -> float:
-    """Return the mean χ² cost of a pose and shape contexts, infinite if beyond the limit.
+    """Return the mean χ² cost of a pose and shape contexts, infinite beyond ``limit``.
 
     For histograms of N joints each, the cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
     """

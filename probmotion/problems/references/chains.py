@@ -1,4 +1,4 @@
-"""`StoredChain`: checkpoint file of a long chain."""
+"""Checkpoint file of a long Markov chain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probmotion.files import written_whole
 
 __all__ = ["StoredChain"]
 
-_SECONDS = 30.0
+_SECONDS = 30.0  # minimum time between checkpoints
 
 
 class StoredChain:

@@ -1,4 +1,4 @@
-"""`make_reference`: certified reference draws from two independent runs.
+"""Certified reference draws from two independent runs.
 
 Each run has four chains. The draws are accepted only if both runs have mixed and agree, in world
 coordinates and after rigid alignment, because large translations can mask poor mixing of poses.
@@ -37,18 +37,18 @@ from probmotion.validation import check_count
 
 __all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
 
-_CHAINS = 4
-_RHAT = 1.01
-_LEAST = 4000
-_PROBES = 4
-_DIRECTIONS = 128
-_SPREADS, _RATIO = 5.0, 1.5
-_LEVEL = 1e-3
-_CONSTANT = 1e-9
+_CHAINS = 4  # per run
+_RHAT = 1.01  # maximum R-hat
+_LEAST = 4000  # minimum number of draws of both runs before thinning
+_PROBES = 4  # points of the fingerprint of unfinished runs
+_DIRECTIONS = 128  # random projections of the sliced Wasserstein distance
+_SPREADS, _RATIO = 5.0, 1.5  # limits of the distance: standard deviations, least ratio
+_LEVEL = 1e-3  # significance level of the test of means
+_CONSTANT = 1e-9  # range or standard deviation of constant coordinates, metres
 
 
 class ReferenceRefused(ValueError):  # noqa: N818
-    """Raised if two runs have not mixed or disagree."""
+    """Error raised if two runs have not mixed or disagree."""
 
 
 def make_reference(
@@ -67,15 +67,15 @@ def make_reference(
     problem : Problem
         The problem; its stored reference is ignored.
     draws : int
-        Number of draws, half from each run: a multiple of 8 (4 chains each). Runs have at least
-        4000 draws, as R-hat is unreliable for short ones, and are thinned to this number.
+        Number of draws, half from each run: a multiple of 8, at least 32. The runs make at least
+        4000 draws, as R-hat is unreliable for short chains, and are thinned to this number.
     seed : int
         Seed of both runs.
     progress : bool
         Show progress bars.
     sampler : Sampler, optional
         Sampler for posteriors that are not exact; by default ``OutlierGibbs`` or ``TemperedPairs``
-        where suitable, else NUTS with a long warm-up, or a random walk without gradients.
+        where suitable, else NUTS with a long warm-up or, without gradients, a random walk.
     unfinished : str or Path, optional
         Folder for finished runs and the state of tempered chains, from which the same call
         resumes; the caller deletes it. By default nothing is written.
@@ -242,7 +242,7 @@ def _alike(aligned: list[np.ndarray]) -> bool:
 
 
 def _is_rigid(problem: Problem) -> bool:
-    """Whether all motions of the prior agree up to rigid motion."""
+    """Return whether eight motions of the prior agree up to a rigid motion."""
     prior, rng = problem.posterior.prior, seeds.generator(0, "rigid")
     drawn = (
         prior.sample(rng, 8)
@@ -263,14 +263,14 @@ def _thinned(run: MotionDraws, draws: int | None) -> np.ndarray:
 def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, float]:
     """Return the discrepancy of two runs and its limits.
 
-    - ``swd_ratio``: sliced Wasserstein distance, relative to the mean distance of halves that each
-      combine chains of both runs and so reflect slow mixing; ``swd_ratio_at_most`` is 1 plus five
-      standard deviations over these halves, at least 1.5
-    - ``mean_z``: largest difference of means in standard errors from the effective sample sizes;
-      ``mean_z_at_most`` is exceeded with probability .001 by equal distributions
+    - ``swd_ratio``: sliced Wasserstein distance of the runs, relative to its mean over splits of
+      all chains into halves with chains of both runs; ``swd_ratio_at_most`` is 1 plus five
+      relative standard deviations over these splits, but at least 1.5
+    - ``mean_z``: largest difference of means in standard errors, given effective sample sizes;
+      ``mean_z_at_most`` is exceeded with probability 0.001 if the distributions are equal
 
-    Both runs are positions (chain, draw, L, J, 3) of equal shape, metres; ``seed`` is that of the
-    projections.
+    Both runs are positions (chain, draw, L, J, 3) of equal shape, metres; ``seed`` is the seed of
+    the random projections.
     """
     from scipy.stats import norm
 
@@ -293,13 +293,13 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
 
 
 def _mixed_halves(chains: int) -> list[tuple[int, ...]]:
-    """Return halves with equal numbers of chains of both runs, one of each complementary pair."""
+    """Return chains of halves with equally many chains of each run, one half per split."""
     halves = list(combinations(range(chains), chains // 2))
     return [(*a, *(chains + i for i in b)) for a in halves for b in halves if 0 in a]
 
 
 def _sliced_distance(projected: np.ndarray, chosen: tuple[int, ...]) -> float:
-    """Return the sliced Wasserstein distance of chosen chains to the others from projections."""
+    """Return the sliced Wasserstein distance between chosen and other chains, given projections."""
     others = [chain for chain in range(len(projected)) if chain not in chosen]
     x, y = (
         np.sort(projected[list(chains)].reshape(-1, projected.shape[-1]), axis=0)
@@ -309,7 +309,7 @@ def _sliced_distance(projected: np.ndarray, chosen: tuple[int, ...]) -> float:
 
 
 def _z_scores(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the differences of the means in standard errors."""
+    """Return the differences of the runs' means in standard errors."""
     from arviz_stats.base import array_stats
 
     difference = first.mean(axis=(0, 1)) - second.mean(axis=(0, 1))

@@ -1,13 +1,13 @@
-"""`OutlierGibbs`: Gibbs sampler for 3D joints with Student-t noise.
+"""Gibbs sampler for 3D joints with Student-t noise.
 
-Student-t noise is Gaussian noise with random precision factors λ ~ Gamma(ν/2, rate ν/2) per
-coordinate (Andrews and Mallows 1974). Given λ, the posterior of motion, style and azimuth has a
-closed form; given the motion X, the λ are independent,
+Student-t noise of scale σ is Gaussian noise with random precision factors λ ~ Gamma(ν/2, rate ν/2)
+per coordinate (Andrews and Mallows 1974). Given λ, the posterior of motion, style and azimuth has a
+closed form; given the motion X and the observed joints y, the factors are independent,
 
     λ | X, y ~ Gamma((ν + 1)/2, rate (ν + (y − X)²/σ²)/2).
 
-Gibbs sampling alternates between the two, without rejections or tuning. NUTS on positions does not
-move between azimuths.
+Gibbs sampling alternates between these two draws, without rejections or tuning. NUTS on
+positions does not move between azimuths.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class OutlierGibbs:
     warmup : int
         Iterations before the first draw; precision factors are initialised from their prior.
     thin : int
-        Iterations per draw.
+        Iterations per draw; states in between are discarded.
     """
 
     name: ClassVar[str] = "outlier-gibbs"
@@ -52,7 +52,7 @@ class OutlierGibbs:
         check_count("thin", self.thin)
 
     def draws_from(self, posterior: MotionPosterior) -> bool:
-        """Return whether the prior is exact and the likelihood is Student-t noise on 3D joints."""
+        """Return whether the prior is exact and observed 3D joints have Student-t noise."""
         likelihood = posterior.likelihood
         noisy = isinstance(likelihood, Joints3D) and likelihood.degrees_of_freedom is not None
         return noisy and isinstance(posterior.prior, HasExactPosterior)

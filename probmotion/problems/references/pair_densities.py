@@ -1,4 +1,4 @@
-"""Compiled log densities of pose pairs: prior terms and the likelihood of one view."""
+"""Compiled log densities of pose pairs: terms of the prior and likelihoods of single views."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Physics(NamedTuple):
 
 
 class ViewAnnotations(NamedTuple):
-    """Parameters of eqs. 6 to 9: views, nearby annotations, and their comparison.
+    """Parameters of eqs. 6 to 9: views, nearby annotations and the distance to them.
 
     ``vectors`` (V, 3); ``near`` (V, N) int64, the annotations close to each view.
     """
@@ -65,10 +65,10 @@ class ViewAnnotations(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def log_prior_terms(pose: np.ndarray, body: Body, physics: Physics, parts: np.ndarray) -> None:
-    """Write the terms of the log prior: ``parts`` (2 + 2 K,).
+    """Write the terms of the log prior of K people to ``parts`` (2 + 2 K,).
 
-    Normal log lengths and positions, penetration, each person's distance to the joint limits
-    (eq. 2), and each person's number of invalid angles.
+    The terms are those of :func:`log_measure` and :func:`log_penetration`, the joint-limit term of
+    each person (eq. 2), and the number of invalid angles of each person.
     """
     parts[0] = log_measure(pose, body)
     parts[1] = log_penetration(pose, physics)
@@ -89,9 +89,9 @@ def log_prior(parts: np.ndarray, physics: Physics) -> float:
 def log_view(
     pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, least: float
 ) -> float:
-    """Return log L(Θ_v; v) of one view: −d²/2σ_l² of the nearest annotation (eq. 9).
+    """Return log L(Θ_v; v) of the pose Θ_v in a view v: −d²/2σ_l² (eq. 9).
 
-    Returns −∞ below ``least``, which allows early termination.
+    d is the distance to the nearest annotation. Returns −∞ below ``least``, to terminate early.
     """
     distance, nearest = nearest_candidate(
         project_to_view(pose, view, body, views),
@@ -132,7 +132,7 @@ def log_surrogate(
     errors: np.ndarray,
     terms: np.ndarray,
 ) -> float:
-    """Return −d²/2σ_l² of one annotation, computed on its graph only (ten times faster).
+    """Return −d²/2σ_l² of one annotation, with d on its graph only (ten times faster).
 
     ``errors`` (2, J) and ``terms`` (edges,) are workspace arrays.
     """
@@ -165,7 +165,7 @@ def log_measure(pose: np.ndarray, body: Body) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def log_penetration(pose: np.ndarray, physics: Physics) -> float:
-    """Return −w ρ²/2σ_p² with penetration depth ρ (eq. 2)."""
+    """Return −w ρ²/2σ_p² with penetration depth ρ, weight w and position noise σ_p (eq. 2)."""
     poses = pose.reshape(1, len(pose), 3)
     depth = total_depths(poses, physics.bones, physics.radii, physics.pairs)[0]
     return -0.5 * physics.penetration_weight * (depth / physics.position_noise) ** 2
@@ -173,7 +173,7 @@ def log_penetration(pose: np.ndarray, physics: Physics) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def write_limit_terms(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) -> None:
-    """Write a person's term of ‖X − X̂‖² and number of invalid angles."""
+    """Write a person's −‖X − X̂‖²/2σ_p², X̂ the projected pose, and number of invalid angles."""
     poses = pose.reshape(1, len(pose), 3)
     valid, nearest = project_poses(poses, physics.trees[person : person + 1], physics.limits)
     square = 0.0

@@ -2,7 +2,7 @@
 
 The base measure is a product: uniform bone directions, normal log lengths and normal root
 positions, as in ``PoseChart.log_measure`` without the roots' frames. Proposals rotate bones or
-change a length or position; they preserve area and volume, so no Jacobian is needed.
+change a log length or position; they preserve this measure's volume, so no Jacobian is needed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = [
     "resample_placement",
 ]
 
-SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)
+SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)  # kinds of moves of propose
 _ANY_ANGLE = 0.3
 """Probability of a uniform angle for cranks and hinges."""
 
@@ -33,9 +33,9 @@ _ANY_ANGLE = 0.3
 class Body(NamedTuple):
     """Skeleton and seed pose of two or more people.
 
-    ``parents`` (J,) int64, −1 for roots; ``below[j, k]``: whether joint k is joint j or one of its
-    descendants; ``roots``, ``chests`` (K,) int64; ``person`` (J,) int64, 0 to K − 1; ``seed``
-    (J, 3), metres.
+    ``parents`` (J,), −1 for roots; ``below[j, k]``: whether joint k is joint j or a descendant;
+    ``roots``, ``chests`` (K,): joints; ``person`` (J,): 0 to K − 1; ``seed`` (J, 3), metres. The
+    noises are standard deviations of log bone lengths and of root positions, metres.
     """
 
     parents: np.ndarray
@@ -129,7 +129,7 @@ def propose(
 def resample_placement(
     pose: np.ndarray, parts: np.ndarray, body: Body, rng: np.random.Generator
 ) -> None:
-    """Metropolis update of the rigid placement of the pair, which affects only the root density."""
+    """Metropolis update of the pair's rigid placement, on which only the root density depends."""
     n_roots = len(body.roots)
     middle, start, new = np.zeros(3), np.zeros(3), np.empty(3)
     for root in body.roots:

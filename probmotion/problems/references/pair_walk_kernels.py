@@ -43,7 +43,7 @@ def walk(
     views: ViewAnnotations,
     rng: np.random.Generator,
 ) -> tuple[int, float]:
-    """Metropolis walk on prior · L_v^power over pose and view; returns the view and log L_v.
+    """Sample pose and view v from prior · L_v^power by Metropolis; return v and log L_v.
 
     Blocks of steps target a surrogate of L_v, the graph distance to one annotation, and are
     accepted or rejected as a whole (surrogate transitions, Liu 2001). The annotation is an
@@ -115,7 +115,7 @@ def _surrogate_walk(
         tried[number] += 1
         propose(pose, moves[number], sizes[number], body, rng, proposed)
         new_parts[:] = parts
-        # Delayed acceptance: cheap terms first (Christen and Fox 2005).
+        # Delayed acceptance: evaluate cheap terms first (Christen and Fox 2005).
         new_parts[0] = log_measure(proposed, body)
         new = 0.0
         if power > 0:

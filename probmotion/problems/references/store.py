@@ -1,4 +1,4 @@
-"""Lookup of reference posteriors, user-computed or shipped."""
+"""Lookup of stored reference draws, user-computed or shipped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def references_folder() -> Path:
 
 
 def find_reference(name: str) -> StoredReference | None:
-    """Return the stored reference of a problem, user-computed before shipped, or None."""
+    """Return a problem's user-computed reference, else the shipped one, else None."""
     for folder in (references_folder(), _SHIPPED):
         if (folder / name / "certificate.json").is_file():
             return StoredReference.load(folder / name)

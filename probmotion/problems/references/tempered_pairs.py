@@ -1,16 +1,15 @@
-"""`TemperedPairs`: reference draws of pose pairs by parallel tempering over single views.
+"""Parallel tempering over pose pairs and single views, for reference draws.
 
-The posterior over pose pairs is a mean over views, and each view depends on its nearest annotation.
-Modes near different annotations are far apart. The view is therefore part of the state,
+The likelihood of a pose pair Θ is a mean over views, and the likelihood L(Θ_v; v) of view v depends
+on its nearest annotation. Modes near different annotations are far apart. The view is therefore
+part of the state: with the prior p, chains target
 
-    π(Θ, v) ∝ f(Θ) L(Θ_v; v),
+    π(Θ, v) ∝ p(Θ) L(Θ_v; v),
 
-whose marginal is the posterior; a step evaluates one view. Levels temper L by powers from 0 to 1
-and neighbours exchange their states (Swendsen and Wang 1986), alternating even and odd pairs, with
-powers tuned to equal rejection rates (Syed et al. 2022).
-
-For a truncated density (eq. 11), f* ≤ f, one more state targets f* and is exchanged with the state
-at power 1.
+whose marginal is the posterior, and a step evaluates one view. Levels temper L by powers in [0, 1].
+Neighbouring levels exchange states (Swendsen and Wang 1986), alternating even and odd pairs, and
+the powers are tuned to equal rejection rates (Syed et al. 2022). If the posterior density f is
+truncated to f* ≤ f (eq. 11), one more state targets f* and is exchanged with the state at power 1.
 """
 
 from __future__ import annotations
@@ -55,12 +54,12 @@ from probmotion.validation import check_count
 
 __all__ = ["TemperedPairs"]
 
-_ACCEPTED = 0.3
-_FIRST_SIZE = 0.1
-_LARGEST_SIZE = math.e
-_FIRST_ROUND = 16
-_SMALLEST_POWER = 1e-5
-_STATE = (
+_ACCEPTED = 0.3  # Target acceptance rate of the moves.
+_FIRST_SIZE = 0.1  # Initial step size of every move.
+_LARGEST_SIZE = math.e  # Maximum step size.
+_FIRST_ROUND = 16  # Number of exchanges before the powers are first tuned.
+_SMALLEST_POWER = 1e-5  # Smallest positive power before tuning.
+_STATE = (  # Stored attributes of a chain, and those of the truncated state.
     "poses", "parts", "seen", "views", "powers", "log_sizes", "tried", "taken", "rejected", "asked",
     "odd", "been_down", "round_trips", "evaluations",
 )  # fmt: skip
@@ -76,11 +75,11 @@ class TemperedPairs:
     levels : int
         Number of powers from 0 to 1.
     steps : int
-        Steps per level between exchanges.
+        Number of Metropolis steps per level between exchanges.
     warmup : int
-        Exchanges before the first draw, which tune powers and step sizes.
+        Number of exchanges before the first draw, used to tune powers and step sizes.
     thin : int
-        Exchanges per draw.
+        Number of exchanges per draw.
     """
 
     name: ClassVar[str] = "tempered-pairs"
@@ -98,7 +97,7 @@ class TemperedPairs:
         check_count("thin", self.thin)
 
     def draws_from(self, posterior: MotionPosterior) -> bool:
-        """Whether the posterior is over pose pairs with annotations of all joints."""
+        """Return whether the posterior is over pose pairs with annotations of all joints."""
         return (
             type(posterior) in (MotionPosterior, TruncatedPosterior)
             and type(posterior.prior) is PosePairPrior
@@ -194,7 +193,7 @@ class _Ladder:
         log_prior_terms(pose, body, physics, self.parts[0])
         self.parts[:] = self.parts[0]
         self.views = rng.integers(len(views.vectors), size=levels)
-        # log L_v of each level.
+        # Log likelihood of the view of each level.
         self.seen = np.array([log_view(pose, view, body, views, -np.inf) for view in self.views])
         truncated = isinstance(posterior, TruncatedPosterior) and posterior.truncated
         self.cut = _Cut(self, posterior) if truncated else None
@@ -210,7 +209,7 @@ class _Ladder:
         return float(self.rejected.sum() / max(self.asked, 1))
 
     def draw(self, draws: int, bar: Any, stop: Event, file: StoredChain) -> np.ndarray:
-        """Return states at power 1 after warm-up, ``thin`` exchanges apart: (draws, J, 3)."""
+        """Return states of the target density, ``thin`` exchanges apart: (draws, J, 3)."""
         states, done, stored = np.empty((draws, *self.poses.shape[1:])), 0, file.load()
         if stored is None:
             self._warm_up(stop)
@@ -313,9 +312,9 @@ class _Ladder:
 
 
 class _Cut:
-    """State of the truncated density, exchanged with the state at power 1.
+    """State that targets the truncated density f* and is exchanged with the state at power 1.
 
-    f*/f is 0 below the floor, cap/f above the cap, else 1.
+    The ratio f*/f is 0 for f below the floor, cap/f for f above the cap, and 1 otherwise.
     """
 
     def __init__(self, ladder: _Ladder, posterior: MotionPosterior) -> None:
@@ -326,7 +325,7 @@ class _Cut:
         self.log_share = self._log_ratio(ladder)
 
     def exchange(self, ladder: _Ladder) -> None:
-        """Metropolis exchange with the top level."""
+        """Exchange states with the top level, accepted with the Metropolis probability."""
         log_ratio = self._log_ratio(ladder)
         # The comparison with NaN rejects if both densities are 0.
         if not -ladder.rng.standard_exponential() < log_ratio - self.log_share:
@@ -354,7 +353,7 @@ class _Cut:
 
 
 def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, ViewAnnotations]:
-    """Return the compiled-code arguments of a posterior over pose pairs."""
+    """Return the arguments of the compiled functions for a posterior over pose pairs."""
     prior, likelihood = posterior.prior, posterior.likelihood
     assert isinstance(prior, PosePairPrior)
     assert isinstance(likelihood, AnnotatedPairs)
