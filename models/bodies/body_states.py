@@ -219,7 +219,7 @@ def turned_about_vertical(positions: Array, angle: Array) -> Array:
 
 
 def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array:
-    """Transform canonical motions to the world: rotated about Y, then translated on the ground.
+    """Transform canonical motions to world coordinates: rotate about Y, then translate.
 
     ``(…, L, J, 3), (…), (…, 2) → (…, L, J, 3)``: heading in radians, X and Z in metres.
     """

@@ -26,7 +26,7 @@ class EvaluatorSettings(TransformerSettings):
     frames, layers, width, heads, feedforward : int
         Size of each of the two transformers.
     latent : int
-        Number of features.
+        Dimension of the latent, the features.
     kl_weight : float
         Weight of the KL divergence of the latent from N(0, I), summed over dimensions, relative to
         the mean squared error in standardised units.
@@ -43,7 +43,7 @@ class EvaluatorSettings(TransformerSettings):
 
     @classmethod
     def tiny(cls, frames: int = 20) -> EvaluatorSettings:
-        """Return a size for tests, which trains in seconds."""
+        """Return settings of a network for tests that trains in seconds."""
         return cls(frames, layers=2, width=32, heads=2, feedforward=64, latent=8)
 
     @classmethod
@@ -67,7 +67,8 @@ class EvaluatorSettings(TransformerSettings):
 class TrackEncoder(nn.Module):
     """Encoder of a standardised motion into the mean and log variance of its latent.
 
-    Two learnt tokens precede the frames; their outputs are mapped linearly to the results (ACTOR).
+    Two learnt tokens precede the frames; their outputs are mapped linearly to the mean and log
+    variance (ACTOR).
     """
 
     def __init__(self, size: EvaluatorSettings, n_joints: int) -> None:

@@ -26,9 +26,9 @@ _LEAST_TIMES = 3
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Ensemble sampler with stretch moves (Goodman and Weare 2010) of emcee.
+    """Ensemble sampler of emcee, with the stretch move of Goodman and Weare (2010).
 
-    A chain is one ensemble; its draws are all walkers, in order of recorded iterations. Walkers
+    A chain is one ensemble; its draws are the states of all walkers, in order of iteration. Walkers
     of an ensemble depend on each other, so R-hat and ESS of a chain are not valid; the
     autocorrelation time is reported instead. See Foreman-Mackey et al. (2013) for emcee.
 
@@ -264,7 +264,7 @@ class _Run:
 
 
 def _words(state: Any) -> np.ndarray:
-    """Return the state of a RandomState, without cached normal variate, as signed 32-bit words."""
+    """Return the state of a RandomState, without its cached normal, as signed 32-bit words."""
     _, key, position, *_ = state
     return np.append(key.view(np.int32), np.int32(position))
 
