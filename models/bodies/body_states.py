@@ -197,7 +197,7 @@ def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
         if not lengths[joint] > _SHORTEST or lengths[joint] > _LONGEST:
             raise ValueError(
                 f"{name} must have bones longer than 0 and at most {_LONGEST:g} m, got "
-                f"{lengths[joint]:.4g} m to {skeleton.joint_names[joint]}"
+                f"{lengths[joint]:.4g} m for {skeleton.joint_names[joint]}"
             )
 
 
@@ -255,6 +255,6 @@ def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:
         length, mean = np.linalg.norm(bones, axis=-1).mean(), bones.mean(axis=0)
         if not length > 0:
             name = skeleton.joint_names[joint]
-            raise ValueError(f"motions must have bones longer than 0, got 0 m to {name}")
+            raise ValueError(f"motions must have bones longer than 0, got 0 m for {name}")
         offsets[joint] = mean * length / np.linalg.norm(mean)
     return offsets

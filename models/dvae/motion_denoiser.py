@@ -66,7 +66,9 @@ class MotionDenoiser:
         with valid_settings(source, "denoiser"):
             digest = checkpoint.settings["network"]["prior_weights"]
         if digest != weights_digest(prior.model):
-            raise CheckpointError(f"{source} must be a denoiser of the given prior, got another")
+            raise CheckpointError(
+                f"{source} must be a denoiser of the given prior, got one of another"
+            )
         networks = DenoisingNetworks(prior)
         load_weights(networks, checkpoint.tensors)
         return cls(networks, prior, checkpoint.settings)
@@ -102,7 +104,9 @@ class MotionDenoiser:
         _check_kind(prior)
         same = prior.model is self.prior.model
         if not same and weights_digest(prior.model) != weights_digest(self.prior.model):
-            raise ValueError("prior must be that of the denoiser's training, got other weights")
+            raise ValueError(
+                "prior must be the one that the denoiser was trained with, got other weights"
+            )
         freedom = degrees_of_freedom
         if freedom is None:
             freedom = likelihood.entries.degrees_of_freedom
@@ -222,6 +226,4 @@ class NoisyMotion:
 
 def _check_kind(prior: Any) -> None:
     if not isinstance(prior, MotionDVAE):
-        raise ValueError(
-            f"prior must be the Motion-DVAE of the denoiser's training, got {type(prior).__name__}"
-        )
+        raise ValueError(f"prior must be the denoiser's Motion-DVAE, got {type(prior).__name__}")

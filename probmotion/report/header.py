@@ -61,8 +61,8 @@ def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
         "With one seed no sampler can be distinguished from another, so none is highlighted."
         if comparison.plan.seeds == 1
         else "★ is the best of its column among samplers with draws at every seed; ☆ is "
-        "statistically tied with it: 95 % intervals of the paired differences over seeds, at "
-        "Holm's levels, contain 0."
+        "statistically tied with it: Holm-corrected 95 % intervals of the paired differences "
+        "over seeds contain 0."
     )
     return f"""\
 <details open><summary>How to read this report</summary>

@@ -218,7 +218,7 @@ class DVAEInference(IndependentSampler):
         if self.network is not None and not self.network.reads(likelihood):
             raise UnsupportedPosterior(
                 self.name,
-                f"got a network that does not support {type(likelihood).__name__}",
+                f"requires a network that supports {type(likelihood).__name__}",
                 word="observations",
             )
         network = self.network
@@ -263,7 +263,7 @@ class DVAEInference(IndependentSampler):
         adam = torch.optim.Adam(parameters, lr=self.learning_rate)
         scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.iterations)
         losses: list[float] = []
-        with progress_bar(self.iterations, f"{self.name} fit", progress) as bar:
+        with progress_bar(self.iterations, f"{self.name} optimisation", progress) as bar:
             for iteration in [*range(self.iterations), 0]:
                 loss = inference.loss(
                     seeds.generator(seed, "fit", iteration),

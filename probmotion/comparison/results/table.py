@@ -77,16 +77,16 @@ BLOCKS: Mapping[str, Mapping[str, str]] = {
 
 _REFERENCES_LEGEND = """\
 swd ratio: sliced Wasserstein distance to the references, divided by that between two reference
-sets (ideal: 1); variance ratio: trace of the covariance, divided by the references' (ideal: 1,
-overconfident below); mean error (sd): error of the mean in posterior standard deviations √tr
-(ideal: 0); off-manifold ratio: variance off the prior's manifold, divided by the references'
-(ideal: 1); log-density gap: mean log density minus the references', nats (ideal: 0); mode
-proportions TV: total variation distance of the mode proportions from the references' (ideal: 0).
+sets (ideal: 1); variance ratio: trace of the covariance, divided by that of the references (ideal:
+1, overconfident below); mean error (sd): error of the mean in posterior standard deviations (root
+of the trace; ideal: 0); off-manifold ratio: variance off the prior's manifold, divided by that of
+the references (ideal: 1); log-density gap: mean log density minus that of the references, nats
+(ideal: 0); mode proportions TV: total variation distance of mode proportions (ideal: 0).
 The data frame and table.csv contain further metrics."""
 _SEEDS_LEGEND = """\
 ±: standard deviation over seeds; *: best of the column among samplers with draws at every seed;
-°: statistically tied with the best (95 % Student intervals of the paired differences over seeds,
-at Holm's levels, contain 0)."""
+°: statistically tied with the best (Holm-corrected 95 % Student-t intervals of the paired
+differences over seeds contain 0)."""
 _TESTS_LEGEND = """\
 C2ST: accuracy of a classifier that separates draws from references (ideal: 0.5); MMD²: squared
 maximum mean discrepancy from the references (ideal: 0); KSD²: squared kernel Stein discrepancy from
@@ -104,9 +104,9 @@ at which the density is clipped."""
 _GENERATION_LEGEND = """\
 FID: Fréchet distance between features of random views and held-out real views; it decreases with
 the number of draws; diversity ratio: mean distance of two motions, divided by that of real motions
-(ideal: 1); side: from π/4 to 3π/4 beside the first view; training: against the training clips,
-since few held-out clips may differ from them; MCD: Motion Chamfer Distance to held-out views in
-windows of 10 frames (cm²); it also decreases with the number of draws."""
+(ideal: 1); side: azimuths of π/4 to 3π/4 from the first view; training: against the training clips,
+because the few held-out clips may not be representative; MCD: Motion Chamfer Distance to held-out
+views in windows of 10 frames (cm²); it also decreases with the number of draws."""
 _LEGENDS = (
     ({"swd_ratio"}, _REFERENCES_LEGEND),
     ({"c2st", "ksd"}, _TESTS_LEGEND),

@@ -209,7 +209,7 @@ def test_invalid_bodies_and_motions_are_rejected(walkers):
         rest_pose(Skeleton(["a", "b"], [-1, 0]), [np.ones((2, 2, 3))])
     with pytest.raises(ValueError, match="skeleton must have one root, got 2"):
         BodyStates(Skeleton.preset("pair17"), np.zeros((34, 3)))
-    for factor, message in ((0, "bones .*, got 0 m to"), (99, "at most 3 m, got")):
+    for factor, message in ((0, "bones .*, got 0 m for"), (99, "at most 3 m, got")):
         with pytest.raises(ValueError, match=message):
             BodyStates(PERSON, factor * rest)
     with pytest.raises(ValueError, match=r"states must have shape \(…, L, 69\), got \(4, 70\)"):

@@ -322,8 +322,8 @@ def test_invalid_inputs_are_rejected(prior, make_prior, denoiser, tmp_path):
     confidence[5:20] = 0
     empty = replace(observed(prior, frames=30), confidence=confidence)
     for given, seen, overlap, message in (
-        (other, likelihood, 3, "prior must be that of the denoiser's training"),
-        (None, likelihood, 3, "prior must be the Motion-DVAE .*, got NoneType"),
+        (other, likelihood, 3, "prior must be the one that the denoiser was"),
+        (None, likelihood, 3, "prior must be the denoiser's Motion-DVAE, got NoneType"),
         (prior, likelihood, 8, "overlap must be less than the denoiser's window of 8 frames"),
         (prior, likelihood, -1, "overlap must be an integer of at least 0, got -1"),
         (prior.of(frames=30), empty, 3, "every window of joints must have a visible joint"),

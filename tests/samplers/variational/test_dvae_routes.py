@@ -276,7 +276,7 @@ def test_a_given_network_takes_precedence(trainings):
 def test_a_given_network_must_support_the_observations(mixture_posterior):
     for draw in (run, lambda sampler, some: sampler.predict(some, progress=False)):
         with pytest.raises(
-            UnsupportedPosterior, match=r"^dvae got a network that does not support Keypoints2D$"
+            UnsupportedPosterior, match=r"^dvae requires a network that supports Keypoints2D$"
         ) as refused:
             draw(replace(BRIEF, network=GaussianNetwork()), mixture_posterior)
         assert refused.value.word == "observations"
