@@ -97,10 +97,15 @@ def without_table(advices: Iterable[Advice]) -> Iterator[str]:
 def in_brief(standings: Sequence[Standing]) -> str:
     """Return samplers with their means and standard deviations."""
     return ", ".join(
-        f"`{each.sampler}` {each.value:.3g}"
-        + (f" ± {each.spread:.1g}" if math.isfinite(each.spread) else "")
+        f"`{each.sampler}` {rounded(each.value, 3)}"
+        + (f" ± {rounded(each.spread, 1)}" if math.isfinite(each.spread) else "")
         for each in standings
     )
+
+
+def rounded(value: float, digits: int) -> str:
+    """Return a number with ``digits`` significant digits, without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def advice_table(advices: Mapping[str, Advice]) -> Iterator[str]:
