@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -209,9 +209,13 @@ def _in_a_line(error: Exception) -> str:
 @contextmanager
 def progress_bar(total: int, label: str, show: bool) -> Iterator[Any]:
     """Show a progress bar on standard error; yield an object with ``update(n)``."""
+    if not show:
+        # Even a disabled bar of tqdm creates a semaphore, which worker processes do not release.
+        yield SimpleNamespace(update=lambda n=1: None)
+        return
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=label, leave=False, dynamic_ncols=True, disable=not show) as bar:
+    with tqdm(total=total, desc=label, leave=False, dynamic_ncols=True) as bar:
         yield bar
 
 

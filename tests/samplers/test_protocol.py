@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict, fields, is_dataclass, replace
 
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 import probmotion.samplers
 from probmotion import MotionDraws, MotionPosterior
 from probmotion.cli.settings_options import object_from_text, text_of_object
-from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, load_sampler, suited
+from probmotion.posteriors.sampling import (
+    Sampler,
+    UnsupportedPosterior,
+    load_sampler,
+    progress_bar,
+    suited,
+)
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.samplers.independent import IndependentSampler
@@ -161,3 +168,13 @@ def test_dvae_is_not_suited_to_observations_it_cannot_be_trained_on(mixture_post
     assert "dvae" not in suited(flat)
     with pytest.raises(UnsupportedPosterior, match="needs observed keypoints or joints, got Flat"):
         load_sampler("dvae")().sample(flat, draws=1, progress=False)
+
+
+def test_hidden_progress_bars_create_no_semaphore(monkeypatch):
+    """Worker processes do not release it and would warn of a leak when they end."""
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    with progress_bar(3, "hidden", show=False) as bar:
+        bar.update()
+        bar.update(2)
+    with pytest.raises(ImportError), progress_bar(3, "shown", show=True):
+        pass
