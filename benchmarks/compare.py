@@ -57,18 +57,18 @@ def main() -> None:
     # Warm-up: import all modules and build the problem before timing.
     thin = 2000
     seconds(0, runs=1, thin=thin)
-    _, one = seconds(0, runs=1, thin=thin)
-    thin = max(1, round(thin * options.run_seconds / one))
+    _, run_seconds = seconds(0, runs=1, thin=thin)
+    thin = max(1, round(thin * options.run_seconds / run_seconds))
     start = subprocess.check_output([sys.executable, "-c", _START], text=True).split()
     print(f"worker_import_seconds: {float(start[0]):.2f}")
     print(f"worker_problem_seconds: {float(start[1]):.2f}")
-    alone, within_one = seconds(0, options.runs, thin)
-    together, within_two = seconds(2, options.runs, thin)
-    print(f"seconds_in_one_process: {alone:.2f}")
-    print(f"seconds_two_workers: {together:.2f}")
-    print(f"seconds_beyond_half: {together - alone / 2:.2f}")
-    print(f"slowdown_in_samplers: {within_two / within_one:.3f}")
-    print(f"efficiency_two_workers: {alone / (2 * together):.3f}")
+    serial, serial_in_samplers = seconds(0, options.runs, thin)
+    parallel, parallel_in_samplers = seconds(2, options.runs, thin)
+    print(f"seconds_in_one_process: {serial:.2f}")
+    print(f"seconds_two_workers: {parallel:.2f}")
+    print(f"seconds_beyond_half: {parallel - serial / 2:.2f}")
+    print(f"slowdown_in_samplers: {parallel_in_samplers / serial_in_samplers:.3f}")
+    print(f"efficiency_two_workers: {serial / (2 * parallel):.3f}")
 
 
 if __name__ == "__main__":

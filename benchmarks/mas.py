@@ -56,7 +56,7 @@ class Timer:
 
     device: str
     seconds: list[float] = field(default_factory=list)
-    begun: float = 0.0
+    start: float = 0.0
 
     def attach(self, network: torch.nn.Module) -> None:
         """Time every subsequent forward pass."""
@@ -64,10 +64,10 @@ class Timer:
         network.register_forward_hook(self._end)
 
     def _begin(self, *_: Any) -> None:
-        self.begun = self._now()
+        self.start = self._now()
 
     def _end(self, *_: Any) -> None:
-        self.seconds.append(self._now() - self.begun)
+        self.seconds.append(self._now() - self.start)
 
     def _now(self) -> float:
         if self.device == "cuda":
@@ -78,9 +78,9 @@ class Timer:
 def run(prior: MotionDiffusion, draws: int, steps: int = 100) -> float:
     """Return the duration of MAS in seconds."""
     sampler = MultiViewAncestral(steps=steps, n_views=VIEWS, perspective=True)
-    begun = time.perf_counter()
+    start = time.perf_counter()
     sampler.sample(MotionPosterior(prior), draws=draws, progress=False)
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 def matmul_gflops(n: int = 2048, repeats: int = 15) -> float:
@@ -88,9 +88,9 @@ def matmul_gflops(n: int = 2048, repeats: int = 15) -> float:
     a, b = torch.randn(n, n), torch.randn(n, n)
     seconds = []
     for _ in range(repeats):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         torch.mm(a, b)
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.perf_counter() - start)
     return 2 * n**3 / statistics.median(seconds) / 1e9
 
 
@@ -133,16 +133,16 @@ def on_cuda() -> dict[str, float]:
     """Return the measurements for one motion and for 64 motions on a GPU."""
     prior, network = paper_prior("cuda")
     run(prior, draws=1, steps=10)
-    one = run(prior, draws=1)
+    single = run(prior, draws=1)
     run(prior, draws=64, steps=10)
-    many = run(prior, draws=64)
+    batch = run(prior, draws=64)
     # Synchronising at every forward pass would increase the durations above.
     timer = Timer("cuda")
     timer.attach(network)
     seconds = run(prior, draws=64)
     return {
-        "cuda_seconds_one_motion": one,
-        "cuda_motions_per_second": 64 / many,
+        "cuda_seconds_one_motion": single,
+        "cuda_motions_per_second": 64 / batch,
         "cuda_network_share": sum(timer.seconds) / seconds,
         "cuda_memory_gib": torch.cuda.max_memory_allocated() / 2**30,
     }
@@ -157,17 +157,17 @@ def strided(draws: int = 256) -> dict[str, float]:
     fid, seconds = {}, {}
     for steps in (20, 100):
         sampler = MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         motions = sampler.sample(problem.posterior, draws=draws, progress=False).flat()
-        seconds[steps] = time.perf_counter() - begun
+        seconds[steps] = time.perf_counter() - start
         scores = reference.score_motions(motions, seed=0, samples=draws // 2)
         fid[steps] = scores["fid"]
-    (few, few_sd), (full, full_sd) = fid[20], fid[100]
+    (fid_20, sd_20), (fid_100, sd_100) = fid[20], fid[100]
     return {
-        "fid_20_steps": few,
-        "fid_100_steps": full,
-        "strided_20_fid_ratio": few / full,
-        "strided_20_fid_gap": (few - full) / max(few_sd, full_sd),
+        "fid_20_steps": fid_20,
+        "fid_100_steps": fid_100,
+        "strided_20_fid_ratio": fid_20 / fid_100,
+        "strided_20_fid_gap": (fid_20 - fid_100) / max(sd_20, sd_100),
         "strided_20_seconds_ratio": seconds[20] / seconds[100],
     }
 
@@ -180,16 +180,16 @@ def peak_memory() -> float:
 
 def main() -> None:
     """Print the measurements."""
-    figures = on_cpu()
-    # A new process, so that the peak memory is that of MAS alone.
-    fresh = subprocess.run(
+    measurements = on_cpu()
+    # Use a new process, so that the peak memory is that of MAS alone.
+    process = subprocess.run(
         [sys.executable, __file__, "--memory"], check=True, capture_output=True, text=True
     )
-    figures["memory_gib"] = float(fresh.stdout)
-    figures |= strided()
+    measurements["memory_gib"] = float(process.stdout)
+    measurements |= strided()
     if torch.cuda.is_available():
-        figures |= on_cuda()
-    for name, value in figures.items():
+        measurements |= on_cuda()
+    for name, value in measurements.items():
         print(f"{name}: {value:.4g}")
 
 

@@ -60,7 +60,7 @@ def denoiser_share(prior: GaussianMixtureMotion, draws: int = 256) -> float:
     return timed.seconds / (time.perf_counter() - start)
 
 
-def growth_of_a_run(draws: int = 1000) -> float:
+def memory_growth(draws: int = 1000) -> float:
     """Return the growth of peak memory during a run of ``draws`` draws, in GiB."""
     posterior = MotionPosterior(gait_prior())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -71,15 +71,15 @@ def growth_of_a_run(draws: int = 1000) -> float:
 def main() -> None:
     """Print the measurements."""
     print(f"mas_denoiser_share: {denoiser_share(gait_prior()):.3f}")
-    # A new process, so that the peak memory is that of MAS alone.
-    fresh = subprocess.run(
+    # Use a new process, so that the peak memory is that of MAS alone.
+    process = subprocess.run(
         [sys.executable, __file__, "--growth"], check=True, capture_output=True, text=True
     )
-    print(f"mas_1000_draws_gib: {float(fresh.stdout):.3f}")
+    print(f"mas_1000_draws_gib: {float(process.stdout):.3f}")
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--growth"]:
-        print(growth_of_a_run())
+        print(memory_growth())
     else:
         main()

@@ -33,8 +33,8 @@ def main() -> None:
     """Print every measurement."""
     skeleton = Skeleton.preset("person14")
     walks = [clip.retarget(skeleton) for clip in synthetic_walks(3, skeleton, seconds=10.0)]
-    prior, denoiser = fresh_networks(walks)
-    joints = observed(walks[0], FRAMES)
+    prior, denoiser = untrained_networks(walks)
+    joints = noisy_joints(walks[0], FRAMES)
     posterior = MotionPosterior(prior.of(frames=FRAMES, inference_network=denoiser), joints)
     regression = DVAEInference()
     fit = DVAEInference(mode="optimization", iterations=ITERATIONS)
@@ -49,7 +49,7 @@ def main() -> None:
     report("memory_gib", peak / (2**30 if sys.platform == "darwin" else 2**20))
 
 
-def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
+def untrained_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
     """Return an untrained prior of the published size and its denoiser."""
     states = BodyStates(
         walks[0].skeleton, rest_pose(walks[0].skeleton, [w.positions for w in walks])
@@ -61,19 +61,19 @@ def fresh_networks(walks: list[Motion]) -> tuple[MotionDVAE, MotionDenoiser]:
     return prior, MotionDenoiser(DenoisingNetworks(prior), prior)
 
 
-def observed(motion: Motion, frames: int) -> Joints3D:
+def noisy_joints(motion: Motion, frames: int) -> Joints3D:
     """Return noisy joints of the first frames of a motion."""
     return Joints3D.observe(motion.window(0, frames), 0.03, seed=0)
 
 
 def throughput_ratio(prior: MotionDVAE, denoiser: MotionDenoiser, motion: Motion) -> float:
     """Return the throughput of a batch over that of single sequences."""
-    one = denoiser.on(prior, observed(motion, WINDOW))
-    many = NoisyMotion(one.denoiser, one.windows.repeated(SEQUENCES), one.stitching)
+    single = denoiser.on(prior, noisy_joints(motion, WINDOW))
+    batch = NoisyMotion(single.denoiser, single.windows.repeated(SEQUENCES), single.stitching)
     rng = np.random.default_rng(0)
-    alone = fastest(lambda: one.bound(rng), 5)
-    together = fastest(lambda: many.bound(rng), 3)
-    return SEQUENCES * alone / together
+    single_seconds = fastest(lambda: single.bound(rng), 5)
+    batch_seconds = fastest(lambda: batch.bound(rng), 3)
+    return SEQUENCES * single_seconds / batch_seconds
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
@@ -81,9 +81,9 @@ def fastest(work: Callable[[], object], times: int) -> float:
     work()
     seconds = []
     for _ in range(times):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         work()
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.perf_counter() - start)
     return min(seconds)
 
 

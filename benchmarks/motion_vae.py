@@ -39,30 +39,30 @@ BONES, SEQUENCES, BATCH = 20, 1_400, 64
 def main() -> None:
     """Print every measurement."""
     torch.set_num_threads(2)
-    body, settings = made_body(), MotionVAESettings.paper()
+    body, settings = chain_body(), MotionVAESettings.paper()
     network = MotionVAENetwork(settings, body.skeleton.n_joints, len(body.bones))
     report("generation_seconds", fastest(lambda: generate(network.eval(), body), 1))
     step, seconds = training(body, settings)
     report("teacher_seconds_per_1000_frames", seconds)
-    taken = fastest(step, 8)
-    report("training_step_seconds", taken)
+    duration = fastest(step, 8)
+    report("training_step_seconds", duration)
     with FlopCounterMode(display=False) as counter:
         step()
-    needed, speed = counter.get_total_flops() / 1e9, product_gigaflops()
+    operations, speed = counter.get_total_flops() / 1e9, product_gigaflops()
     report("product_gigaflops", speed)
-    report("training_step_gigaflop", needed)
-    report("training_step_share_of_products", needed / speed / taken)
+    report("training_step_gigaflop", operations)
+    report("training_step_share_of_products", operations / speed / duration)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     report("memory_gib", peak / (2**30 if sys.platform == "darwin" else 2**20))
 
 
 def product_gigaflops(rows: int = 2048) -> float:
     """Return the rate of bfloat16 matrix products, gigaflops."""
-    one = torch.randn(rows, rows, generator=torch.Generator().manual_seed(0)).bfloat16()
-    return 2 * rows**3 / fastest(lambda: one @ one, 20) / 1e9
+    matrix = torch.randn(rows, rows, generator=torch.Generator().manual_seed(0)).bfloat16()
+    return 2 * rows**3 / fastest(lambda: matrix @ matrix, 20) / 1e9
 
 
-def made_body() -> ArticulatedBody:
+def chain_body() -> ArticulatedBody:
     """Return a chain of 20 bones; the rigid pose determines the first, 19 rotate."""
     n_joints = BONES + 1
     names = ["root", *(f"joint {number}" for number in range(1, n_joints))]
@@ -109,11 +109,11 @@ def training(
         torch.nn.utils.clip_grad_norm_(network.vae.parameters(), 1.0)
         optimiser.step()
 
-    begun = time.perf_counter()
+    start = time.perf_counter()
     rest = torch.as_tensor(body.rest_positions, dtype=torch.float32)
     TeacherForcedPoses(teacher, trainee.batches, rest)
     frames = len(trainee.batches.all_frames()[0])
-    return step, 1000 * (time.perf_counter() - begun) / frames
+    return step, 1000 * (time.perf_counter() - start) / frames
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
@@ -121,9 +121,9 @@ def fastest(work: Callable[[], object], times: int) -> float:
     work()
     seconds = []
     for _ in range(times):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         work()
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.perf_counter() - start)
     return min(seconds)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 _ROOT = Path(__file__).resolve().parent.parent
-# Sufficient to execute every branch of a sampler, but not for accurate draws.
+# These settings execute every branch of a sampler, but do not yield accurate draws.
 _EFFORT = {
     "steps": 8,
     "iterations": 20,
@@ -75,7 +75,7 @@ def _digests_of_tree(folder: Path) -> dict[str, str]:
     return dict(json.loads(done.stdout))
 
 
-def _lay_out(revision: str, folder: Path) -> Path:
+def _install(revision: str, folder: Path) -> Path:
     """Install a revision and its entry points into ``folder``; return the installed tree."""
     source = folder / "source"
     source.mkdir(parents=True)
@@ -102,15 +102,15 @@ def main() -> None:
         if options.keep and options.keep.exists():
             before = dict(json.loads(options.keep.read_text(encoding="utf-8")))
         else:
-            before = _digests_of_tree(_lay_out(options.before, Path(folder) / "before"))
+            before = _digests_of_tree(_install(options.before, Path(folder) / "before"))
             if options.keep:
                 options.keep.write_text(json.dumps(before, indent=1), encoding="utf-8")
-        after = _digests_of_tree(_lay_out("HEAD", Path(folder) / "after"))
+        after = _digests_of_tree(_install("HEAD", Path(folder) / "after"))
     differing = [run for run in before | after if before.get(run) != after.get(run)]
     for run in differing:
         print(f"{run}: {before.get(run)} before, {after.get(run)} after")
-    drawn = [run for run, digest in before.items() if len(digest) == 64 and run in after]
-    print(f"moved_draws_compared: {len(drawn)}")
+    compared = [run for run, digest in before.items() if len(digest) == 64 and run in after]
+    print(f"moved_draws_compared: {len(compared)}")
     print(f"moved_draws_differ: {len(differing)}")
 
 

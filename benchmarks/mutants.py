@@ -33,7 +33,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 _COUNT, _SEED = 200, 20261123
 _SECONDS = 60
 _FOLDERS = ("metrics", "formats", "io", "samplers", "models")
-# Priors; other models are networks and their training.
+# These models are priors; the others are networks and their training.
 _PRIORS = (
     "mixture", "pose_chart", "penetration.py", "joint_limits.py", "standard_normal",
     "reduced_latent", "row_decoding", "body_states", "articulated_body", "pair_posterior",
@@ -47,11 +47,11 @@ _OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """Fault of one expression: occurrence ``place`` of ``old`` in a function becomes ``new``."""
+    """Fault in a function: ``new`` replaces the given occurrence of ``old``, counted from 0."""
 
     file: str
     function: str
-    place: int
+    occurrence: int
     old: str
     new: str
 
@@ -111,13 +111,13 @@ def choose(package: Path) -> list[Mutant]:
         if folder not in _FOLDERS or not is_prior or "kernels" in file:
             continue
         for name, function in functions(ast.parse(path.read_text(encoding="utf-8"))):
-            seen: dict[str, int] = {}
+            occurrences: dict[str, int] = {}
             for node in expressions(function):
                 old = ast.unparse(node)
-                seen[old] = seen.get(old, -1) + 1
+                occurrences[old] = occurrences.get(old, -1) + 1
                 fault = mutated(node)
                 if fault is not None and ast.unparse(fault) != old:
-                    mutants.append(Mutant(file, name, seen[old], old, ast.unparse(fault)))
+                    mutants.append(Mutant(file, name, occurrences[old], old, ast.unparse(fault)))
     return random.Random(_SEED).sample(mutants, _COUNT)
 
 
@@ -133,8 +133,9 @@ def apply(mutant: Mutant, package: Path) -> Path | None:
             if qualified != mutant.function:
                 continue
             same = [node for node in expressions(function) if ast.unparse(node) == mutant.old]
-            if len(same) > mutant.place:
-                path.write_text(_replaced(source, same[mutant.place], mutant.new), encoding="utf-8")
+            if len(same) > mutant.occurrence:
+                fault = _replaced(source, same[mutant.occurrence], mutant.new)
+                path.write_text(fault, encoding="utf-8")
                 return path
     return None
 
@@ -157,7 +158,7 @@ def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
         for node in ast.parse(path.read_text(encoding="utf-8")).body
         if isinstance(node, ast.FunctionDef | ast.ClassDef)
     }
-    found = []
+    files = []
     for test in sorted(tests.rglob("test_*.py")):
         for node in ast.walk(ast.parse(test.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.ImportFrom) or not node.module:
@@ -165,16 +166,16 @@ def tests_of(path: Path, package: Path, tests: Path) -> list[str]:
             names = {alias.name for alias in node.names}
             above = module.startswith(f"{node.module}.")
             if node.module == module or (above and names & (public | {module.split(".")[-1]})):
-                found.append(test.relative_to(tests.parent).as_posix())
+                files.append(test.relative_to(tests.parent).as_posix())
                 break
-    if not found:
+    if not files:
         folder = tests / path.parent.relative_to(package)
-        found = [test.relative_to(tests.parent).as_posix() for test in folder.rglob("test_*.py")]
-    words = set(path.stem.split("_"))
-    return sorted(found, key=lambda test: (-len(words & set(Path(test).stem.split("_"))), test))
+        files = [test.relative_to(tests.parent).as_posix() for test in folder.rglob("test_*.py")]
+    stem = set(path.stem.split("_"))
+    return sorted(files, key=lambda test: (-len(stem & set(Path(test).stem.split("_"))), test))
 
 
-def lay_out(revision: str, folder: Path) -> None:
+def install(revision: str, folder: Path) -> None:
     """Create a folder with the installed package of a revision, its metadata and its tests."""
     if (folder / "ready").exists():
         return
@@ -187,16 +188,16 @@ def lay_out(revision: str, folder: Path) -> None:
     subprocess.run(["tar", "-x"], cwd=checkout, input=archive.stdout, check=True)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*pip, "--target", str(folder), str(checkout)], check=True)
-    for wing in ("probmotion", "samplers", "models"):
-        shutil.rmtree(checkout / wing)
+    for part in ("probmotion", "samplers", "models"):
+        shutil.rmtree(checkout / part)
     shared = _ROOT.parent / "shared"
     if shared.exists():
         (folder / "shared").symlink_to(shared)
     (folder / "ready").write_text("")
 
 
-def caught(mutant: Mutant, tree: Path) -> str:
-    """Return the result of a mutant: ``caught``, ``survived``, ``untested`` or ``gone``."""
+def run_tests(mutant: Mutant, tree: Path) -> str:
+    """Test a mutant and return ``caught``, ``survived``, ``untested`` or ``gone``."""
     package = tree / "probmotion"
     before: dict[Path, str] = {}
     for path in package.rglob("*.py"):
@@ -220,7 +221,7 @@ def caught(mutant: Mutant, tree: Path) -> str:
             capture_output=True, check=False, stdin=subprocess.DEVNULL,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS)),
         )  # fmt: skip
-        # Negative codes: time limit reached without a failure. 5: no test selected.
+        # Codes below 0 mean a time limit without a failure, code 5 that no test was selected.
         return "caught" if done.returncode in (1, 2, 3, 4) else "survived"
     finally:
         changed.write_text(before[changed], encoding="utf-8")
@@ -237,40 +238,38 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     out = options.out.resolve()
-    lay_out(options.before, out / "before-0")
+    install(options.before, out / "before-0")
     mutants = choose(out / "before-0" / "probmotion")
     results = {}
     for side in ("before", "after"):
-        kept = out / f"{side}.json"
-        found = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
-        results[side] = found
+        store = out / f"{side}.json"
+        outcomes = json.loads(store.read_text(encoding="utf-8")) if store.exists() else {}
+        results[side] = outcomes
         if options.only not in (None, side):
             continue
         trees = [out / f"{side}-{worker}" for worker in range(options.workers)]
         for tree in trees:
-            lay_out(getattr(options, side), tree)
+            install(getattr(options, side), tree)
 
         def run(
             worker: int,
             trees: list[Path] = trees,
-            found: dict[str, str] = found,
-            kept: Path = kept,
+            outcomes: dict[str, str] = outcomes,
+            store: Path = store,
         ) -> None:
             for number in range(worker, len(mutants), options.workers):
-                if str(number) not in found:
-                    found[str(number)] = caught(mutants[number], trees[worker])
-                    kept.write_text(json.dumps(found, indent=1), encoding="utf-8")
-                    print(
-                        kept.stem, number, found[str(number)], asdict(mutants[number]), flush=True
-                    )
+                if str(number) not in outcomes:
+                    outcome = outcomes[str(number)] = run_tests(mutants[number], trees[worker])
+                    store.write_text(json.dumps(outcomes, indent=1), encoding="utf-8")
+                    print(store.stem, number, outcome, asdict(mutants[number]), flush=True)
 
         with ThreadPoolExecutor(options.workers) as pool:
             list(pool.map(run, range(options.workers)))
-    both = [
+    common = [
         n for n, result in results["after"].items() if result != "gone" and n in results["before"]
     ]
     for side in ("before", "after"):
-        numbers = both or list(results[side])
+        numbers = common or list(results[side])
         detected = [results[side].get(n) == "caught" for n in numbers]
         print(f"mutants_caught_{side}: {sum(detected) / max(1, len(detected)):.3f}")
     print(f"mutants_gone: {sum(result == 'gone' for result in results['after'].values())}")

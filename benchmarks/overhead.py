@@ -93,7 +93,7 @@ def ratio(ours: Callable[[], np.ndarray], theirs: Callable[[], np.ndarray], repe
         seconds, draws = {}, {}
         # Alternate the order, so that a drift of the clock rate does not bias the ratio.
         for function in (ours, theirs) if repeat % 2 else (theirs, ours):
-            # Processor time of this process only, independent of other load.
+            # Measure processor time of this process only, independent of other load.
             start = time.process_time()
             draws[function] = function()
             seconds[function] = time.process_time() - start
@@ -115,18 +115,18 @@ def main() -> None:
     """Print the measurements, then those of ``mas_overhead.py``."""
     print(f"import_seconds: {import_seconds():.3f}")
     posterior = load_problem("gait-monocular").posterior
-    of_nuts = ratio(
+    nuts_median = ratio(
         lambda: nuts(posterior, warmup=500, draws=2000),
         lambda: nuts_directly(posterior, warmup=500, draws=2000),
         repeats=5,
     )
-    print(f"nuts_ratio: {of_nuts:.3f}")
-    of_ensemble = ratio(
+    print(f"nuts_ratio: {nuts_median:.3f}")
+    ensemble_median = ratio(
         lambda: ensemble(posterior, warmup=1000, draws=1600, thin=50),
         lambda: ensemble_directly(posterior, warmup=1000, draws=1600, thin=50),
         repeats=11,
     )
-    print(f"ensemble_ratio: {of_ensemble:.3f}")
+    print(f"ensemble_ratio: {ensemble_median:.3f}")
     mas = Path(__file__).with_name("mas_overhead.py")
     if mas.exists():
         subprocess.run([sys.executable, str(mas)], check=True)

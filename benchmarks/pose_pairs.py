@@ -1,4 +1,4 @@
-"""Speed of pose-pair sampling: 32 views, for each the 32 nearest of 6000 annotations.
+"""Speed of pose-pair sampling with 32 views and the 32 nearest of 6000 annotations per view.
 
 ``proposals_per_second``: density evaluations of Metropolis-Hastings on all threads (SciPy's Qhull
 takes about 220 µs for each of the 32 triangulations of an evaluation). ``draws_per_second``: one
@@ -77,7 +77,7 @@ def triangulation_share(given: Problem, theta: np.ndarray) -> float:
     return seconds[0] / seconds[1]
 
 
-def keep_many(folder: str | None, draws: int) -> None:
+def save_many_draws(folder: str | None, draws: int) -> None:
     """Draw and save ``draws`` draws; print the peak memory of the process."""
     sampler = MetropolisHastings(Isotropic(0.02), warmup=WARMUP, thin=1)
     posterior = problem(folder).posterior
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--keep", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.keep:
-        keep_many(options.data, options.keep)
+        save_many_draws(options.data, options.keep)
         return
     given = problem(options.data)
     sampler = MetropolisHastings(Isotropic(0.02), warmup=WARMUP, thin=1)
@@ -109,7 +109,7 @@ def main() -> None:
     share = triangulation_share(given, draws.dataset["theta"].values[:, -1])
     print(f"triangulation_share: {share:.3f}")
     folder = ["--data", options.data] if options.data else []
-    # A new process, so that the peak memory is that of drawing and saving alone.
+    # Use a new process, so that the peak memory is that of drawing and saving alone.
     subprocess.run([sys.executable, __file__, "--keep", "100000", *folder], check=True)
 
 

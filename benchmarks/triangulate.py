@@ -38,11 +38,11 @@ def problem(seed: int = 0) -> tuple[np.ndarray, Cameras, list[np.ndarray]]:
     cameras = Cameras.ring(V, elevation=np.pi / 16, perspective=True)
     motion = 0.4 * rng.standard_normal((L, J, 3))
     keypoints = cameras.project(motion) + 0.02 * rng.standard_normal((V, L, J, 2))
-    return keypoints, cameras, [motion + off * rng.standard_normal(motion.shape) for off in STARTS]
+    return keypoints, cameras, [motion + sd * rng.standard_normal(motion.shape) for sd in STARTS]
 
 
 def adam(
-    keypoints: np.ndarray, cameras: Cameras, initial: np.ndarray, most: int = 1000
+    keypoints: np.ndarray, cameras: Cameras, initial: np.ndarray, max_iterations: int = 1000
 ) -> np.ndarray:
     """Return the estimate of Adam, stopped when an iteration does not reduce the loss."""
     import torch
@@ -52,7 +52,7 @@ def adam(
     motion = torch.tensor(initial, requires_grad=True)
     optimiser = torch.optim.Adam([motion], lr=0.01)
     best = float("inf")
-    for _ in range(most):
+    for _ in range(max_iterations):
         loss = ((cameras.project(motion) - target) ** 2).mean()
         if float(loss.detach()) >= best:
             break

@@ -1,4 +1,4 @@
-"""Models: priors over motion. None imports a sampler."""
+"""Priors over motion and networks for their evaluation. No model imports a sampler."""
 
 import lazy_loader
 

@@ -16,11 +16,12 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/01_one_posterior_many_samplers.ipynb)
 #
-# A camera films a person. What did the person do in three dimensions? One view leaves depth open, so the
-# answer is a *distribution* over motions, and a method that returns it is a *sampler*.
+# One camera observes a person, and the person's 3D motion is to be estimated. A single view does not determine
+# depth, so the result is a *distribution* over motions, the posterior. A *sampler* is a method that draws motions
+# from it.
 #
-# This notebook goes from BVH files to a table that says how far several samplers are from the right
-# distribution. The prior is a Gaussian mixture, for which that distribution is known exactly:
+# This notebook starts from BVH files and compares the errors of several samplers in a table. The prior is a
+# Gaussian mixture, for which the posterior is known exactly:
 #
 # $$
 # p(X \mid y) \propto p(X)\, p(y \mid X), \qquad
@@ -44,7 +45,7 @@ from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredic
 # %% [markdown]
 # ## 1. Motion files
 #
-# Put your own BVH files into the folder `walks`. If there are none, synthetic people who walk, run and
+# Put your own BVH files into the folder `walks`. If there are none, synthetic clips of people who walk, run and
 # march are written there.
 
 # %%
@@ -73,9 +74,8 @@ Image("clips.png")
 # %% [markdown]
 # ## 2. The prior
 #
-# The last clip is held out: it is the person in front of the camera. The prior is fitted to the others. It
-# has three styles, each a Gaussian over whole motions of 30 frames, rotated about the vertical axis by any
-# of 36 angles.
+# The last clip is held out and later observed by the camera. The prior is fitted to the other clips. It has three
+# styles, each a Gaussian over whole motions of 30 frames, rotated about the vertical axis by any of 36 angles.
 
 # %%
 *training, held_out = clips
@@ -94,7 +94,7 @@ Image("prior.png")
 # ## 3. The observations
 #
 # The camera is 15° above the horizon. It observes hips, shoulders and knees only, in every tenth frame, with
-# an error of 3 cm. Much is left open.
+# errors of 3 cm. Most of the motion remains undetermined.
 
 # %%
 truth = held_out.window(0, 30).centred()
@@ -108,8 +108,9 @@ posterior = pm.MotionPosterior(prior, keypoints)
 print(f"{(~occluded).sum()} of {occluded.size} keypoints observed")
 
 # %% [markdown]
-# Prior and likelihood make the **posterior**, the one object that every sampler receives. This one has exact
-# draws. They are shown from the side, the direction that the camera cannot see; grey is the true motion.
+# Prior and likelihood define the **posterior**, the object that every sampler receives. This posterior can be
+# sampled exactly. The figure shows three exact draws from the side, where the depth is visible; the true motion
+# is grey.
 
 # %%
 exact = prior.exact_posterior(keypoints).sample(np.random.default_rng(0), 3)
@@ -118,14 +119,14 @@ draw_skeletons({"exact": exact}, prior.skeleton, "posterior.png", **side)
 Image("posterior.png")
 
 # %% [markdown]
-# All three agree with the observations, yet they differ. That spread is the uncertainty that a sampler has
-# to reproduce.
+# All three draws agree with the observations, but differ from each other. A sampler must reproduce this spread.
 #
 # ## 4. Four samplers
 #
-# These samplers do not use the closed form. `ancestral3d` denoises a 3D motion step by step. `mas`
-# (multi-view ancestral sampling) does so with a 2D model in five views at once. `mvpc` adds a correction
-# after every step. `mh`, random-walk Metropolis-Hastings, needs a density only. All share one method:
+# These samplers do not use the closed form. `ancestral3d` denoises a 3D motion step by step. `mas` (multi-view
+# ancestral sampling) denoises five views at once with a 2D model. `mvpc` (multi-view predictor-corrector) adds a
+# correction after every step. `mh`, random-walk Metropolis-Hastings, requires only a density. All samplers have
+# the same method `sample`:
 
 # %%
 draws = MultiViewAncestral(steps=50).sample(posterior, draws=20, seed=0, progress=False)
@@ -153,7 +154,7 @@ comparison = pm.compare(
 comparison.table()
 
 # %% [markdown]
-# ## 5. What is wrong with each
+# ## 5. Errors of the samplers
 #
 # With $x$ the draws and $y$ exact draws of the same posterior,
 #
@@ -162,25 +163,25 @@ comparison.table()
 # \text{variance ratio} = \frac{\mathrm{tr}\,\mathrm{Cov}[x]}{\mathrm{tr}\,\mathrm{Cov}[y]} .
 # $$
 #
-# The first is the sliced Wasserstein distance to exact draws in units of the distance between two exact sets:
-# 1 means that they cannot be told apart. A variance ratio below 1 is overconfident, above 1 underconfident.
-# `off_manifold_ratio` compares the variance that no style explains: below 1, motions are too smooth. Read them
-# together with the cost:
+# The first is the sliced Wasserstein distance to exact draws in units of the distance between two exact sets; at
+# 1, the draws are indistinguishable from exact draws. A variance ratio below 1 is overconfident, above 1
+# underconfident. `off_manifold_ratio` compares the variance that no style explains; below 1, motions are too
+# smooth. The figure shows these errors and the cost:
 
 # %%
 comparison.plot("quality.png")
 Image("quality.png")
 
 # %% [markdown]
-# - `ancestral3d` finds the right region, but its motions are too smooth: 50 first-order steps never reach the
+# - `ancestral3d` is close to the posterior, but its motions are too smooth: 50 first-order steps do not reach the
 #   smallest variance (`off_manifold_ratio` far below 1). More steps reduce this error.
-# - `mas` has about twice the right spread: it guides each view separately, so the observations reach the other
-#   views weakened.
-# - `mvpc` is closer at the same number of denoiser evaluations, and still too wide.
+# - `mas` has about twice the correct variance: it guides each view separately, which weakens the effect of the
+#   observations on the other views.
+# - `mvpc` has a smaller error at the same number of denoiser evaluations, but its variance is still too large.
 # - `mh` is as close as exact draws, but its chains have not converged (R-hat far above 1.01, few effective
-#   draws). It also needs a log density, which a learnt 2D model does not have.
+#   draws). It also requires a log density, which a learnt 2D model does not have.
 #
-# The draws show the same. Two draws per sampler, the truth in grey:
+# The figure shows two draws per sampler, and the truth in grey:
 
 # %%
 draw_skeletons(
@@ -194,7 +195,7 @@ Image("samplers.png")
 # %% [markdown]
 # ## Next
 #
-# The same on your own clips, with all samplers, from the command line:
+# To compare all samplers on your own clips from the command line, run:
 #
 #     probmotion compare --clips "walks/*.bvh" --observe monocular --out mine --figures
 #

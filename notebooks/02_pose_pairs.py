@@ -16,10 +16,10 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/02_pose_pairs.ipynb)
 #
-# Videos of two people in close contact are common; 3D recordings are not, because each body occludes the
-# other. Yin et al. (2018) do not lift single images to 3D. They build *one* posterior over pose pairs from
-# all annotated frames of a kind of motion and explore it by MCMC, starting at a single 3D pose pair, the
-# seed:
+# Videos of two people in close contact are common; 3D recordings are not, because each body occludes the other.
+# Yin et al. (2018) do not lift single images to 3D. They define *one* posterior over pose pairs, given all
+# annotated frames of a kind of motion, and sample it by Markov chain Monte Carlo (MCMC), starting at a single 3D
+# pose pair, the seed:
 #
 # $$
 # p(x \mid \mathcal{A}) \propto p(x) \frac{1}{m} \sum_{i=1}^{m} \max_{a \in \mathcal{A}}
@@ -75,7 +75,7 @@ draw_pairs({"held out": real}, skeleton, "real.png", azimuth=0.6, elevation=0.2)
 Image("real.png")
 
 # %% [markdown]
-# The last clip is held out as a whole, since neighbouring frames of one clip are nearly the same pose.
+# The entire last clip is held out, because neighbouring frames of one clip show nearly the same pose.
 #
 # ## 2. Annotations and the seed
 #
@@ -126,7 +126,7 @@ Image("draws.png")
 # The likelihood determines neither the position of the pair nor its orientation in the world. For the figure,
 # draws are aligned to the seed.
 #
-# Could real pairs be draws of this density? Compare log densities of real pairs, of the seed and of the draws:
+# The next figure compares the log densities of real pairs, of the seed and of the draws:
 
 # %%
 levels = {}
@@ -139,12 +139,12 @@ draw_calibration(levels, "calibration.png")
 Image("calibration.png")
 
 # %% [markdown]
-# The three should overlap. Here draws are more probable than most real pairs: each chain has settled where one
-# annotation, in one view, is matched well, and mixes slowly.
+# The three distributions should overlap. Here, draws have a higher density than most real pairs: each chain stays
+# close to one annotation in one view and mixes slowly.
 #
-# ## 5. What are the draws like?
+# ## 5. Comparison with annotations
 #
-# For some draws, the annotation closest to one of their views:
+# The figure shows projections of five draws, each with the nearest annotation:
 
 # %%
 some = drawn_poses[:: len(drawn_poses) // 5][:5]
@@ -164,8 +164,8 @@ draw_pairs(
 Image("nearest.png")
 
 # %% [markdown]
-# Conversely, *indirect lifting*: which draw looks most like an image that was not annotated? And how well do
-# the draws cover the held-out clip?
+# *Indirect lifting* retrieves the draw that is most similar to a 2D pair outside the annotations. The coverage is
+# the mean distance between held-out poses and the nearest draw:
 
 # %%
 query = draw_annotations([held_out], 1, seed=1)
@@ -177,13 +177,13 @@ print(f"coverage: {coverage(truth, drawn_poses):.3f} m, by the seed alone "
       f"{coverage(truth, seed[None]):.3f} m")  # fmt: skip
 
 # %% [markdown]
-# ## 6. Animate the draws, and continue from one of them
+# ## 6. Animation of the draws, and continuation from one of them
 #
-# The draws of a chain, one after the other, form a motion that opens in Blender. Any draw can be the start of
-# another run.
+# The draws of a chain, in order, form a motion that can be opened in Blender. Any draw can be the starting point
+# of another run.
 
 # %%
 pm.save(draws.playback(chain=0), "walk.bvh")
 start = draws.dataset["theta"].values[:1, 120]
-again = sampler.sample(posterior, draws=5, chains=1, seed=1, initial=start, progress=False)
-print(again.positions.sizes)
+continued = sampler.sample(posterior, draws=5, chains=1, seed=1, initial=start, progress=False)
+print(continued.positions.sizes)

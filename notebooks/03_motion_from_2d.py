@@ -24,8 +24,8 @@
 # \hat{X}_0 = \arg\min_X \sum_v \lVert P_v X - \hat{x}_0^v \rVert^2 .
 # $$
 #
-# This notebook goes from tracks to 3D motion and measures it. All networks are tiny, so that it takes two
-# minutes on one core; `notebooks/ablations/mas.py` is the full study.
+# This notebook trains a diffusion model on 2D tracks, samples 3D motion and evaluates it. All networks are tiny,
+# so that it takes two minutes on one core; `notebooks/ablations/mas.py` is the full study.
 #
 # On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
@@ -58,8 +58,8 @@ from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 # ## 1. Tracks
 #
 # Put your own keypoint files (COCO, OpenPose or AlphaPose JSON, DeepLabCut, npz) into the folder `tracks`. If
-# there are none, synthetic walks are filmed by random cameras and detected with errors. The preparation reports
-# what each step did.
+# there are none, synthetic walks are projected to random cameras and detected with errors. The preparation prints
+# a report per step.
 
 # %%
 person = pm.Skeleton.preset("person14")
@@ -77,11 +77,11 @@ for part in ("train", "validation", "test"):
     print(f"{part}: {len(getattr(tracks, part))} tracks of {len(names)} clips")
 
 # %% [markdown]
-# Tracks of one clip stay in one part of the split: the same motion from another side is not new data. The `test`
-# clips are used only at the end. Errors in 3D below need the truth, which synthetic walks have; with your own
-# tracks, put motion capture in place of `walks`.
+# All tracks of one clip are in one part of the split, because the same motion from another side is not new data.
+# The `test` clips are used only at the end. The 3D errors below require the truth, which is known for synthetic
+# walks; with your own tracks, replace `walks` by motion capture.
 #
-# ## 2. A prior that has seen 2D only
+# ## 2. A prior learnt from 2D data only
 #
 # A transformer learns to denoise windows of 20 frames (one second). `probmotion train diffusion` does the same on
 # the command line at larger sizes; a stopped run continues with the same call.
@@ -99,8 +99,8 @@ print(losses.round(3).to_string(index=False))
 #
 # ## 3. Motion in 3D
 #
-# To a sampler the network is a prior like any other. `mas` denoises five views at once and projects them to *one*
-# motion after every step.
+# For a sampler, the network is a prior like any other. `mas` denoises five views at once and projects them to
+# *one* motion after every step.
 
 # %%
 prior = MotionDiffusion.load("diffusion")
@@ -108,10 +108,16 @@ posterior = pm.MotionPosterior(prior)
 mas = MultiViewAncestral(perspective=True)
 drawn = mas.sample(posterior, draws=128, seed=0, progress=False).flat()
 
-hidden = [walk for walk in walks if walk.name in tracks.split.test]
-real = np.concatenate(
-    [windows(centre_motion(walk.retarget(person).resample(20)).positions, 20) for walk in hidden]
-)
+test_walks = [walk for walk in walks if walk.name in tracks.split.test]
+
+
+def segments(clips: list[pm.Motion]) -> np.ndarray:
+    """Return all windows of one second, centred on the root."""
+    centred = [centre_motion(clip.retarget(person).resample(20)) for clip in clips]
+    return np.concatenate([windows(motion.positions, 20) for motion in centred])
+
+
+real = segments(test_walks)
 rows = {"mas": drawn, "real, held out": real[::61]}
 draw_skeletons(rows, person, "front.png", heading=0.0, title="From the front")
 Image("front.png")
@@ -121,26 +127,27 @@ draw_skeletons(rows, person, "side.png", heading=np.pi / 2, title="From their ri
 Image("side.png")
 
 # %% [markdown]
-# They look like walking people from either side, although all training data are flat. Drag them, or press the
-# arrow keys, to rotate.
+# The draws look like walking people from both directions, although all training data are 2D. Drag the animation,
+# or press the arrow keys, to rotate it.
 
 # %%
 animate_skeletons(rows, person, "walks.html", fps=20)
 
 # %% [markdown]
-# ## 4. How good are they?
+# ## 4. Evaluation
 #
-# First in 2D, as in the paper. Draws are filmed from random sides and encoded by an evaluator, the encoder of a
-# small autoencoder trained on the same tracks. In feature space, `fid` is the Fréchet distance to held-out
-# motion (0 is best), precision the fraction of draws within real motion, recall the fraction of real motion within
-# the draws. The 2D model itself, drawn one view at a time, is the published upper bound.
+# The first evaluation is in 2D, as in the paper. Draws are projected from random sides and encoded by an
+# evaluator, the encoder of a small autoencoder trained on the same tracks. In feature space, `fid` is the Fréchet
+# distance to held-out motion (0 is best), precision the fraction of draws within real motion, and recall the
+# fraction of real motion within the draws (1 is best). The 2D model itself, sampled one view at a time, is the
+# published upper bound.
 
 # %%
 trainee = EvaluatorTrainee(tracks.train, tracks.validation, EvaluatorSettings.tiny(20))
 settings = TrainingSettings(steps=1000, batch=32, learning_rate=2e-3, ema=0.99)
 train(trainee, settings, "evaluator", progress=False)
 evaluator = TrackEvaluator.load("evaluator")
-held_out = evaluator.features(film_windows(hidden, person, 20, 20, 300, seed=1))
+held_out = evaluator.features(film_windows(test_walks, person, 20, 20, 300, seed=1))
 reference = GenerationReference(evaluator, held_out)
 
 plain = MultiViewAncestral(perspective=True, shared_noise=False)
@@ -149,13 +156,14 @@ motions = {
     "mas, no 3D noise": plain.sample(posterior, draws=128, seed=0, progress=False).flat(),
 }
 views = Ancestral2D().sample_views(posterior, draws=128, seed=0, progress=False)
-seen = [walk for walk in walks if walk.name in tracks.split.train]
+train_walks = [walk for walk in walks if walk.name in tracks.split.train]
 
-asked = {"seed": 0, "samples": 128, "repeats": 5}
+real_views = film_windows(train_walks, person, 20, 20, 640, seed=2)
+options = {"seed": 0, "samples": 128, "repeats": 5}
 scores = {
-    "real": reference.score_views(film_windows(seen, person, 20, 20, 640, seed=2), **asked),
-    "2D model": reference.score_views(views, **asked),
-    **{name: reference.score_motions(some, **asked) for name, some in motions.items()},
+    "real": reference.score_views(real_views, **options),
+    "2D model": reference.score_views(views, **options),
+    **{name: reference.score_motions(some, **options) for name, some in motions.items()},
 }
 table = pd.DataFrame(
     {name: {key: mean for key, (mean, _) in row.items()} for name, row in scores.items()}
@@ -163,75 +171,76 @@ table = pd.DataFrame(
 print(table.round(2).to_string())
 
 # %% [markdown]
-# MAS looks as real as the 2D model: going to 3D costs nothing here, and the gap to real motion is that of the tiny
-# network. In the paper recall collapses without 3D noise; here it does not, since the walks are similar.
+# The scores of MAS are similar to those of the 2D model, so the step to 3D adds no error here; the difference
+# from real motion is due to the tiny network. In the paper, recall collapses without 3D noise. It does not here,
+# because the walks are similar.
 #
-# Then in 3D, where the truth is known: how far is each draw from the closest held-out motion after alignment
-# about the vertical axis? And is its mirror image in depth closer? The two are easily confused in 2D.
+# The second evaluation is in 3D, where the truth is known. It measures the distance between each draw and the
+# closest held-out motion after alignment about the vertical axis, and the fraction of draws whose mirror image in
+# depth is closer. Mirror images are hard to distinguish in 2D.
 
 # %%
 rng = np.random.default_rng(0)
-known = np.concatenate(
-    [windows(centre_motion(walk.retarget(person).resample(20)).positions, 20) for walk in seen]
-)
+known = segments(train_walks)
 motions["real"] = known[rng.choice(len(known), 128)]
 for name, some in motions.items():
-    near = nearest_distances(some, real)
+    distances = nearest_distances(some, real)
     print(
-        f"{name + ':':18} {1000 * near.of_draws:3.0f} mm to real motion, "
-        f"{1000 * near.of_real:3.0f} mm from real motion, "
+        f"{name + ':':18} {1000 * distances.of_draws:3.0f} mm to real motion, "
+        f"{1000 * distances.of_real:3.0f} mm from real motion, "
         f"mirrored {mirrored_fraction(some, real):.2f}"
     )
 
 # %% [markdown]
-# Draws are about as close to held-out motion as other real motion is: 3D, learnt from 2D alone.
+# Draws are about as close to held-out motion as other real motion is, although the prior was learnt from 2D data
+# alone.
 #
 # ## 5. Denoising a track
 #
-# The same denoiser cleans 2D tracks. A poor detector, with errors of 4 cm and missing joints, observes the
-# held-out clips; the denoiser uses its confidence.
+# The same denoiser can clean 2D tracks. Here, a detector with errors of 4 cm and missing joints observes the
+# held-out clips; the denoiser uses the confidence of the detections.
 
 # %%
-clips = [walk.retarget(person).resample(20) for walk in hidden]
-poor = DetectorNoise(found=0.04, silent=0.0)
-detected = project_clips(clips, views=4, noise=poor)
+clips = [walk.retarget(person).resample(20) for walk in test_walks]
+noise = DetectorNoise(found=0.04, silent=0.0)
+detected = project_clips(clips, views=4, noise=noise)
 true = project_clips(clips, views=4, noise=DetectorNoise.none())
 cleaned = [denoise_track(track, prior, noise=0.04) for track in detected]
 
 lost = np.stack([track.confidence < 0.3 for track in detected])
-for name, joints in {"found": ~lost, "lost": lost}.items():
+for name, joints in {"detected": ~lost, "lost": lost}.items():
     before, after = (
         np.stack([a.keypoints - b.keypoints for a, b in zip(some, true, strict=True)])[joints]
         for some in (detected, cleaned)
     )
     print(
-        f"{name} joints: {1000 * np.linalg.norm(before, axis=-1).mean():.0f} mm as detected, "
-        f"{1000 * np.linalg.norm(after, axis=-1).mean():.0f} mm cleaned"
+        f"{name} joints: {1000 * np.linalg.norm(before, axis=-1).mean():.0f} mm before denoising, "
+        f"{1000 * np.linalg.norm(after, axis=-1).mean():.0f} mm after"
     )
 
 
-def upright(track: pm.KeypointTrack) -> np.ndarray:
-    """Return a track as a flat motion, to be drawn."""
+def in_plane(track: pm.KeypointTrack) -> np.ndarray:
+    """Return a track as a motion at depth 0, for figures."""
     return np.dstack([track.keypoints * [1, -1], np.zeros(track.confidence.shape)])
 
 
 shown = slice(3, None, 4)
 draw_skeletons(
-    {"detected": upright(detected[0])[None, shown], "cleaned": upright(cleaned[0])[None, shown]},
+    {"detected": in_plane(detected[0])[None, shown], "cleaned": in_plane(cleaned[0])[None, shown]},
     person,
     "cleaned.png",
     moments=10,
-    truth=upright(true[0])[shown],
+    truth=in_plane(true[0])[shown],
 )
 Image("cleaned.png")
 
 # %% [markdown]
-# Denoising helps where the detector's error exceeds that of the network, which is tiny here.
+# Denoising helps only where the errors of the detector exceed those of this tiny network.
 #
 # ## 6. Conditioning on observations
 #
-# Finally one camera observes a held-out walk, and `mas` draws from the posterior. Guidance needs orthographic
-# views; views from seven metres are nearly that.
+# Finally, one camera observes a held-out walk, and `mas` samples the posterior. Guidance requires orthographic
+# views, which approximate views from seven metres.
 
 # %%
 truth = pm.Motion(real[10], person, 20)
@@ -248,10 +257,10 @@ def errors(some: np.ndarray) -> np.ndarray:
     return 1000 * np.linalg.norm(some - truth.positions, axis=-1).mean(axis=(1, 2))
 
 
-misses = np.linalg.norm(camera.project(draws)[:, 0] - keypoints.keypoints[0], axis=-1)
-misses = 1000 * misses.mean(axis=(1, 2))
-order = misses.argsort()
-print("error against observations, mm:", *misses[order].round().astype(int))
+image_errors = np.linalg.norm(camera.project(draws)[:, 0] - keypoints.keypoints[0], axis=-1)
+image_errors = 1000 * image_errors.mean(axis=(1, 2))
+order = image_errors.argsort()
+print("error against observations, mm:", *image_errors[order].round().astype(int))
 print("error against truth, mm:       ", *errors(draws)[order].round().astype(int))
 print(f"without observations: {errors(drawn).mean():.0f} mm")
 
@@ -275,16 +284,16 @@ draw_skeletons(
 Image("guided_side.png")
 
 # %% [markdown]
-# Most draws are close to the truth, also in the direction that the camera does not see. Guidance is approximate,
-# so single draws can be wrong. Such draws are recognised without the truth: they miss the observations by far
-# more than the detector's error, here 63 mm on average. The worst draw is shown last.
+# Most draws are close to the truth, also in depth. Guidance is approximate, so single draws can be stuck in a
+# local optimum. They can be recognised without the truth: their error against the observations is far above that
+# of the detector, here 63 mm on average. The draw with the largest error is shown last.
 #
 # ## Next
 #
-# A prior trained for longer on real motion capture comes with the package:
+# The package includes a prior trained for longer on real motion capture:
 #
 #     probmotion compare walk2d --out learnt
 #
-# To learn from your own tracks:
+# To train on your own tracks:
 #
 #     probmotion train diffusion --tracks "tracks/*.json" --out mine

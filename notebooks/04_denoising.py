@@ -12,19 +12,19 @@
 # ---
 
 # %% [markdown]
-# # Denoise a recording, with uncertainty
+# # Denoising a recording, with uncertainty
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/04_denoising.ipynb)
 #
-# Triangulated joints are off by centimetres, limbs are occluded, and some detections are outliers. A filter
-# smooths what was recorded. Motion-DVAE (Fiche et al. 2023) is a *prior* of body motion with one latent variable
-# per frame,
+# Triangulated joints have errors of centimetres, limbs are occluded, and some detections are outliers. A filter
+# can only smooth the recorded joints. Motion-DVAE (Fiche et al. 2023) is a *prior* of body motion with one latent
+# variable per frame,
 #
 # $$
 # p(x_{1:L}, z_{1:L}) = \prod_t p(z_t \mid z_{t-1}, x_{<t})\; p(x_t \mid x_{<t}, z_t),
 # $$
 #
-# together with networks that read noisy joints and return an approximate posterior.
+# together with networks that map noisy joints to an approximate posterior.
 #
 # Put your own recording (`.bvh` or `.npz` of 3D joints, floor at height 0) into the folder `recordings`; noise is
 # added to it so that errors can be measured. Otherwise a held-out CMU clip is used if available, else a synthetic
@@ -66,28 +66,28 @@ print(truth)
 # %% [markdown]
 # ## 1. The recording
 #
-# Gaussian noise of 4 cm in each direction. The right elbow and wrist are occluded for a third of the time, then the
-# left knee and ankle.
+# The recording has Gaussian noise of 4 cm per coordinate. The right elbow and wrist are occluded for a third of
+# the time, then the left knee and ankle.
 
 # %%
-hidden = limb_occlusions(truth)
-recorded = pm.Joints3D.observe(truth, noise=0.04, seed=0, hidden=hidden)
+occluded = limb_occlusions(truth)
+recorded = pm.Joints3D.observe(truth, noise=0.04, seed=0, hidden=occluded)
 
 # %% [markdown]
-# Your own recording is an array (frames, joints, 3) with NaN where nothing was observed. `noisy_joints` turns it
-# into a likelihood and explains what does not fit: another frame rate, millimetres, unknown joints.
+# Your own recording is an array (frames, joints, 3) with NaN for missing joints. `noisy_joints` converts it to a
+# likelihood and raises an error for a wrong frame rate, unit or joint name.
 
 # %%
-array = np.where(hidden[..., None], np.nan, recorded.joints)
-same = noisy_joints(
+array = np.where(occluded[..., None], np.nan, recorded.joints)
+likelihood = noisy_joints(
     array, truth.skeleton, truth.fps, prior=prior.of(frames=truth.frames), noise=0.04
 )
-assert np.array_equal(same.entries.visible, ~hidden)
+assert np.array_equal(likelihood.entries.visible, ~occluded)
 
 # %% [markdown]
 # ## 2. The posterior
 #
-# Bone lengths are estimated from the recording. Prior and likelihood then make a posterior like any other.
+# Bone lengths are estimated from the recording. Prior and likelihood then define a posterior like any other.
 
 # %%
 body = body_of(recorded, prior)
@@ -98,45 +98,45 @@ drawn = draws.flat()
 print(f"{len(drawn)} draws in {float(draws.dataset.attrs['seconds']):.1f} s")
 
 # %% [markdown]
-# The networks were trained on other recordings (`mode="regression"`); they can also be fitted to this one
-# (`mode="optimization"`), which takes longer. `predict` returns a single estimate.
+# The networks were trained on other recordings. They can be used unchanged (`mode="regression"`) or optimised for
+# this recording (`mode="optimization"`), which takes longer. `predict` returns a single estimate.
 
 # %%
-fit = DVAEInference(mode="optimization")
+optimised = DVAEInference(mode="optimization")
 joints = recorded.joints
-seen = ~hidden
-kalman, _ = kalman_smooth(joints, seen.astype(float), noise=0.04, fps=truth.fps)
+visible = ~occluded
+kalman, _ = kalman_smooth(joints, visible.astype(float), noise=0.04, fps=truth.fps)
 estimates = {
-    "recorded, hidden ones interpolated": filled_between(joints, seen),
-    "Savitzky-Golay filter": savitzky_golay(joints, seen, fps=truth.fps),
+    "recorded, interpolated": filled_between(joints, visible),
+    "Savitzky-Golay filter": savitzky_golay(joints, visible, fps=truth.fps),
     "Kalman smoother": kalman,
     "Motion-DVAE, regression": regression.predict(posterior, progress=False).positions,
-    "Motion-DVAE, optimization": fit.predict(posterior, progress=False).positions,
+    "Motion-DVAE, optimization": optimised.predict(posterior, progress=False).positions,
     "Motion-DVAE, mean of the draws": drawn.mean(axis=0),
 }
 rows = {}
-for name, found in estimates.items():
-    errors = 1000 * accuracy.joint_errors(found, truth.positions)
+for name, positions in estimates.items():
+    errors = 1000 * accuracy.joint_errors(positions, truth.positions)
     rows[name] = {
         "all, mm": errors.mean(),
-        "seen, mm": errors[seen].mean(),
-        "hidden, mm": errors[hidden].mean(),
-        "acceleration": float(accuracy.acceleration_ratio(found, truth.positions)),
+        "visible, mm": errors[visible].mean(),
+        "occluded, mm": errors[occluded].mean(),
+        "acceleration": float(accuracy.acceleration_ratio(positions, truth.positions)),
     }
 print(pd.DataFrame(rows).T.round(2).to_string())
 
 # %% [markdown]
-# The last column is the acceleration relative to the truth: 1 is right, above 2 the motion jitters, below .5 it is
-# oversmoothed.
+# The first three columns are mean joint errors. The last column is the acceleration relative to the truth: 1 is
+# ideal, above 2 the motion jitters, below 0.5 it is oversmoothed.
 #
-# ## 3. Is the uncertainty right?
+# ## 3. Calibration of the uncertainty
 #
-# Draws should differ where the recording says nothing. If the posterior is calibrated, its spread equals its error
-# and 90 % of coordinates lie in the central 90 % interval. The variational approximation is overconfident, more so
-# for a body that the prior has not seen; fitting helps:
+# Draws should differ most where joints are occluded. If the posterior is calibrated, its spread equals its error
+# and 90 % of coordinates lie in the central 90 % interval. The variational approximation is overconfident, more
+# so for a body that is not in the training data; optimisation reduces the overconfidence:
 
 # %%
-fitted = fit.sample(posterior, draws=100, seed=0, progress=False).flat()
+fitted = optimised.sample(posterior, draws=100, seed=0, progress=False).flat()
 rows = {}
 for name, motions in (("regression", drawn), ("optimization", fitted)):
     middle = motions.mean(axis=0)
@@ -144,11 +144,11 @@ for name, motions in (("regression", drawn), ("optimization", fitted)):
     error = 1000 * np.linalg.norm(middle - truth.positions, axis=-1)
     low, high = np.quantile(motions, [0.05, 0.95], axis=0)
     inside = (truth.positions >= low) & (truth.positions <= high)
-    for joints_are, which in (("seen", seen), ("hidden", hidden)):
-        rows[f"{name}, {joints_are}"] = {
-            "spread, mm": spread[which].mean(),
-            "error, mm": error[which].mean(),
-            "truth inside the central 90 %": inside[which].mean(),
+    for kind, mask in (("visible", visible), ("occluded", occluded)):
+        rows[f"{name}, {kind}"] = {
+            "spread, mm": spread[mask].mean(),
+            "error, mm": error[mask].mean(),
+            "truth inside the central 90 %": inside[mask].mean(),
         }
 print(pd.DataFrame(rows).T.round(2).to_string())
 
@@ -156,7 +156,7 @@ print(pd.DataFrame(rows).T.round(2).to_string())
 some = slice(None, None, 8)
 draw_skeletons(
     {
-        "recorded": estimates["recorded, hidden ones interpolated"][None, some],
+        "recorded": estimates["recorded, interpolated"][None, some],
         "Kalman": kalman[None, some],
         "a draw": fitted[:1, some],
     },
@@ -168,12 +168,12 @@ draw_skeletons(
 Image("denoised.png")
 
 # %% [markdown]
-# The estimates side by side, animated. Drag to rotate.
+# The animation shows the estimates side by side. Drag it to rotate.
 
 # %%
 animate_skeletons(
     {
-        "recorded": estimates["recorded, hidden ones interpolated"][None],
+        "recorded": estimates["recorded, interpolated"][None],
         "Kalman": kalman[None],
         "a draw": fitted[:1],
         "the truth": truth.positions[None],
@@ -186,11 +186,11 @@ animate_skeletons(
 # %% [markdown]
 # ## Next
 #
-# The same comparison with other samplers, on the command line:
+# To compare other samplers on the command line:
 #
 #     probmotion compare denoise-cmu denoise-cmu-occluded --samplers dvae nuts --draws 200
 #
-# A prior and a denoiser from your own clips:
+# To train a prior and a denoiser on your own clips:
 #
 #     probmotion train dvae --clips "clips/*.bvh" --out body
 #     probmotion train denoiser --prior body --clips "clips/*.bvh" --out denoiser

@@ -16,16 +16,16 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/05_animals.ipynb)
 #
-# Few animals wear markers, but there are videos of them and detectors for their joints. A motion VAE (Sun et al.
-# 2024, *Ponymation*) learns from such 2D tracks how a kind of body moves in 3D. It maximises the evidence lower
-# bound with one latent code $z \sim \mathcal{N}(0, I)$ per second of motion,
+# Motion capture of animals is rare, but there are videos of them and detectors for their joints. A motion VAE
+# (variational autoencoder; Sun et al. 2024, *Ponymation*) learns from such 2D tracks how a kind of body moves in
+# 3D. It maximises the evidence lower bound with one latent code $z \sim \mathcal{N}(0, I)$ per second of motion,
 #
 # $$
 # \mathcal{L} = \mathcal{L}_\text{reconstruction in 2D} + \lambda_{KL}\,
 #   \mathrm{KL}\left( q(z \mid \text{track}) \,\Vert\, \mathcal{N}(0, I) \right).
 # $$
 #
-# `animal-vae` comes with the package. It was trained on dogs and on synthetic quadrupeds that walk, trot, pace,
+# The package includes the prior `animal-vae`, trained on dogs and on synthetic quadrupeds that walk, trot, pace,
 # canter and spin.
 #
 # On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
@@ -56,12 +56,12 @@ from probmotion.samplers import DVAEInference
 
 prior = MotionVAE.load("animal-vae")
 skeleton = prior.skeleton
-print(skeleton.n_joints, "joints,", prior.frames, "frames at", prior.fps, "a second")
+print(f"{skeleton.n_joints} joints, {prior.frames} frames at {prior.fps:g} fps")
 
 # %% [markdown]
 # ## 1. Tracks
 #
-# Eight animals that the prior has not seen are filmed from all sides. For your own videos,
+# Eight synthetic animals that are not in the training data are projected from all sides. For your own videos,
 # `pm.read_keypoints` reads DeepLabCut tables and the JSON of other detectors.
 
 # %%
@@ -71,40 +71,41 @@ print(len(tracks), "tracks of", tracks[0].frames, "frames")
 
 # %% [markdown]
 # The body is estimated from the tracks: over many views, the covariance of projected widths determines depth. No
-# 3D data are used; the last line compares with the truth.
+# 3D data are used; the truth is needed only for the printed error.
 
 # %%
 body = ArticulatedBody(skeleton, estimate_rest_pose(tracks))
-true = np.linalg.norm(
+true_lengths = np.linalg.norm(
     [
         animals[0].positions[0, joint] - animals[0].positions[0, parent]
         for joint, parent in skeleton.bones
     ],
     axis=-1,
 )
-found = np.linalg.norm([body.rest[joint] for joint, _ in skeleton.bones], axis=-1)
-print(f"bones are {100 * np.abs(found / true - 1).mean():.1f} % off in length, on average")
+lengths = np.linalg.norm([body.rest[joint] for joint, _ in skeleton.bones], axis=-1)
+print(f"mean error of bone lengths: {100 * np.abs(lengths / true_lengths - 1).mean():.1f} %")
 
 # %% [markdown]
-# ## 2. Which view is right?
+# ## 2. View hypotheses
 #
-# A single view does not say whether a leg points towards the camera or away from it. The network makes four
-# hypotheses, a quarter turn apart, and keeps the one that explains the tracks best within joint limits. Against
-# the truth:
+# A single view does not show whether a leg points towards the camera or away from it. The network makes four
+# hypotheses about the view, a quarter turn apart, and selects the one that fits the tracks best within joint
+# limits. Comparison with the truth:
 
 # %%
-judged = evaluate_hypotheses(
+selection = evaluate_hypotheses(
     prior.model.pose, prior.settings, prior.body, animals, n=300, fps=prior.fps
 )
 print(
-    f"the right view wins in {judged.right:.0%}, depth is not mirrored in {judged.depth_right:.0%}"
+    f"correct view in {selection.right:.0%}, correct depth in {selection.depth_right:.0%} of sequences"
 )
-print(f"joints are {1000 * judged.error:.0f} mm from the truth")
+print(f"mean joint error: {1000 * selection.error:.0f} mm")
 
 # %% [markdown]
 # ## 3. New motion
 #
-# One latent code is one second of motion. Draws stay in place, because the code does not contain the path.
+# One latent code represents one second of motion. Draws stay at one position, because the code does not contain
+# the path.
 
 # %%
 drawn = prior.sample(np.random.default_rng(0), 6)
@@ -112,16 +113,17 @@ draw_skeletons({"draws": drawn[:4]}, skeleton, "animals.png", moments=5, azimuth
 Image("animals.png")
 
 # %% [markdown]
-# Longer motions join several codes by transition codes that are fitted to begin and end like their neighbours. At
-# a seam a joint should accelerate no more than within the segments; `long_motion` warns otherwise.
+# Longer motions consist of several codes, joined by transition codes that are optimised to begin and end like
+# their neighbours. At segment boundaries, the maximum acceleration should not exceed that within segments;
+# `long_motion` warns otherwise.
 
 # %%
 codes = prior.initial(np.random.default_rng(1), 4)
-pieces = prior.motion(codes)
+segments = prior.motion(codes)
 long = long_motion(prior, codes)
-within = max(greatest_acceleration(piece) for piece in pieces)
-share = greatest_acceleration(long) / within
-print(f"{len(long)} frames; the greatest acceleration is {share:.2f} of that within pieces")
+within = max(greatest_acceleration(segment) for segment in segments)
+ratio = greatest_acceleration(long) / within
+print(f"{len(long)} frames; maximum acceleration {ratio:.2f} times that within segments")
 
 # %%
 animate_skeletons({"several codes": long[None]}, skeleton, "long.html", fps=prior.fps)
@@ -129,8 +131,8 @@ animate_skeletons({"several codes": long[None]}, skeleton, "long.html", fps=prio
 # %% [markdown]
 # ## 4. One camera
 #
-# With keypoints as observations, the same prior gives a posterior. The pose network places the body; the encoder
-# infers the code, and can be fitted to this recording.
+# With keypoints as observations, the same prior defines a posterior. The pose network estimates position and
+# orientation of the body; the encoder infers the code, and can be optimised for this recording.
 
 # %%
 truth = animals[1].retarget(skeleton).resample(prior.fps).window(5, prior.frames).centred()
@@ -148,16 +150,16 @@ for mode in ("regression", "optimization"):
 print(pd.DataFrame(rows).T.round(0).to_string())
 
 # %%
-shown = {"drawn": drawn[:1], "seen by one camera": draws[:1], "the truth": truth.positions[None]}
+shown = {"draws": drawn[:1], "seen by one camera": draws[:1], "the truth": truth.positions[None]}
 standing = {name: some - [0, some[..., 1].min(), 0] for name, some in shown.items()}
 animate_skeletons(standing, skeleton, "animals.html", fps=prior.fps)
 
 # %% [markdown]
-# ## 5. A prior of these animals
+# ## 5. A prior trained on these animals
 #
-# Tiny networks learn from the tracks above in a minute or two: first poses, frame by frame under four view
-# hypotheses, then a code for a whole second. In the first thousand steps hardly any bone rotates: the network
-# first learns the standing pose.
+# Tiny networks are trained on the tracks above in a minute or two: first the pose network, frame by frame under
+# four view hypotheses, then the VAE, with one code per second. In the first thousand steps, the network learns
+# the standing pose and hardly any bone rotates.
 
 # %%
 size = MotionVAESettings.tiny()
@@ -177,11 +179,11 @@ def speed(motions):
 
 
 real = [speed(animal.retarget(skeleton).resample(own.fps).positions) for animal in animals]
-print(f"new motions are {speed(new) / np.mean(real):.2f} as fast as the animals' own")
+print(f"speed of draws relative to the animals: {speed(new) / np.mean(real):.2f}")
 animate_skeletons(
     {
-        "of the prior that ships": drawn[:2],
-        "of these animals": new[:2],
+        "shipped prior": drawn[:2],
+        "prior trained on these animals": new[:2],
     },
     skeleton,
     "own.html",
@@ -191,9 +193,9 @@ animate_skeletons(
 # %% [markdown]
 # ## Next
 #
-# The same from your own files, at a useful size:
+# To train a larger model on your own files:
 #
 #     probmotion train motion-vae --tracks "videos/*.csv" --tracks-fps 30 --threshold 0.5 \
 #         --skeleton quadruped21 --out runs/mine
 #
-# `notebooks/ablations/motion_vae.py` measures what every part contributes.
+# `notebooks/ablations/motion_vae.py` measures the contribution of every component.

@@ -12,11 +12,11 @@
 # ---
 
 # %% [markdown]
-# # Which sampler, and how wrong is it?
+# # Comparison and calibration of samplers
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/probmotion/probmotion/blob/main/notebooks/06_compare_and_calibrate.ipynb)
 #
-# Samplers are compared on problems with known answers and equal budgets, their uncertainty is checked by
+# Samplers are compared on problems with known posteriors and equal budgets, their uncertainty is checked by
 # simulation-based calibration, and the error of one of them is decomposed into parts.
 #
 # On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
@@ -37,7 +37,8 @@ from probmotion.samplers import ExactSampler, MetropolisHastings, MultiViewAnces
 # %% [markdown]
 # ## 1. A problem of adjustable difficulty
 #
-# Here: eight frames, one camera, keypoints with σ = 5 cm, so that depth is nearly unknown.
+# This problem has eight frames and one camera. Keypoints have a standard deviation of 5 cm, so depth is nearly
+# undetermined.
 
 # %%
 problem = load_problem("gait-monocular", frames=8, noise=0.05)
@@ -46,8 +47,8 @@ print(problem.name, "has exact draws:", problem.has_reference)
 # %% [markdown]
 # ## 2. The same budget for all
 #
-# Every sampler may evaluate a density or a denoiser 20 000 times (a gradient counts twice); pilot runs find the
-# setting that spends the budget. `exact` needs none and shows how close one can get.
+# Every sampler may evaluate a density or a denoiser 20 000 times (a gradient counts twice); pilot runs select the
+# setting that uses the budget. `exact` requires no evaluations and shows the smallest attainable error.
 
 # %%
 samplers = {
@@ -68,20 +69,20 @@ comparison = pm.compare(
 print(comparison.table())
 
 # %% [markdown]
-# Three seeds show how much of a difference is chance: the report highlights the best sampler and all that are
-# statistically tied with it. It is one HTML file with the table, quality against cost, and animated draws beside
-# exact ones with the keypoints on top.
+# The variation over three seeds shows which differences are significant: the report highlights the best sampler
+# and all that are statistically tied with it. The report is one HTML file with the table, a figure of quality
+# against cost, and animated draws beside exact draws, with the keypoints.
 
 # %%
-page = comparison.report("report.html")
-print(page.name, f"{Path(page).stat().st_size / 1e6:.1f} MB")
+report = comparison.report("report.html")
+print(report.name, f"{Path(report).stat().st_size / 1e6:.1f} MB")
 
 # %%
 comparison.plot("quality.png")
 Image("quality.png")
 
 # %% [markdown]
-# ## 3. Are they calibrated?
+# ## 3. Calibration
 #
 # A truth $\theta^\ast$ is drawn from the prior and observations from the likelihood. Over many simulations the rank
 # of $f(\theta^\ast)$ among the draws,
@@ -90,8 +91,8 @@ Image("quality.png")
 # r = \sum_{i=1}^{n} \mathbb{1}\left[ f(\theta_i) < f(\theta^\ast) \right],
 # $$
 #
-# is uniform on $0, \dots, n$ if the sampler is right. `Overconfident` shrinks the draws of another sampler: the
-# negative control that must fail.
+# is uniform on $0, \dots, n$ if the sampler is correct. `Overconfident` shrinks the draws of another sampler. It
+# is a negative control, which the test must reject.
 
 # %%
 calibration = calibrate(
@@ -110,10 +111,10 @@ calibration.plot("calibration.png")
 Image("calibration.png")
 
 # %% [markdown]
-# ## 4. Where does the error of MAS come from?
+# ## 4. Decomposition of the error of MAS
 #
-# A chain of samplers leads from exact draws to MAS; neighbours differ in one property, and the differences add up
-# to the total error.
+# A chain of samplers leads from exact draws to multi-view ancestral sampling (MAS). Consecutive samplers differ
+# in one property, and the differences add up to the total error.
 
 # %%
 errors = decompose_error(
@@ -129,19 +130,19 @@ errors.plot("errors.png")
 Image("errors.png")
 
 # %% [markdown]
-# ## 5. Which sampler, then?
+# ## 5. Choice of a sampler
 #
-# Every sampler was measured on every problem of the package with a small budget. `probmotion which` prints the same
-# on the command line.
+# Every sampler was measured on every problem of the package with a small budget. `probmotion which` prints the
+# same advice on the command line.
 
 # %%
 print(advise("gait-monocular"))
 
 # %% [markdown]
-# ## 6. Your own
+# ## 6. Your own posterior or sampler
 #
-# Any posterior and any object with `name`, `requires` and `sample` can take part; packages register samplers by an
-# entry point of the group `probmotion.samplers`.
+# Any posterior can be compared, and any object with `name`, `requires` and `sample` can be used as a sampler.
+# Packages register samplers by an entry point of the group `probmotion.samplers`.
 
 # %%
 table = pm.compare(

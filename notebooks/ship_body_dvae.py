@@ -1,10 +1,9 @@
-"""Train body-dvae and write the weights and model card that the package ships.
+"""Train body-dvae and write its weights and model card.
 
     python notebooks/ship_body_dvae.py --runs runs
 
-A stopped run continues; a finished one is not repeated. Both networks are written to
-``models/weights`` in half precision. The denoiser is trained with the prior as it is shipped. Clips
-are read from ``--data``, by default ../shared/data beside the repository.
+Run the command again to resume a stopped run. Both networks are written to ``models/weights`` in
+half precision; the denoiser is trained with the half-precision prior. Clips are read from ``--data``, by default ../shared/data beside the repository.
 """
 
 from __future__ import annotations
@@ -32,37 +31,37 @@ NAME = "body-dvae"
 
 
 def main() -> None:
-    """Train what is missing; write weights and card."""
+    """Train both networks unless finished, and write weights and card."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument(
-        "--table", type=Path, help="table.csv of notebooks/ablations/motion_dvae.py"
-    )
-    asked = parser.parse_args()
-    clips = denoising_clips(asked.data)
-    prior = trained_prior(clips, asked.runs / NAME)
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="Folder of training runs.")
+    data = ROOT.parent / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data, help="Folder of the clips.")
+    table = "table.csv written by notebooks/ablations/motion_dvae.py."
+    parser.add_argument("--table", type=Path, help=table)
+    options = parser.parse_args()
+    clips = denoising_clips(options.data)
+    prior = trained_prior(clips, options.runs / NAME)
     refit_joint_scale(prior, clips["validation"])
     prior.save(WEIGHTS / f"{NAME}.safetensors", half=True)
-    # As it will be loaded: half-precision weights.
+    # The denoiser must be trained with the shipped half-precision weights.
     prior = MotionDVAE.load(NAME)
-    denoiser = trained_denoiser(clips, prior, asked.runs / f"{NAME}-denoiser")
+    denoiser = trained_denoiser(clips, prior, options.runs / f"{NAME}-denoiser")
     denoiser.save(WEIGHTS / f"{NAME}-denoiser.safetensors", half=True)
     with written_whole(WEIGHTS / f"{NAME}.md") as path:
-        path.write_text(card(prior, denoiser, asked.table), encoding="utf-8")
+        path.write_text(card(prior, denoiser, options.table), encoding="utf-8")
     print(f"wrote {WEIGHTS / NAME}*")
 
 
 def trained_prior(clips: dict[str, list[Motion]], folder: Path) -> MotionDVAE:
     """Return the prior, trained in a folder."""
-    learnt = clips["train"]
-    rest = rest_pose(learnt[0].skeleton, [clip.positions for clip in learnt])
+    training = clips["train"]
+    rest = rest_pose(training[0].skeleton, [clip.positions for clip in training])
     settings, annealing = usual_dvae_training("small")
     trainee = DVAETrainee(
-        learnt,
+        training,
         clips["validation"],
         DVAESettings.small(),
-        BodyStates(learnt[0].skeleton, rest),
+        BodyStates(training[0].skeleton, rest),
         annealing=annealing,
     )
     train(trainee, settings, folder)
@@ -85,53 +84,53 @@ def card(prior: MotionDVAE, denoiser: MotionDenoiser, table: Path | None) -> str
     size = prior.settings
     noise = denoiser.card["network"]["noise"]
     names = ", ".join(network["data"]["clips"])
-    watched = ", ".join(network["validation_data"]["clips"])
+    validation = ", ".join(network["validation_data"]["clips"])
     rows = "\n".join(
-        _row(name, kept) for name, kept in (("prior", prior.card), ("denoiser", denoiser.card))
+        _row(name, record) for name, record in (("prior", prior.card), ("denoiser", denoiser.card))
     )
     return f"""# {NAME}
 
-What a body does next: a Motion-DVAE (supplement of the paper, A) with the cumulative decoder,
-and the inference networks that denoise beside it. Windows of {size.frames} frames of
-{prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z of {size.latent} numbers,
-layers of {size.hidden}.
+Autoregressive prior over human motion: a Motion-DVAE (Fiche et al. 2023, supplement A) with the
+cumulative decoder, and its inference networks for denoising. Windows have {size.frames} frames of
+{prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z has {size.latent} dimensions, and
+layers have width {size.hidden}.
 
-- **Data**: {network["data"]["frames"]} frames and their mirror images, of {names}.
-  The loss is watched on {watched}; the error of
-  decoded joints, {1000 * prior.joint_scale:.0f} mm, is that of these clips. Clips that were held
-  out whole: see `probmotion.data.denoising_clips`.
-- **Noise learnt from**: σ {1000 * noise["least"]:g} to {1000 * noise["most"]:g} mm;
+- **Data**: {network["data"]["frames"]} frames and their mirror images. Training clips: {names}.
+  Validation clips: {validation};
+  the error of their decoded joints is {1000 * prior.joint_scale:.0f} mm. Test clips: see
+  `probmotion.data.denoising_clips`.
+- **Noise in training**: σ {1000 * noise["least"]:g} to {1000 * noise["most"]:g} mm;
   {noise["outliers"]:.0%} of windows Student-t with 2 to 8 degrees of freedom,
-  {noise["hidden"]:.0%} with limbs that hide.
+  {noise["hidden"]:.0%} with occluded limbs.
 - **Provenance**: humanoid3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng.
   cmu_*: mocap.cs.cmu.edu, free for research and commercial use; the database was created
   with funding from NSF EIA-0196217.
-- **Not for**: other skeletons, frame rates other than {prior.fps:g}, children and animals; what
-  few clips show (climbing apart, actions have one or two clips each) is known poorly.
+- **Not for**: other skeletons, frame rates other than {prior.fps:g}, children and animals.
+  Except for climbing and walking, an action has only one or two training clips.
 
-| network | weights | steps | batch | seconds | loss | validation loss |
-|---|---|---|---|---|---|---|
+| network | weights | steps | batch | seconds | loss (training / validation) |
+|---|---|---|---|---|---|
 {rows}
 
-Seconds are of training steps on one thread of a shared CPU; no GPU was used. The denoiser's loss is
-minus the evidence lower bound per frame; the prior's is that of states, with the error of joints
-counted beside it. The prior is that of the lowest validation loss.
+Seconds: duration of training on one thread of a shared CPU; no GPU was used. The loss of the
+denoiser is the negative evidence lower bound per frame; that of the prior also includes the error of joints.
+The prior with the lowest validation loss is shipped.
 Command: `python notebooks/ship_body_dvae.py --runs runs`.
-{_measured(table)}"""
+{_results(table)}"""
 
 
-def _row(name: str, kept: dict[str, Any]) -> str:
-    last = next(row for row in kept["history"] if row["step"] == kept["step"])
-    training = kept["training"]
+def _row(name: str, record: dict[str, Any]) -> str:
+    last = next(row for row in record["history"] if row["step"] == record["step"])
+    training = record["training"]
     file = NAME if name == "prior" else f"{NAME}-denoiser"
     size = (WEIGHTS / f"{file}.safetensors").stat().st_size / 1e6
     return (
-        f"| {name} | {size:.1f} MB | {kept['step']} | {training['batch']} | "
-        f"{kept['seconds']:.0f} | {last['loss']:.1f} | {last['validation_loss']:.1f} |"
+        f"| {name} | {size:.1f} MB | {record['step']} | {training['batch']} | "
+        f"{record['seconds']:.0f} | {last['loss']:.1f} / {last['validation_loss']:.1f} |"
     )
 
 
-def _measured(table: Path | None) -> str:
+def _results(table: Path | None) -> str:
     if table is None:
         return ""
     rows = pd.read_csv(table)
@@ -143,8 +142,9 @@ def _measured(table: Path | None) -> str:
         for row in shown.itertuples()
     ]
     head = (
-        "\nMeasured by `python notebooks/ablations/motion_dvae.py` on the clips held out, mm:\n\n"
-        "| recording | estimate | G-MPJPE | occluded joints | acceleration relative to the truth's |\n"
+        "\nMean errors on the test clips in mm (`python notebooks/ablations/motion_dvae.py`; lower is\n"
+        "better; G-MPJPE: global mean per-joint position error; acceleration ratio: 1 is best).\n\n"
+        "| recording | estimate | G-MPJPE | G-MPJPE, occluded joints | acceleration ratio |\n"
         "|---|---|---|---|---|\n"
     )
     return head + "\n".join(lines) + "\n"

@@ -1,12 +1,12 @@
-"""Train the motion VAEs and write the weights and model cards that the package ships.
+"""Train walk-vae and animal-vae and write their weights and model cards.
 
     python notebooks/ship_motion_vae.py walk-vae --runs runs
     python notebooks/ship_motion_vae.py animal-vae --runs runs
 
-A stopped run continues; a finished one is not repeated. Networks are written to
-``models/weights`` in half precision, with the evaluator and the features of held-out views. Clips
-are read from ``--data``, by default ../shared/data beside the repository, and filmed; their 3D
-positions are used only to count how often the correct view is chosen.
+Run the command again to resume a stopped run. Networks are written to ``models/weights`` in half
+precision, with the evaluator and the features of held-out views. Clips are read from ``--data``, by
+default ../shared/data beside the repository, and projected to 2D; their 3D positions are used only
+to evaluate the selection of view hypotheses.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ FPS = 10.0
 
 @dataclass(frozen=True)
 class Kind:
-    """One prior: its skeleton, clips by part, and their origin."""
+    """Skeleton, clips and training settings of one prior."""
 
     about: str
     skeleton: Skeleton
     clips: Callable[[Path], dict[str, list[Motion]]]
     views: Mapping[str, int]
-    """Cameras around a clip of a data set whose name begins so."""
+    """Number of cameras per clip, by the prefix of clip names."""
     kl: float
-    """Weight of KL: of people the tenfold of the published one generates better; of animals, whose
-    motion is smaller in metres, it leaves nothing in the code."""
+    """Weight of the KL divergence. Ten times the published weight improves generation of people; for
+    animals, whose motion is smaller in metres, the latent code would collapse."""
     steps: int
-    """Of the second phase."""
+    """Number of steps of the second phase."""
     provenance: str
 
 
@@ -82,44 +82,45 @@ KINDS = {
         {"quadruped": 16, "dog3d": 128},
         0.001,
         2500,
-        "dog3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng; they look like dog motion "
-        "capture that its authors offer for non-commercial use, and should be treated so in doubt. "
-        "quadruped-*: made by this project.",
+        "dog3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng; they resemble dog motion "
+        "capture that its authors offer for non-commercial use only, which may apply here too. "
+        "quadruped-*: synthetic clips of this project.",
     ),
 }
 
 
 def main() -> None:
-    """Train what is missing; write weights and card."""
+    """Train all networks unless finished, and write weights and card."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("name", choices=KINDS)
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    asked = parser.parse_args()
-    kind, folder = KINDS[asked.name], asked.runs / asked.name
-    clips = kind.clips(asked.data)
-    tracks = filmed(kind, clips)
+    parser.add_argument("name", choices=KINDS, help="Name of the prior.")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="Folder of training runs.")
+    data = ROOT.parent / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data, help="Folder of the clips.")
+    options = parser.parse_args()
+    kind, folder = KINDS[options.name], options.runs / options.name
+    clips = kind.clips(options.data)
+    tracks = projected_tracks(kind, clips)
     prior = trained(kind, tracks, folder)
-    prior.save(WEIGHTS / f"{asked.name}.safetensors", half=True)
-    # As it will be loaded: half-precision weights.
-    prior = MotionVAE.load(asked.name)
+    prior.save(WEIGHTS / f"{options.name}.safetensors", half=True)
+    # The card describes the shipped half-precision weights.
+    prior = MotionVAE.load(options.name)
     evaluator = trained_evaluator(tracks, prior.frames, folder / "evaluator")
-    evaluator.save(WEIGHTS / f"{asked.name}-evaluator.safetensors", half=True)
-    evaluator = TrackEvaluator.load(f"{asked.name}-evaluator")
-    write_features(asked.name, evaluator, prior, clips)
-    text = card(asked.name, kind, prior, folder, clips)
-    with written_whole(WEIGHTS / f"{asked.name}.md") as path:
+    evaluator.save(WEIGHTS / f"{options.name}-evaluator.safetensors", half=True)
+    evaluator = TrackEvaluator.load(f"{options.name}-evaluator")
+    write_features(options.name, evaluator, prior, clips)
+    text = card(options.name, kind, prior, folder, clips)
+    with written_whole(WEIGHTS / f"{options.name}.md") as path:
         path.write_text(text, encoding="utf-8")
     print(text)
 
 
-def filmed(kind: Kind, clips: dict[str, list[Motion]]) -> dict[str, list[KeypointTrack]]:
+def projected_tracks(kind: Kind, clips: dict[str, list[Motion]]) -> dict[str, list[KeypointTrack]]:
     """Return prepared 2D tracks by part."""
     tracks: dict[str, list[KeypointTrack]] = {}
     for part in ("train", "validation"):
         tracks[part] = []
         for start, views in kind.views.items():
-            if some := of_kind(clips[part], start, kind):
+            if some := clips_of(clips[part], start, kind):
                 tracks[part] += certain(film_clips(some, kind.skeleton, FPS, views=views).tracks)
     return tracks
 
@@ -148,22 +149,22 @@ def trained_evaluator(
     return TrackEvaluator.load(folder)
 
 
-def judged_views(
+def view_accuracy(
     kind: Kind, prior: MotionVAE, clips: dict[str, list[Motion]]
 ) -> dict[str, HypothesisAccuracy]:
-    """Return how often the correct view is chosen, by part and data set."""
-    found = {}
+    """Return the accuracy of view selection, by part and data set."""
+    accuracies = {}
     for part in ("train", "test"):
         for start in kind.views:
-            of = f"{part}, {start}" if start else part
-            some = of_kind(clips[part], start, kind)
-            found[of] = evaluate_hypotheses(
+            label = f"{part}, {start}" if start else part
+            some = clips_of(clips[part], start, kind)
+            accuracies[label] = evaluate_hypotheses(
                 prior.model.pose, prior.settings, prior.body, some, fps=FPS
             )
-    return found
+    return accuracies
 
 
-def of_kind(clips: list[Motion], start: str, kind: Kind) -> list[Motion]:
+def clips_of(clips: list[Motion], start: str, kind: Kind) -> list[Motion]:
     """Return the clips whose names start with a prefix, unless a longer prefix applies."""
     longer = [other for other in kind.views if other.startswith(start) and other != start]
     return [
@@ -173,21 +174,21 @@ def of_kind(clips: list[Motion], start: str, kind: Kind) -> list[Motion]:
     ]
 
 
-def pace_of_draws(prior: MotionVAE, clips: dict[str, list[Motion]]) -> tuple[float, float]:
+def relative_speed(prior: MotionVAE, clips: dict[str, list[Motion]]) -> tuple[float, float]:
     """Return the mean speed of draws relative to held-out motion, and the proportion of slow draws.
 
-    A draw is slow if it is slower than 99 of 100 held-out sequences.
+    A draw is slow if it is slower than 99 % of held-out sequences.
     """
     motions = [
         centre_motion(clip.retarget(prior.skeleton).resample(prior.fps)) for clip in clips["test"]
     ]
     real = np.concatenate([windows(motion.positions, prior.frames) for motion in motions])
     drawn = prior.sample(np.random.default_rng(0), 1000)
-    ours, theirs = (
+    draw_speeds, real_speeds = (
         np.linalg.norm(np.diff(some, axis=1), axis=-1).mean(axis=(1, 2)) for some in (drawn, real)
     )
-    slow = float((ours < np.quantile(theirs, 0.01)).mean())
-    return float(ours.mean() / theirs.mean()), slow
+    slow = float((draw_speeds < np.quantile(real_speeds, 0.01)).mean())
+    return float(draw_speeds.mean() / real_speeds.mean()), slow
 
 
 def card(
@@ -197,57 +198,56 @@ def card(
     network, size = prior.card["network"], prior.settings
     poses = load_checkpoint(folder / "poses", PoseTrainee.kind).settings
     rows = []
-    for phase, kept in (("poses", poses), ("VAE", prior.card)):
-        last = kept["history"][-1]
+    for phase, record in (("poses", poses), ("VAE", prior.card)):
+        last = record["history"][-1]
         rows.append(
-            f"| {phase} | {kept['step']} | {kept['training']['batch']} | {kept['seconds']:.0f} | "
-            f"{last['loss']:.3f} | {last['validation_loss']:.3f} |"
+            f"| {phase} | {record['step']} | {record['training']['batch']} | "
+            f"{record['seconds']:.0f} | {last['loss']:.3f} | {last['validation_loss']:.3f} |"
         )
     views = [
         f"| {part} | {100 * one.right:.1f} % | {100 * one.depth_right:.1f} % | "
         f"{1000 * one.error:.0f} mm |"
-        for part, one in judged_views(kind, prior, clips).items()
+        for part, one in view_accuracy(kind, prior, clips).items()
     ]
-    pace, slow = pace_of_draws(prior, clips)
+    speed, slow = relative_speed(prior, clips)
     weights = (WEIGHTS / f"{name}.safetensors").stat().st_size / 1e6
     return f"""# {name}
 
-{kind.about}: a motion VAE learnt from 2D tracks alone. Motions of {size.frames} frames of
-{prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z of {size.latent} numbers,
-λ_KL = {size.kl:g}; {weights:.1f} MB.
+{kind.about}: a motion variational autoencoder (VAE) learnt from 2D tracks alone. Motions have
+{size.frames} frames of {prior.skeleton.n_joints} joints at {prior.fps:g} frames per second; z has {size.latent}
+dimensions; λ_KL = {size.kl:g}; {weights:.1f} MB.
 
-- **Data**: {network["data"]["tracks"]} tracks of {network["data"]["frames"]} frames, filmed
-  {network["distance"]:g} m away from random sides, of
-  {listed(network["data"]["clips"])};
-  tracks are mirrored every other time. The loss is watched on
-  {listed(network["validation_data"]["clips"])}.
+- **Data**: {network["data"]["tracks"]} tracks of {network["data"]["frames"]} frames,
+  projected from random sides at a distance of {network["distance"]:g} m and mirrored with probability 1/2.
+  Training clips: {clip_list(network["data"]["clips"])}.
+  Validation clips: {clip_list(network["validation_data"]["clips"])}.
 - **Provenance**: {kind.provenance}
-- **Not for**: other skeletons or frame rates; motions unlike those named. The rigid pose is no
-  part of the latent code: draws stay in place and look ahead.
+- **Not for**: other skeletons or frame rates; motions unlike the training clips. The rigid pose is
+  not part of the latent code: draws stay at one position and face forward.
 
 | phase | steps | batch | seconds | loss | validation loss |
 |---|---|---|---|---|---|
 {chr(10).join(rows)}
 
-Seconds are of training steps on one thread of a shared CPU; no GPU was used.
+Seconds: duration of training on one thread of a shared CPU; no GPU was used.
 
-The view hypothesis that is chosen, in 1000 sequences of clips whose 3D is known (right: nearest to
-the truth, or a fifth farther; depth: nearer to the truth than its mirror image in depth; by chance
-a quarter and a half):
+Accuracy of the selected view hypothesis in 1000 sequences with known 3D motion (correct view: error
+at most 1.2 times the smallest, 25 % by chance; correct depth: closer to the truth than the mirror
+image in depth, 50 % by chance):
 
-| clips | right | depth right | joints' distance from the truth |
+| clips | correct view | correct depth | mean joint error |
 |---|---|---|---|
 {chr(10).join(views)}
 
-Draws move at {pace:.2f} of the mean speed of held-out motion; {100 * slow:.0f} % of 1000 draws are
-slower than 99 of 100 held-out sequences.
+The mean speed of 1000 draws is {speed:.2f} times that of held-out motion; {100 * slow:.0f} % of draws are
+slower than 99 % of held-out sequences.
 
 Command: `python notebooks/ship_motion_vae.py {name} --runs runs`.
 """
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return names in a row; synthetic clips are counted by kind."""
+def clip_list(names: Sequence[str]) -> str:
+    """Return names as text, with the numbers of synthetic clips by kind."""
     kinds = Counter(re.sub(r"-\d+$", "", name) for name in names)
     return ", ".join(f"{kind} ({n} clips)" if n > 1 else kind for kind, n in kinds.items())
 

@@ -44,32 +44,36 @@ COMMANDS = (
 def main() -> None:
     """Write weights, features and card, or list the clips."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--table", type=Path, help="table.csv of notebooks/ablations/mas.py")
-    parser.add_argument("--list", choices=["clips", "validation", "test"])
-    asked = parser.parse_args()
-    if asked.list:
-        print(" ".join(listed(asked.list, asked.data)))
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="Folder of training runs.")
+    data = ROOT.parent / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data, help="Folder of the clips.")
+    parser.add_argument(
+        "--table", type=Path, help="table.csv written by notebooks/ablations/mas.py."
+    )
+    parts = ["clips", "validation", "test"]
+    parser.add_argument("--list", choices=parts, help="Print all clips or those of a part.")
+    options = parser.parse_args()
+    if options.list:
+        print(" ".join(clip_names(options.list, options.data)))
         return
-    prior = MotionDiffusion.load(asked.runs / "walk2d")
-    evaluator = TrackEvaluator.load(asked.runs / "walk2d-evaluator")
+    prior = MotionDiffusion.load(options.runs / "walk2d")
+    evaluator = TrackEvaluator.load(options.runs / "walk2d-evaluator")
     prior.save(WEIGHTS / "walk2d.safetensors", half=True)
     evaluator.save(WEIGHTS / "walk2d-evaluator.safetensors", half=True)
-    # As they will be loaded: features of half-precision weights.
+    # The features must be those of the shipped half-precision weights.
     evaluator = TrackEvaluator.load("walk2d-evaluator")
-    write_features("walk2d", evaluator, prior, walk_clips(asked.data))
+    write_features("walk2d", evaluator, prior, walk_clips(options.data))
     lines = card_lines(prior.card, evaluator.card)
-    if asked.table is not None:
-        lines += measured(pd.read_csv(asked.table))
+    if options.table is not None:
+        lines += result_lines(pd.read_csv(options.table))
     card = "\n".join(lines)
     with written_whole(WEIGHTS / "walk2d.md") as path:
         path.write_text(card + "\n", encoding="utf-8")
     print(card)
 
 
-def listed(part: str, data: Path) -> list[str]:
-    """Return the files of all clips, or the names of those of a part."""
+def clip_names(part: str, data: Path) -> list[str]:
+    """Return the files of all clips, or the names of the clips of a part."""
     if part == "clips":
         return [str(data / f"{name}.npz") for names in WALK_CLIPS.values() for name in names]
     return [Path(name).name for name in WALK_CLIPS[part]]
@@ -82,16 +86,16 @@ def write_features(
     clips: dict[str, list[Motion]],
 ) -> None:
     """Write features of random windows of test and training clips and their cameras."""
-    filming, found = Filming(), {}
-    for seed, (part, of) in enumerate((("test", "held_out"), ("train", "learnt")), start=1):
+    filming, features = Filming(), {}
+    for seed, (part, key) in enumerate((("test", "held_out"), ("train", "learnt")), start=1):
         views = film_windows(
             clips[part], prior.skeleton, prior.fps, prior.frames, WINDOWS, seed=seed
         )
-        found[of] = evaluator.features(views).astype(np.float16)
-    held = io.BytesIO()
-    np.savez_compressed(held, elevation=filming.elevation, distance=filming.distance, **found)
+        features[key] = evaluator.features(views).astype(np.float16)
+    archive = io.BytesIO()
+    np.savez_compressed(archive, elevation=filming.elevation, distance=filming.distance, **features)
     with written_whole(WEIGHTS / f"{name}-features.npz") as path:
-        path.write_bytes(held.getvalue())
+        path.write_bytes(archive.getvalue())
 
 
 def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
@@ -100,51 +104,53 @@ def card_lines(prior: dict[str, Any], evaluator: dict[str, Any]) -> list[str]:
     lines = [
         "# walk2d",
         "",
-        "People who walk, some of them stealthily, as one camera sees them: a 2D motion diffusion",
-        "model (MAS, section 6.2) and the evaluator of its tables. Up to "
+        "2D motion diffusion model of walking people in one view (MAS, section 6.2), and the",
+        "evaluator for its scores. Motions have up to "
         f"{size['frames']} frames of {len(prior['network']['joint_names'])} joints at "
-        f"{prior['network']['fps']:g} frames per second, the pelvis at the origin in every frame.",
+        f"{prior['network']['fps']:g} frames per second, with the pelvis at the origin.",
         "",
-        "- **Data**: 3D clips filmed by cameras around them (elevation "
-        f"{math.degrees(Filming().elevation):.2f}° ± {math.degrees(Filming().tilt):.0f}°, 7 m) and",
-        "  a detector with errors; only these pictures are learnt from. Learnt from: "
+        "- **Data**: 2D projections of 3D clips to random cameras (elevation "
+        f"{math.degrees(Filming().elevation):.2f}° ± {math.degrees(Filming().tilt):.0f}°, 7 m) with",
+        "  detection errors. Training clips: "
         f"{', '.join(data['clips'])} ({data['tracks']} tracks, {data['frames']} frames).",
-        f"  The loss is watched on {', '.join(prior['network']['validation_data']['clips'])}.",
-        f"  Held out: {', '.join(listed('test', Path()))}.",
+        f"  Validation clips: {', '.join(prior['network']['validation_data']['clips'])}.",
+        f"  Test clips: {', '.join(clip_names('test', Path()))}.",
         "- **Provenance**: humanoid3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng.",
         "  cmu_*: mocap.cs.cmu.edu, free for research and commercial use; the database was created",
         "  with funding from NSF EIA-0196217.",
-        "- **Not for**: other actions, cameras far above or below, people who travel through the",
-        "  picture; few bodies were learnt from, so proportions are theirs.",
+        "- **Not for**: other actions, cameras far above or below the subject, or tracks that are",
+        "  not centred. The training data contain few bodies, so body proportions vary little.",
         "",
-        "| network | layers × width | steps | batch | seconds | loss | validation loss |",
-        "|---|---|---|---|---|---|---|",
+        "| network | layers × width | steps | batch | seconds | loss (training / validation) |",
+        "|---|---|---|---|---|---|",
     ]
     for name, card in (("prior", prior), ("evaluator", evaluator)):
         shape, last = card["network"]["size"], card["history"][-1]
         lines.append(
             f"| {name} | {shape['layers']} × {shape['width']} | {card['step']} "
             f"| {card['training']['batch']} | {card['seconds']:.0f} | {last['loss']:.4f} "
-            f"| {last['validation_loss']:.4f} |"
+            f"/ {last['validation_loss']:.4f} |"
         )
     return [
         *lines,
         "",
-        "Seconds are of training steps on one thread of a shared CPU; no GPU was used. The",
-        "validation loss is that of a body of which one other clip was learnt from. Commands:",
+        "Seconds: duration of training on one thread of a shared CPU; no GPU was used. One other",
+        "clip of the person in the validation clip is a training clip. Commands:",
         "",
         *(f"    {line}" for line in COMMANDS),
     ]
 
 
-def measured(table: pd.DataFrame) -> list[str]:
-    """Return the rows of the ablation's table that concern the prior."""
+def result_lines(table: pd.DataFrame) -> list[str]:
+    """Return the rows for the prior in the table of the ablation."""
     columns = ("fid_learnt", "precision_learnt", "recall_learnt", "fid", "to_real_mm")
     lines = [
         "",
-        "Measured by `python notebooks/ablations/mas.py` (± over halves of the draws and sides):",
+        "Scores (`python notebooks/ablations/mas.py`; FID: Fréchet inception distance; ±: standard",
+        "deviation over random halves of the draws and random views). Lower is better, except for",
+        "precision and recall.",
         "",
-        "| | FID, learnt clips | P | R | FID, held-out clips | 3D to held-out, mm |",
+        "| | FID | precision | recall | FID, test clips | distance to 3D test clips, mm |",
         "|---|---|---|---|---|---|",
     ]
     for _, row in table[table["name"].isin(ROWS)].iterrows():

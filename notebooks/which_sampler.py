@@ -41,9 +41,9 @@ def main() -> None:
     parser.add_argument("--grid", type=Path, help="Folder of a finished comparison to store.")
     grid = parser.parse_args().grid
     if grid is not None:
-        found = Comparison.load(grid)
-        command = f"probmotion compare all --quick --workers 2 --seeds {found.plan.seeds}"
-        save_measurements(found, command)
+        comparison = Comparison.load(grid)
+        command = f"probmotion compare all --quick --workers 2 --seeds {comparison.plan.seeds}"
+        save_measurements(comparison, command)
     advices = {name: advise(name) for name in dict.fromkeys(measured().rows["problem"])}
     tables = {
         "advice": "\n".join(advice_table(advices)),

@@ -1,4 +1,4 @@
-"""One posterior over 3D skeletal motion, many samplers."""
+"""Sampling from posterior distributions over 3D skeletal motion."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# Names from before the packages were regrouped. To be removed in 0.2.
+# Former names of modules; to be removed in 0.2.
 _RENAMED = {
     "load_motion": "load", "load_motions": "load_all", "save_motion": "save",
     "advice": "comparison", "bias": "calibration", "checks": "validation",

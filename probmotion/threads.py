@@ -68,7 +68,7 @@ class _Shared:
             if not self._inside:
                 self.torch_threads = torch.get_num_threads() if torch else 0
                 with ExitStack() as limits:
-                    limits.enter_context(_environment_of_one())
+                    limits.enter_context(_single_thread_environment())
                     limits.callback(_limit_linear_algebra())
                     self._limits = limits.pop_all()
             self._inside += 1
@@ -103,7 +103,7 @@ def _limit_linear_algebra() -> Callable[[], None]:
 
 
 @contextmanager
-def _environment_of_one() -> Iterator[None]:
+def _single_thread_environment() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:

@@ -1,4 +1,4 @@
-"""Samplers of motion posteriors; none imports a model."""
+"""Samplers of motion posteriors. No sampler imports a model."""
 
 import lazy_loader
 

@@ -29,7 +29,7 @@ class Density:
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
         """Return log p(θ) + log p(y | θ): ``(n, dim) → (n,)``; NaN and +∞ raise ``ValueError``."""
-        return _below_infinity(self._counted(self.posterior.log_density, theta), theta)
+        return _check_density(self._counted(self.posterior.log_density, theta), theta)
 
     def evaluate(
         self, theta: np.ndarray, generators: Sequence[np.random.Generator] | None, guided: bool
@@ -44,7 +44,7 @@ class Density:
         self.evaluations += len(theta)
         value, closest = self.posterior.evaluate(theta, generators)
         guide = self.posterior.speeds(closest) if guided else np.empty((len(theta), 0))
-        return _below_infinity(value, theta), guide
+        return _check_density(value, theta), guide
 
     def likelihood(self, theta: np.ndarray) -> np.ndarray:
         """Return log p(y | θ), ``(n, dim) → (n,)``; counted as n evaluations."""
@@ -75,7 +75,7 @@ class Density:
         return value, guide
 
 
-def _below_infinity(value: np.ndarray, theta: np.ndarray) -> np.ndarray:
+def _check_density(value: np.ndarray, theta: np.ndarray) -> np.ndarray:
     # NaN compares as false, so one comparison detects NaN and +∞.
     if not value.max() < np.inf:
         bad = int(np.flatnonzero(~(value < np.inf))[0])

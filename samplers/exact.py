@@ -47,7 +47,7 @@ class ExactSampler(IndependentSampler):
 
 
 def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable | None, str, str]:
-    """Return the closed-form posterior, or ``None`` with the reason as text and as one word."""
+    """Return the closed-form posterior, or ``None`` with the reason and a failure code."""
     prior = posterior.prior
     if posterior.truncated:
         return None, "cannot draw from a posterior with a truncated density", "truncated"
@@ -55,8 +55,8 @@ def _closed_form(posterior: MotionPosterior) -> tuple[ExactPosterior | Samplable
         try:
             return prior.exact_posterior(posterior.likelihood), "", ""
         except NotConjugate as error:
-            return None, f"needs a posterior in closed form, but {error}", "not-conjugate"
+            return None, f"requires a posterior in closed form, but {error}", "not-conjugate"
     if posterior.likelihood is None and isinstance(prior, Samplable):
         return prior, "", ""
-    reason = "needs a prior with HasExactPosterior to condition on observations, got"
+    reason = "requires a prior that implements HasExactPosterior for observations, got"
     return None, f"{reason} {type(prior).__name__}", "HasExactPosterior"

@@ -1,4 +1,4 @@
-"""Fixtures of several test folders: array libraries and real motions."""
+"""Fixtures used by several test folders: array libraries and real motions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-# No time limit per example, since the machine may be busy.
+# Set no time limit per example, since the machine may be busy.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 
@@ -96,7 +96,7 @@ class Library:
     ids="-".join,
 )
 def library(request: pytest.FixtureRequest) -> Iterator[Library]:
-    """NumPy, torch, JAX and array-api-strict in double and single precision."""
+    """Provide NumPy, torch, JAX and array-api-strict in double and single precision."""
     name, dtype = request.param
     if name == "jax":
         import jax
@@ -109,7 +109,7 @@ def library(request: pytest.FixtureRequest) -> Iterator[Library]:
 
 @pytest.fixture(params=["torch", "jax"])
 def differentiable(request: pytest.FixtureRequest) -> Iterator[Library]:
-    """Libraries with automatic differentiation, in double precision."""
+    """Provide libraries with automatic differentiation in double precision."""
     import jax
 
     with jax.enable_x64(True):

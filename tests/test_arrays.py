@@ -1,4 +1,4 @@
-"""Array helpers: agreement of the libraries."""
+"""Array helpers: agreement between array libraries."""
 
 import numpy as np
 import pytest

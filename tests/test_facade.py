@@ -11,7 +11,7 @@ import probmotion as pm
 
 
 @pytest.mark.parametrize("old", list(pm._RENAMED))
-def test_renamed_names_name_their_replacement(old):
+def test_errors_for_renamed_names_state_the_new_name(old):
     new = f"probmotion.{pm._RENAMED[old]}"
     with pytest.raises(AttributeError, match=rf"^probmotion\.{old} is now {new}$"):
         getattr(pm, old)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_PACKAGES = 36
+MAX_PACKAGES = 36
 # Top-level packages and their modules outside any subpackage.
 LOOSE = {
     "probmotion": {"arrays", "citations", "files", "seeds", "threads", "validation"},
@@ -106,7 +106,7 @@ def imports_between(graph: Graph, first: str, second: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def graph() -> Graph:
-    """Imported modules of every module."""
+    """Return the imported modules of every module."""
     modules = {
         module: {
             target
@@ -142,7 +142,7 @@ def test_loose_modules_import_only_each_other(graph: Graph) -> None:
 
 def test_number_and_size_of_packages_are_limited() -> None:
     homes = [package_of(module) for module in MODULES]
-    assert len(set(homes)) <= MOST_PACKAGES
+    assert len(set(homes)) <= MAX_PACKAGES
     for top, allowed in LOOSE.items():
         loose = {module.rpartition(".")[2] for module in MODULES if package_of(module) == top}
         assert loose == allowed

@@ -13,7 +13,7 @@ ADDRESSES: list[tuple[Any, ...]] = [
     (), (0,), (1,), ("0",), ("1",), ("chain",), ("draw",), ("chain", 0), ("chain", 1), (0, "chain"),
     ("draw", 0), ("draw", 0, 0), ("draw", 0, 1), ("draw", 1, 0), ("draw", 10), ("draw", "10"),
     (1, 0), (0, 1), (0, 0), ("", "chain"),
-    # A string must differ from its checksum, and a tag from a name.
+    # A string differs from its CRC-32, also if the type tag 1 precedes it.
     (zlib.crc32(b"chain"),), (1, zlib.crc32(b"chain")),
 ]  # fmt: skip
 
@@ -51,25 +51,25 @@ def test_torch_and_jax_generators_are_addressed_by_path():
         [torch.randn(3, generator=seeds.torch_generator(0, "chain", k)) for k in (1, 1, 2)],
         [jax.random.key_data(seeds.jax_key(0, "chain", k)) for k in (1, 1, 2)],
     ):
-        first, same, other = map(np.asarray, numbers)
-        np.testing.assert_array_equal(first, same)
+        first, repeated, other = map(np.asarray, numbers)
+        np.testing.assert_array_equal(first, repeated)
         assert (first != other).any()
 
 
 def test_draws_do_not_depend_on_their_batch():
     draws = [(chain, draw) for chain in range(2) for draw in range(4)]
-    together = seeds.NormalStreams.of_draws(9, draws)
-    first, uniform, second = together.normal(3, 2), together.uniform(5), together.normal(4)
+    all_draws = seeds.NormalStreams.of_draws(9, draws)
+    first, uniform, second = all_draws.normal(3, 2), all_draws.uniform(5), all_draws.normal(4)
     assert 0 <= uniform.min() <= uniform.max() < 1
     for batch in ([(1, 2)], [(1, 3), (0, 0), (1, 2)], draws[::-1]):
-        apart = seeds.NormalStreams.of_draws(9, batch)
+        streams = seeds.NormalStreams.of_draws(9, batch)
         rows = [draws.index(draw) for draw in batch]
-        # A generator's methods take the size with the number of draws in front.
-        np.testing.assert_array_equal(apart.standard_normal((len(batch), 3, 2)), first[rows])
-        np.testing.assert_array_equal(apart.random((len(batch), 5)), uniform[rows])
-        np.testing.assert_array_equal(apart.normal(4), second[rows])
+        # Methods of a generator take the full size, whose first axis is the draws.
+        np.testing.assert_array_equal(streams.standard_normal((len(batch), 3, 2)), first[rows])
+        np.testing.assert_array_equal(streams.random((len(batch), 5)), uniform[rows])
+        np.testing.assert_array_equal(streams.normal(4), second[rows])
     with pytest.raises(ValueError, match="size must begin with the number of draws, 8, got"):
-        together.standard_normal((3, 2))
+        all_draws.standard_normal((3, 2))
 
 
 @pytest.mark.parametrize("buffered", [1, 2])

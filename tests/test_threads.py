@@ -83,8 +83,8 @@ def test_overlapping_threads_restore_all_limits(workers, first_out, known):
     assert limits() == before
     assert [worker.run(limits) for worker in workers if known] == before_each
     assert [worker.run(torch.get_num_threads) for worker in workers] == [2, 2]
-    with ThreadPoolExecutor(1) as later:
-        assert later.submit(torch.get_num_threads).result() == 2
+    with ThreadPoolExecutor(1) as executor:
+        assert executor.submit(torch.get_num_threads).result() == 2
 
 
 def test_per_thread_limits_are_restored(workers):

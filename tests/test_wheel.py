@@ -36,16 +36,16 @@ def wheel(tmp_path_factory) -> Path:
     for name in PACKAGES:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     run("-m", "build", "--wheel", "--no-isolation", "--outdir", out, source)
-    (built,) = out.glob("*.whl")
-    return built
+    (path,) = out.glob("*.whl")
+    return path
 
 
 def test_wheel_contains_every_module_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as archive:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     modules = {
-        f"{place}/{path.relative_to(ROOT / name).as_posix()}"
-        for name, place in PACKAGES.items()
+        f"{target}/{path.relative_to(ROOT / name).as_posix()}"
+        for name, target in PACKAGES.items()
         for path in (ROOT / name).rglob("*.py*")
         if path.suffix in (".py", ".pyi")
     }

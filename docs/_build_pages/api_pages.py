@@ -13,7 +13,7 @@ _TITLE = "API reference"
 
 
 @cache
-def rooms() -> list[str]:
+def packages() -> list[str]:
     """Return the names of all packages of probmotion, from the folders."""
     root = Path(probmotion.__file__).parent
     names = []
@@ -28,36 +28,36 @@ def rooms() -> list[str]:
     return names
 
 
-def _home(room: str, name: str) -> str:
+def _documenting_package(package: str, name: str) -> str:
     """Return the package whose page documents a name: that of the defining module."""
-    value = getattr(importlib.import_module(room), name)
-    module = getattr(value, "__module__", None) or room
-    return module.rpartition(".")[0] if module not in rooms() else module
+    value = getattr(importlib.import_module(package), name)
+    module = getattr(value, "__module__", None) or package
+    return module.rpartition(".")[0] if module not in packages() else module
 
 
-def _directive(room: str, name: str) -> str:
-    value = getattr(importlib.import_module(room), name)
-    if _home(room, name) != room:
+def _directive(package: str, name: str) -> str:
+    value = getattr(importlib.import_module(package), name)
+    if _documenting_package(package, name) != package:
         return f"- :py:obj:`{name} <{value.__module__}.{name}>`\n"
     if inspect.isclass(value):
         return f".. autoclass:: {value.__module__}.{name}\n   :members:\n   :show-inheritance:\n"
     if callable(value):
         return f".. autofunction:: {value.__module__}.{name}\n"
-    return f".. py:data:: {room}.{name}\n"
+    return f".. py:data:: {package}.{name}\n"
 
 
-def _page(room: str) -> str:
-    module = importlib.import_module(room)
+def _page(package: str) -> str:
+    module = importlib.import_module(package)
     names = [
         name
         for name in sorted(module.__all__, key=str.lower)
         if not inspect.ismodule(getattr(module, name))
     ]
-    lines = [f"``{room}``", "=" * (len(room) + 4), "", (module.__doc__ or "").strip(), ""]
+    lines = [f"``{package}``", "=" * (len(package) + 4), "", (module.__doc__ or "").strip(), ""]
     # Links to names documented by other packages come first.
-    here = [name for name in names if _home(room, name) == room]
-    lines += [_directive(room, name).rstrip() for name in names if name not in here]
-    lines += ["", *(_directive(room, name) for name in here)]
+    own = [name for name in names if _documenting_package(package, name) == package]
+    lines += [_directive(package, name).rstrip() for name in names if name not in own]
+    lines += ["", *(_directive(package, name) for name in own)]
     return "\n".join(lines)
 
 
@@ -65,15 +65,15 @@ def write(docs: Path) -> None:
     """Write ``reference/*.rst``."""
     folder = docs / "reference"
     folder.mkdir(exist_ok=True)
-    for room in rooms():
-        page = folder / f"{room}.rst"
-        text = _page(room)
+    for package in packages():
+        page = folder / f"{package}.rst"
+        text = _page(package)
         if not page.exists() or page.read_text(encoding="utf-8") != text:
             page.write_text(text, encoding="utf-8")
-    listed = "\n".join(f"   {room}" for room in rooms())
+    listed = "\n".join(f"   {package}" for package in packages())
     index = (
         f"{_TITLE}\n{'=' * len(_TITLE)}\n\n"
-        "Every public name, by package. Most work needs only ``import probmotion as pm``.\n\n"
+        "All public names by package. For most uses, ``import probmotion as pm`` suffices.\n\n"
         f".. toctree::\n   :maxdepth: 1\n\n{listed}\n"
     )
     (folder / "index.rst").write_text(index, encoding="utf-8")

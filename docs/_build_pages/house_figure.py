@@ -7,76 +7,76 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-_WINGS = {"probmotion": "#dbe9f6", "samplers": "#fde3cf", "models": "#dff0d8"}
+_COLOURS = {"probmotion": "#dbe9f6", "samplers": "#fde3cf", "models": "#dff0d8"}
 _WIDTH, _HEIGHT, _GAP = 2.9, 0.62, 0.35
 
 
-def imports_of_rooms(root: Path) -> dict[str, set[str]]:
+def package_imports(root: Path) -> dict[str, set[str]]:
     """Return the packages that each package imports, without the top level of probmotion."""
-    rooms = {
+    packages = {
         ".".join(init.parent.relative_to(root).parts)
-        for folder in _WINGS
+        for folder in _COLOURS
         for init in (root / folder).rglob("__init__.py")
     } - {"probmotion"}
-    graph: dict[str, set[str]] = {room: set() for room in rooms}
-    for room in rooms:
-        for path in (root / room.replace(".", "/")).glob("*.py"):
+    graph: dict[str, set[str]] = {package: set() for package in packages}
+    for package in packages:
+        for path in (root / package.replace(".", "/")).glob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ImportFrom) and node.module:
-                    graph[room] |= {_room_of(node.module, rooms)} - {"", room}
+                    graph[package] |= {_package_of(node.module, packages)} - {"", package}
     return graph
 
 
-def _room_of(module: str, rooms: set[str]) -> str:
+def _package_of(module: str, packages: set[str]) -> str:
     name = module
     for folder in ("samplers", "models"):
         name = name.replace(f"probmotion.{folder}", folder, 1)
-    while name and name not in rooms:
+    while name and name not in packages:
         name = name.rpartition(".")[0]
     return name
 
 
-def floors_of(graph: dict[str, set[str]]) -> dict[str, int]:
+def package_levels(graph: dict[str, set[str]]) -> dict[str, int]:
     """Return the level of each package: one above the highest package that it imports."""
-    floors: dict[str, int] = {}
+    levels: dict[str, int] = {}
 
-    def floor(room: str) -> int:
-        if room not in floors:
-            floors[room] = 1 + max((floor(below) for below in graph[room]), default=-1)
-        return floors[room]
+    def level(package: str) -> int:
+        if package not in levels:
+            levels[package] = 1 + max((level(below) for below in graph[package]), default=-1)
+        return levels[package]
 
-    for room in graph:
-        floor(room)
-    return floors
+    for package in graph:
+        level(package)
+    return levels
 
 
 def draw(path: Path) -> None:
     """Write the diagram as SVG."""
-    graph = imports_of_rooms(Path(__file__).parents[2])
-    floors = floors_of(graph)
+    graph = package_imports(Path(__file__).parents[2])
+    levels = package_levels(graph)
     rows = [
-        sorted(room for room in floors if floors[room] == floor)
-        for floor in range(max(floors.values()) + 1)
+        sorted(package for package in levels if levels[package] == level)
+        for level in range(max(levels.values()) + 1)
     ]
     figure, axes = plt.subplots(figsize=(11, 0.62 * len(rows) + 0.6))
     positions = {}
     for height, row in enumerate(rows):
-        for column, room in enumerate(row):
+        for column, package in enumerate(row):
             x = (column - (len(row) - 1) / 2) * (_WIDTH + _GAP)
-            positions[room] = (x, height * (_HEIGHT + _GAP))
-    for room, targets in graph.items():
+            positions[package] = (x, height * (_HEIGHT + _GAP))
+    for package, targets in graph.items():
         for target in targets:
-            (x, y), (a, b) = positions[room], positions[target]
+            (x, y), (a, b) = positions[package], positions[target]
             axes.annotate(
                 "",
                 (a, b + _HEIGHT / 2),
                 (x, y - _HEIGHT / 2),
                 arrowprops={"arrowstyle": "-|>", "color": "#9aa7b4", "lw": 0.5, "alpha": 0.6},
             )
-    for room, (x, y) in positions.items():
-        colour = _WINGS[room.partition(".")[0]]
+    for package, (x, y) in positions.items():
+        colour = _COLOURS[package.partition(".")[0]]
         box = {"boxstyle": "round,pad=0.35", "facecolor": colour, "edgecolor": "#56646f"}
-        label = room.removeprefix("probmotion.").replace(".", "/")
+        label = package.removeprefix("probmotion.").replace(".", "/")
         axes.text(x, y, label, ha="center", va="center", fontsize=8, bbox=box)
     xs, ys = zip(*positions.values(), strict=True)
     axes.set_xlim(min(xs) - _WIDTH, max(xs) + _WIDTH)

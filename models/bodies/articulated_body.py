@@ -67,7 +67,7 @@ class ArticulatedBody:
         return Skeleton(names, parents)
 
     @cached_property
-    def _turning(self) -> tuple[int, ...]:
+    def _rotating(self) -> tuple[int, ...]:
         """Indices of the rig's joints with children, except the root."""
         below = set(self._rig.parents) - {self.skeleton.roots[0], -1}
         return tuple(joint for joint in range(self._rig.n_joints) if joint in below)
@@ -75,7 +75,7 @@ class ArticulatedBody:
     @property
     def bones(self) -> tuple[str, ...]:
         """Names of the joints about which the B bones rotate; trunks last."""
-        return tuple(self._rig.joint_names[joint] for joint in self._turning)
+        return tuple(self._rig.joint_names[joint] for joint in self._rotating)
 
     @cached_property
     def symmetric(self) -> bool:
@@ -121,7 +121,7 @@ class ArticulatedBody:
         names, parents = self.skeleton.canonical_names, self.skeleton.parents
         animal, n_joints = is_four_legged(self.skeleton), self.skeleton.n_joints
         limits = []
-        for joint in self._turning:
+        for joint in self._rotating:
             if joint < n_joints:
                 children = [child for child, parent in self.skeleton.bones if parent == joint]
                 below = self.rest[children].mean(axis=0)
@@ -189,11 +189,11 @@ class ArticulatedBody:
         return joints[..., : self.skeleton.n_joints, :]
 
     def _rotations(
-        self, xp: Any, turned: Array, root_rotation: Array, shape: tuple[int, ...]
+        self, xp: Any, matrices: Array, root_rotation: Array, shape: tuple[int, ...]
     ) -> Array:
         """Return the rotations of the J' joints of the rig, (…, L, J', 3, 3)."""
-        identity = constant(np.eye(3), turned)
-        rotations = {joint: turned[..., at, :, :] for at, joint in enumerate(self._turning)}
+        identity = constant(np.eye(3), matrices)
+        rotations = {joint: matrices[..., at, :, :] for at, joint in enumerate(self._rotating)}
         rotations[self.skeleton.roots[0]] = root_rotation
         each = [
             xp.broadcast_to(rotations.get(joint, identity), (*shape, 3, 3))

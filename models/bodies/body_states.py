@@ -27,9 +27,9 @@ __all__ = [
 
 _GUIDE = 0.07
 """Position of a trunk's guide joint, as a fraction of the trunk's length."""
-_LONGEST = 3.0
+_MAX_BONE_LENGTH = 3.0
 """Maximum bone length, metres; longer bones suggest that the unit is not metres."""
-_SHORTEST = 1e-6
+_MIN_BONE_LENGTH = 1e-6
 """Minimum bone length, metres; the direction of shorter bones is undefined."""
 
 
@@ -78,7 +78,7 @@ class BodyStates:
             parents[joint] = len(names) - 2
         return Skeleton(names, parents)
 
-    def _rigged(self, offsets: Array) -> Array:
+    def _offsets(self, offsets: Array) -> Array:
         """Return offsets (…, J, 3), followed by those of the rig's additional joints."""
         xp = array_namespace(offsets)
         parts = [offsets]
@@ -122,7 +122,7 @@ class BodyStates:
             lengths[joint] = np.linalg.norm(bones, axis=-1).mean()
         # Fit the rotations to a body of the same size, or the joints would not coincide.
         offsets = self.of_lengths(lengths)
-        rotations = self._turns(positions, offsets)
+        rotations = self._global_rotations(positions, offsets)
         parents = self._rig.parents
         for joint, parent in self.skeleton.bones:
             if parents.count(parents[joint]) > 1:
@@ -143,7 +143,7 @@ class BodyStates:
         Positions do not determine the twist of a limb; see
         :func:`~probmotion.motion.kinematics.fit_rotations`.
         """
-        rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), self._rigged(body))
+        rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), self._offsets(body))
         rotations_6d = matrix_to_rotation_6d(rotations[:, list(self.turning)])
         root = positions[:, self.skeleton.roots[0]]
         return np.concatenate([root, rotations_6d.reshape(len(positions), -1)], axis=-1)
@@ -161,15 +161,15 @@ class BodyStates:
         index = {joint: at for at, joint in enumerate(self.turning)}
         joints = range(self._rig.n_joints)
         rotations = [matrices[..., index[j], :, :] if j in index else identity for j in joints]
-        offsets = self._rigged(constant(body, states) if isinstance(body, np.ndarray) else body)
+        offsets = self._offsets(constant(body, states) if isinstance(body, np.ndarray) else body)
         joints, _ = forward_kinematics(
             self._rig, xp.stack(rotations, axis=-3), states[..., None, :3], offsets
         )
         return joints[..., : self.skeleton.n_joints, :]
 
-    def _turns(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
+    def _global_rotations(self, positions: np.ndarray, body: np.ndarray) -> np.ndarray:
         """Return the global rotations of the J' joints of the rig, (L, J', 3, 3)."""
-        rest = self._rigged(body)
+        rest = self._offsets(body)
         rotations, _ = fit_rotations(self._rig, self._rig_positions(positions), rest)
         translation = np.zeros((len(positions), 1, 3))
         return forward_kinematics(self._rig, rotations, translation, rest)[1]
@@ -194,9 +194,9 @@ def check_bones(name: str, offsets: np.ndarray, skeleton: Skeleton) -> None:
     check_finite(name, offsets)
     lengths = np.linalg.norm(offsets, axis=-1)
     for joint, _ in skeleton.bones:
-        if not lengths[joint] > _SHORTEST or lengths[joint] > _LONGEST:
+        if not lengths[joint] > _MIN_BONE_LENGTH or lengths[joint] > _MAX_BONE_LENGTH:
             raise ValueError(
-                f"{name} must have bones longer than 0 and at most {_LONGEST:g} m, got "
+                f"{name} must have bones longer than 0 and at most {_MAX_BONE_LENGTH:g} m, got "
                 f"{lengths[joint]:.4g} m for {skeleton.joint_names[joint]}"
             )
 
@@ -224,9 +224,9 @@ def to_world(positions: Array, heading: np.ndarray, ground: np.ndarray) -> Array
     ``(…, L, J, 3), (…), (…, 2) → (…, L, J, 3)``: heading in radians, X and Z in metres.
     """
     xp = array_namespace(positions)
-    turned = turned_about_vertical(positions, heading)
+    rotated = turned_about_vertical(positions, heading)
     x, z = (constant(ground[..., axis], positions) for axis in (0, 1))
-    return turned + xp.stack([x, xp.zeros_like(x), z], axis=-1)[..., None, None, :]
+    return rotated + xp.stack([x, xp.zeros_like(x), z], axis=-1)[..., None, None, :]
 
 
 def rest_pose(skeleton: Skeleton, motions: list[np.ndarray]) -> np.ndarray:

@@ -37,15 +37,15 @@ _ANIMALS: Mapping[str, Box] = {
     "ankle": ((-1.5, 1.5), (-0.5, 0.5), (-0.5, 0.5)),
     "wrist": ((-1.8, 1.8), (-0.5, 0.5), (-0.5, 0.5)),
 }
-_SAME = {  # Joints with the limits of another joint.
+_SAME_LIMITS = {  # Joints with the limits of another joint.
     "lower_spine": "spine", "chest": "spine", "upper_neck": "neck", "lower_neck": "neck",
     "head": "neck", "nose": "neck", "palm": "wrist", "foot": "ankle",
 }  # fmt: skip
 # Hinges: sign of the Z direction in which human limbs bend, and maximum flexion in radians.
 _HINGES: Mapping[str, tuple[float, float]] = {"knee": (-1.0, 2.7), "elbow": (1.0, 2.7)}
-_SIDEWAYS = 0.5
+_HINGE_TOLERANCE = 0.5
 """Tolerance of a hinge about directions perpendicular to its axis, radians."""
-_IN_LINE = 0.15
+_COLLINEAR_ANGLE = 0.15
 """Angle below which two bones count as collinear, radians: the accuracy of poses from 2D."""
 
 
@@ -68,7 +68,7 @@ def range_of(
     if part in _HINGES:
         return _hinge(part, animal, above, below)
     table = _ANIMALS if animal else _PEOPLE
-    lower, upper = np.array(table.get(_SAME.get(part, part), _UNKNOWN)).T
+    lower, upper = np.array(table.get(_SAME_LIMITS.get(part, part), _UNKNOWN)).T
     if name.startswith("right_"):
         # A rotation vector (x, y, z) is mirrored to (x, −y, −z).
         lower, upper = np.array([lower[0], *-upper[1:]]), np.array([upper[0], *-lower[1:]])
@@ -82,17 +82,17 @@ def _hinge(
     across = np.cross(above, below)
     # Positive rotations about the axis bend the hinge further; it is straight at −bent.
     bent = float(np.arctan2(np.linalg.norm(across), above @ below))
-    least = -bent
-    if bent > _IN_LINE:
+    min_angle = -bent
+    if bent > _COLLINEAR_ANGLE:
         axis = across / np.linalg.norm(across)
     else:
         axis = np.cross(above, [0.0, 0.0, direction])
         size = float(np.linalg.norm(axis))
         # For bones along Z the direction is ambiguous: elbows bend upwards.
-        ambiguous = size < _IN_LINE * np.linalg.norm(above)
+        ambiguous = size < _COLLINEAR_ANGLE * np.linalg.norm(above)
         axis = np.array([-direction, 0.0, 0.0]) if ambiguous else axis / size
         bent = float(np.arctan2(across @ axis, above @ below))
-        least = -bent - max_flexion if animal else -bent
-    ends = np.stack([least * axis, (max_flexion - bent) * axis])
-    tolerance = _SIDEWAYS * np.sqrt(np.maximum(0.0, 1 - axis**2))
+        min_angle = -bent - max_flexion if animal else -bent
+    ends = np.stack([min_angle * axis, (max_flexion - bent) * axis])
+    tolerance = _HINGE_TOLERANCE * np.sqrt(np.maximum(0.0, 1 - axis**2))
     return ends.min(axis=0) - tolerance, ends.max(axis=0) + tolerance

@@ -41,8 +41,8 @@ class MotionTransformer(nn.Module):
             width, heads, feedforward, dropout, activation="gelu", batch_first=True
         )
         self.encoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
-        places = sinusoids(torch.arange(frames + 1), width)
-        self.register_buffer("places", places, persistent=False)
+        positions = sinusoids(torch.arange(frames + 1), width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(
         self, motions: torch.Tensor, levels: torch.Tensor, valid: torch.Tensor | None = None
@@ -53,20 +53,20 @@ class MotionTransformer(nn.Module):
         """
         first = self.level(sinusoids(levels, self.width))[:, None]
         tokens = torch.cat([first, self.enter(motions)], dim=1)
-        tokens = self.dropout(tokens + self.places[: tokens.shape[1]])
+        tokens = self.dropout(tokens + self.positions[: tokens.shape[1]])
         ignored = None
         if valid is not None:
             ignored = torch.cat([torch.zeros_like(valid[:, :1]), ~valid], dim=1)
         return self.leave(self.encoder(tokens, src_key_padding_mask=ignored)[:, 1:])
 
 
-def sinusoids(places: torch.Tensor, width: int) -> torch.Tensor:
+def sinusoids(positions: torch.Tensor, width: int) -> torch.Tensor:
     """Return the embedding of positions (Vaswani et al. 2017, section 3.5): ``(N,) → (N, width)``.
 
     Sines are at even indices, cosines at odd ones.
     """
     rates = torch.exp(
-        torch.arange(0, width, 2, device=places.device) * (-math.log(10_000.0) / width)
+        torch.arange(0, width, 2, device=positions.device) * (-math.log(10_000.0) / width)
     )
-    angles = places.to(torch.float32)[:, None] * rates
+    angles = positions.to(torch.float32)[:, None] * rates
     return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)

@@ -20,7 +20,7 @@ __all__ = ["denoise_track"]
 
 # Maximum root mean square of detections, in units of the prior's scale. Larger values indicate
 # pixels, millimetres or tracks that are not centred.
-_FARTHEST = 20.0
+_MAX_RMS = 20.0
 
 
 def denoise_track(
@@ -70,10 +70,10 @@ def denoise_track(
     seen = np.where(visible[..., None], track.keypoints, prior.standards.mean) / prior.scale
     target = noise / prior.scale
     last = prior.settings.schedule.alpha_bar[-1]
-    most = math.sqrt((1 - last) / last)
-    if target > most:
+    limit = math.sqrt((1 - last) / last)
+    if target > limit:
         raise ValueError(
-            f"noise must be at most {most * prior.scale:.3g} m, the prior's highest level, got "
+            f"noise must be at most {limit * prior.scale:.3g} m, the prior's highest level, got "
             f"{noise:g}"
         )
     clean = seen
@@ -81,12 +81,12 @@ def denoise_track(
     for sigma in levels:
         filled = np.where(visible[..., None], seen, clean)
         clean = _denoise(prior, filled, float(sigma))
-    clean = _shrunk_towards(clean, seen, visible, target)
+    clean = _limit_deviation(clean, seen, visible, target)
     confidence = np.where(visible, 1.0, track.confidence)
     return replace(track, keypoints=clean * prior.scale, confidence=confidence)
 
 
-def _shrunk_towards(
+def _limit_deviation(
     clean: np.ndarray, seen: np.ndarray, visible: np.ndarray, sigma: float
 ) -> np.ndarray:
     """Return the estimate, moved towards detections where it deviates by more than σ.
@@ -144,8 +144,8 @@ def _check_track(
             f"{name} must have a joint with a confidence of {threshold:g} or more, got none"
         )
     distance = math.sqrt(((track.keypoints - prior.standards.mean)[visible] ** 2).mean())
-    if distance > _FARTHEST * prior.scale:
+    if distance > _MAX_RMS * prior.scale:
         raise ValueError(
             f"{name} must be in metres relative to the root, at most "
-            f"{_FARTHEST * prior.scale:.3g} m in root mean square, got {distance:.3g}"
+            f"{_MAX_RMS * prior.scale:.3g} m in root mean square, got {distance:.3g}"
         )

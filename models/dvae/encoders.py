@@ -66,7 +66,7 @@ class _JointPosterior:
         return torch.tanh(hidden), cell
 
     def posterior(
-        self, state: tuple[torch.Tensor, torch.Tensor], frame: int, moved: State
+        self, state: tuple[torch.Tensor, torch.Tensor], frame: int, generative_state: State
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log scale of q(z_t | …) given the recurrent state and y_{t:T}."""
         inputs = torch.cat([state[0], self.read[:, frame - 1]], dim=-1)
@@ -110,12 +110,14 @@ class _TrackingPosterior:
     def start(self, initial: torch.Tensor) -> None:
         """Return None: the encoder has no recurrent state."""
 
-    def posterior(self, state: None, frame: int, moved: State) -> tuple[torch.Tensor, torch.Tensor]:
+    def posterior(
+        self, state: None, frame: int, generative_state: State
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log scale of q(z_t | …)."""
-        trust = self.inputs.trust[:, frame]
-        innovation = (self.inputs.joints[:, frame] - self.inputs.pose(moved.motion)) / _STEP
+        previous, trust = generative_state, self.inputs.trust[:, frame]
+        innovation = (self.inputs.joints[:, frame] - self.inputs.pose(previous.motion)) / _STEP
         innovation = torch.where(trust[..., None] > 0, innovation, 0.0).flatten(-2)
-        parts = [moved.hidden, self.read[:, frame - 1], moved.motion, innovation, trust]
+        parts = [previous.hidden, self.read[:, frame - 1], previous.motion, innovation, trust]
         return mean_and_log_scale(self.encoder.latents(torch.cat(parts, dim=-1)))
 
     def step(self, state: None, latent: torch.Tensor) -> None:

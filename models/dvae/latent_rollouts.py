@@ -27,13 +27,13 @@ class Generative(Protocol):
 class Inference(Protocol):
     """Inference model q(z_t | z_{1:t−1}, y_{t:T}, x₀) with a recurrent state.
 
-    ``posterior`` returns mean and log scale of z_t at ``frame`` t ≥ 1; ``moved`` is the generative
-    state of frame t − 1.
+    ``posterior`` returns mean and log scale of z_t at ``frame`` t ≥ 1; ``generative_state`` is that
+    of frame t − 1.
     """
 
     def start(self, initial: torch.Tensor) -> Any: ...
     def posterior(
-        self, state: Any, frame: int, moved: Any
+        self, state: Any, frame: int, generative_state: Any
     ) -> tuple[torch.Tensor, torch.Tensor]: ...
     def step(self, state: Any, latent: torch.Tensor) -> Any: ...
 

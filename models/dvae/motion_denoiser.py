@@ -34,8 +34,8 @@ __all__ = ["KIND", "MotionDenoiser", "NoisyMotion"]
 KIND = "motion-denoiser"
 
 _ROWS = 64  # Maximum number of windows per batch of draws.
-_AVERAGED = 8  # Draws averaged by `NoisyMotion.predict`.
-_MEANS = 64  # Draws per window for the mean of q.
+_AVERAGED_DRAWS = 8  # Draws averaged by `NoisyMotion.predict`.
+_DRAWS_FOR_MEANS = 64  # Draws per window for the mean of q.
 
 
 class MotionDenoiser:
@@ -65,9 +65,9 @@ class MotionDenoiser:
         checkpoint = load_checkpoint(source, KIND)
         with valid_settings(source, "denoiser"):
             digest = checkpoint.settings["network"]["prior_weights"]
-        if digest != weights_digest(prior.model):
+        if digest != (expected := weights_digest(prior.model)):
             raise CheckpointError(
-                f"{source} must be a denoiser of the given prior, got one of another"
+                f"{source} must be a denoiser of prior {expected[:8]}, got one of {digest[:8]}"
             )
         networks = DenoisingNetworks(prior)
         load_weights(networks, checkpoint.tensors)
@@ -105,7 +105,7 @@ class MotionDenoiser:
         same = prior.model is self.prior.model
         if not same and weights_digest(prior.model) != weights_digest(self.prior.model):
             raise ValueError(
-                "prior must be the one that the denoiser was trained with, got other weights"
+                "prior must be the one that the denoiser was trained with, got different weights"
             )
         freedom = degrees_of_freedom
         if freedom is None:
@@ -184,8 +184,8 @@ class NoisyMotion:
         decoded = self._by_window(self._inferred_from(zeros).positions)[0]
         if not average:
             return self.stitching.mean(decoded)
-        windows = self.windows.repeated(_AVERAGED)
-        inferred = self.denoiser.infer(windows, *self._numbers(rng, _AVERAGED))
+        windows = self.windows.repeated(_AVERAGED_DRAWS)
+        inferred = self.denoiser.infer(windows, *self._numbers(rng, _AVERAGED_DRAWS))
         square = self.denoiser.prior.joint_scale**2
         v = self.denoiser.drawn_variance(windows, inferred, rng)
         combined = (v * inferred.positions + square * windows.joints) / (v + square)
@@ -215,8 +215,8 @@ class NoisyMotion:
 
     @torch.no_grad()
     def _mean_of_windows(self) -> np.ndarray:
-        numbers = self._numbers(seeds.generator(0, "means of windows"), _MEANS)
-        inferred = self.denoiser.infer(self.windows.repeated(_MEANS), *numbers)
+        numbers = self._numbers(seeds.generator(0, "means of windows"), _DRAWS_FOR_MEANS)
+        inferred = self.denoiser.infer(self.windows.repeated(_DRAWS_FOR_MEANS), *numbers)
         return self._by_window(inferred.positions).mean(axis=0)
 
     def _theta(self, inferred: InferenceDraw) -> np.ndarray:

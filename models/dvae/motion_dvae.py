@@ -39,7 +39,7 @@ __all__ = ["KIND", "MotionDVAE", "description_of"]
 
 KIND = "motion-dvae"
 
-_PLACE = 4  # Number of coordinates of ground position and heading.
+_PLACEMENT_DIM = 4  # Number of coordinates of ground position and heading.
 _CHUNK = 256  # Number of motions decoded at once.
 
 
@@ -167,7 +167,7 @@ class MotionDVAE(StandardNormalPrior):
     @property
     def dim(self) -> int:
         """Length of θ."""
-        return _PLACE + self.rank + (self.frames - 1) * self.settings.latent
+        return _PLACEMENT_DIM + self.rank + (self.frames - 1) * self.settings.latent
 
     @property
     def joint_scale(self) -> float:
@@ -197,8 +197,8 @@ class MotionDVAE(StandardNormalPrior):
         model = self.model if theta.dtype == torch.float32 else self._double
         ground = self.spread * theta[:, :2]
         heading = torch.atan2(theta[:, 3], theta[:, 2])
-        start = model.first_states(theta[:, _PLACE : _PLACE + self.rank])
-        noise = theta[:, _PLACE + self.rank :].unflatten(1, (self.frames - 1, -1))
+        start = model.first_states(theta[:, _PLACEMENT_DIM : _PLACEMENT_DIM + self.rank])
+        noise = theta[:, _PLACEMENT_DIM + self.rank :].unflatten(1, (self.frames - 1, -1))
         rolled = rollout(model.generative, model.standardised(start), noise)
         states = torch.cat([start[:, None], model.decoded(rolled)], dim=1)
         result = turned_about_vertical(self.states.positions(states, self.body), heading)

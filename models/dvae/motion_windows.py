@@ -37,9 +37,9 @@ class MotionWindows:
     def __init__(self, clips: Sequence[Motion], states: BodyStates, frames: int) -> None:
         long = [clip for clip in clips if clip.frames >= frames]
         if not long:
-            most = max((clip.frames for clip in clips), default=0)
+            longest = max((clip.frames for clip in clips), default=0)
             raise ValueError(
-                f"clips must contain one of at least {frames} frames, got at most {most}"
+                f"clips must contain one of at least {frames} frames, got at most {longest}"
             )
         self.fps = long[0].fps
         for clip in long:
@@ -71,7 +71,7 @@ class MotionWindows:
         for clip, start, factor in zip(clips, self._start[numbers], tempo, strict=True):
             states = self._states[clip]
             last = min(start + factor * (self.frames - 1), len(states) - 1)
-            segments.append(_between(states, np.linspace(start, last, self.frames)))
+            segments.append(_interpolated(states, np.linspace(start, last, self.frames)))
         return Windows(canonical_windows(np.stack(segments)), self._bodies[clips])
 
     def spread(self, n: int) -> Windows:
@@ -88,7 +88,7 @@ class MotionWindows:
         return Windows(canonical_windows(np.stack(segments)), self._bodies[clips])
 
 
-def _between(states: np.ndarray, times: np.ndarray) -> np.ndarray:
+def _interpolated(states: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Interpolate states (T, D) linearly at fractional frames."""
     before = np.minimum(times.astype(int), len(states) - 2)
     fraction = (times - before)[:, None]
@@ -104,11 +104,11 @@ def canonical_windows(states: np.ndarray) -> np.ndarray:
     back[:, 0, 1, 1] = 1
     back[:, 0, 0, 0] = back[:, 0, 2, 2] = cosine
     back[:, 0, 0, 2], back[:, 0, 2, 0] = -sine, sine
-    moved = states.copy()
-    moved[..., [0, 2]] -= states[:, :1, [0, 2]]
-    moved[..., :3] = (back @ moved[..., :3, None])[..., 0]
-    moved[..., 3:9] = matrix_to_rotation_6d(back @ root)
-    return moved
+    canonical = states.copy()
+    canonical[..., [0, 2]] -= states[:, :1, [0, 2]]
+    canonical[..., :3] = (back @ canonical[..., :3, None])[..., 0]
+    canonical[..., 3:9] = matrix_to_rotation_6d(back @ root)
+    return canonical
 
 
 class WindowTrainee:
@@ -129,8 +129,8 @@ class WindowTrainee:
         self.windows = MotionWindows(clips, states, frames)
         self.held_out = MotionWindows(validation, states, frames)
         if self.held_out.fps != self.windows.fps:
-            wanted, got = self.windows.fps, self.held_out.fps
-            raise ValueError(f"validation must have {wanted:g} frames per second, got {got:g}")
+            expected, got = self.windows.fps, self.held_out.fps
+            raise ValueError(f"validation must have {expected:g} frames per second, got {got:g}")
         self.annealing, self._seed = annealing, seed
         self._full_weight = self._weight = weight
 

@@ -69,8 +69,8 @@ class NoisyWindows:
 
     def in_frame(self, heading: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
         """Return joints in a canonical frame, (B, L, J, 3); undefined where occluded."""
-        moved = self.joints - on_ground(ground)[:, None, None, :]
-        return turned_about_vertical(moved, -heading)
+        centred = self.joints - on_ground(ground)[:, None, None, :]
+        return turned_about_vertical(centred, -heading)
 
 
 def on_ground(ground: torch.Tensor) -> torch.Tensor:
@@ -98,7 +98,7 @@ def rough_placement(
     left, right = (list(side) for side in zip(*skeleton.mirrored_pairs, strict=True))
     paired = seen[:, :, left] & seen[:, :, right]
     offsets = np.where(paired[..., None], joints[:, :, left] - joints[:, :, right], 0.0).sum(axis=2)
-    across = _over_first(offsets, paired.any(axis=2)).sum(axis=1)
+    across = _first_valid(offsets, paired.any(axis=2)).sum(axis=1)
     heading = np.arctan2(-across[:, 2], across[:, 0])
     root = skeleton.roots[0]
     count = seen.sum(axis=2)
@@ -106,12 +106,12 @@ def rough_placement(
     root_seen = seen[:, :, root].sum(axis=1) > 0
     points = np.where(root_seen[:, None, None], np.nan_to_num(joints[:, :, root]), visible)
     valid = np.where(root_seen[:, None], seen[:, :, root], count > 0)
-    first = _over_first(np.ones_like(valid, dtype=float)[..., None], valid)
+    first = _first_valid(np.ones_like(valid, dtype=float)[..., None], valid)
     ground = (first * points).sum(axis=1) / first.sum(axis=1)
     return heading, ground[:, [0, 2]]
 
 
-def _over_first(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _first_valid(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return values (B, L, …), set to 0 outside the first valid frames of each window."""
     order = np.cumsum(valid, axis=1)
     return np.where((valid & (order <= _PLACEMENT_FRAMES))[..., None], values, 0.0)

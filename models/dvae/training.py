@@ -90,10 +90,10 @@ class DVAETrainee(WindowTrainee):
         joints = self.states.positions(states, windows.bodies)
         deviation = states.std(axis=(0, 1))
         # Bound deviations below, or standardisation would amplify nearly constant dimensions.
-        least = 0.05 * float(np.median(deviation)) or 1.0
+        minimum = 0.05 * float(np.median(deviation)) or 1.0
         statistics = {
             "state_mean": states.mean(axis=(0, 1)),
-            "state_deviation": np.maximum(deviation, least),
+            "state_deviation": np.maximum(deviation, minimum),
             "joint_mean": joints.mean(axis=(0, 1)),
             "joint_deviation": np.maximum(joints.std(axis=(0, 1)), 0.05),
             "initial_mean": states[:, 0].mean(axis=0),

@@ -100,12 +100,12 @@ def lifting_losses(
     points = raise_points(poses, depth, zero, elevation, distance)
     projections = project_points(points, azimuth, elevation[order], distance)
     depth_again, elevation_again = network(projections)
-    again = raise_points(projections, depth_again, azimuth, elevation_again, distance)
-    final = project_points(again, zero, elevation, distance)
+    lifted_again = raise_points(projections, depth_again, azimuth, elevation_again, distance)
+    final = project_points(lifted_again, zero, elevation, distance)
     lengths = torch.linalg.norm(points[:, bones[:, 0]] - points[:, bones[:, 1]], dim=-1)
     return {
         "likelihood": -flow.log_density(projections).mean() / (2 * len(flow.joints)),
-        "points": ((again - points) ** 2).sum(dim=-1).mean(),
+        "points": ((lifted_again - points) ** 2).sum(dim=-1).mean(),
         "picture": ((final - poses) ** 2).sum(dim=-1).mean(),
         "bones": ((lengths / sizes - 1) ** 2).mean(),
     }
@@ -134,7 +134,8 @@ class LifterTrainee(PoseTrainee):
     ) -> None:
         super().__init__(tracks, validation, size, **options)
         if flow.skeleton != self.skeleton:
-            raise ValueError("flow must have the same skeleton as tracks, got another")
+            names = ", ".join(flow.skeleton.joint_names)
+            raise ValueError(f"flow must have the skeleton of tracks, got joints {names}")
         self.weights = LossWeights() if weights is None else weights
         self.sizes = bone_sizes(self.skeleton, self.poses.astype(np.float64))
         root = self.skeleton.roots[0]

@@ -27,7 +27,7 @@ __all__ = ["KIND", "CouplingFlow", "FlowSettings", "PoseFlow"]
 
 KIND = "pose-flow"
 # Maximum absolute log scale of a coupling, for stability.
-_MOST = 1.5
+_MAX_LOG_SCALE = 1.5
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class CouplingFlow(nn.Module):
         for order, network in zip(self.orders, self.networks, strict=True):
             fixed, changed = x[:, order].split([self.fixed, x.shape[1] - self.fixed], dim=1)
             log_scale, shift = network(fixed).chunk(2, dim=1)
-            log_scale = _MOST * torch.tanh(log_scale / _MOST)
+            log_scale = _MAX_LOG_SCALE * torch.tanh(log_scale / _MAX_LOG_SCALE)
             x = torch.cat([fixed, changed * log_scale.exp() + shift], dim=1)
             log_determinant = log_determinant + log_scale.sum(dim=1)
         return x, log_determinant
@@ -153,7 +153,7 @@ class PoseFlow(nn.Module):
         variance, basis = np.linalg.eigh(covariance)
         variance, basis = variance[::-1], basis[:, ::-1]
         if not variance[-1] > 1e-12:
-            raise ValueError("blur must be above 0 for poses in a subspace, got 0")
+            raise ValueError(f"blur must be larger for poses in a subspace, got {settings.blur:g}")
         explained = np.cumsum(variance) / variance.sum()
         components = max(2, min(len(variance), 1 + int((explained < settings.share).sum())))
         flow = cls(skeleton, settings, components, seed)

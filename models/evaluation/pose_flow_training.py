@@ -15,10 +15,10 @@ from probmotion.models.evaluation.pose_flow import KIND, FlowSettings, PoseFlow
 from probmotion.models.training.track_batches import describe_tracks
 from probmotion.motion.motion import KeypointTrack
 
-__all__ = ["PoseFlowTrainee", "PoseTrainee", "whole_poses"]
+__all__ = ["PoseFlowTrainee", "PoseTrainee", "fully_visible_poses"]
 
 
-def whole_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray:
+def fully_visible_poses(tracks: Sequence[KeypointTrack], threshold: float) -> np.ndarray:
     """Return the fully visible poses and their mirror images, root-centred: (N, J, 2), metres.
 
     In a fully visible pose, all joints have a confidence of ``threshold`` or more. Raises
@@ -71,11 +71,12 @@ class PoseTrainee:
         seed: int = 0,
     ) -> None:
         self.size = size
-        self.poses = whole_poses(tracks, threshold).astype(np.float32)
-        self.held_out = whole_poses(validation, threshold).astype(np.float32)
+        self.poses = fully_visible_poses(tracks, threshold).astype(np.float32)
+        self.held_out = fully_visible_poses(validation, threshold).astype(np.float32)
         self.skeleton = tracks[0].skeleton
         if validation[0].skeleton != self.skeleton:
-            raise ValueError("validation must have the same skeleton as tracks, got another")
+            names = ", ".join(validation[0].skeleton.joint_names)
+            raise ValueError(f"validation must have the skeleton of tracks, got joints {names}")
         self._seed = seed
         self.settings: Mapping[str, Any] = {
             "size": asdict(size),

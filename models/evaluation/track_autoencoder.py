@@ -78,14 +78,14 @@ class TrackEncoder(nn.Module):
         self.transformer = size.transformer()
         self.mean = nn.Linear(size.width, size.latent)
         self.log_variance = nn.Linear(size.width, size.latent)
-        places = sinusoids(torch.arange(size.frames), size.width)
-        self.register_buffer("places", places, persistent=False)
+        positions = sinusoids(torch.arange(size.frames), size.width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(
         self, motions: torch.Tensor, valid: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log variance: ``(N, L, 2J), (N, L) → (N, latent), (N, latent)``."""
-        frames = self.enter(motions) + self.places[: motions.shape[1]]
+        frames = self.enter(motions) + self.positions[: motions.shape[1]]
         learnt = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
         padding = torch.cat([torch.zeros_like(valid[:, :2]), ~valid], dim=1)
         tokens = torch.cat([learnt, frames], dim=1)
@@ -104,12 +104,12 @@ class TrackDecoder(nn.Module):
         self.enter = nn.Linear(size.latent, size.width)
         self.transformer = size.transformer()
         self.leave = nn.Linear(size.width, 2 * n_joints)
-        places = sinusoids(torch.arange(size.frames), size.width)
-        self.register_buffer("places", places, persistent=False)
+        positions = sinusoids(torch.arange(size.frames), size.width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(self, latents: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
         """Return motions: ``(N, latent), (N, L) → (N, L, 2J)``."""
-        tokens = self.enter(latents)[:, None] + self.places[: valid.shape[1]]
+        tokens = self.enter(latents)[:, None] + self.positions[: valid.shape[1]]
         return self.leave(self.transformer(tokens, src_key_padding_mask=~valid))
 
 

@@ -55,7 +55,7 @@ class ReducedLatent(StandardNormalPrior):
         self.skeleton: Skeleton = prior.skeleton
         self.frames: int = prior.frames
         self.fps: float = prior.fps
-        # Hints for obtaining missing protocols, shown if a sampler is not applicable.
+        # Remedies for protocols that the prior lacks, shown if a sampler is not applicable.
         self.stand_ins: Mapping[str, str] = getattr(prior, "stand_ins", {})
         values, vectors = np.linalg.eigh(_mean_square(prior, seeds.generator(seed, "directions")))
         leading = np.argsort(values)[::-1][:k]

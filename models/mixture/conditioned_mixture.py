@@ -17,7 +17,7 @@ from probmotion.arrays import Array
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.models.mixture.posterior import MixturePosterior
-from probmotion.models.mixture.turned_mixture import turning_coefficients
+from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 from probmotion.posteriors.protocols import Likelihood, NotConjugate
 from probmotion.validation import check_shape
 
@@ -51,7 +51,7 @@ class ConditionedMixture:
         self.scale = prior.scale
         self.dim = prior.means[0].size
         self._posterior = prior.exact_posterior(likelihood)
-        self._turns = turning_coefficients(prior.yaws)
+        self._turns = rotation_coefficients(prior.yaws)
 
     def motion(self, theta: Array) -> Array:
         """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
@@ -99,15 +99,15 @@ class ConditionedMixture:
         K, width, _, F, _ = fields.shape
         turns = self._turns
         flat = fields.reshape(K, width * 3, F * 3)
-        moved = np.einsum("fij,knefj->knefi", shrink @ information, fields, optimize=True)
-        gram = (flat @ moved.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
+        weighted = np.einsum("fij,knefj->knefi", shrink @ information, fields, optimize=True)
+        gram = (flat @ weighted.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
         gram = np.einsum("kicjd,ac,ad->kaij", gram, turns, turns, optimize=True)
         # The arrays below have one row per draw.
         shift = self._posterior.shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (
             seen @ axes
         )
-        pull = np.einsum("fij,bfj->bfi", shrink, shift)
-        products = pull.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T
+        shrunk_shift = np.einsum("fij,bfj->bfi", shrink, shift)
+        products = shrunk_shift.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T
         linear = products.reshape(len(seen), K, width, 3) @ turns.T
         return self._recombine(linear.swapaxes(2, 3), gram, shrink, shift)
 

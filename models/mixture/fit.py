@@ -54,7 +54,7 @@ def fit_styles(
                 f"style {name} must have at least {rank + 2} windows for rank {rank}, got "
                 f"{len(members)}; use more or longer clips, fewer styles or a lower rank"
             )
-        members = _turned_to_mean(members)
+        members = _rotated_to_mean(members)
         mean = members.mean(axis=0)
         centred = (members - mean).reshape(len(members), -1)
         _, size, axes = np.linalg.svd(centred, full_matrices=False)
@@ -146,7 +146,7 @@ def _common_heading(windows: np.ndarray, motion: Motion) -> np.ndarray:
     return turned_about_vertical(windows, np.arctan2(-side[:, 2], -side[:, 0]))
 
 
-def _turned_to_mean(windows: np.ndarray, sweeps: int = 5) -> np.ndarray:
+def _rotated_to_mean(windows: np.ndarray, sweeps: int = 5) -> np.ndarray:
     for _ in range(sweeps):
         windows = turn_to(windows, windows.mean(axis=0))
     return windows

@@ -19,7 +19,7 @@ from probmotion.arrays import Array, array_namespace
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.fit import fit_styles
 from probmotion.models.mixture.posterior import MixturePosterior
-from probmotion.models.mixture.turned_mixture import TurnedMixture, turning_fields
+from probmotion.models.mixture.rotated_mixture import RotatedMixture, rotation_fields
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Likelihood
@@ -73,7 +73,7 @@ class GaussianMixtureMotion:
     _posteriors: WeakKeyDictionary = field(
         init=False, repr=False, default_factory=WeakKeyDictionary
     )
-    _views: dict[bytes, TurnedMixture] = field(init=False, repr=False, default_factory=dict)
+    _views: dict[bytes, RotatedMixture] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         J = self.skeleton.n_joints
@@ -182,8 +182,8 @@ class GaussianMixtureMotion:
 
     @cached_property
     def base_fields(self) -> np.ndarray:
-        """Base fields (``turned_mixture``) of means and factors, metres, (K, 1 + r, 3, L·J, 3)."""
-        return turning_fields(self._fields)
+        """Base fields (``rotated_mixture``) of means and factors, metres, (K, 1 + r, 3, L·J, 3)."""
+        return rotation_fields(self._fields)
 
     @property
     def _fields(self) -> np.ndarray:
@@ -265,7 +265,7 @@ class GaussianMixtureMotion:
             If a camera is perspective, as its marginals are not Gaussian mixtures.
         """
         out = np.empty_like(x_t)
-        for view, mixture in enumerate(self._seen_by(cameras, x_t)):
+        for view, mixture in enumerate(self._view_mixtures(cameras, x_t)):
             flat = np.ascontiguousarray(x_t[:, view]).reshape(len(x_t), mixture.dim)
             out[:, view] = mixture.denoise(flat, alpha_bar).reshape(out[:, view].shape)
         return out
@@ -275,7 +275,7 @@ class GaussianMixtureMotion:
     ) -> np.ndarray:
         """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
         out = np.empty_like(vectors)
-        for view, mixture in enumerate(self._seen_by(cameras, x_t)):
+        for view, mixture in enumerate(self._view_mixtures(cameras, x_t)):
             noisy, flat = (
                 np.ascontiguousarray(values[:, view]).reshape(len(x_t), mixture.dim)
                 for values in (x_t, vectors)
@@ -355,20 +355,20 @@ class GaussianMixtureMotion:
         prior.__dict__["scale"] = self.scale
         return prior, basis
 
-    def _mixture(self, fields: np.ndarray, scale: float) -> TurnedMixture:
+    def _mixture(self, fields: np.ndarray, scale: float) -> RotatedMixture:
         """Return the mixture of base fields (K, 1 + r, 3, L·J, M) divided by a scale."""
         flat = fields.reshape(*fields.shape[:3], -1) / scale
-        return TurnedMixture(flat, self.yaws, self.weights, (self.noise / scale) ** 2)
+        return RotatedMixture(flat, self.yaws, self.weights, (self.noise / scale) ** 2)
 
     @cached_property
-    def _metres(self) -> TurnedMixture:
+    def _metres(self) -> RotatedMixture:
         return self._mixture(self.base_fields, 1.0)
 
     @cached_property
-    def _normalised(self) -> TurnedMixture:
+    def _normalised(self) -> RotatedMixture:
         return self._mixture(self.base_fields, self.scale)
 
-    def _seen_by(self, cameras: Cameras, x_t: np.ndarray) -> list[TurnedMixture]:
+    def _view_mixtures(self, cameras: Cameras, x_t: np.ndarray) -> list[RotatedMixture]:
         """Return the 2D marginals of the V views, which are mixtures with the same weights."""
         if not cameras.orthographic:
             raise ValueError("cameras must be orthographic, got perspective")

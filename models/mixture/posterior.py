@@ -3,7 +3,7 @@
 The posterior is also a mixture. At one joint and frame, the likelihood of a position x is
 exp(−½ xᵀΛx + ηᵀx). With the noise δ ε integrated out, it has the same form in m_k + W_k z with
 Λ̃ = SΛ and η̃ = Sη, S = (I + δ²Λ)⁻¹. Rotated means and factors are combinations of three base
-fields (``turned_mixture``), so K small Gram matrices determine those of all K·A components.
+fields (``rotated_mixture``), so K small Gram matrices determine those of all K·A components.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
-from probmotion.models.mixture.turned_mixture import turning_coefficients
+from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 from probmotion.posteriors.protocols import Likelihood, NotConjugate
 from probmotion.seeds import RandomNumbers
 
@@ -25,14 +25,14 @@ class MixturePosterior:
     """Posterior p(X | y) of a rotated Gaussian mixture; the prior if there is no likelihood.
 
     Created by :meth:`GaussianMixtureMotion.exact_posterior` from base fields (K, 1 + r, 3, L·J, 3),
-    yaws (A,), style probabilities (K,), noise δ, the shape (L, J, 3) and a likelihood with
+    azimuths (A,), style probabilities (K,), noise δ, the shape (L, J, 3) and a likelihood with
     ``linear()``; raises ``NotConjugate`` for other likelihoods.
     """
 
     def __init__(
         self,
         base_fields: np.ndarray,
-        yaws: np.ndarray,
+        azimuths: np.ndarray,
         weights: np.ndarray,
         noise: float,
         shape: tuple[int, ...],
@@ -41,7 +41,7 @@ class MixturePosterior:
         self.shape = shape
         self.noise = noise
         self._fields = base_fields
-        self._turns = turning_coefficients(yaws)
+        self._turns = rotation_coefficients(azimuths)
         self.information, self.shift, constant_part = _natural_parameters(
             likelihood, base_fields.shape[3]
         )
@@ -49,15 +49,15 @@ class MixturePosterior:
         self._shrink = np.linalg.inv(np.eye(3) + variance * self.information)
         metric = self._shrink @ self.information
         shrunk_shift = np.einsum("fij,fj->fi", self._shrink, self.shift)
-        moved = np.einsum("fij,knefj->knefi", metric, base_fields)
-        gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, moved, optimize=True)
+        weighted = np.einsum("fij,knefj->knefi", metric, base_fields)
+        gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, weighted, optimize=True)
         turns = self._turns
         self._gram = np.einsum("kijcd,ac,ad->kaij", gram, turns, turns, optimize=True)
         linear = np.einsum("fx,kicfx->kic", shrunk_shift, base_fields, optimize=True)
         self._linear = np.einsum("kic,ac->kai", linear, turns)
         constant_part -= 0.5 * np.linalg.slogdet(np.linalg.inv(self._shrink))[1].sum()
         constant_part += 0.5 * variance * float((self.shift * shrunk_shift).sum())
-        log_weights = np.log(weights)[:, None] - math.log(len(yaws))
+        log_weights = np.log(weights)[:, None] - math.log(len(azimuths))
         # log π p(y | z, k, a) = offset + slope·z − ½ zᵀ H z, π: prior of k, a
         self._offset = (
             log_weights + constant_part + self._linear[..., 0] - 0.5 * self._gram[..., 0, 0]
@@ -129,7 +129,7 @@ class MixturePosterior:
         return self._motions(rng, style, azimuth, latent)
 
     def log_likelihood(self, latent: Array) -> Array:
-        """Return log p(y | z) with style, yaw and noise integrated out: ``(…, r) → (…)``."""
+        """Return log p(y | z) with style, azimuth and noise integrated out: ``(…, r) → (…)``."""
         return logsumexp(self._log_terms(latent))
 
     def log_density(self, positions: Array) -> Array:
@@ -146,17 +146,17 @@ class MixturePosterior:
         square = xp.sum(weighted * centred, axis=(-2, -1))
         shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields)
         products = xp.reshape(weighted, (n, F * 3)) @ constant(shrunk.reshape(-1, F * 3).T, flat)
-        turned = xp.reshape(products, (n, K, width, 3)) @ constant(self._turns.T, flat)
-        turned = xp.permute_dims(turned, (0, 1, 3, 2))
+        rotated = xp.reshape(products, (n, K, width, 3)) @ constant(self._turns.T, flat)
+        rotated = xp.permute_dims(rotated, (0, 1, 3, 2))
         gram = self._clean_gram
-        slope = turned[..., 1:] - constant(gram[..., 0, 1:], flat)
+        slope = rotated[..., 1:] - constant(gram[..., 0, 1:], flat)
         slope = slope + constant(self._slope, flat)
         total = self._latent_precision + gram[..., 1:, 1:]
         half = constant(np.linalg.inv(np.linalg.cholesky(total)), flat)
         latent = xp.sum(half * slope[..., None, :], axis=-1)
         log_det = np.linalg.slogdet(total)[1]
         offset = self._offset - self.log_marginal_likelihood - 0.5 * (log_det + gram[..., 0, 0])
-        logits = turned[..., 0] + 0.5 * xp.sum(latent**2, axis=-1) + constant(offset, flat)
+        logits = rotated[..., 0] + 0.5 * xp.sum(latent**2, axis=-1) + constant(offset, flat)
         norm = F * 3 * math.log(2 * math.pi) - np.linalg.slogdet(precision)[1].sum()
         value = logsumexp(xp.reshape(logits, (n, K * A))) - 0.5 * (square + float(norm))
         return xp.reshape(value, positions.shape[:-3])
@@ -167,8 +167,8 @@ class MixturePosterior:
 
         S Q S = S / δ², because S Q = I/δ².
         """
-        moved = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields) / self.noise**2
-        gram = np.einsum("kicfx,kjdfx->kijcd", self._fields, moved, optimize=True)
+        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields) / self.noise**2
+        gram = np.einsum("kicfx,kjdfx->kijcd", self._fields, shrunk, optimize=True)
         return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
 
     def _log_terms(self, latent: Array) -> Array:

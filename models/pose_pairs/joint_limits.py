@@ -72,8 +72,9 @@ class JointLimits:
         check_shape("allowed", self.allowed, (len(PARTS), *sizes))
         check_shape("rest", self.rest, (len(PARTS), 3))
         check_finite("rest", self.rest)
-        if not np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max() < 1e-9:
-            raise ValueError("rest must contain unit vectors, got other lengths")
+        error = np.abs(np.linalg.norm(self.rest, axis=1) - 1.0).max()
+        if not error < 1e-9:
+            raise ValueError(f"rest must contain unit vectors, got an error of {error:.2g}")
         if not 0 < self.tilt < np.pi / 2:
             raise ValueError(f"tilt must be between 0 and π/2, got {self.tilt!r}")
         empty = np.argwhere(~self.allowed.any(axis=-1))
@@ -132,8 +133,8 @@ class JointLimits:
             joints = {skeleton.canonical_names[j].rpartition(":")[2]: j for j in tree}
             person = [joints.get(name, -1) for name in _PERSON.joint_names]
             parents = [skeleton.parents[j] for j in person]
-            wanted = [-1 if parent < 0 else person[parent] for parent in _PERSON.parents]
-            if len(tree) != _PERSON.n_joints or -1 in person or parents != wanted:
+            expected = [-1 if parent < 0 else person[parent] for parent in _PERSON.parents]
+            if len(tree) != _PERSON.n_joints or -1 in person or parents != expected:
                 raise ValueError(
                     "skeleton must have trees with the joints and parents of 'person17', got "
                     f"{', '.join(skeleton.joint_names[j] for j in tree)}"

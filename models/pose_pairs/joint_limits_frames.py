@@ -47,11 +47,11 @@ def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
     """
     x = unit((left[0] - right[0], left[1] - right[1], left[2] - right[2]))
     if x == NO_LENGTH:
-        x = _any_across(up)
+        x = _any_orthogonal(up)
     along = _dot(x, up)
     y = unit((up[0] - along * x[0], up[1] - along * x[1], up[2] - along * x[2]))
     if y == NO_LENGTH:
-        y = _any_across(x)
+        y = _any_orthogonal(x)
     return (x, y, _cross(x, y))
 
 
@@ -78,7 +78,7 @@ def least_rotation(a: Vector, b: Vector) -> Frame:
     c = _dot(a, b)
     if c < -1.0 + 1e-9:
         # A half turn: the axis is arbitrary but deterministic.
-        x, y, z = _any_across(a)
+        x, y, z = _any_orthogonal(a)
         return (
             (2.0 * x * x - 1.0, 2.0 * y * x, 2.0 * z * x),
             (2.0 * x * y, 2.0 * y * y - 1.0, 2.0 * z * y),
@@ -110,7 +110,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 @numba.njit(cache=True)
-def _any_across(v: Vector) -> Vector:
+def _any_orthogonal(v: Vector) -> Vector:
     """Return a deterministic unit vector orthogonal to ``v``."""
     x, y, z = abs(v[0]), abs(v[1]), abs(v[2])
     if x <= y and x <= z:

@@ -69,7 +69,7 @@ def _row(rows: np.ndarray, number: int) -> Vector:
 
 
 @numba.njit(cache=True)
-def _put(rows: np.ndarray, number: int, v: Vector) -> None:
+def _set_row(rows: np.ndarray, number: int, v: Vector) -> None:
     rows[number, 0], rows[number, 1], rows[number, 2] = v
 
 
@@ -79,22 +79,22 @@ def _mirrored(v: Vector) -> Vector:
 
 
 @numba.njit(cache=True)
-def _of_side(frame: Frame, side: int) -> Frame:
+def _side_frame(frame: Frame, side: int) -> Frame:
     """Return the frame for bones of the left (0) or right (1) side."""
     left, up, forward = frame
     return frame if side == 0 else ((-left[0], -left[1], -left[2]), up, forward)
 
 
 @numba.njit(cache=True)
-def _set_and_turn(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
+def _rotate_bone(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
     """Set the direction of a bone and rotate its descendants, up to joint ``last``."""
     old = _row(directions, joint)
-    _put(directions, joint, new)
+    _set_row(directions, joint, new)
     if old == NO_LENGTH:
         return
     turn = least_rotation(old, new)
     for below in range(joint + 1, last + 1):
-        _put(directions, below, unit(from_frame(turn, _row(directions, below))))
+        _set_row(directions, below, unit(from_frame(turn, _row(directions, below))))
 
 
 @numba.njit(cache=True)
@@ -111,17 +111,17 @@ def _nearest_allowed(u: Vector, part: int, row: int, limits: LimitArrays) -> Vec
     outside, inside = 0.0, 1.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (outside + inside)
-        between = _between(u, centre, middle)
+        between = _interpolated(u, centre, middle)
         cell = cell_of(between, limits.cell_rings)
         if between != NO_LENGTH and limits.allowed[part, row, cell]:
             inside = middle
         else:
             outside = middle
-    return _between(u, centre, inside)
+    return _interpolated(u, centre, inside)
 
 
 @numba.njit(cache=True)
-def _between(a: Vector, b: Vector, fraction: float) -> Vector:
+def _interpolated(a: Vector, b: Vector, fraction: float) -> Vector:
     """Return the normalised linear interpolation of two unit vectors."""
     return unit(
         (
@@ -143,16 +143,16 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
     valid[joint] = True
     if direction == NO_LENGTH:
         u = _row(limits.rest, part)
-        _set_and_turn(directions, joint, from_frame(frame, u), last)
+        _rotate_bone(directions, joint, from_frame(frame, u), last)
     else:
         u = in_frame(frame, direction)
         row = cell_of(condition, limits.bin_rings)
         valid[joint] = limits.allowed[part, row, cell_of(u, limits.cell_rings)]
         if correct and not valid[joint]:
             u = _nearest_allowed(u, part, row, limits)
-            _set_and_turn(directions, joint, from_frame(frame, u), last)
-    _put(local[joint], 0, condition)
-    _put(local[joint], 1, u)
+            _rotate_bone(directions, joint, from_frame(frame, u), last)
+    _set_row(local[joint], 0, condition)
+    _set_row(local[joint], 1, u)
     return u
 
 
@@ -173,12 +173,12 @@ def _walk_person(walk: Walk) -> None:
     hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, walk)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
     for i in range(2):
-        _put(local[RIGHT_HIP], i, _row(local[LEFT_HIP], i))
+        _set_row(local[RIGHT_HIP], i, _row(local[LEFT_HIP], i))
     if correct and not valid[LEFT_HIP]:
-        _set_and_turn(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
+        _rotate_bone(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
     for side in range(2):
         joint = LEFT_HIP if side == 0 else RIGHT_HIP
-        _limb(KNEE, joint, _of_side(pelvis, side), hip, walk)
+        _limb(KNEE, joint, _side_frame(pelvis, side), hip, walk)
 
     trunk = product(pelvis, least_rotation(_UP, spine))
     chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, walk)
@@ -186,7 +186,7 @@ def _walk_person(walk: Walk) -> None:
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
         condition = chest if side == 0 else _mirrored(chest)
-        _check(SHOULDER, joint, joint + 2, _of_side(below, side), condition, walk)
+        _check(SHOULDER, joint, joint + 2, _side_frame(below, side), condition, walk)
 
     # The line of the shoulders determines the twist of the trunk.
     trunk = line_frame(
@@ -199,7 +199,7 @@ def _walk_person(walk: Walk) -> None:
     _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, walk)
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
-        sided = _of_side(trunk, side)
+        sided = _side_frame(trunk, side)
         _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), walk)
 
 
@@ -208,16 +208,16 @@ def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     """Check the tilt of the spine in the left-up plane of the pelvis and return its direction."""
     limits, correct, directions, valid, local = walk
     if _row(directions, SPINE) == NO_LENGTH:
-        _put(directions, SPINE, pelvis[1])
+        _set_row(directions, SPINE, pelvis[1])
     u = in_frame(pelvis, _row(directions, SPINE))
     valid[SPINE] = abs(u[0]) <= limits.tilt
     if correct and not valid[SPINE]:
         # Stay slightly inside the limit despite rounding.
         tilt = np.copysign(limits.tilt * (1.0 - 1e-9), u[0])
         u = (tilt, np.sqrt(1.0 - tilt * tilt), 0.0)
-        _set_and_turn(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
-    _put(local[SPINE], 0, _UP)
-    _put(local[SPINE], 1, u)
+        _rotate_bone(directions, SPINE, from_frame(pelvis, u), LAST_OF_TRUNK)
+    _set_row(local[SPINE], 0, _UP)
+    _set_row(local[SPINE], 1, u)
     return u
 
 
@@ -239,7 +239,7 @@ def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> N
             pose[end, 1] - pose[start, 1],
             pose[end, 2] - pose[start, 2],
         )
-        _put(directions, joint, unit(bone))
+        _set_row(directions, joint, unit(bone))
 
 
 @numba.njit(cache=True)
@@ -270,9 +270,9 @@ def project_poses(
                     length += (poses[pose, end, i] - poses[pose, start, i]) ** 2
                 # Add only the change of direction, so that unchanged bones are not rounded.
                 for i in range(3):
-                    turned = np.sqrt(length) * (directions[joint, i] - before[joint, i])
-                    moved = nearest[pose, start, i] - poses[pose, start, i]
-                    nearest[pose, end, i] = poses[pose, end, i] + moved + turned
+                    rotated = np.sqrt(length) * (directions[joint, i] - before[joint, i])
+                    translated = nearest[pose, start, i] - poses[pose, start, i]
+                    nearest[pose, end, i] = poses[pose, end, i] + translated + rotated
     return valid, nearest
 
 

@@ -38,7 +38,7 @@ HELD_OUT = (
 
 _PERSON = Skeleton.preset("person17")
 # Minimum left component of the left hip's direction: swapped hips would flip the pelvis frame.
-_LEAST_LEFT_OF_HIP = 0.1
+_MIN_LEFT_OF_HIP = 0.1
 # Quantile of the spine's tilt that sets its limit; below 1 for robustness to outlier frames.
 _TILT_QUANTILE = 0.999
 
@@ -79,7 +79,7 @@ def learn_limits(
             *_samples(local, part), bins, bin_centres, cells, centres, np.cos(bin_dilation)
         )
         allowed[part] = closeness >= np.cos(dilation)
-    allowed[HIP] &= centres[:, 0] > _LEAST_LEFT_OF_HIP
+    allowed[HIP] &= centres[:, 0] > _MIN_LEFT_OF_HIP
     tilts = np.arcsin(np.clip(np.abs(local[:, _PERSON.index("spine"), 1, 0]), 0.0, 1.0))
     tilt = np.quantile(tilts, _TILT_QUANTILE) + dilation
     return JointLimits(

@@ -76,20 +76,20 @@ class PoseChart:
         """Return the pose at θ: ``(…, dim) → (…, J, 3)``, metres; NumPy, torch or JAX."""
         check_shape("theta", theta, ("…", self.dim))
         xp = array_namespace(theta)
-        turns, places, bends, stretches = self._parts(theta)
+        turns, translations, bends, stretches = self._parts(theta)
         local = vector_to_matrix(
             xp.sum(constant(self._bases, theta) * bends[..., None, :], axis=-1)
         )
         vectors = (xp.exp(stretches)[..., None] * constant(self._bones, theta))[..., None]
         frames = vector_to_matrix(turns)
-        joints = places + constant(self.seed[list(self.skeleton.roots)], theta)
+        joints = translations + constant(self.seed[list(self.skeleton.roots)], theta)
         positions = [joints]
         # Process one generation of bones at a time: few large matrix products are faster.
         for bones, above in self._generations:
             frames = xp.matmul(frames[..., above, :, :], local[..., bones, :, :])
             joints = joints[..., above, :] + xp.matmul(frames, vectors[..., bones, :, :])[..., 0]
             positions.append(joints)
-        return xp.concat(positions, axis=-2)[..., self._places, :]
+        return xp.concat(positions, axis=-2)[..., self._joint_order, :]
 
     def coordinates(self, positions: np.ndarray) -> np.ndarray:
         """Return coordinates θ of poses: ``(…, J, 3) → (…, dim)``.
@@ -109,18 +109,18 @@ class PoseChart:
             )
         rest = np.linalg.norm(self._bones, axis=-1)
         theta = np.zeros((*positions.shape[:-2], self.dim))
-        turns, places, bends, stretches = self._parts(theta)
+        turns, translations, bends, stretches = self._parts(theta)
         stretches[...] = np.log(lengths / rest)
         frames: dict[int, np.ndarray] = {}
         for k, root in enumerate(self.skeleton.roots):
             below = [bone for bone, start in enumerate(starts) if start == root]
             frames[root] = _best_rotation(self._bones[below], vectors[..., below, :])
             turns[..., k, :] = matrix_to_vector(frames[root])
-            places[..., k, :] = positions[..., root, :] - self.seed[root]
+            translations[..., k, :] = positions[..., root, :] - self.seed[root]
         for bone in (bone for bones, _ in self._generations for bone in bones):
             above = frames[starts[bone]]
             target = (np.swapaxes(above, -1, -2) @ vectors[..., bone, :, None])[..., 0]
-            vector = _least_turn(self._bones[bone] / rest[bone], target / lengths[..., bone, None])
+            vector = _rotation_to(self._bones[bone] / rest[bone], target / lengths[..., bone, None])
             bends[..., bone, :] = vector @ self._bases[bone]
             frames[ends[bone]] = above @ vector_to_matrix(vector)
         return theta
@@ -132,7 +132,7 @@ class PoseChart:
         Gaussian, all normalised. Rotations beyond π have density 0, so each direction counts once.
         """
         theta = to_numpy(theta)
-        turns, places, bends, stretches = self._parts(theta)
+        turns, translations, bends, stretches = self._parts(theta)
         angle = np.linalg.norm(turns, axis=-1)
         bend = np.linalg.norm(bends, axis=-1)
         inside = (angle < np.pi).all(axis=-1) & (bend < np.pi).all(axis=-1)
@@ -141,7 +141,7 @@ class PoseChart:
         with np.errstate(divide="ignore", invalid="ignore"):
             area = np.log(np.sinc(bend / np.pi) / (4 * np.pi))
         total = (haar.sum(axis=-1) + area.sum(axis=-1)) + _log_normal(stretches, self.bone_noise)
-        total = total + _log_normal(places.reshape(*theta.shape[:-1], -1), self.root_noise)
+        total = total + _log_normal(translations.reshape(*theta.shape[:-1], -1), self.root_noise)
         return np.where(inside, total, -np.inf)
 
     def speeds(self, turn: np.ndarray, stretch: np.ndarray) -> np.ndarray:
@@ -155,10 +155,10 @@ class PoseChart:
             Squared change of the bone's length (at a root: of its position), metres².
         """
         speeds = np.empty((*turn.shape[:-1], self.dim))
-        turns, places, bends, stretches = self._parts(speeds)
+        turns, translations, bends, stretches = self._parts(speeds)
         roots, ends = list(self.skeleton.roots), self._ends[0]
         turns[...] = turn[..., roots, None]
-        places[...] = stretch[..., roots, None]
+        translations[...] = stretch[..., roots, None]
         bends[...] = turn[..., ends, None]
         stretches[...] = stretch[..., ends] / (self._bones**2).sum(axis=-1)
         return speeds
@@ -168,9 +168,9 @@ class PoseChart:
         n_roots, n_bones = len(self.skeleton.roots), len(self.skeleton.bones)
         batch = theta.shape[:-1]
         turns = theta[..., : 3 * n_roots].reshape((*batch, n_roots, 3))
-        places = theta[..., 3 * n_roots : 6 * n_roots].reshape((*batch, n_roots, 3))
+        translations = theta[..., 3 * n_roots : 6 * n_roots].reshape((*batch, n_roots, 3))
         bones = theta[..., 6 * n_roots :].reshape((*batch, n_bones, 3))
-        return turns, places, bones[..., :2], bones[..., 2]
+        return turns, translations, bones[..., :2], bones[..., 2]
 
     @cached_property
     def _generations(self) -> list[tuple[list[int], list[int]]]:
@@ -183,7 +183,7 @@ class PoseChart:
         return generations
 
     @cached_property
-    def _places(self) -> list[int]:
+    def _joint_order(self) -> list[int]:
         """Index of each joint in the order of generations."""
         order = list(self.skeleton.roots)
         order += [self.skeleton.bones[k][0] for bones, _ in self._generations for k in bones]
@@ -206,7 +206,7 @@ def _best_rotation(rest: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return (left * signs) @ right
 
 
-def _least_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _rotation_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the shortest rotation vectors from unit ``start`` (3,) to ``end``, (…, 3)."""
     axis = np.cross(start, end)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)

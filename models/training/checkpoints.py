@@ -43,7 +43,7 @@ _ENTRY = "probmotion"  # key of the header's metadata
 
 
 class CheckpointError(ValueError):
-    """Error for a file that is no checkpoint, is damaged or contains another kind of network."""
+    """Error for a file that is not a checkpoint, is damaged or has another kind of network."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     except (SafetensorError, json.JSONDecodeError, OSError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
-        raise CheckpointError(f"{path} must be a checkpoint of probmotion, got another file")
+        raise CheckpointError(f"{path} must be a checkpoint of probmotion, got no header")
     if header["format"] != _FORMAT:
         raise CheckpointError(
             f"{path} must be a checkpoint of version {_FORMAT}, got version {header['format']}"
@@ -145,7 +145,8 @@ def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> Non
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:
-        raise CheckpointError("weights must match the checkpoint's settings, got others") from error
+        detail = " ".join(str(error).split("\n\t")[1:2])
+        raise CheckpointError(f"weights must match the checkpoint's settings: {detail}") from error
 
 
 def weights_digest(network: nn.Module) -> str:
@@ -167,10 +168,9 @@ def _find(source: str | Path, kind: str) -> Path:
     if isinstance(source, str) and shipped.is_file():
         return shipped
     known = [file.stem for file in sorted(WEIGHTS.glob("*.safetensors")) if _kind(file) == kind]
-    raise FileNotFoundError(
-        "source must be a file, the folder of a training run or one of "
-        f"{', '.join(known) or 'no names'}, got {str(source)!r}"
-    )
+    names = f", the folder of a training run or one of {', '.join(known)}" if known else ""
+    names = names or " or the folder of a training run"
+    raise FileNotFoundError(f"source must be a file{names}, got {str(source)!r}")
 
 
 def _kind(path: Path) -> str:

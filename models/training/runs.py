@@ -28,7 +28,7 @@ __all__ = ["LOSSES", "STATE", "Run", "check_same_run", "keep_run", "resume_run",
 STATE, LOSSES = "state.safetensors", "losses.csv"
 """Names of the files for resuming and of the losses, in the folder of a run."""
 
-_LONGEST_DIFFERENCE = 200  # characters; error messages do not quote longer values
+_MAX_QUOTED = 200  # characters; error messages do not quote longer values
 
 
 @dataclass(eq=False)
@@ -114,14 +114,14 @@ def check_same_run(
     # A run without a setting was saved before its introduction and used its present default.
     defaults = {"network": {}, "training": json.loads(json.dumps(asdict(TrainingSettings())))}
     for part, settings in described.items():
-        for name, wanted in settings.items():
+        for name, expected in settings.items():
             got = saved[part].get(name, defaults[part].get(name))
             # These two settings do not affect the training steps.
-            if got != wanted and name not in ("steps", "checkpoint_every"):
-                if len(f"{got}{wanted}") > _LONGEST_DIFFERENCE:
-                    got, wanted = "the same", "another"
+            if got != expected and name not in ("steps", "checkpoint_every"):
+                if len(f"{got}{expected}") > _MAX_QUOTED:
+                    got, expected = "the same", "another"
                 raise ValueError(
-                    f"{name} must be {got} to resume {folder}, got {wanted}; use another folder"
+                    f"{name} must be {got} to resume {folder}, got {expected}; use another folder"
                 )
 
 

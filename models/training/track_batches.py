@@ -142,10 +142,10 @@ class TrackBatches:
         """Raise ``ValueError`` if a joint is never visible: its position could not be learnt."""
         seen = self.all_frames()[1].any(axis=0)
         if not seen.all():
-            never = np.array(self.skeleton.joint_names)[~seen]
+            never_seen = np.array(self.skeleton.joint_names)[~seen]
             raise ValueError(
                 f"tracks must show every joint with a confidence of at least {self.threshold:g}, "
-                f"never got {', '.join(never)}; choose a skeleton without these joints"
+                f"got none for {', '.join(never_seen)}; choose a skeleton without these joints"
             )
 
     @property
@@ -235,7 +235,8 @@ def learning_and_held_out(
     batches = TrackBatches(tracks, frames, threshold, augmentation)
     held_out = TrackBatches(validation, frames, threshold, Augmentation.none())
     if held_out.skeleton != batches.skeleton:
-        raise ValueError("validation must have the same skeleton as tracks, got another")
+        names = ", ".join(held_out.skeleton.joint_names)
+        raise ValueError(f"validation must have the skeleton of tracks, got joints {names}")
     if held_out.fps != batches.fps:
         raise ValueError(
             f"validation must have the frame rate of tracks, {batches.fps:g}, got {held_out.fps:g}"
@@ -261,8 +262,8 @@ def _check_alike(tracks: Sequence[KeypointTrack]) -> None:
     for track in tracks:
         if track.skeleton != first.skeleton:
             raise ValueError(
-                f"tracks must have the same skeleton, got another for {track.name or 'a track'} "
-                f"than for {first.name or 'the first'}"
+                f"tracks must have one skeleton, got different ones for {track.name or 'a track'} "
+                f"and {first.name or 'the first'}"
             )
         if track.fps != first.fps:
             raise ValueError(

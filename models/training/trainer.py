@@ -189,7 +189,7 @@ def _take_step(
         group["lr"] = settings.rate(step)
     run.optimiser.zero_grad(set_to_none=True)
     with (
-        _dropout_of(settings.seed, step, device),
+        _seeded_dropout(settings.seed, step, device),
         torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"),
     ):
         if isinstance(trainee, Anneals):
@@ -248,7 +248,7 @@ def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) ->
 
 
 @contextmanager
-def _dropout_of(seed: int, step: int, device: torch.device) -> Iterator[None]:
+def _seeded_dropout(seed: int, step: int, device: torch.device) -> Iterator[None]:
     """Seed torch's global generator, which dropout uses, for one step; then restore it."""
     devices = [torch.cuda.current_device()] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices):

@@ -17,7 +17,7 @@ from probmotion.seeds import RandomNumbers
 
 __all__ = ["EncodedLatent", "VAEEncoder"]
 
-_AVERAGED = 64  # number of draws averaged for a predicted motion
+_AVERAGED_DRAWS = 64  # number of draws averaged for a predicted motion
 
 
 class VAEEncoder:
@@ -109,7 +109,7 @@ class EncodedLatent:
         Averaging shortens bones where draws disagree; the motion at μ has the body's bone lengths.
         """
         if average:
-            return self.draw(rng, _AVERAGED)[0].mean(axis=0)
+            return self.draw(rng, _AVERAGED_DRAWS)[0].mean(axis=0)
         return self.prior.motion(self.mean.detach().numpy())
 
 

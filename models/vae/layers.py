@@ -192,10 +192,10 @@ class BoneDecoder(nn.Module):
     def forward(self, frames: torch.Tensor) -> torch.Tensor:
         """Return rotation vectors: ``(…, width) → (…, bones, 3)``, radians."""
         memories = frames.flatten(0, -2).split(FRAMES_AT_ONCE)
-        result = torch.cat([self._turns(memory) for memory in memories])
+        result = torch.cat([self._rotation_vectors(memory) for memory in memories])
         return result.unflatten(0, frames.shape[:-1])
 
-    def _turns(self, memory: torch.Tensor) -> torch.Tensor:
+    def _rotation_vectors(self, memory: torch.Tensor) -> torch.Tensor:
         # The first layer's self-attention is the same for every frame and is computed once.
         tokens, memory = _cast_tokens(self.bones[None]), _cast_tokens(memory)
         for layer in self.layers:

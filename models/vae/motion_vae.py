@@ -201,7 +201,7 @@ class MotionVAE(StandardNormalPrior):
     def turns(self, theta: Array) -> Array:
         """Return D(θ), ``(…, dim) → (…, L, bones, 3)``: rotation vectors relative to parents."""
         shape = (self.frames, len(self.body.bones), 3)
-        return decode_rows(self._turns, theta, self.dim, shape, _ROWS)
+        return decode_rows(self._decoded_rotations, theta, self.dim, shape, _ROWS)
 
     def row_by_row(self, theta: np.ndarray) -> np.ndarray:
         """Return :meth:`motion`, ``(n, dim) → (n, L, J, 3)``, bit-identical in any batch.
@@ -216,7 +216,7 @@ class MotionVAE(StandardNormalPrior):
         """Return n motions, (n, L, J, 3), metres; decoded in single precision."""
         return self.row_by_row(self.initial(rng, n).astype(np.float32)).astype(np.float64)
 
-    def _turns(self, theta: torch.Tensor) -> torch.Tensor:
+    def _decoded_rotations(self, theta: torch.Tensor) -> torch.Tensor:
         """Decode rows, ``(B, dim) → (B, L, bones, 3)``."""
         # Densities require double precision.
         model = self.model if theta.dtype == torch.float32 else self._double
@@ -226,7 +226,7 @@ class MotionVAE(StandardNormalPrior):
         """Decode rows, ``(B, dim) → (B, L, J, 3)``."""
         fixed = (self.rigid.rotations, self.rigid.translations, self.log_lengths)
         tensors = (torch.as_tensor(values, dtype=theta.dtype) for values in fixed)
-        return self.body.positions(self._turns(theta), *tensors)
+        return self.body.positions(self._decoded_rotations(theta), *tensors)
 
     @cached_property
     def _double(self) -> MotionVAEModel:

@@ -75,8 +75,8 @@ class TimeEncoder(nn.Module):
         self.log_variance = Readout(size.width, size.latent)
         # Start with small variances: with unit noise the decoder ignores z for thousands of steps.
         nn.init.constant_(self.log_variance.bias, _INITIAL_LOG_VARIANCE)
-        places = sinusoids(torch.arange(size.frames + 2), size.width)
-        self.register_buffer("places", places, persistent=False)
+        positions = sinusoids(torch.arange(size.frames + 2), size.width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(self, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and log variance: ``(B, T, width) → (B, Z), (B, Z)``.
@@ -84,7 +84,7 @@ class TimeEncoder(nn.Module):
         The log variance is bounded by 10 tanh(·/10), so that its exponentials stay finite.
         """
         queries = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
-        tokens = torch.cat([queries, frames], dim=1) + self.places
+        tokens = torch.cat([queries, frames], dim=1) + self.positions
         for layer in self.layers[:-1]:
             tokens = layer(tokens)
         result = self.norm(self.layers[-1](tokens, first=2))

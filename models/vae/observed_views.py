@@ -58,23 +58,23 @@ class ObservedView:
             return plane
         depth = self.distance - offsets[..., 2:]
         if not depth.min() > 0:
-            least = f"{depth.min():.3g} m"
-            raise ValueError(f"offsets must have positive depth in the camera, got {least}")
+            nearest = f"{depth.min():.3g} m"
+            raise ValueError(f"offsets must have positive depth in the camera, got {nearest}")
         return plane * self.distance / depth
 
     def world_rotations(self, rotations: np.ndarray) -> np.ndarray:
         """Convert camera-relative rotations to world rotations, (…, 3, 3)."""
         return self.camera.rotation[0].T @ (_TO_OPENCV[:, None] * rotations)
 
-    def world_roots(self, moved: np.ndarray) -> np.ndarray:
+    def world_roots(self, image_offsets: np.ndarray) -> np.ndarray:
         """Return root positions in the world, ``(L, 2) → (L, 3)``, metres.
 
-        ``moved`` (L, 2) is the offset from the root keypoint, metres, x right and y up. The depth
-        is the subject's distance; for an orthographic camera, that of the world origin.
+        ``image_offsets`` (L, 2) are relative to the root keypoint, metres, x right and y up. The
+        depth is the subject's distance; for an orthographic camera, that of the world origin.
         """
         translation = self.camera.translation[0]
         depth = translation[2] if self.distance is None else self.distance
-        plane = self.root + moved * _TO_OPENCV[:2]
+        plane = self.root + image_offsets * _TO_OPENCV[:2]
         in_camera = np.concatenate([plane, np.full((len(plane), 1), depth)], axis=-1)
         return (in_camera - translation) @ self.camera.rotation[0]
 

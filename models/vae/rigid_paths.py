@@ -22,7 +22,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["BodyEstimate", "RigidPath", "estimate_body"]
 
-_OFF_ORTHONORMAL = 1e-4  # tolerance for the entries of R Rᵀ − I
+_ROTATION_TOLERANCE = 1e-4  # tolerance for the entries of R Rᵀ − I
 _PASSES = 3
 """Number of alternating updates of distance and pose; the initial distance is already close."""
 
@@ -56,10 +56,10 @@ class RigidPath:
         check_finite("rotations", rotations)
         check_finite("translations", translations)
         deviation = float(np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max())
-        if deviation > _OFF_ORTHONORMAL or (np.linalg.det(rotations) < 0).any():
+        if deviation > _ROTATION_TOLERANCE or (np.linalg.det(rotations) < 0).any():
             raise ValueError(
                 "rotations must be orthonormal with determinant 1 within "
-                f"{_OFF_ORTHONORMAL:g}, got a deviation of {deviation:.2g}"
+                f"{_ROTATION_TOLERANCE:g}, got a deviation of {deviation:.2g}"
             )
         object.__setattr__(self, "rotations", rotations)
         object.__setattr__(self, "translations", translations)
@@ -116,7 +116,7 @@ def estimate_body(
     """
     view = observed_view(likelihood, body.skeleton)
     if view.distance is not None:
-        view = view.at(_first_distance(view, body))
+        view = view.at(_initial_distance(view, body))
         for _ in range(_PASSES):
             assert view.distance is not None
             best, _ = _best_hypothesis(network, settings, body, view)
@@ -138,7 +138,7 @@ def _best_hypothesis(
     return best_hypothesis(hypotheses, losses), losses[0].double().numpy()
 
 
-def _first_distance(view: ObservedView, body: ArticulatedBody) -> float:
+def _initial_distance(view: ObservedView, body: ArticulatedBody) -> float:
     """Estimate the initial distance, as bones project to π/4 of their length on average."""
     joints, parents = (list(side) for side in zip(*body.skeleton.bones, strict=True))
     visible = (view.confidence[:, joints] > 0) & (view.confidence[:, parents] > 0)

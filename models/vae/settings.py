@@ -29,12 +29,12 @@ class MotionVAESettings:
     layers, heads : int
         Number of layers of each encoder (E_s, E_t) and decoder (D_t, D_s), and heads per layer.
     feedforward : int
-        Hidden width of the perceptron of each layer; not published. At size ``small``, a quarter
-        of ``width`` reconstructs as well as the full width.
+        Hidden width of the perceptron of each layer; not published. At size ``small``,
+        reconstruction is equally accurate with a quarter of ``width``.
     latent : int
         Dimension of the latent code z.
     spatial : bool
-        Whether to use E_s and D_s; otherwise linear maps of joints and bones (ablation, table 7).
+        Whether to use E_s and D_s; otherwise linear maps of joints and bones (Ponymation, table 7).
     hypotheses : int
         Number of view hypotheses H of the pose network, 1 to 4, at quarter turns.
     image_features : int
@@ -85,7 +85,7 @@ class MotionVAESettings:
         check_count("image_features", self.image_features, least=0)
         if self.width % self.heads or self.width % 2:
             raise ValueError(
-                f"width must be an even multiple of heads={self.heads}, got {self.width}"
+                f"width must be even and a multiple of heads={self.heads}, got {self.width}"
             )
         if self.hypotheses > 4:
             raise ValueError(
@@ -118,7 +118,7 @@ class MotionVAESettings:
 
     @classmethod
     def paper(cls) -> MotionVAESettings:
-        """Return the published size and weights (section 3.3, table 5).
+        """Return the published size and weights (Ponymation, section 3.3, table 5).
 
         The published reconstruction loss compares images; the loss here compares joints, in m².
         """

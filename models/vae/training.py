@@ -41,11 +41,11 @@ from probmotion.validation import check_positive
 __all__ = ["MotionVAETrainee", "PoseTrainee", "usual_motion_vae_training"]
 
 # Weight of the mean loss over all hypotheses, so that unselected ones continue to learn.
-_OTHERS = 0.05
+_MEAN_LOSS_WEIGHT = 0.05
 # Tolerance of the root position for rounding, metres.
-_CENTRED = 1e-3
+_ROOT_TOLERANCE = 1e-3
 # Number of initial steps in which hypotheses are selected with the body in its rest pose.
-_AT_REST = 500
+_REST_STEPS = 500
 
 
 class _VAETrainee(TrackTrainee):
@@ -212,10 +212,10 @@ class PoseTrainee(_VAETrainee):
         confidence = torch.as_tensor(drawn.confidence, device=device)
         terms = hypothesis_losses(self.body, hypotheses, keypoints, confidence, self.distance)
         losses = weighted_sum(terms, self.size)
-        at_rest = batches is self.batches and self._step <= _AT_REST
+        at_rest = batches is self.batches and self._step <= _REST_STEPS
         selection = self._rest_losses(hypotheses, keypoints, confidence) if at_rest else losses
         best = selection.argmin(dim=1, keepdim=True)
-        return losses.gather(1, best).mean() + _OTHERS * losses.mean()
+        return losses.gather(1, best).mean() + _MEAN_LOSS_WEIGHT * losses.mean()
 
     @torch.no_grad()
     def _rest_losses(
@@ -365,7 +365,7 @@ def _check_centred(name: str, tracks: Sequence[KeypointTrack], threshold: float)
     for track in tracks:
         seen = (track.confidence[:, root] >= threshold) & (track.confidence[:, root] > 0)
         offset = np.linalg.norm(track.keypoints[seen, root], axis=-1).max(initial=0.0)
-        if offset > _CENTRED:
+        if offset > _ROOT_TOLERANCE:
             raise ValueError(
                 f"{name} must have the root at the origin in every frame, got {offset:.2g} m in "
                 f"{track.name or 'a track'}; use prepare_tracks"

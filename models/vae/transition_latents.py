@@ -19,11 +19,11 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["greatest_acceleration", "long_motion"]
 
-_SHARED = 2
+_OVERLAP = 2
 """Frames shared by neighbouring segments: two determine the pose and its velocity."""
-_MOST = 4
+_MAX_CODES = 4
 """Maximum number of codes in a transition."""
-_SMOOTH = 10.0
+_ACCELERATION_WEIGHT = 10.0
 """Weight of squared accelerations relative to squared angle mismatches."""
 
 
@@ -75,7 +75,7 @@ def long_motion(
     parts = [segments[0]]
     for neighbours, codes in zip(pairwise(segments), pairwise(z), strict=True):
         candidates = []
-        for count in range(1, _MOST + 1) if transitions is None else [transitions]:
+        for count in range(1, _MAX_CODES + 1) if transitions is None else [transitions]:
             between = np.linspace(*codes, count + 2)[1:-1]
             transition = _transition(prior, *neighbours, between, iterations, prior_weight)
             # Include one frame of each segment to measure the acceleration at the seams.
@@ -83,14 +83,14 @@ def long_motion(
             candidates.append((greatest_acceleration(_positions(prior, around)), transition))
             if candidates[-1][0] <= allowed:
                 break
-        least, transition = min(candidates, key=lambda candidate: candidate[0])
-        if least > allowed:
+        lowest, transition = min(candidates, key=lambda candidate: candidate[0])
+        if lowest > allowed:
             warnings.warn(
-                f"the transition after segment {len(parts) // 2} has {least / allowed:.2f} times "
+                f"the transition after segment {len(parts) // 2} has {lowest / allowed:.2f} times "
                 "the largest acceleration of the segments; increase iterations or transitions",
                 stacklevel=2,
             )
-        parts += [transition[_SHARED:-_SHARED], neighbours[1]]
+        parts += [transition[_OVERLAP:-_OVERLAP], neighbours[1]]
     return _positions(prior, torch.cat(parts))
 
 
@@ -105,9 +105,9 @@ def _check(
         check_count("transitions", transitions)
     if not 0 <= weight < np.inf:
         raise ValueError(f"prior_weight must be a finite number of at least 0, got {weight}")
-    if prior.frames <= 2 * _SHARED:
+    if prior.frames <= 2 * _OVERLAP:
         raise ValueError(
-            f"prior must have motions of at least {2 * _SHARED + 1} frames, got {prior.frames}"
+            f"prior must have motions of at least {2 * _OVERLAP + 1} frames, got {prior.frames}"
         )
 
 
@@ -143,7 +143,7 @@ def _transition(
         optimiser.zero_grad()
         joined, mismatch = _joined(vector_to_matrix(prior.turns(codes)), before, after)
         acceleration = 0.5 * (joined.diff(n=2, dim=0) ** 2).sum()
-        total = mismatch + _SMOOTH * acceleration + prior_weight * (codes**2).sum()
+        total = mismatch + _ACCELERATION_WEIGHT * acceleration + prior_weight * (codes**2).sum()
         total.backward()
         return total
 
@@ -161,11 +161,11 @@ def _joined(
     """
     joined, mismatch = motions[0], motions[0].new_zeros(())
     for motion in motions[1:]:
-        ends = torch.cat([joined[-_SHARED:], motion[-_SHARED:]])
+        ends = torch.cat([joined[-_OVERLAP:], motion[-_OVERLAP:]])
         mismatch = mismatch + _mismatch(motion, ends)
-        joined = torch.cat([joined, _corrected(motion, ends)[_SHARED:]])
+        joined = torch.cat([joined, _corrected(motion, ends)[_OVERLAP:]])
     # Spread the correction at both ends over the entire transition.
-    ends = torch.cat([before[-_SHARED:], after[:_SHARED]])
+    ends = torch.cat([before[-_OVERLAP:], after[:_OVERLAP]])
     return _corrected(joined, ends), mismatch + _mismatch(joined, ends)
 
 
@@ -176,7 +176,7 @@ def _mismatch(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
 
 def _shared_frames(frames: int) -> list[int]:
     """Return the indices of the frames shared with the neighbours."""
-    return [*range(_SHARED), *range(frames - _SHARED, frames)]
+    return [*range(_OVERLAP), *range(frames - _OVERLAP, frames)]
 
 
 def _corrected(rotations: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:

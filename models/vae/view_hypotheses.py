@@ -25,7 +25,7 @@ from probmotion.validation import check_count
 __all__ = ["HypothesisAccuracy", "evaluate_hypotheses"]
 
 # A hypothesis counts as correct up to this multiple of the smallest error.
-_AS_GOOD = 1.2
+_MAX_ERROR_RATIO = 1.2
 _TO_Y_UP = np.array([1.0, -1.0, -1.0])  # from OpenCV axes to y up, z towards the camera
 
 
@@ -122,7 +122,7 @@ def evaluate_hypotheses(
     rows, best = np.arange(n), losses.numpy().argmin(axis=1)
     selected = errors[rows, best]
     return HypothesisAccuracy(
-        right=float((selected <= _AS_GOOD * errors.min(axis=1)).mean()),
+        right=float((selected <= _MAX_ERROR_RATIO * errors.min(axis=1)).mean()),
         depth_right=float((selected < mirrored[rows, best]).mean()),
         error=float(selected.mean()),
         least_error=float(errors.min(axis=1).mean()),

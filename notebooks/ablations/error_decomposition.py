@@ -58,13 +58,13 @@ class Study:
     out: Path
     quick: bool
 
-    def budget(self, name: str) -> ErrorDecomposition:
+    def decomposition(self, name: str) -> ErrorDecomposition:
         """Return the error decomposition of a setting; write its table and figure."""
         setting = SETTINGS[name]
         scale = {"frames": 6, "components": 12} if self.quick else {}
         problem = load_problem(setting.problem, **scale)
         folder = self.out / name.replace(" ", "-")
-        budget = decompose_error(
+        decomposition = decompose_error(
             problem,
             steps=setting.steps // (10 if self.quick else 1),
             seeds=2 if self.quick else 5,
@@ -74,12 +74,12 @@ class Study:
             learnt=self.network(problem, folder / "network") if setting.network else None,
             out=folder,
         )
-        budget.plot(folder / "decompose_error.png")
-        return budget
+        decomposition.plot(folder / "decompose_error.png")
+        return decomposition
 
     def network(self, problem: Problem, folder: Path) -> MotionDiffusion:
         """Return a 2D denoiser trained on views of draws from the prior of the problem."""
-        # The projection of the exact denoiser: orthographic, level, centred on average.
+        # Use the projection of the exact denoiser: orthographic, level, centred on average.
         filming = Filming(tilt=0.0, perspective=False, centre="sequence")
         steps = 60 if self.quick else 4000
         return denoiser_of(
@@ -98,15 +98,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="Output folder.")
     parser.add_argument("--quick", action="store_true", help="Short motions and few draws.")
-    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    names = list(SETTINGS)
+    parser.add_argument(
+        "--settings", nargs="+", choices=names, default=names, help="Settings to run."
+    )
     options = parser.parse_args()
     study = Study(options.out, options.quick)
     options.out.mkdir(parents=True, exist_ok=True)
     tables = []
     for name in options.settings:
-        budget = study.budget(name)
-        tables.append(budget.table().assign(setting=f"{name}: {budget.setting}"))
-        print(f"\n{budget.setting} ({name})", *budget.findings, *budget.notes, sep="\n", flush=True)
+        result = study.decomposition(name)
+        tables.append(result.table().assign(setting=f"{name}: {result.setting}"))
+        print(f"\n{result.setting} ({name})", *result.findings, *result.notes, sep="\n", flush=True)
     with written_whole(options.out / "bias_budgets.csv") as path:
         pd.concat(tables).to_csv(path, index=False)
 

@@ -1,4 +1,4 @@
-"""MAS on our clips: tables 2 and 3 of Kapon et al. (2024), and errors in 3D.
+"""Evaluation of MAS on motion capture: tables 2 and 3 of Kapon et al. (2024), and errors in 3D.
 
     python notebooks/ablations/mas.py --out mas
     python notebooks/ablations/mas.py --quick --out quick    (synthetic walks, tiny networks, 1 min)
@@ -96,8 +96,8 @@ class Study:
     @cached_property
     def tracks(self) -> LearningTracks:
         """Detected 2D tracks of the clips, by part."""
-        every = [clip for clips in self.clips.values() for clip in clips]
-        filmed = film_clips(every, PERSON, FPS, views=8 if self.quick else 64)
+        all_clips = [clip for clips in self.clips.values() for clip in clips]
+        filmed = film_clips(all_clips, PERSON, FPS, views=8 if self.quick else 64)
         names = {part: [clip.name for clip in clips] for part, clips in self.clips.items()}
         return split_tracks(filmed.tracks, validation=names["validation"], test=names["test"])
 
@@ -268,9 +268,9 @@ def table(study: Study) -> pd.DataFrame:
         study.out / "draws.png",
         heading=math.pi / 3,
     )
-    made = pd.DataFrame(rows)
-    draw_generation(made, SHOWN, study.out / "table.png", logarithmic=["fid", "fid_learnt"])
-    return made
+    table = pd.DataFrame(rows)
+    draw_generation(table, SHOWN, study.out / "table.png", logarithmic=["fid", "fid_learnt"])
+    return table
 
 
 def score(
@@ -312,12 +312,12 @@ def score(
 
 
 def score_run(
-    study: Study, name: str, found: Comparison, run: RunResult, real: np.ndarray
+    study: Study, name: str, comparison: Comparison, run: RunResult, real: np.ndarray
 ) -> dict[str, object]:
     """Return the row of a run of the comparison, or the reason for its failure."""
     if run.failure is not None:
         return {"name": name, "failed": str(run.failure)}
-    motions = found.draws(run.problem, run.sampler).flat()
+    motions = comparison.draws(run.problem, run.sampler).flat()
     return score(study, name, motions, None, real, run.metrics["seconds"] / study.draws)
 
 
@@ -400,20 +400,22 @@ def exact(study: Study) -> pd.DataFrame:
     The network is trained on views of prior draws. Metrics compare with exact draws.
     """
     problem = load_problem("gait")
-    known = problem.posterior.prior
+    exact_prior = problem.posterior.prior
     n = 400 if study.quick else 4000
-    drawn = known.sample(seeds.generator(SEED, "pictures"), n)
+    drawn = exact_prior.sample(seeds.generator(SEED, "pictures"), n)
     clips = [
-        Motion(motion, known.skeleton, known.fps, name=f"gait-{number}")
+        Motion(motion, exact_prior.skeleton, exact_prior.fps, name=f"gait-{number}")
         for number, motion in enumerate(drawn)
     ]
-    # The projection of the exact denoiser: orthographic, one elevation, centred on average.
+    # Use the projection of the exact denoiser: orthographic, one elevation, centred on average.
     filming = Filming(tilt=0.0, perspective=False, centre="sequence")
     tracks = project_clips(clips, views=4, filming=filming, noise=DetectorNoise.none())
-    held = len(tracks) // 10
+    n_validation = len(tracks) // 10
     size = DiffusionSettings.tiny(30) if study.quick else DiffusionSettings.small(30)
     plain = replace(Augmentation.none(), shortest=1.0)
-    trainee = DiffusionTrainee(tracks[held:], tracks[:held], size, augmentation=plain)
+    trainee = DiffusionTrainee(
+        tracks[n_validation:], tracks[:n_validation], size, augmentation=plain
+    )
     settings = TrainingSettings(steps=study.steps // (10 if study.quick else 1), learning_rate=1e-3)
     learnt = MotionDiffusion.load(study.trained("gait", trainee, settings))
     comparison = study.compared(
@@ -455,9 +457,11 @@ PARTS = {"table": table, "strided": strided, "exact": exact}
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
+    data_folder = Path(__file__).parents[3] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
+    names = list(PARTS)
+    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
     parser.add_argument("--draws", type=int, help="Number of motions per sampler.")
     parser.add_argument("--iterations", type=int, help="Iterations of SDS.")
@@ -476,10 +480,10 @@ def main() -> None:
     )
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
-        made = PARTS[part](study)
+        results = PARTS[part](study)
         with written_whole(options.out / f"{part}.csv") as path:
-            made.to_csv(path, index=False)
-        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+            results.to_csv(path, index=False)
+        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -126,17 +126,17 @@ class Study:
 
     def recordings(self, kind: str) -> list[Recording]:
         """Return the recordings of a kind, evenly spaced in the test clips."""
-        noise, freedom, hides = KINDS[kind]
-        made = []
+        noise, freedom, occlusion = KINDS[kind]
+        recordings = []
         for clip in self.clips["test"]:
             frames = min(FRAMES, clip.frames)
-            room = clip.frames - frames
+            last_start = clip.frames - frames
             # Clips of at most FRAMES frames provide one recording.
-            count = min(self.per_clip, room // (frames // 2) + 1)
-            for start in np.linspace(0, room, count).astype(int):
+            count = min(self.per_clip, last_start // (frames // 2) + 1)
+            for start in np.linspace(0, last_start, count).astype(int):
                 truth = replace(clip.window(int(start), frames), name=f"{clip.name}/{start}")
-                hidden = limb_occlusions(truth, cut_off=hides == "from the ends")
-                hidden &= hides != "nothing"
+                hidden = limb_occlusions(truth, cut_off=occlusion == "from the ends")
+                hidden &= occlusion != "nothing"
                 observed = Joints3D.observe(
                     truth,
                     noise,
@@ -144,8 +144,8 @@ class Study:
                     hidden=hidden,
                     degrees_of_freedom=freedom,
                 )
-                made.append(Recording(truth, observed, hidden))
-        return made
+                recordings.append(Recording(truth, observed, hidden))
+        return recordings
 
     def posterior(
         self, recording: Recording, network: MotionDenoiser | None = None
@@ -197,7 +197,7 @@ def mixture(study: Study) -> Estimate:
     frames = study.prior.settings.frames
     clips = [clip for clip in study.clips["train"] if clip.frames >= frames]
     order = list(clips[0].skeleton.mirrored_order)
-    # Mirrored clips too, as in the training of the DVAE.
+    # As in the training of the DVAE, mirrored clips are included.
     mirrored = [replace(c, positions=c.positions[:, order] * [-1.0, 1.0, 1.0]) for c in clips]
     known = GaussianMixtureMotion.fit(
         [*clips, *mirrored], frames, rank=20, styles=4 if study.quick else 6, seed=study.seed
@@ -207,7 +207,7 @@ def mixture(study: Study) -> Estimate:
     def estimate(recording: Recording) -> np.ndarray:
         observed = recording.observed
         stitching = Stitching(recording.truth.frames, frames, frames // 3)
-        found = []
+        means = []
         for joints, confidence in zip(
             stitching.cut(observed.joints), stitching.cut(observed.entries.confidence), strict=True
         ):
@@ -215,8 +215,8 @@ def mixture(study: Study) -> Estimate:
             seen = confidence[:, root] > 0
             centre = joints[seen, root].mean(axis=0)
             centred = Joints3D(joints - centre, gaussian_noise(observed), confidence)
-            found.append(known.exact_posterior(centred).mean() + centre)
-        return stitching.mean(np.stack(found))
+            means.append(known.exact_posterior(centred).mean() + centre)
+        return stitching.mean(np.stack(means))
 
     return estimate
 
@@ -226,9 +226,9 @@ def estimates(study: Study) -> dict[str, Estimate]:
     fit = DVAEInference(mode="optimization", iterations=50)
     regression = DVAEInference()
     known = mixture(study)
-    blind = study.trained("no prior", study.prior, latent_weight=0.0)
-    clean = study.trained("no noisy training", study.prior, noise=JointNoise.nearly_clean())
-    free = replace(fit, latent_weight=0.0)
+    no_prior = study.trained("no prior", study.prior, latent_weight=0.0)
+    no_noise = study.trained("no noisy training", study.prior, noise=JointNoise.nearly_clean())
+    without_prior = replace(fit, latent_weight=0.0)
     return {
         "noisy input": noisy,
         "Savitzky-Golay": filtered,
@@ -239,31 +239,31 @@ def estimates(study: Study) -> dict[str, Estimate]:
         "optimization, 100 iterations": study.dvae(replace(fit, iterations=100)),
         "NN output, regression": study.dvae(regression, average=False),
         "NN output, optimization": study.dvae(fit, average=False),
-        "no prior, regression": study.dvae(regression, blind),
-        "no prior, optimization": study.dvae(free, blind),
-        "no noisy training, regression": study.dvae(regression, clean),
-        "no noisy training, optimization": study.dvae(fit, clean),
+        "no prior, regression": study.dvae(regression, no_prior),
+        "no prior, optimization": study.dvae(without_prior, no_prior),
+        "no noisy training, regression": study.dvae(regression, no_noise),
+        "no noisy training, optimization": study.dvae(fit, no_noise),
         "Gaussian noise, optimization": study.dvae(replace(fit, degrees_of_freedom=math.inf)),
         "Student-t noise, optimization": study.dvae(replace(fit, degrees_of_freedom=4.0)),
         "as published, optimization": study.dvae(DVAEInference.paper()),
     }
 
 
-def measured(recording: Recording, found: np.ndarray) -> dict[str, float]:
+def errors_of(recording: Recording, estimate: np.ndarray) -> dict[str, float]:
     """Return the errors of an estimate in mm, and its acceleration ratio."""
     truth = recording.truth.positions
     root = recording.truth.skeleton.roots[0]
     local = accuracy.joint_errors(
-        accuracy.aligned_by_root(found, root), accuracy.aligned_by_root(truth, root)
+        accuracy.aligned_by_root(estimate, root), accuracy.aligned_by_root(truth, root)
     )
-    world = accuracy.joint_errors(found, truth)
+    world = accuracy.joint_errors(estimate, truth)
     row = {"mpjpe": local.mean(), "g_mpjpe": world.mean()}
     if recording.hidden.any():
         for name, mask in (("visible", ~recording.hidden), ("occluded", recording.hidden)):
             row[f"mpjpe_{name}"] = accuracy.mean_over(local, mask)
             row[f"g_mpjpe_{name}"] = accuracy.mean_over(world, mask)
     row = {name: 1000 * float(value) for name, value in row.items()}
-    row["acceleration_ratio"] = float(accuracy.acceleration_ratio(found, truth))
+    row["acceleration_ratio"] = float(accuracy.acceleration_ratio(estimate, truth))
     return row
 
 
@@ -275,21 +275,21 @@ def table(study: Study) -> pd.DataFrame:
     """
     stored = study.out / "table.csv"
     rows = pd.read_csv(stored).to_dict("records") if stored.exists() else []
-    made_of = {"per_clip": study.per_clip, "weights": weights_digest(study.prior.model)[:12]}
+    origin = {"per_clip": study.per_clip, "weights": weights_digest(study.prior.model)[:12]}
     for row in rows:
-        if any(str(row.get(name)) != str(value) for name, value in made_of.items()):
-            raise ValueError(f"{stored} must have rows of {made_of}; use another --out")
-    made = {(row["kind"], row["estimate"]) for row in rows}
+        if any(str(row.get(name)) != str(value) for name, value in origin.items()):
+            raise ValueError(f"{stored} must have rows of {origin}; use another --out")
+    finished = {(row["kind"], row["estimate"]) for row in rows}
     methods = estimates(study)
     for kind in KINDS:
         recordings = study.recordings(kind)
         for name, estimate in methods.items():
             # "Gaussian noise" equals "optimization" if the simulated noise is Gaussian.
             same = name.startswith("Gaussian") and KINDS[kind][1] is None
-            if same or (kind, name) in made:
+            if same or (kind, name) in finished:
                 continue
-            found = table_row(recordings, estimate)
-            rows.append({"kind": kind, "estimate": name, **found, **made_of})
+            errors = table_row(recordings, estimate)
+            rows.append({"kind": kind, "estimate": name, **errors, **origin})
             print(rows[-1], flush=True)
             with written_whole(stored) as path:
                 pd.DataFrame(rows).to_csv(path, index=False)
@@ -301,19 +301,19 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
 
     A mean over the successful recordings is not comparable with other rows.
     """
-    begun = time.perf_counter()
-    found, failed = [], 0
+    started = time.perf_counter()
+    estimates, failed = [], 0
     for recording in recordings:
         try:
-            found.append((recording, estimate(recording)))
+            estimates.append((recording, estimate(recording)))
         except ValueError as error:
             failed += 1
             print(f"{recording.truth.name}: {error}", flush=True)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - started
     row: dict[str, float] = {"recordings": len(recordings), "failed": failed}
     if failed:
         return row
-    errors = pd.DataFrame([measured(*pair) for pair in found])
+    errors = pd.DataFrame([errors_of(*pair) for pair in estimates])
     # Recordings of a clip are correlated, so standard errors are computed over clips.
     clips = errors.groupby([one.truth.name.partition("/")[0] for one in recordings]).mean()
     frames = sum(recording.truth.frames for recording in recordings)
@@ -336,10 +336,12 @@ def speed(study: Study) -> pd.DataFrame:
             else DVAEInference()
         )
         estimate = study.dvae(sampler)
-        begun = time.perf_counter()
-        found = [estimate(recording) for recording in recordings]
-        seconds = time.perf_counter() - begun
-        errors = pd.DataFrame([measured(*pair) for pair in zip(recordings, found, strict=True)])
+        started = time.perf_counter()
+        estimates = [estimate(recording) for recording in recordings]
+        seconds = time.perf_counter() - started
+        errors = pd.DataFrame(
+            [errors_of(*pair) for pair in zip(recordings, estimates, strict=True)]
+        )
         frames = sum(recording.truth.frames for recording in recordings)
         rows.append(
             {
@@ -349,11 +351,11 @@ def speed(study: Study) -> pd.DataFrame:
             }
         )
         print(rows[-1], flush=True)
-    made = pd.DataFrame(rows)
+    results = pd.DataFrame(rows)
     figure, left = plt.subplots(figsize=(6, 4), layout="constrained")
     for name, label in (("g_mpjpe", "all joints"), ("g_mpjpe_occluded", "occluded joints")):
-        left.plot(made["seconds_per_frame"], made[name], "o-", label=label)
-    for _, row in made.iterrows():
+        left.plot(results["seconds_per_frame"], results[name], "o-", label=label)
+    for _, row in results.iterrows():
         left.annotate(f"{row['iterations']:.0f}", (row["seconds_per_frame"], row["g_mpjpe"]))
     left.set(xscale="log", xlabel="seconds per frame", ylabel="G-MPJPE, mm")
     left.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -362,7 +364,7 @@ def speed(study: Study) -> pd.DataFrame:
     with written_whole(study.out / "speed.png") as path:
         figure.savefig(path, format="png", dpi=150)
     plt.close(figure)
-    return made
+    return results
 
 
 def recording(study: Study) -> pd.DataFrame:
@@ -376,9 +378,9 @@ def recording(study: Study) -> pd.DataFrame:
     # with four degrees of freedom and this scale.
     scale = 0.0126
     rows = []
-    for hides in (False, True):
+    for occlusion in (False, True):
         truth = Motion(real.filtered, real.skeleton, real.fps, name=real.name)
-        hidden = (limb_occlusions(truth) & hides) | ~real.seen
+        hidden = (limb_occlusions(truth) & occlusion) | ~real.seen
         observed = Joints3D(
             real.joints, scale, (~hidden).astype(float), 4.0, real.skeleton, real.fps
         )
@@ -393,7 +395,7 @@ def recording(study: Study) -> pd.DataFrame:
             "optimization, 200 iterations": study.dvae(replace(fit, iterations=200)),
         }
         for name, estimate in methods.items():
-            rows.append({"hidden": hides, "estimate": name, **measured(one, estimate(one))})
+            rows.append({"hidden": occlusion, "estimate": name, **errors_of(one, estimate(one))})
             print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
@@ -409,12 +411,12 @@ class StartedNUTS:
     nuts: NUTS
 
     def sample(
-        self, posterior: MotionPosterior, *, chains: int, seed: int, progress: bool, **how: Any
+        self, posterior: MotionPosterior, *, chains: int, seed: int, progress: bool, **options: Any
     ) -> MotionDraws:
         """Return NUTS draws; each chain starts at a Motion-DVAE draw."""
-        begun = self.start.sample(posterior, draws=1, chains=chains, seed=seed, progress=progress)
-        how["initial"] = begun.dataset["theta"].values[:, 0]
-        return self.nuts.sample(posterior, chains=chains, seed=seed, progress=progress, **how)
+        started = self.start.sample(posterior, draws=1, chains=chains, seed=seed, progress=progress)
+        options["initial"] = started.dataset["theta"].values[:, 0]
+        return self.nuts.sample(posterior, chains=chains, seed=seed, progress=progress, **options)
 
 
 def posterior(study: Study) -> pd.DataFrame:
@@ -455,7 +457,7 @@ def posterior(study: Study) -> pd.DataFrame:
             row: dict[str, object] = {"sampler": run.sampler}
             if run.failure is None:
                 drawn = comparison.draws(run.problem, run.sampler)
-                row |= honesty(drawn.flat(), truth, hidden)
+                row |= draw_accuracy(drawn.flat(), truth, hidden)
                 row["log_density"] = float(drawn.dataset["log_density"].mean())
                 row["seconds"] = run.metrics["seconds"]
             else:
@@ -465,7 +467,7 @@ def posterior(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, float]:
+def draw_accuracy(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, float]:
     """Return spread and error of draws in mm, and coverage of central 90 % intervals."""
     middle = drawn.mean(axis=0)
     spread = np.sqrt(((drawn - middle) ** 2).sum(axis=-1).mean(axis=0))
@@ -473,11 +475,11 @@ def honesty(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[str, f
     low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
     inside = (truth.positions >= low) & (truth.positions <= high)
     row = {}
-    for name, which in (("seen", ~hidden), ("occluded", hidden)):
-        if which.any():
-            row[f"spread_{name}_mm"] = 1000 * float(spread[which].mean())
-            row[f"error_{name}_mm"] = 1000 * float(error[which].mean())
-            row[f"inside_{name}"] = float(inside[which].mean())
+    for name, mask in (("seen", ~hidden), ("occluded", hidden)):
+        if mask.any():
+            row[f"spread_{name}_mm"] = 1000 * float(spread[mask].mean())
+            row[f"error_{name}_mm"] = 1000 * float(error[mask].mean())
+            row[f"inside_{name}"] = float(inside[mask].mean())
     return row
 
 
@@ -487,9 +489,11 @@ PARTS = {"table": table, "speed": speed, "recording": recording, "posterior": po
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
+    data_folder = Path(__file__).parents[3] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
+    names = list(PARTS)
+    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic clips and tiny networks.")
     parser.add_argument("--per-clip", type=int, default=6, help="Recordings per test clip.")
     options = parser.parse_args()
@@ -499,10 +503,10 @@ def main() -> None:
     for part in options.parts:
         if part == "recording" and study.quick:
             continue  # requires the real recording
-        made = PARTS[part](study)
+        results = PARTS[part](study)
         with written_whole(options.out / f"{part}.csv") as path:
-            made.to_csv(path, index=False)
-        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+            results.to_csv(path, index=False)
+        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
 
 
 if __name__ == "__main__":

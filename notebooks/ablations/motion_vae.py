@@ -102,8 +102,8 @@ class Study:
         """3D clips by part."""
         if not self.quick:
             return walk_clips(self.data)
-        made = synthetic_walks(18, PERSON)
-        return {"train": made[:12], "validation": made[12:15], "test": made[15:]}
+        walks = synthetic_walks(18, PERSON)
+        return {"train": walks[:12], "validation": walks[12:15], "test": walks[15:]}
 
     @cached_property
     def tracks(self) -> dict[str, list[KeypointTrack]]:
@@ -124,8 +124,8 @@ class Study:
 
     def size(self, changes: Mapping[str, Any]) -> MotionVAESettings:
         """Return the network size of a variant."""
-        usual = MotionVAESettings.tiny() if self.quick else MotionVAESettings.small()
-        return replace(usual, **changes)
+        defaults = MotionVAESettings.tiny() if self.quick else MotionVAESettings.small()
+        return replace(defaults, **changes)
 
     def poses(self, changes: Mapping[str, Any]) -> PoseNetwork:
         """Return the network of the first phase, shared by variants with the same loss."""
@@ -172,8 +172,8 @@ class Study:
     def real_views(self, part: str, n: int) -> np.ndarray:
         """Return new 2D views of clips without detector noise, (n, frames, J, 2)."""
         rng = seeds.generator(self.seed, "real views", part)
-        every = self.real_windows(part, FRAMES)
-        return film_motions(every[rng.integers(0, len(every), n)], rng)
+        motions = self.real_windows(part, FRAMES)
+        return film_motions(motions[rng.integers(0, len(motions), n)], rng)
 
 
 def views(study: Study) -> pd.DataFrame:
@@ -205,8 +205,10 @@ def reconstructed(
     """Return PCK and velocity error in % on held-out tracks; without ``prior``, of poses only."""
     poses, size = study.poses(changes), study.size(changes)
     tracks = study.tracks["test"]
-    keypoints = np.concatenate([pieces(track.keypoints, size.frames) for track in tracks])
-    visible = np.concatenate([pieces(track.confidence, size.frames) for track in tracks]) >= 0.3
+    keypoints = np.concatenate([segments_of(track.keypoints, size.frames) for track in tracks])
+    visible = (
+        np.concatenate([segments_of(track.confidence, size.frames) for track in tracks]) >= 0.3
+    )
     detected = visible.any(axis=(1, 2))
     keypoints, visible = keypoints[detected], visible[detected]
     shown = np.where(visible[..., None], keypoints, 0.0)
@@ -215,14 +217,14 @@ def reconstructed(
     rest = torch.as_tensor(study.body.rest_positions, dtype=torch.float32)
     distance = Filming().distance
     with torch.no_grad():
-        guesses = poses.eval()(observed, weight, rest)
-        terms = hypothesis_losses(study.body, guesses, observed, weight, distance)
-        guess = best_hypothesis(guesses, weighted_sum(terms, size))
-        turns = guess.turns
+        hypotheses = poses.eval()(observed, weight, rest)
+        terms = hypothesis_losses(study.body, hypotheses, observed, weight, distance)
+        best = best_hypothesis(hypotheses, weighted_sum(terms, size))
+        turns = best.turns
         if prior is not None:
             turns = prior.model.vae.decode(prior.model.vae.encode(observed, weight, rest)[0])
-        translation = torch.nn.functional.pad(guess.translation, (0, 1))
-        joints = study.body.positions(turns, guess.rotation, translation, guess.log_lengths)
+        translation = torch.nn.functional.pad(best.translation, (0, 1))
+        joints = study.body.positions(turns, best.rotation, translation, best.log_lengths)
         projected = project_to_image(joints, distance).numpy()
     sizes = image_extent(shown, visible)
     return {
@@ -234,7 +236,7 @@ def reconstructed(
     }
 
 
-def pieces(values: np.ndarray, frames: int) -> np.ndarray:
+def segments_of(values: np.ndarray, frames: int) -> np.ndarray:
     """Return consecutive segments of an array (L, …), as (n, frames, …)."""
     n = len(values) // frames
     return values[: n * frames].reshape(n, frames, *values.shape[1:])
@@ -252,11 +254,11 @@ def generated(study: Study, motions: np.ndarray, seed: int) -> dict[str, float]:
     return row
 
 
-def measured(study: Study, name: str) -> dict[str, float]:
+def metrics_of(study: Study, name: str) -> dict[str, float]:
     """Return reconstruction and generation metrics of a variant."""
-    begun = time.perf_counter()
+    started = time.perf_counter()
     prior = study.variant(name)
-    row = {"seconds": time.perf_counter() - begun} | reconstructed(study, VARIANTS[name], prior)
+    row = {"seconds": time.perf_counter() - started} | reconstructed(study, VARIANTS[name], prior)
     repeats = pd.DataFrame(
         [
             generated(study, prior.sample(seeds.generator(seed, "draws"), study.draws), seed)
@@ -270,12 +272,12 @@ def table(study: Study) -> pd.DataFrame:
     """Return the metrics of every variant."""
     rows: list[dict[str, Any]] = []
     for name in VARIANTS:
-        rows.append({"variant": name} | measured(study, name))
+        rows.append({"variant": name} | metrics_of(study, name))
         print(rows[-1], flush=True)
     rows.append({"variant": "no motion VAE"} | reconstructed(study, {}))
     rng = seeds.generator(study.seed, "real draws")
-    every = study.real_windows("train", FRAMES)
-    real = every[rng.integers(0, len(every), study.draws)]
+    motions = study.real_windows("train", FRAMES)
+    real = motions[rng.integers(0, len(motions), study.draws)]
     rows.append({"variant": "real motion that was learnt from"} | generated(study, real, 0))
     for row in rows[-2:]:
         print(row, flush=True)
@@ -289,7 +291,7 @@ def data(study: Study) -> pd.DataFrame:
         subset = study if every == 1 else replace(study, out=study.out / name, every=every)
         of_poses = reconstructed(subset, VARIANTS[variant])
         row = {f"poses_{metric}": value for metric, value in of_poses.items()}
-        rows.append({"learnt from": name} | row | measured(subset, variant))
+        rows.append({"learnt from": name} | row | metrics_of(subset, variant))
         print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
@@ -301,11 +303,13 @@ def generation(study: Study) -> pd.DataFrame:
     per_motion = longer.frames // round(longer.fps / FPS) // FRAMES
     # A run has at least ten draws.
     n = max(10, study.draws // 10)
-    ours = MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
+    motion_vae = (
+        MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
+    )
     iterations = 50 if study.quick else 1000
     mas = MultiViewAncestral(steps=10, trained_steps=100) if study.quick else MultiViewAncestral()
     grids: tuple[tuple[str, Problem | MotionPosterior, dict[str, Sampler], int], ...] = (
-        ("motion-vae", ours, {"motion VAE": ExactSampler()}, n * per_motion),
+        ("motion-vae", motion_vae, {"motion VAE": ExactSampler()}, n * per_motion),
         (
             "walk2d",
             other,
@@ -329,16 +333,16 @@ def generation(study: Study) -> pd.DataFrame:
             if run.failure is None:
                 motions = sequences(comparison.draws(run.problem, run.sampler))
                 row |= {"sequences": len(motions), "seconds": run.metrics["seconds"]}
-                row |= beside_real(study, motions)
+                row |= distances_to_real(study, motions)
             else:
                 row["failed"] = str(run.failure)
             rows.append(row)
             print(row, flush=True)
     rng = seeds.generator(study.seed, "real draws")
-    every = study.real_windows("train", FRAMES)
-    motions = every[rng.integers(0, len(every), n * per_motion)]
+    real = study.real_windows("train", FRAMES)
+    motions = real[rng.integers(0, len(real), n * per_motion)]
     row = {"way": "real motion that was learnt from", "sequences": len(motions)}
-    rows.append(row | beside_real(study, motions))
+    rows.append(row | distances_to_real(study, motions))
     print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 
@@ -346,10 +350,10 @@ def generation(study: Study) -> pd.DataFrame:
 def sequences(draws: MotionDraws) -> np.ndarray:
     """Return draws as sequences at the frame rate of the study, (n, FRAMES, J, 3)."""
     thinned = draws.flat()[:, :: round(draws.fps / FPS)]
-    return np.concatenate([pieces(motion, FRAMES) for motion in thinned])
+    return np.concatenate([segments_of(motion, FRAMES) for motion in thinned])
 
 
-def beside_real(study: Study, motions: np.ndarray) -> dict[str, float]:
+def distances_to_real(study: Study, motions: np.ndarray) -> dict[str, float]:
     """Return distances of root-centred motions and their views to real ones."""
     centred = motions - motions[:, :, :1]
     row = generated(study, centred, 0)
@@ -366,9 +370,11 @@ PARTS = {"views": views, "table": table, "data": data, "generation": generation}
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
+    data_folder = Path(__file__).parents[3] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
+    names = list(PARTS)
+    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
     parser.add_argument("--steps", type=int, help="Training steps of the second phase.")
     parser.add_argument("--draws", type=int, help="Generated sequences; default: 1400.")
@@ -377,10 +383,10 @@ def main() -> None:
     study = Study(options.out, options.data, options.quick, options.steps, draws)
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
-        made = PARTS[part](study)
+        results = PARTS[part](study)
         with written_whole(options.out / f"{part}.csv") as path:
-            made.to_csv(path, index=False)
-        print(f"\n{part}\n{made.round(3).to_string(index=False)}\n", flush=True)
+            results.to_csv(path, index=False)
+        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -70,13 +70,13 @@ NOISE = {"interaction": 0.005, "cartesian": 0.01, "shape-context": 0.005}
 class Runs:
     """Comparison of a part, and the settings of its problems by name."""
 
-    asked: Mapping[str, Mapping[str, Any]]
-    found: Comparison
+    settings: Mapping[str, Mapping[str, Any]]
+    comparison: Comparison
 
     def draws(self, problem: str, sampler: str = "isotropic") -> MotionDraws | None:
         """Return the draws of a run; None if it failed."""
-        failed = {(run.problem, run.sampler) for run in self.found.failures}
-        return None if (problem, sampler) in failed else self.found.draws(problem, sampler)
+        failed = {(run.problem, run.sampler) for run in self.comparison.failures}
+        return None if (problem, sampler) in failed else self.comparison.draws(problem, sampler)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Study:
         return training, test
 
     @cached_property
-    def held_in(self) -> np.ndarray:
+    def training_poses(self) -> np.ndarray:
         """All dance frames of the training clips, (n, J, 3)."""
         return ground_truth(self.clips[0])[0]
 
@@ -120,9 +120,9 @@ class Study:
     @cached_property
     def seed_pose(self) -> np.ndarray:
         """The 3D seed pose of both people, (J, 3)."""
-        return self.held_in[choose_seed(self.held_in)]
+        return self.training_poses[choose_seed(self.training_poses)]
 
-    def pictures(self, repeat: int) -> DrawnAnnotations:
+    def drawn_annotations(self, repeat: int) -> DrawnAnnotations:
         """Return 2D annotations and their 3D poses, different in every repeat."""
         frames = [dance_frames(clip) for clip in self.clips[0]]
         n = min(self.n_annotations, sum(int(mask.sum()) for mask in frames))
@@ -135,13 +135,13 @@ class Study:
         if density == "prior":
             return pair_posterior(self.seed_pose, None, replace(PairSettings(), **changes))
         settings = replace(PairSettings(measure=density, noise=NOISE[density]), **changes)
-        annotations = self.pictures(repeat).annotations
+        annotations = self.drawn_annotations(repeat).annotations
         return pair_posterior(self.seed_pose, annotations, settings, view_seed=repeat)
 
     def run(
         self,
         part: str,
-        asked: Mapping[str, Mapping[str, Any]],
+        settings: Mapping[str, Mapping[str, Any]],
         proposals: Mapping[str, Proposal] | None = None,
         draws: int | None = None,
     ) -> Runs:
@@ -156,13 +156,13 @@ class Study:
                 self.posterior(**changes),
                 held_out=self.held_out[:, None],
             )
-            for name, changes in asked.items()
+            for name, changes in settings.items()
         }
         samplers = {
             name: MetropolisHastings(proposal, warmup=self.warmup, thin=1)
             for name, proposal in (proposals or {"isotropic": Isotropic(0.02)}).items()
         }
-        found = compare(
+        comparison = compare(
             problems,
             samplers,
             draws=draws or self.draws // 10,
@@ -171,9 +171,9 @@ class Study:
             workers=0,
             progress=not self.quick,
         )
-        for run in found.failures:
+        for run in comparison.failures:
             print(f"{part}: {run.sampler} on {run.problem} failed, {run.failure}")
-        return Runs(asked, found)
+        return Runs(settings, comparison)
 
     @cached_property
     def by_density(self) -> Runs:
@@ -194,27 +194,29 @@ class Study:
         ``fewer`` lists numbers of first draws, ``also`` additional metrics of the comparison.
         """
         rows = []
-        for run in runs.found.results:
-            about = dict(runs.asked[run.problem])
-            if len(runs.found.plan.samplers) > 1:
-                about["proposal"] = run.sampler
+        for run in runs.comparison.results:
+            row = dict(runs.settings[run.problem])
+            if len(runs.comparison.plan.samplers) > 1:
+                row["proposal"] = run.sampler
             covered = {
-                (measure, runs.found.plan.draws): run.metrics.get(f"coverage_{measure}", np.nan)
+                (measure, runs.comparison.plan.draws): run.metrics.get(
+                    f"coverage_{measure}", np.nan
+                )
                 for measure in MEASURES
             }
             draws = runs.draws(run.problem, run.sampler)
             if draws is None:
-                about["failed"] = str(run.failure)
+                row["failed"] = str(run.failure)
             else:
-                about |= {name: run.metrics[name] for name in ("acceptance", *also)}
-                about["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
-                about |= {
+                row |= {name: run.metrics[name] for name in ("acceptance", *also)}
+                row["scale"] = float(np.exp(draws.state["proposal_log_scale"]).mean())
+                row |= {
                     "ess": run.metrics.get("ess_bulk", np.nan),
                     "seconds": run.metrics["seconds"],
                 }
                 covered = self.covered(step_by_step(draws), fewer) | covered
             rows += [
-                {"measure": measure, "draws": count, "coverage": value, **about}
+                {"measure": measure, "draws": count, "coverage": value, **row}
                 for (measure, count), value in covered.items()
             ]
         return pd.DataFrame(rows)
@@ -274,7 +276,9 @@ def levels(posterior: TruncatedPosterior, poses: np.ndarray) -> dict[str, np.nda
 def calibration(study: Study) -> pd.DataFrame:
     """Return log densities of real pairs, the seed and draws at several σ_l."""
     rng = seeds.generator(SEED, "calibration")
-    real = study.held_in[rng.choice(len(study.held_in), min(400, len(study.held_in)), False)]
+    real = study.training_poses[
+        rng.choice(len(study.training_poses), min(400, len(study.training_poses)), False)
+    ]
     sizes = {f"noise {size}": size for size in (0.005, PairSettings().noise, 0.02)}
     runs = study.run("calibration", {name: {"noise": size} for name, size in sizes.items()})
     rows = []
@@ -376,7 +380,7 @@ def densities(study: Study) -> pd.DataFrame:
         }
         for name, poses in (
             ("the seed alone", study.seed_pose[None]),
-            ("all held-in real pairs", study.held_in),
+            ("all held-in real pairs", study.training_poses),
         )
         for measure in MEASURES
     ]
@@ -388,7 +392,7 @@ def embedding(study: Study) -> pd.DataFrame:
     sets = {"real": evenly(study.held_out, 150)}
     for kind, density in (("prior", "prior"), ("posterior", "interaction")):
         if (draws := study.by_density.draws(f"{density}, repeat 0")) is not None:
-            # Of 2000 evenly spaced draws, a subset of the first 20, of the first 200 and of all.
+            # Subsets of the first 20, of the first 200 and of all 2000 evenly spaced draws.
             states = evenly(step_by_step(draws), 2000)
             sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
@@ -410,7 +414,7 @@ def completion(study: Study) -> pd.DataFrame:
     n = 10 if study.quick else 60
     test = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
     complete = draw_annotations(study.clips[1], n, SEED, frames=frames)
-    annotated = study.pictures(0).annotations
+    annotated = study.drawn_annotations(0).annotations
     skeleton = annotated.skeleton
     views = annotation_views(test.annotations, study.seed_pose)
     draws = study.by_density.draws("interaction, repeat 0")
@@ -473,8 +477,9 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
 def main() -> None:
     """Run the selected parts and print every table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("pose-pairs"))
-    parser.add_argument("--parts", nargs="*", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--out", type=Path, default=Path("pose-pairs"), help="Output folder.")
+    names = list(PARTS)
+    parser.add_argument("--parts", nargs="*", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic dances and few draws.")
     parser.add_argument("--draws", type=int, help="Draws of all chains; default: 100000.")
     parser.add_argument("--repeats", type=int, default=3, help="Number of repeats.")

@@ -70,7 +70,10 @@ def main() -> None:
     """Run the selected studies and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="Output folder.")
-    parser.add_argument("--studies", nargs="+", choices=STUDIES, default=list(STUDIES))
+    names = list(STUDIES)
+    parser.add_argument(
+        "--studies", nargs="+", choices=names, default=names, help="All by default."
+    )
     parser.add_argument("--draws", type=int, default=100, help="Number of draws per run.")
     parser.add_argument("--seeds", type=int, default=3, help="Number of seeds.")
     parser.add_argument("--workers", type=int, default=2, help="Number of processes.")

@@ -36,10 +36,10 @@ from probmotion.validation import check_count
 
 __all__ = ["decompose_error"]
 
-_MORE = 10  # steps of the `remainder` sampler, as a multiple of T
+_REFINEMENT = 10  # steps of the `remainder` sampler, as a multiple of T
 # Settings of `mas` that are compatible with the decomposition.
 _SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance", "batch")
-_SHARED = ("schedule_power", "batch")  # also settings of `ancestral3d`
+_COMMON_SETTINGS = ("schedule_power", "batch")  # also settings of `ancestral3d`
 
 
 def decompose_error(
@@ -139,7 +139,7 @@ def _chain(
             raise ValueError(f"settings must be among {', '.join(_SETTINGS)}, got {name!r}")
     require_exact(problem)
     Ancestral, Mas = load_sampler("ancestral3d"), load_sampler("mas")
-    common = {name: settings[name] for name in _SHARED if name in settings}
+    common = {name: settings[name] for name in _COMMON_SETTINGS if name in settings}
     likelihood = problem.posterior.likelihood
     inside = conditioned(problem.posterior)
     shared = likelihood is not None if shared_noise is None else shared_noise
@@ -149,7 +149,7 @@ def _chain(
         )
     links = [
         _Link("exact", load_sampler("exact")(), problem.posterior),
-        _Link("remainder", Ancestral(steps=_MORE * steps, **common), inside),
+        _Link("remainder", Ancestral(steps=_REFINEMENT * steps, **common), inside),
         _Link("discretisation", Ancestral(steps=steps, **common), inside),
         _Link("single view", Mas(steps=steps, **settings), inside),
     ]

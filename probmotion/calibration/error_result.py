@@ -90,11 +90,11 @@ class ErrorDecomposition:
             clear = {part: row for part, row in rows.items() if row["low"] > 0 or row["high"] < 0}
             whole = clear.pop(_WHOLE, None)
             rows.pop(_WHOLE)
-            total = "not significant" if whole is None else _in_words(whole)
-            words = [f"{measure}: {total} in all"]
+            total = "not significant" if whole is None else _with_interval(whole)
+            words = [f"{measure}: total {total}"]
             if clear:
                 ordered = sorted(clear, key=lambda part: -abs(clear[part]["mean"]))
-                words.append(", ".join(f"{part} {_in_words(clear[part])}" for part in ordered))
+                words.append(", ".join(f"{part} {_with_interval(clear[part])}" for part in ordered))
             if unclear := [part for part in rows if part not in clear]:
                 words.append(f"not significant: {', '.join(unclear)}")
             sentences.append("; ".join(words))
@@ -148,5 +148,5 @@ class StoredValues:
             unfinished.write_text(text, encoding="utf-8")
 
 
-def _in_words(row: Any) -> str:
+def _with_interval(row: Any) -> str:
     return f"{row['mean']:+.3g} ({row['low']:+.3g} to {row['high']:+.3g})"

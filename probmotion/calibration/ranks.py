@@ -18,7 +18,7 @@ from probmotion.posteriors.problem import Problem
 
 __all__ = ["Rank", "independent_draws", "rank", "ranks_of_truth"]
 
-_FEWEST = 4  # minimum draws per chain for an effective sample size
+_MIN_DRAWS = 4  # minimum draws per chain for an effective sample size
 
 
 class Rank(NamedTuple):
@@ -51,7 +51,7 @@ def independent_draws(values: np.ndarray, draws: MotionDraws) -> np.ndarray:
         return flat
     if "autocorrelation_time" in draws.dataset:
         size = len(flat) / float(np.max(draws.dataset["autocorrelation_time"].values))
-    elif not np.isfinite(flat).all() or np.ptp(flat) == 0 or values.shape[1] < _FEWEST:
+    elif not np.isfinite(flat).all() or np.ptp(flat) == 0 or values.shape[1] < _MIN_DRAWS:
         size = 1.0
     else:
         from arviz_stats.base import array_stats
@@ -66,20 +66,20 @@ def ranks_of_truth(
     problem: Problem,
     simulation: Problem,
     draws: MotionDraws,
-    elsewhere: Problem,
+    other: Problem,
     seed: int,
 ) -> dict[str, Rank]:
     """Return the rank of a simulation's truth in each quantity of ``problem``.
 
     The quantity ``distance`` is the root mean square distance of joints from the truth of another
-    simulation, ``elsewhere``, in metres. ``seed`` determines how ties are broken.
+    simulation, ``other``, in metres. ``seed`` determines how ties are broken.
     """
-    if simulation.truth is None or elsewhere.truth is None:
+    if simulation.truth is None or other.truth is None:
         raise ValueError(f"simulations of {problem.name} must have a truth, got none")
     positions = np.concatenate([simulation.truth[None], draws.flat()])
     values_of = {item.name: item.evaluate(positions) for item in quantities(problem.posterior)}
     values_of |= log_densities(simulation, positions)
-    square = ((positions - elsewhere.truth) ** 2).sum(axis=-1)
+    square = ((positions - other.truth) ** 2).sum(axis=-1)
     values_of[DISTANCE] = np.sqrt(square.mean(axis=(1, 2)))
     shape = (draws.dataset.sizes["chain"], draws.dataset.sizes["draw"])
     ranks = {}

@@ -22,7 +22,7 @@ from probmotion.files import written_whole
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probmotion.calibration.table import CalibrationTable, Ranked
+    from probmotion.calibration.table import CalibrationRanks, CalibrationTable
 
 __all__ = ["Calibration"]
 
@@ -167,13 +167,13 @@ class Calibration:
 
         return coverage_frame(self.ranks(problem, sampler))
 
-    def _ranked(self, problem: str, sampler: str) -> Ranked:
-        from probmotion.calibration.table import Ranked
+    def _ranked(self, problem: str, sampler: str) -> CalibrationRanks:
+        from probmotion.calibration.table import CalibrationRanks
 
         runs = self.runs(problem, sampler)
         failures = [run.failure for run in runs if run.failure is not None]
         ranks = self.ranks(problem, sampler)
-        return Ranked(problem, sampler, ranks, failures, len(runs), self.plan.seeds)
+        return CalibrationRanks(problem, sampler, ranks, failures, len(runs), self.plan.seeds)
 
     def verdict(self, problem: str, sampler: str) -> str:
         """Return a one-sentence verdict on a sampler's calibration."""

@@ -14,7 +14,9 @@ from probmotion.comparison.results.failures import Failure
 from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
 from probmotion.metrics.uniformity import adjusted_p_values, uniformity_p_value
 
-__all__ = ["LEVELS", "CalibrationTable", "Ranked", "coverage_curve", "coverage_frame", "verdict"]
+__all__ = [
+    "LEVELS", "CalibrationRanks", "CalibrationTable", "coverage_curve", "coverage_frame", "verdict",
+]  # fmt: skip
 
 # Levels of credible sets: 0.05, 0.1, …, 0.95.
 LEVELS = np.arange(1, 20) / 20
@@ -23,18 +25,18 @@ _COLUMNS = [
     "problem", "sampler", "quantity", "p_value", "coverage_90", "coverage_error", "simulations",
     "failed",
 ]  # fmt: skip
-_SHOWN = 0.9  # level of the credible sets in the table and the verdicts
+_LEVEL = 0.9  # level of the credible sets in the table and the verdicts
 _SIGNIFICANT = 0.05  # significance level of the verdicts
-_FEWEST = 2  # minimum number of simulations for a verdict
+_MIN_SIMULATIONS = 2  # minimum number of simulations for a verdict
 _LEGEND = """\
 p: p-value of uniform ranks, all quantities together (Holm); worst: quantity with the smallest p;
-90 % covers: fraction of truths in central 90 % intervals, mean over quantities; density, distance:
-the same for highest-density sets and balls around random motions (TARP); error: mean |coverage −
-level|, mean over quantities, about 0.3/√simulations for exact draws"""
+90 % coverage: fraction of truths in central 90 % intervals, mean over quantities; density,
+distance: the same for highest-density sets and balls around random motions (TARP); error:
+mean |coverage − level|, mean over quantities, about 0.3/√simulations for exact draws"""
 
 
 @dataclass(frozen=True, eq=False)
-class Ranked:
+class CalibrationRanks:
     """Ranks of the truths in [0, 1] by quantity, (n,), for one sampler on one problem.
 
     Failed simulations have an entry in ``failures`` instead of ranks; ``simulations`` and
@@ -53,7 +55,7 @@ class CalibrationTable(pd.DataFrame):
     """Data frame of :meth:`Calibration.table`, printed as a summary; slices are plain frames."""
 
     @classmethod
-    def of(cls, ranked: Sequence[Ranked], notes: Sequence[str]) -> CalibrationTable:
+    def of(cls, ranked: Sequence[CalibrationRanks], notes: Sequence[str]) -> CalibrationTable:
         """Return the table of every sampler's ranks on every problem."""
         rows: list[tuple] = []
         for item in ranked:
@@ -105,7 +107,7 @@ def coverage_frame(ranks: Mapping[str, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["quantity", "level", "coverage", "lower", "upper"])
 
 
-def verdict(ranked: Ranked) -> str:
+def verdict(ranked: CalibrationRanks) -> str:
     """Return a one-sentence verdict on a sampler's calibration on a problem."""
     failed, ranks, finished = ranked.failures, ranked.ranks, ranked.simulations
     succeeded = finished - len(failed)
@@ -116,7 +118,7 @@ def verdict(ranked: Ranked) -> str:
         if not succeeded and all(failure.unsupported for failure in failed):
             return f"{where}: not supported, {first}"
         note = f"; {len(failed)} of {finished} simulations failed, the first: {first}"
-    if succeeded < _FEWEST:
+    if succeeded < _MIN_SIMULATIONS:
         return f"{where}: too few simulations, {succeeded} of {ranked.planned} succeeded{note}"
     p_values = {name: uniformity_p_value(values) for name, values in ranks.items()}
     p = float(adjusted_p_values(np.array(list(p_values.values()))).min())
@@ -132,11 +134,11 @@ def _deviation(ranks: Mapping[str, np.ndarray], p_values: Mapping[str, float]) -
     coverage = _central(ranks)
     n = len(next(iter(ranks.values())))
     # Two standard errors of a single quantity, because quantities of a motion are correlated.
-    error = 2 * math.sqrt(_SHOWN * (1 - _SHOWN) / n)
+    error = 2 * math.sqrt(_LEVEL * (1 - _LEVEL) / n)
     intervals = f"90 % intervals cover {100 * coverage:.0f} %"
-    if coverage < _SHOWN - error:
+    if coverage < _LEVEL - error:
         return f"overconfident: {intervals}"
-    if coverage > _SHOWN + error:
+    if coverage > _LEVEL + error:
         return f"underconfident: {intervals}"
     worst = min(p_values, key=lambda name: p_values[name])
     mean = 100 * float(ranks[worst].mean())
@@ -147,17 +149,17 @@ def _central(ranks: Mapping[str, np.ndarray]) -> float:
     """Return the mean coverage of central 90 % intervals over quantities."""
     central = [name for name in ranks if name not in (DENSITY, DISTANCE)]
     levels = np.array([credible_level(name, ranks[name]) for name in central])
-    return float((levels <= _SHOWN).mean())
+    return float((levels <= _LEVEL).mean())
 
 
 def _scores(ranks: Mapping[str, np.ndarray]) -> list[tuple[str, float, float, float]]:
     """Return quantity, p-value, 90 % coverage and coverage error; the first row combines all."""
-    if not ranks or len(next(iter(ranks.values()))) < _FEWEST:
+    if not ranks or len(next(iter(ranks.values()))) < _MIN_SIMULATIONS:
         return [("all", math.nan, math.nan, math.nan)]
     scores = []
     for name, values in ranks.items():
         error = float(np.abs(coverage_curve(name, values) - LEVELS).mean())
-        covered = float((credible_level(name, values) <= _SHOWN).mean())
+        covered = float((credible_level(name, values) <= _LEVEL).mean())
         scores.append((name, uniformity_p_value(values), covered, error))
     p = float(adjusted_p_values(np.array([score[1] for score in scores])).min())
     error = float(np.mean([score[3] for score in scores]))
@@ -173,7 +175,7 @@ def _line(sampler: str, table: pd.DataFrame) -> dict[str, str]:
         "sampler": sampler,
         "p": _number(float(combined["p_value"])),
         "worst": "-" if p_values.empty else str(p_values.idxmin()),
-        "90 % covers": _percent(float(combined["coverage_90"])),
+        "90 % coverage": _percent(float(combined["coverage_90"])),
         "density": _percent(float(covered.get(DENSITY, math.nan))),
         "distance": _percent(float(covered.get(DISTANCE, math.nan))),
         "error": _number(float(combined["coverage_error"])),

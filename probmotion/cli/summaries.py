@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.cli.training_options import listed
+from probmotion.cli.training_options import listed_clips
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.draws import MotionDraws
@@ -59,18 +59,18 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
         If the file does not exist.
     """
     if path.suffix == ".nc":
-        return _of_draws(path, MotionDraws.load(path))
+        return _draw_summary(path, MotionDraws.load(path))
     if path.suffix == ".safetensors":
-        return _of_checkpoint(path)
+        return _checkpoint_summary(path)
     if (path / _MODEL).is_file():
-        return _of_checkpoint(path / _MODEL)
-    if _holds_keypoints(path):
+        return _checkpoint_summary(path / _MODEL)
+    if _contains_keypoints(path):
         from probmotion.io.files import read_keypoints
 
-        return _of_tracks(path, read_keypoints(path, fps, skeleton))
+        return _track_summary(path, read_keypoints(path, fps, skeleton))
     from probmotion.io.files import load
 
-    return _of_motion(path, load(path))
+    return _motion_summary(path, load(path))
 
 
 def kind_of_network(path: Path) -> str:
@@ -84,7 +84,7 @@ def kind_of_network(path: Path) -> str:
     return str(_header(file)["kind"])
 
 
-def _holds_keypoints(path: Path) -> bool:
+def _contains_keypoints(path: Path) -> bool:
     if path.suffix == ".npz":
         from zipfile import BadZipFile, ZipFile
 
@@ -97,7 +97,7 @@ def _holds_keypoints(path: Path) -> bool:
     return path.suffix.lower() in (".json", ".csv", ".h5", ".hdf5") or path.is_dir()
 
 
-def _of_motion(path: Path, motion: Motion) -> Summary:
+def _motion_summary(path: Path, motion: Motion) -> Summary:
     heights = motion.positions[..., 1]
     root = motion.positions[:, motion.skeleton.roots[0]]
     travelled = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
@@ -111,7 +111,7 @@ def _of_motion(path: Path, motion: Motion) -> Summary:
     return Summary("\n".join(text), motion.skeleton, motion.positions[None], motion.name)
 
 
-def _of_tracks(path: Path, tracks: list[KeypointTrack]) -> Summary:
+def _track_summary(path: Path, tracks: list[KeypointTrack]) -> Summary:
     count = f"{len(tracks)} keypoint track{'s' if len(tracks) != 1 else ''}"
     text = [f"{path}: {count}"]
     for track in tracks:
@@ -122,7 +122,7 @@ def _of_tracks(path: Path, tracks: list[KeypointTrack]) -> Summary:
     return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
 
 
-def _of_draws(path: Path, draws: MotionDraws) -> Summary:
+def _draw_summary(path: Path, draws: MotionDraws) -> Summary:
     attributes, sizes = draws.dataset.attrs, draws.dataset.sizes
     sampler = str(attributes["sampler"])
     evaluations = ", ".join(f"{n} {kind}" for kind, n in draws.counts.items()) or "not counted"
@@ -138,7 +138,7 @@ def _of_draws(path: Path, draws: MotionDraws) -> Summary:
     return Summary("\n".join(text), draws.skeleton, draws.flat()[:4], sampler)
 
 
-def _of_checkpoint(path: Path) -> Summary:
+def _checkpoint_summary(path: Path) -> Summary:
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     header = _header(path)
@@ -156,7 +156,7 @@ def _of_checkpoint(path: Path) -> Summary:
             _progress(card),
         ]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise _no_checkpoint(path) from error
+        raise _not_a_checkpoint(path) from error
     return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
 
 
@@ -170,10 +170,10 @@ def _header(path: Path) -> dict[str, Any]:
             sizes = [np.prod(file.get_slice(name).get_shape()) for name in file.keys()]  # noqa: SIM118
         return {"kind": header["kind"], **header, "numbers": sum(map(int, sizes))}
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise _no_checkpoint(path) from error
+        raise _not_a_checkpoint(path) from error
 
 
-def _no_checkpoint(path: Path) -> ValueError:
+def _not_a_checkpoint(path: Path) -> ValueError:
     from probmotion.io.errors import MotionFileError
 
     return MotionFileError(f"{path} is damaged or not a checkpoint of probmotion")
@@ -183,13 +183,13 @@ def _training_data(kind: str, network: dict[str, Any]) -> list[str]:
     """Return lines that describe the training data of a network."""
     if kind == "motion-dvae":
         data = network["data"]
-        frames = f"  trained on {data['frames']} frames of {_clips(data['clips'])}"
+        frames = f"  trained on {data['frames']} frames of {listed_clips(data['clips'])}"
         return [_windows(network), frames]
     if kind == "motion-denoiser":
         noise = network["noise"]
         return [
             _windows(network["prior"]),
-            f"  trained on noisy joints of {_clips(network['clips'])}",
+            f"  trained on noisy joints of {listed_clips(network['clips'])}",
             f"  noise of {noise['least']:g} to {noise['most']:g} m, outliers in "
             f"{noise['outliers']:.0%} of windows, occlusion in {noise['hidden']:.0%}",
         ]
@@ -200,10 +200,6 @@ def _training_data(kind: str, network: dict[str, Any]) -> list[str]:
 def _windows(network: dict[str, Any]) -> str:
     frames, fps = network["size"]["frames"], network["fps"]
     return f"  windows of {frames} frames at {fps:g} fps, {(frames - 1) / fps:.2f} s"
-
-
-def _clips(names: list[str]) -> str:
-    return f"{len(names)} clips: {listed(names)}"
 
 
 def _progress(card: dict[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from probmotion.cli.training_options import check_enough_clips, listed
+from probmotion.cli.training_options import check_enough_clips, listed_clips
 
 if TYPE_CHECKING:
     from probmotion.data.tracks.learning import LearningTracks
@@ -113,5 +113,5 @@ def learning_tracks(
     )
     for part in ("train", "validation", "test"):
         names = getattr(split.split, part)
-        print(f"{part}: {len(getattr(split, part))} tracks of {len(names)} clips: {listed(names)}")
+        print(f"{part}: {len(getattr(split, part))} tracks of {listed_clips(names)}")
     return split

@@ -33,11 +33,11 @@ class _TrackTraining:
     data: OmitArgPrefixes[TrackData] = field(default_factory=TrackData)
     training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
 
-    def prepared(self, usual: TrainingSettings) -> tuple[TrainingSettings, LearningTracks]:
+    def prepared(self, defaults: TrainingSettings) -> tuple[TrainingSettings, LearningTracks]:
         """Return the training settings and the data, after validating the options."""
         from probmotion.validation import check_positive
 
-        settings = self.training.settings(usual)
+        settings = self.training.settings(defaults)
         check_positive("threshold", self.threshold)
         check_out(self.out)
         return settings, learning_tracks(self.data, self.threshold)
@@ -99,8 +99,8 @@ class TrainEvaluator(_TrackTraining):
             raise ValueError(f"centre must be 'frame', got {self.data.centre!r}")
         preset = getattr(EvaluatorSettings, self.size.replace("-", "_"))
         size = preset() if self.frames is None else preset(self.frames)
-        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
-        settings, tracks = self.prepared(usual)
+        defaults = TrainingSettings(steps=1000 if self.size == "tiny" else 5000, learning_rate=1e-3)
+        settings, tracks = self.prepared(defaults)
         trainee = EvaluatorTrainee(
             tracks.train, tracks.validation, size, threshold=self.threshold, seed=settings.seed
         )
@@ -126,8 +126,8 @@ class TrainLifter(_TrackTraining):
         from probmotion.models.training.runs import STATE
         from probmotion.models.training.settings import TrainingSettings
 
-        usual = TrainingSettings(steps=1000 if self.size == "tiny" else 4000, learning_rate=1e-3)
-        settings, tracks = self.prepared(usual)
+        defaults = TrainingSettings(steps=1000 if self.size == "tiny" else 4000, learning_rate=1e-3)
+        settings, tracks = self.prepared(defaults)
         data = (tracks.train, tracks.validation)
         shared: dict[str, Any] = {"threshold": self.threshold, "seed": settings.seed}
         if not (self.out / "lifter" / STATE).exists():

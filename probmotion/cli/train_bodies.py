@@ -13,7 +13,7 @@ from probmotion.cli.training_options import (
     Steps,
     check_enough_clips,
     check_out,
-    listed,
+    listed_clips,
     run_training,
 )
 
@@ -28,7 +28,7 @@ Size = Literal["tiny", "small", "paper"]
 
 @dataclass(frozen=True)
 class BodyClips:
-    """Training data: 3D clips of bodies; synthetic people who walk, run and march by default."""
+    """3D clips for training; by default synthetic people who walk, run and march."""
 
     clips: tuple[str, ...] = ()
     """3D motion files (.npz, .bvh) or quoted patterns."""
@@ -90,8 +90,8 @@ class TrainDVAE:
         from probmotion.motion.skeleton import Skeleton
         from probmotion.validation import check_positive
 
-        usual, annealing = usual_dvae_training(self.size)
-        settings = self.training.settings(usual)
+        defaults, annealing = usual_dvae_training(self.size)
+        settings = self.training.settings(defaults)
         check_out(self.out)
         check_positive("fps", self.fps)
         skeleton = Skeleton.preset(self.skeleton)
@@ -123,7 +123,7 @@ class TrainDenoiser:
     Its weights are frozen."""
 
     size: Size = "small"
-    """Prior size, for default settings; tiny takes seconds, small minutes; paper needs a GPU."""
+    """Size of the prior, which selects default settings; tiny takes seconds, paper needs a GPU."""
 
     noise: OmitArgPrefixes[Noise] = field(default_factory=Noise)
     data: OmitArgPrefixes[BodyClips] = field(default_factory=BodyClips)
@@ -137,8 +137,8 @@ class TrainDenoiser:
         from probmotion.models.dvae.joint_noise import JointNoise
         from probmotion.models.dvae.motion_dvae import MotionDVAE
 
-        usual, annealing = usual_denoiser_training(self.size)
-        settings = self.training.settings(usual)
+        defaults, annealing = usual_denoiser_training(self.size)
+        settings = self.training.settings(defaults)
         check_out(self.out)
         noise = JointNoise(**asdict(self.noise))
         prior = MotionDVAE.load(self.prior)
@@ -191,7 +191,7 @@ def _learning_clips(
     for part, clips in parts.items():
         count = sum(clip.frames for clip in clips)
         names = [clip.name for clip in clips]
-        print(f"{part}: {count} frames of {len(clips)} clips: {listed(names)}")
+        print(f"{part}: {count} frames of {listed_clips(names)}")
     return parts
 
 
@@ -202,7 +202,7 @@ def _long_clips(clips: list[Motion], skeleton: Skeleton, fps: float, frames: int
     rates = Counter(clip.fps for clip in clips if clip.fps != fps)
     resampled = [_retargeted(clip, skeleton).resample(fps) for clip in clips]
     for rate, count in sorted(rates.items()):
-        print(f"resampled to {fps:g} fps: {count} clips at {rate:g} fps")
+        print(f"resampled from {rate:g} to {fps:g} fps: {count} of {len(clips)} clips")
     parents = [max(parent, 0) for parent in skeleton.parents]
     for clip in resampled:
         check_bones(clip.name, clip.positions[0] - clip.positions[0, parents], skeleton)
@@ -210,10 +210,10 @@ def _long_clips(clips: list[Motion], skeleton: Skeleton, fps: float, frames: int
     if not long:
         raise ValueError(
             f"clips must include one of at least {frames} frames at {fps:g} fps, got at most "
-            f"{max(clip.frames for clip in resampled)}"
+            f"{max(clip.frames for clip in resampled)} frames"
         )
     if short := [clip.name for clip in resampled if clip.frames < frames]:
-        print(f"skipped, shorter than {frames} frames: {len(short)} clips: {listed(short)}")
+        print(f"skipped, shorter than {frames} frames: {listed_clips(short)}")
     return long
 
 
@@ -225,5 +225,5 @@ def _retargeted(clip: Motion, skeleton: Skeleton) -> Motion:
 
 
 def _print_annealing(annealing: int, steps: int) -> None:
-    note = "" if annealing <= steps else f", more than the {steps} of this run"
-    print(f"KL weight: annealed over {annealing} steps{note}")
+    note = "" if annealing <= steps else f", but this run has {steps}"
+    print(f"KL annealing takes {annealing} steps{note}")

@@ -22,7 +22,8 @@ __all__ = ["TrainMotionVAE"]
 class TrainMotionVAE:
     """Train a pose network, then a motion VAE (prior over short 3D motions), on 2D tracks.
 
-    Run the same command again to resume an interrupted run; increase --steps to extend the VAE.
+    Run the same command again to resume an interrupted run; increase --steps to extend
+    the training of the VAE.
     """
 
     out: Path

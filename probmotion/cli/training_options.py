@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from probmotion.models.training.settings import TrainingSettings
 
-__all__ = ["Steps", "check_enough_clips", "check_out", "listed", "run_training"]
+__all__ = ["Steps", "check_enough_clips", "check_out", "listed_clips", "run_training"]
 
 _LISTED = 6  # maximum number of printed names
 
@@ -37,13 +37,13 @@ class Steps:
     device: Literal["cpu", "cuda"] = "cpu"
     """Device; cuda uses mixed precision."""
 
-    def settings(self, usual: TrainingSettings) -> TrainingSettings:
-        """Return the default settings ``usual``, overridden by the given options."""
+    def settings(self, defaults: TrainingSettings) -> TrainingSettings:
+        """Return the default settings ``defaults``, overridden by the given options."""
         from probmotion.models.training.trainer import check_device
 
         check_device(self.device)  # early, since data preparation takes minutes
         given = {k: v for k, v in asdict(self).items() if v is not None and k != "device"}
-        return replace(usual, **given)
+        return replace(defaults, **given)
 
 
 def check_out(out: Path) -> None:
@@ -63,9 +63,10 @@ def check_enough_clips(names: Iterable[str]) -> None:
         )
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return the first 6 names as text, with "…" if there are more."""
-    return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
+def listed_clips(names: Sequence[str]) -> str:
+    """Return the number of clips and the first 6 names, such as ``2 clips: walk0, walk1``."""
+    more = ", …" if len(names) > _LISTED else ""
+    return f"{len(names)} clip{'s' * (len(names) != 1)}: {', '.join(names[:_LISTED])}{more}"
 
 
 def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: str) -> None:
@@ -81,7 +82,7 @@ def run_training(trainee: Any, settings: TrainingSettings, out: Path, device: st
     last, saved = result.history[-1], result.saved
     ended = ""
     if last["step"] < settings.steps:
-        ended = f"; stopped early at step {last['step']:.0f}: the validation loss stopped falling"
+        ended = f"; stopped early at step {last['step']:.0f}: validation loss no longer decreases"
     if not result.steps:
         print(f"{result.model} is finished: {before} of {settings.steps} steps{ended}")
         return

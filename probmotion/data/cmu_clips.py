@@ -22,7 +22,7 @@ _FRAMES = 900  # maximum length of a clip, 30 s
 _NAME = re.compile(r"cmu_(?P<subject>\d{2,3})_(?P<trial>\d{2})", re.ASCII)
 _DATASET = "cmu-01-02-03"
 _SUBJECTS = ("01", "02", "03")  # subjects of _DATASET
-_PLACE = "as folder= or in the environment variable PROBMOTION_DATA"
+_FOLDER_OPTION = "as folder= or in the environment variable PROBMOTION_DATA"
 
 
 def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
@@ -58,12 +58,12 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
     if match is None:
         raise ValueError(f"name must be a subject and a trial, such as 'cmu_02_02', got {name!r}")
     subject, trial = match["subject"], match["trial"]
-    places = data_places(folder)
-    for place in places:
-        for archive in (place / "cmu_single" / f"{name}.npz", place / f"{name}.npz"):
+    folders = data_places(folder)
+    for candidate in folders:
+        for archive in (candidate / "cmu_single" / f"{name}.npz", candidate / f"{name}.npz"):
             if archive.is_file():
                 return _first_seconds(load(archive), name, archive)
-        for originals in (place / _DATASET, place):
+        for originals in (candidate / _DATASET, candidate):
             skeleton = originals / f"{subject}.asf"
             motion = originals / f"{subject}_{trial}.amc"
             if skeleton.is_file() and motion.is_file():
@@ -71,14 +71,14 @@ def cmu_clip(name: str, folder: str | Path | None = None) -> Motion:
                 # Single precision, as in the archives.
                 positions = clip.positions[:: round(_SOURCE_FPS / _FPS)].astype(np.float32)
                 return _first_seconds(replace(clip, positions=positions, fps=_FPS), name, motion)
-    remedy = f"pass the folder with its archive {_PLACE}"
+    remedy = f"pass the folder with its archive {_FOLDER_OPTION}"
     if subject in _SUBJECTS:
         names = f'["{subject}.asf", "{subject}_{trial}.amc"]'
         remedy = (
             f'probmotion.data.downloads.download("{_DATASET}", names={names}) downloads it, or '
-            f"pass the folder with the files {_PLACE}"
+            f"pass the folder with the files {_FOLDER_OPTION}"
         )
-    raise FileNotFoundError(f"clip {name} is not in {', '.join(map(str, places))}; {remedy}")
+    raise FileNotFoundError(f"clip {name} is not in {', '.join(map(str, folders))}; {remedy}")
 
 
 def _first_seconds(motion: Motion, name: str, path: Path) -> Motion:

@@ -84,8 +84,8 @@ def data_places(folder: str | Path | None = None) -> list[Path]:
     if folder is not None:
         return [Path(folder)]
     named = os.environ.get(_FOLDER_VARIABLE)
-    places = [*([Path(named)] if named else []), Path("../shared/data"), data_folder()]
-    return list(dict.fromkeys(places))
+    folders = [*([Path(named)] if named else []), Path("../shared/data"), data_folder()]
+    return list(dict.fromkeys(folders))
 
 
 def download(
@@ -143,13 +143,13 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
     FileNotFoundError
         If the clips are missing; the message explains how to obtain them.
     """
-    places = data_places(folder)
-    for place in places:
-        for archives in (place / "cmu_salsa_pairs", place):
+    folders = data_places(folder)
+    for candidate in folders:
+        for archives in (candidate / "cmu_salsa_pairs", candidate):
             paths = [archives / f"cmu_60_61_{trial}.npz" for trial in SALSA_TRIALS]
             if all(path.is_file() for path in paths):
                 return load_pairs(paths)
-        for originals in (place / "cmu-salsa", place):
+        for originals in (candidate / "cmu-salsa", candidate):
             couples = [
                 [originals / f"{subject}_{trial}_scaled.bvh" for subject in (60, 61)]
                 for trial in SALSA_TRIALS
@@ -157,7 +157,7 @@ def salsa_pairs(folder: str | Path | None = None) -> list[Motion]:
             if all(path.is_file() for couple in couples for path in couple):
                 return [read_salsa_bvh(lead, follow) for lead, follow in couples]
     raise FileNotFoundError(
-        f"the ten salsa clips are not in {', '.join(map(str, places))}; "
+        f"the ten salsa clips are not in {', '.join(map(str, folders))}; "
         'probmotion.data.downloads.download("cmu-salsa") downloads them, or pass their folder'
     )
 

@@ -19,9 +19,9 @@ __all__ = [
     "savitzky_golay",
 ]
 
-_FIRST_POSITION = 10.0  # prior sd of the first position about the mean observation, m
-_FIRST_SPEED = 10.0  # prior sd of the first velocity, m/s
-_LEAST, _MOST = 1e-3, 1e3  # range of the fitted √q, m/s^1.5
+_POSITION_SD = 10.0  # prior sd of the first position about the mean observation, m
+_VELOCITY_SD = 10.0  # prior sd of the first velocity, m/s
+_MIN_ACCELERATION, _MAX_ACCELERATION = 1e-3, 1e3  # range of the fitted √q, m/s^1.5
 
 
 def savitzky_golay(
@@ -170,7 +170,7 @@ def fit_acceleration(
         problem = _Problem.of(joints[:, joint], confidence[:, joint], noise, fps, 10.0**exponent)
         return -float(_forward(problem).log_marginal_likelihood[0])
 
-    bounds = (math.log10(_LEAST), math.log10(_MOST))
+    bounds = (math.log10(_MIN_ACCELERATION), math.log10(_MAX_ACCELERATION))
     slices = [slice(joint, joint + 1) for joint in range(joints.shape[1])]
     fits = [minimize_scalar(cost, bounds=bounds, args=(each,), method="bounded") for each in slices]
     return np.array([10.0**fit.x for fit in fits])
@@ -229,7 +229,7 @@ def _forward(problem: _Problem) -> _Passes:
     L, J, _ = problem.joints.shape
     means, covariances = np.empty((2, L, J, 2, 3)), np.empty((2, L, J, 2, 2))
     mean = np.zeros((J, 2, 3))
-    covariance = np.tile(np.diag([_FIRST_POSITION**2, _FIRST_SPEED**2]), (J, 1, 1))
+    covariance = np.tile(np.diag([_POSITION_SD**2, _VELOCITY_SD**2]), (J, 1, 1))
     log_marginal_likelihood = np.zeros(J)
     for frame in range(L):
         if frame > 0:
@@ -260,10 +260,11 @@ def _seen_joints(joints: np.ndarray, seen: np.ndarray, name: str) -> np.ndarray:
     check_shape(name, seen, joints.shape[:2])
     if len(joints) == 0:
         raise ValueError("joints must have at least one frame, got none")
-    never = np.flatnonzero(~seen.any(axis=0))
-    if len(never):
+    never_seen = np.flatnonzero(~seen.any(axis=0))
+    if len(never_seen):
         raise ValueError(
-            f"{name} must observe every joint in at least one frame, got none of joint {never[0]}"
+            f"{name} must be positive in at least one frame of every joint, got none for joint "
+            f"{never_seen[0]}"
         )
     check_finite("joints", joints[seen])
     return np.where(seen[..., None], joints, 0.0)

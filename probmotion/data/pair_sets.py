@@ -33,13 +33,13 @@ _FOOT = 0.039
 _SKULL = 0.10
 _SEED_POSES = 400  # maximum number of pose pairs compared by choose_seed
 _HEIGHTS = (0.5, 3.0)  # plausible heights, m
-_FARTHEST = 5.0  # maximum distance between roots, m
-_MOST_APART, _FASTEST = 1.2, 7.0  # limits of dance frames, m and m/s
+_MAX_ROOT_DISTANCE = 5.0  # maximum distance between roots, m
+_MAX_DISTANCE, _MAX_SPEED = 1.2, 7.0  # limits of dance frames, m and m/s
 _LEG = ("hip", "knee", "ankle")
 
 
 def dance_frames(
-    motion: Motion, *, farthest: float = _MOST_APART, fastest: float = _FASTEST
+    motion: Motion, *, farthest: float = _MAX_DISTANCE, fastest: float = _MAX_SPEED
 ) -> np.ndarray:
     """Return a mask of the frames that show the dance.
 
@@ -67,12 +67,12 @@ def describe_dance_frames(motion: Motion) -> str:
 
     The default limits apply. An excluded frame counts only for the first reason that applies.
     """
-    opening, distant, glitch = _excluded_frames(motion, _MOST_APART, _FASTEST)
+    opening, distant, glitch = _excluded_frames(motion, _MAX_DISTANCE, _MAX_SPEED)
     counts = opening.sum(), (distant & ~opening).sum(), (glitch & ~distant & ~opening).sum()
     return (
         f"{motion.name or 'the motion'}: {motion.frames - sum(counts)} of {motion.frames} frames "
-        f"are dance; excluded are {counts[0]} of the opening, {counts[1]} with partners over "
-        f"{_MOST_APART:g} m apart and {counts[2]} next to a step faster than {_FASTEST:g} m/s"
+        f"show the dance; excluded: {counts[0]} of the opening, {counts[1]} with partners over "
+        f"{_MAX_DISTANCE:g} m apart, {counts[2]} next to a step faster than {_MAX_SPEED:g} m/s"
     )
 
 
@@ -200,9 +200,9 @@ def check_close_people(name: str, pose: np.ndarray, skeleton: Skeleton) -> None:
         )
     roots = pose[list(skeleton.roots)]
     distance = np.linalg.norm(roots[:, None] - roots, axis=-1).max()
-    if distance > _FARTHEST:
+    if distance > _MAX_ROOT_DISTANCE:
         raise ValueError(
-            f"people in {name} must be at most {_FARTHEST:g} m apart, got {distance:.3g}"
+            f"people in {name} must be at most {_MAX_ROOT_DISTANCE:g} m apart, got {distance:.3g}"
         )
 
 

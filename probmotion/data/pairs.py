@@ -140,15 +140,15 @@ def read_salsa_bvh(lead: str | Path, follow: str | Path) -> Motion:
         read_bvh(path, scale=scale, end_sites=True)
         for path, scale in zip((lead, follow), _SALSA_SCALES, strict=True)
     )
-    both = pair_motion(leader, follower, name=f"cmu_60_61_{trial}")
-    least = _SALSA_START + _SALSA_END + 1
-    if both.frames < least:
-        raise ValueError(f"lead must have at least {least} frames, got {both.frames}")
+    pair = pair_motion(leader, follower, name=f"cmu_60_61_{trial}")
+    min_frames = _SALSA_START + _SALSA_END + 1
+    if pair.frames < min_frames:
+        raise ValueError(f"lead must have at least {min_frames} frames, got {pair.frames}")
     # The floor is estimated with the toes, which are End Sites and dropped later.
     lowest = np.stack([motion.positions[..., 1].min(axis=1) for motion in (leader, follower)])
     floor = np.percentile(lowest, 2)
-    positions = both.positions[_SALSA_START : both.frames - _SALSA_END : 2]
-    return Motion(positions - [0.0, floor, 0.0], both.skeleton, _SALSA_FPS / 2, name=both.name)
+    positions = pair.positions[_SALSA_START : pair.frames - _SALSA_END : 2]
+    return Motion(positions - [0.0, floor, 0.0], pair.skeleton, _SALSA_FPS / 2, name=pair.name)
 
 
 def _salsa_trial(lead: Path, follow: Path) -> str:

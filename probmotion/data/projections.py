@@ -56,7 +56,7 @@ class DetectorNoise:
         ):
             if not valid:
                 raise ValueError(f"{name} must be {expected}, got {getattr(self, name)}")
-        if self._begin > 1:
+        if self._loss_probability > 1:
             raise ValueError(
                 f"share must be at most frames / (1 + frames), got {self.share} with frames "
                 f"{self.frames}"
@@ -68,7 +68,7 @@ class DetectorNoise:
         return cls(found=0.0, share=0.0)
 
     @property
-    def _begin(self) -> float:
+    def _loss_probability(self) -> float:
         """Probability that a detected joint is lost in the next frame."""
         return self.share / (1 - self.share) / self.frames
 
@@ -77,7 +77,7 @@ class DetectorNoise:
         lost = np.empty((frames, joints), bool)
         lost[0] = rng.random(joints) < self.share
         for frame in range(1, frames):
-            probability = np.where(lost[frame - 1], 1 - 1 / self.frames, self._begin)
+            probability = np.where(lost[frame - 1], 1 - 1 / self.frames, self._loss_probability)
             lost[frame] = rng.random(joints) < probability
         return lost
 

@@ -203,11 +203,11 @@ class Cameras:
             return plane + constant(self.offset, points)[:, None, None, :]
         shift = self.focal[:, None] * self.translation[:, :2]
         depth = self.depth(points)
-        self._refuse_behind(depth)
+        self._check_in_front(depth)
         centre = constant(self.centre, points)[:, None, None, :]
         return (plane + constant(shift, points)[:, None, None, :]) / depth[..., None] + centre
 
-    def _refuse_behind(self, depth: Array) -> None:
+    def _check_in_front(self, depth: Array) -> None:
         if type(depth).__name__.endswith("Tracer"):
             return
         depth = to_numpy(depth)

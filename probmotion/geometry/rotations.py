@@ -62,7 +62,7 @@ def quaternion_to_vector(quaternion: Array) -> Array:
 
     The quaternion need not be normalised.
     """
-    quaternion = _short(_unit(quaternion))
+    quaternion = _nonnegative_real(_unit(quaternion))
     xp = array_namespace(quaternion)
     real, imaginary = quaternion[..., :1], quaternion[..., 1:]
     square = xp.sum(imaginary**2, axis=-1, keepdims=True)
@@ -107,7 +107,7 @@ def matrix_to_quaternion(matrix: Array) -> Array:
     largest = xp.astype(xp.argmax(diagonal, axis=-1), matrix.dtype)
     chosen = largest[..., None] == constant(np.arange(4), matrix)
     row = xp.sum(xp.where(chosen[..., None], products, xp.zeros_like(products)), axis=-2)
-    return _short(_unit(row))
+    return _nonnegative_real(_unit(row))
 
 
 def quaternion_product(first: Array, second: Array) -> Array:
@@ -264,9 +264,9 @@ def _turn(angle: Array, axis: int) -> Array:
     fixed[axis, axis] = 1
     cosine[j, j] = cosine[k, k] = 1
     sine[j, k], sine[k, j] = -1, 1
-    turned = xp.cos(angle)[..., None, None] * constant(cosine, angle)
-    turned = constant(fixed, angle) + turned
-    return turned + xp.sin(angle)[..., None, None] * constant(sine, angle)
+    rotation = xp.cos(angle)[..., None, None] * constant(cosine, angle)
+    rotation = constant(fixed, angle) + rotation
+    return rotation + xp.sin(angle)[..., None, None] * constant(sine, angle)
 
 
 def _cross_matrix(vector: Array) -> Array:
@@ -289,7 +289,7 @@ def _unit(vector: Array) -> Array:
     return vector / xp.sqrt(xp.sum(vector**2, axis=-1, keepdims=True))
 
 
-def _short(quaternion: Array) -> Array:
+def _nonnegative_real(quaternion: Array) -> Array:
     """Return q or −q, whichever has w at least 0."""
     xp = array_namespace(quaternion)
     return xp.where(quaternion[..., :1] < 0, -quaternion, quaternion)

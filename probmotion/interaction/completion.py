@@ -26,7 +26,7 @@ __all__ = [
 BANDWIDTH = 0.3
 """Default bandwidth of :func:`blend`, metres."""
 
-_FEWEST = 4  # minimum number of visible joints, enough for a tetrahedron in 3D
+_MIN_VISIBLE = 4  # minimum number of visible joints, enough for a tetrahedron in 3D
 
 
 class CompletionResult(NamedTuple):
@@ -119,8 +119,8 @@ def nearest_annotation_completion(
 ) -> CompletionResult:
     """Complete the occluded joints of a 2D pair (J, 2) from the nearest annotation (baseline).
 
-    Of the annotations that contain every occluded joint, the nearest in interaction coordinates of
-    the visible joints is selected and rigidly aligned in the image.
+    Selects the nearest annotation, in interaction coordinates of the visible joints, among those
+    that contain every occluded joint, and aligns it rigidly in the image.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def _checked(
     pose, visible = np.asarray(pose, dtype=np.float64), np.asarray(visible, dtype=bool)
     check_shape(name, pose, (skeleton.n_joints, axes))
     check_shape("visible", visible, (skeleton.n_joints,))
-    if visible.sum() < _FEWEST:
-        raise ValueError(f"visible must mark at least {_FEWEST} joints, got {visible.sum()}")
+    if visible.sum() < _MIN_VISIBLE:
+        raise ValueError(f"visible must mark at least {_MIN_VISIBLE} joints, got {visible.sum()}")
     check_finite(name, pose[visible])
     return np.where(visible[:, None], pose, 0.0), visible

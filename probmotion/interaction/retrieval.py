@@ -62,7 +62,7 @@ def retrieve(
 ) -> RetrievalResult:
     """Return the n draws with the smallest distance to each 2D pair over all views.
 
-    Projections are rigidly aligned to the pair. Of identical draws, only the first is considered.
+    Projections are rigidly aligned to the pair. Only the first of identical draws is considered.
 
     Parameters
     ----------

@@ -75,20 +75,20 @@ def acceleration_error(motions: Array, truth: Array, fps: float) -> Array:
     """
     check_positive("fps", fps)
     _check_frames(motions, truth)
-    return _mean_bend(motions - truth) * fps**2
+    return _mean_acceleration(motions - truth) * fps**2
 
 
 def acceleration_ratio(motions: Array, truth: Array) -> Array:
     """Return the mean acceleration relative to the truth's: ``(…, L, J, 3), (L, J, 3) → (…)``.
 
-    Plausible ratios are 0.5 to 2 (paper 001, appendix H.1); lower ones indicate oversmoothing,
-    higher ones jitter. ``ValueError``: fewer than three frames, or a truth without acceleration.
+    Plausible ratios are 0.5 to 2 (Motion-DVAE, appendix H.1); lower ones indicate oversmoothing,
+    higher ones jitter. Raises ``ValueError`` for fewer than three frames or no true acceleration.
     """
     _check_frames(motions, truth)
-    size = float(_mean_bend(truth))
+    size = float(_mean_acceleration(truth))
     if size == 0:
         raise ValueError("truth must have a nonzero acceleration in at least one frame, got 0")
-    return _mean_bend(motions) / size
+    return _mean_acceleration(motions) / size
 
 
 def _check_frames(motions: Array, truth: Array) -> None:
@@ -97,7 +97,7 @@ def _check_frames(motions: Array, truth: Array) -> None:
         raise ValueError(f"truth must have at least 3 frames, got {truth.shape[-3]}")
 
 
-def _mean_bend(paths: Array) -> Array:
+def _mean_acceleration(paths: Array) -> Array:
     """Return the mean length of second differences, ``(…, L, J, 3) → (…)``."""
     xp = array_namespace(paths)
     bend = paths[..., 2:, :, :] - 2 * paths[..., 1:-1, :, :] + paths[..., :-2, :, :]

@@ -14,15 +14,15 @@ __all__ = [
     "rhat_of_independent",
 ]
 
-# Above this dimension, only principal coordinates are monitored.
-_FEW = 32
+# In more dimensions, only principal coordinates are monitored.
+_MAX_DIMENSIONS = 32
 _PRINCIPAL = 10  # number of principal coordinates
 # Relative standard deviation below which a coordinate counts as constant.
-_NOTHING = 1e-9
+_RELATIVE_TOLERANCE = 1e-9
 # Minimum draws per chain for the effective sample size (ESS): fewer do not show autocorrelation.
-_TO_CORRELATE = 10
+_MIN_DRAWS_FOR_ESS = 10
 # Number of simulated runs from which a quantile of R-hat is computed.
-_RUNS = 100
+_SIMULATED_RUNS = 100
 
 
 def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> dict[str, float]:
@@ -49,7 +49,7 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
         slowest = float(np.max(data["autocorrelation_time"].values))
         if not np.isnan(slowest):
             diagnostics["ess_bulk"] = n_chains * n_draws / slowest
-    elif n_draws >= _TO_CORRELATE:
+    elif n_draws >= _MIN_DRAWS_FOR_ESS:
         diagnostics["ess_bulk"] = float(np.min(array_stats.ess(values, method="bulk", **axes)))
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
         diagnostics["ess_tail"] = float(np.min(tails))
@@ -70,7 +70,7 @@ def principal_coordinates(values: np.ndarray) -> np.ndarray:
     """
     flat = values.reshape(-1, values.shape[-1])
     left, size, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    vary = size[:_PRINCIPAL] >= _NOTHING * size[0]
+    vary = size[:_PRINCIPAL] >= _RELATIVE_TOLERANCE * size[0]
     vary[1:] &= size[0] > 0
     return (left * size)[:, :_PRINCIPAL][:, vary].reshape(*values.shape[:2], -1)
 
@@ -79,16 +79,16 @@ def rhat_of_independent(chains: int, draws: int, *, level: float = 0.95, seed: i
     """Return the ``level`` quantile of R-hat over converged runs.
 
     100 runs are simulated, each of ``chains`` chains with ``draws`` (at least 4) independent draws.
-    R-hat of a run is the largest over 33 coordinates, the most that are monitored. For short
+    R-hat of a run is the largest over 33 coordinates, the maximum number monitored. For short
     chains, the quantile is well above 1.
     """
     from arviz_stats.base import array_stats
 
     maxima = []
-    for run in range(_RUNS):
+    for run in range(_SIMULATED_RUNS):
         # Simulate one run at a time, since all runs would require gigabytes.
         rng = seeds.generator(seed, "rhat", run)
-        values = rng.standard_normal((chains, draws, _FEW + 1))
+        values = rng.standard_normal((chains, draws, _MAX_DIMENSIONS + 1))
         maxima.append(array_stats.rhat(values, chain_axis=0, draw_axis=1).max())
     return float(np.quantile(maxima, level))
 
@@ -103,7 +103,7 @@ def monitored_coordinates(draws: MotionDraws) -> np.ndarray:
     shape = (data.sizes["chain"], data.sizes["draw"])
     values = (data["theta"] if "theta" in data else data["positions"]).values
     values = values.reshape(*shape, -1)
-    if values.shape[-1] > _FEW:
+    if values.shape[-1] > _MAX_DIMENSIONS:
         values = principal_coordinates(values)
     if "log_density" in data:
         values = np.concatenate([values, data["log_density"].values[..., None]], axis=-1)

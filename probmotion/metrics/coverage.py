@@ -41,8 +41,8 @@ def coverage(
     coverage : float, or ndarray (len(counts),)
         Mean distance, metres; dimensionless for shape contexts.
     """
-    wanted = [len(draws)] if counts is None else list(counts)
-    minima = nearest_draw_distances(ground_truth, draws, measure, wanted)
+    requested = [len(draws)] if counts is None else list(counts)
+    minima = nearest_draw_distances(ground_truth, draws, measure, requested)
     means = minima.mean(axis=1)
     return float(means[0]) if counts is None else means
 

@@ -28,7 +28,7 @@ def random_directions(rng: np.random.Generator, n: int, dim: int) -> np.ndarray:
 
 
 def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
-    """Return the sliced 2-Wasserstein distance of two sets of equal size (Bonneel et al. 2015).
+    """Return the sliced 2-Wasserstein distance between equally large sets (Bonneel et al. 2015).
 
     ``(n, D), (n, D) → ()``, in any array library: the root mean square of the 2-Wasserstein
     distances between projections onto ``directions`` (P, D).
@@ -44,7 +44,7 @@ def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
 def sliced_wasserstein_ratio(
     draws: Array, references: Sequence[Array], directions: np.ndarray
 ) -> float:
-    """Return the sliced Wasserstein distance to exact draws, relative to that of two exact sets.
+    """Return the sliced Wasserstein distance to exact draws, relative to that between exact sets.
 
     The ratio is 1 for draws that cannot be distinguished from exact ones.
 

@@ -49,7 +49,7 @@ class EncodesViews(Protocol):
 
 
 def frechet_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the squared Fréchet distance of the fitted Gaussians (Heusel et al. 2017, eq. 6).
+    """Return the squared Fréchet distance between the fitted Gaussians (Heusel et al. 2017, eq. 6).
 
     ‖μ_a − μ_b‖² + tr(C_a + C_b − 2 (C_a C_b)^½) for features (N, D) and (M, D) of means μ and
     covariances C = RᵀR. The trace of (C_a C_b)^½ is the sum of the singular values of R_a R_bᵀ,
@@ -82,7 +82,7 @@ def _covariance_root(features: np.ndarray) -> np.ndarray:
 
 
 def diversity(features: np.ndarray, rng: np.random.Generator, pairs: int = 200) -> float:
-    """Return the mean feature distance of random pairs of motions, from features (N, D), N ≥ 2.
+    """Return the mean feature distance within random pairs of motions, from features (N, D), N ≥ 2.
 
     The definition is that of the MAS authors' code (200 pairs); the paper calls it the variance.
     """
@@ -152,7 +152,7 @@ class GenerationReference:
         """Return mean and standard deviation of the scores of 3D motions, (N, L, J, 3) metres.
 
         - ``fid``: squared Fréchet distance of features; 0 is ideal
-        - ``diversity``: mean feature distance of two motions; ideally that of real motions
+        - ``diversity``: mean feature distance between two motions; ideally that of real motions
         - ``precision``: fraction of generated motions on the manifold of real ones; 1 is best
         - ``recall``: fraction of real motions on the manifold of generated ones; 1 is best
 
@@ -164,7 +164,7 @@ class GenerationReference:
         Scores for ``angles="side"`` require motions with random headings, such as motions lifted
         from random views. If all motions face +Z, even real motions have poor scores.
         """
-        return self._score(positions, partial(self._film, angles=angles), seed, samples, repeats)
+        return self._score(positions, partial(self._project, angles=angles), seed, samples, repeats)
 
     def score_views(
         self, views: np.ndarray, *, seed: int, samples: int = 1000, repeats: int = 10
@@ -179,7 +179,7 @@ class GenerationReference:
         """
         if self.held_out_views is None:
             raise ValueError("held_out_views must be given, got None")
-        views = self._film(positions, seeds.generator(seed, "chamfer"))
+        views = self._project(positions, seeds.generator(seed, "chamfer"))
         frames = min(_CHAMFER_FRAMES, views.shape[1], self.held_out_views.shape[1])
         generated, real = (
             motions[:, : motions.shape[1] // frames * frames]
@@ -187,7 +187,7 @@ class GenerationReference:
         )
         return motion_chamfer_distance(generated, real, frames=frames)
 
-    def _film(
+    def _project(
         self, positions: np.ndarray, rng: np.random.Generator, angles: Angles = "all"
     ) -> np.ndarray:
         return film_motions(

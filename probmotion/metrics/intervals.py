@@ -62,15 +62,16 @@ def best_and_tied(
     an interval includes 0. With one seed, all samplers are tied. The standard deviation of
     differences is at least that of the difference of two values rounded to ``step``.
 
-    The set contains the truly best sampler with probability ≥ .95. If several samplers are equal,
-    it contains only one with probability ≤ .05. Since the best is selected from the same values,
+    The set contains the truly best sampler with probability ≥ .95. The probability that it contains
+    only one of several equal samplers is ≤ .05. Since the best is selected from the same values,
     the probability that any of ten equal samplers is excluded is about .1.
 
     Parameters
     ----------
     values : mapping of str to sequence of float
         One value per seed for each sampler, seeds in the same order; NaN for a failed run. Samplers
-        without values or with an infinite error are excluded. The best has no more NaN than others.
+        without values or with an infinite error are excluded. The best is one of the samplers with
+        the fewest failed runs.
     target : float or None
         Ideal value; the error is the distance from it. If None, the value is the error.
     ratio : bool

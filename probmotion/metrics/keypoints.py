@@ -95,9 +95,9 @@ def velocity_error(
         Mask of visible keypoints; all by default.
     """
     seen = _check_keypoints(predicted, truth, visible)
-    both = seen[..., 1:, :] & seen[..., :-1, :]
-    steps = _masked(np.diff(truth, axis=-3), both)
-    errors = _masked(np.diff(predicted, axis=-3) - np.diff(truth, axis=-3), both)
+    in_both = seen[..., 1:, :] & seen[..., :-1, :]
+    steps = _masked(np.diff(truth, axis=-3), in_both)
+    errors = _masked(np.diff(predicted, axis=-3) - np.diff(truth, axis=-3), in_both)
     length = np.sqrt((steps**2).sum(axis=(-2, -1)))
     error_length = np.sqrt((errors**2).sum(axis=(-2, -1)))
     moving = length > 0

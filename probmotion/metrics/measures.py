@@ -34,21 +34,21 @@ _LIBRARIES = (
 
 _DIRECTIONS = 256  # of the sliced Wasserstein distance
 # Target number of exact draws, and maximum number of sets of exact draws, each as large as a run.
-_ENOUGH, _MOST_SETS = 4000, 8
+_EXACT_DRAWS, _MAX_SETS = 4000, 8
 _MILLIMETRES = 1000.0  # per metre
 _SQUARE_CENTIMETRES = 1e4  # per square metre
-_MOST_DEGENERATE = 100  # approximate maximum of draws tested for degenerate views
-_MOST_STEIN = 500  # maximum number of draws for the kernel Stein discrepancy
+_MAX_DEGENERATE = 100  # approximate maximum of draws tested for degenerate views
+_MAX_STEIN = 500  # maximum number of draws for the kernel Stein discrepancy
 _REAL_PAIRS = 5000  # pairs for the diversity of real motions
 
 
 def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]:
     """Return all metrics that apply to a problem and a run, by name.
 
-    Comparison with reference draws, exact or stored. If the problem requires it, motions are
+    Metrics relative to reference draws, exact or stored. If the problem requires it, motions are
     aligned first, except for densities, styles and the manifold:
 
-    - ``swd_ratio``: sliced Wasserstein distance relative to that of two exact sets; 1 is ideal
+    - ``swd_ratio``: sliced Wasserstein distance relative to that between exact sets; 1 is ideal
     - ``variance_ratio``: trace of the covariance relative to the exact one; < 1: overconfident
     - ``mean_error_sd``: error of the mean in posterior standard deviations; 0 is ideal
     - ``off_manifold_ratio``: variance off the prior's manifold relative to exact draws; 1 is ideal
@@ -59,7 +59,7 @@ def measure(problem: Problem, draws: MotionDraws, seed: int) -> dict[str, float]
     - ``mmd``: squared maximum mean discrepancy, unbiased; 0 is ideal
     - ``c2st``: accuracy of a classifier between draws and reference draws; 0.5 is ideal
 
-    Comparison with held-out real 2D motion (MAS, section 6.3), as means over random views:
+    Metrics relative to held-out real 2D motion (MAS, section 6.3), averaged over random views:
 
     - ``fid``, ``view_precision``, ``view_recall``, ``diversity_ratio`` (relative to real motion)
     - ``fid_side``, ``view_recall_side``: side views; ``fid_learnt``, ``view_recall_learnt``:
@@ -126,8 +126,8 @@ class _Exact:
 
 @lru_cache(maxsize=2)
 def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
-    most = problem.max_references
-    n_sets = min(_MOST_SETS, max(2, _ENOUGH // n), *([] if most is None else [most // n]))
+    limit = problem.max_references
+    n_sets = min(_MAX_SETS, max(2, _EXACT_DRAWS // n), *([] if limit is None else [limit // n]))
     reference = problem.reference(seed, n_sets * n)
     flat = _compared(problem, reference)
     rng = seeds.generator(seed, "directions")
@@ -145,8 +145,8 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
     flat = _compared(problem, positions)
     # Thin draws to the size of two available reference sets.
-    most = problem.max_references
-    n = len(flat) if most is None else min(len(flat), most // 2)
+    limit = problem.max_references
+    n = len(flat) if limit is None else min(len(flat), limit // 2)
     thinned = flat[np.arange(n) * len(flat) // n]
     exact = _exact_draws(problem, seed, n)
     prior = problem.posterior.prior
@@ -184,7 +184,7 @@ def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:
         return {}
     theta = draws.dataset["theta"].values
     theta = theta.reshape(-1, theta.shape[-1])
-    n = min(len(theta), _MOST_STEIN)
+    n = min(len(theta), _MAX_STEIN)
     chosen = theta[np.arange(n) * len(theta) // n]
     try:
         score = score_of(problem.posterior, chosen)
@@ -253,7 +253,7 @@ def _degenerate(problem: Problem, positions: np.ndarray) -> dict[str, float]:
     fraction = getattr(problem.posterior.likelihood, "degenerate_fraction", None)
     if fraction is None:
         return {}
-    return {"degenerate": float(fraction(positions[:: max(1, len(positions) // _MOST_DEGENERATE)]))}
+    return {"degenerate": float(fraction(positions[:: max(1, len(positions) // _MAX_DEGENERATE)]))}
 
 
 def accuracy_of(

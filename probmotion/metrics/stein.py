@@ -84,10 +84,10 @@ def score_of(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     check_shape("theta", theta, ("n", posterior.dim))
     check_finite("theta", theta)
     if not isinstance(posterior.prior, HasLogDensity):
-        raise NoGradient(f"posterior has no score: {_kind(posterior.prior)} has no log density")
+        raise NoGradient(f"posterior must have a log density, got {_kind(posterior.prior)}")
     for part in (posterior.prior, posterior.likelihood):
         if not getattr(part, "differentiable", True):
-            raise NoGradient(f"posterior has no score: {_kind(part)} has no gradient")
+            raise NoGradient(f"posterior must be differentiable, but {_kind(part)} has no gradient")
     score = _score(posterior, np.asarray(theta, np.float64))
     check_finite("score", score)
     return score
@@ -102,13 +102,13 @@ def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
             parts = [gradient(posterior, theta[start : start + _BATCH]) for start in starts]
             return np.concatenate(parts)
         except NotConjugate as error:
-            raise NoGradient(f"posterior has no score: {error}") from error
+            raise NoGradient(f"posterior must be differentiable: {error}") from error
         except Exception as cause:
             # Densities may raise any exception for unsupported arrays.
             reasons.append(f"{name} raised {type(cause).__name__}")
     raise NoGradient(
-        f"posterior has no score: {_kind(posterior.prior)} with "
-        f"{_kind(posterior.likelihood)} is not differentiable, {' and '.join(reasons)}"
+        f"posterior must be differentiable, got {_kind(posterior.prior)} with "
+        f"{_kind(posterior.likelihood)}: {' and '.join(reasons)}"
     )
 
 

@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 _FOLDS = 5  # of cross-validation
-_MOST_COORDINATES, _POINTS_PER_COORDINATE = 40, 10  # maximum features, minimum points per feature
+_MAX_COORDINATES, _POINTS_PER_COORDINATE = 40, 10  # maximum features, minimum points per feature
 _ROUNDING = 1e-9  # relative rounding error
 
 
@@ -129,27 +129,27 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     if len(draws) < _FOLDS:
         raise ValueError(f"draws must have at least {_FOLDS} points, got {len(draws)}")
     pooled = np.concatenate([draws, reference])
-    most = min(_MOST_COORDINATES, len(pooled) // _POINTS_PER_COORDINATE)
-    features = principal_coordinates(pooled, max(1, most))
+    size = min(_MAX_COORDINATES, len(pooled) // _POINTS_PER_COORDINATE)
+    features = principal_coordinates(pooled, max(1, size))
     labels = np.repeat([0, 1], len(draws))
     random_state = seeds.integer(seed, "folds") % 2**32
     folds = StratifiedKFold(_FOLDS, shuffle=True, random_state=random_state)
     return float(cross_val_score(SVC(), features, labels, cv=folds).mean())
 
 
-def principal_coordinates(points: np.ndarray, most: int) -> np.ndarray:
+def principal_coordinates(points: np.ndarray, max_coordinates: int) -> np.ndarray:
     """Return standardised principal coordinates, ``(n, D) → (n, k) or (n, k + 1)``.
 
-    Returns the at most ``most`` leading coordinates and, if the points have more dimensions, the
-    log squared distance from the subspace of these coordinates, to detect errors off the manifold.
+    Returns up to ``max_coordinates`` leading coordinates and, if the points have more dimensions,
+    the log squared distance from their subspace, to detect errors off the manifold.
     """
     from sklearn.decomposition import PCA
 
     if (points == points[0]).all():
         raise ValueError(f"points must differ, got {len(points)} equal points")
     centred = points - points.mean(axis=0)
-    most = min(most, *centred.shape)
-    coordinates = PCA(most, random_state=0).fit_transform(centred)
+    size = min(max_coordinates, *centred.shape)
+    coordinates = PCA(size, random_state=0).fit_transform(centred)
     sizes = coordinates.std(axis=0)
     coordinates = coordinates[:, sizes > _ROUNDING * sizes[0]]
     features = coordinates / coordinates.std(axis=0)
@@ -170,7 +170,7 @@ def _kernel(squared: np.ndarray, length_scale: float) -> np.ndarray:
 def _median(squared: np.ndarray) -> float:
     median = float(np.median(squared[np.triu_indices(len(squared), 1)]))
     if median <= _ROUNDING * squared.max():
-        raise ValueError("points must mostly differ, got median distance 0")
+        raise ValueError("points must have a median distance above 0, got 0; most are equal")
     return math.sqrt(median)
 
 

@@ -17,16 +17,16 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["adjusted_p_values", "ecdf_band", "evaluation_points", "uniformity_p_value"]
 
-_MOST_POINTS = 100  # maximum number of evaluation points, plus 1
+_MAX_POINTS = 100  # maximum number of evaluation points, plus 1
 # Tolerance of comparisons of tail probabilities: those equal by symmetry differ by rounding.
-_EQUAL = 1 + 1e-9
-_HALVINGS = 40  # bisection steps
+_TOLERANCE = 1 + 1e-9
+_BISECTIONS = 40  # bisection steps
 
 
 def evaluation_points(n: int) -> np.ndarray:
     """Return the evaluation points 1/m, 2/m, …, (m − 1)/m for n values, with m = min(n, 100)."""
     check_count("n", n, least=2)
-    m = min(n, _MOST_POINTS)
+    m = min(n, _MAX_POINTS)
     return np.arange(1, m) / m
 
 
@@ -71,7 +71,7 @@ def ecdf_band(n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     check_count("n", n, least=2)
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, got {level!r}")
-    inside = _tails(n) > _EQUAL * _gamma(n, level)
+    inside = _tails(n) > _TOLERANCE * _gamma(n, level)
     lowest = inside.argmax(axis=1)
     highest = n - inside[:, ::-1].argmax(axis=1)
     return lowest / n, highest / n
@@ -110,7 +110,7 @@ def _probability_of_leaving(n: int, gamma: float) -> float:
     inside = np.zeros(n + 1)
     inside[0] = 1.0
     total = 0.0
-    for allowed, remaining in zip(_tails(n) > _EQUAL * gamma, finish, strict=True):
+    for allowed, remaining in zip(_tails(n) > _TOLERANCE * gamma, finish, strict=True):
         inside = np.convolve(inside, step)[: n + 1]
         total += float(inside[~allowed] @ remaining[~allowed])
         inside[~allowed] = 0.0
@@ -130,7 +130,7 @@ def _poisson(n: int) -> tuple[np.ndarray, np.ndarray]:
 def _gamma(n: int, level: float) -> float:
     """Return the largest γ whose band is left with probability at most 1 − ``level``."""
     low, high = 0.0, 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         if _probability_of_leaving(n, middle) <= 1 - level:
             low = middle

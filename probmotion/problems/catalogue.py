@@ -27,13 +27,13 @@ __all__ = [
 ]
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
-_OTHERS = {**CLIP_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
+_OTHER_PROBLEMS = {**CLIP_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
 _SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")  # e.g. gait(frames=20)
 
 
 def problem_names() -> list[str]:
     """Return the names of all problems."""
-    return [*_GAITS, *_OTHERS]
+    return [*_GAITS, *_OTHER_PROBLEMS]
 
 
 def available_problems() -> tuple[list[str], dict[str, str]]:
@@ -50,7 +50,7 @@ def available_problems() -> tuple[list[str], dict[str, str]]:
 def problem_descriptions() -> dict[str, str]:
     """Return one-sentence descriptions of all problems by name, without loading them."""
     gaits = {name: problem.description for name, problem in _GAITS.items()}
-    return gaits | {name: description for name, (description, _) in _OTHERS.items()}
+    return gaits | {name: description for name, (description, _) in _OTHER_PROBLEMS.items()}
 
 
 def load_problem(name: str, **scale: Any) -> Problem:
@@ -101,15 +101,15 @@ def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
     return name, tuple((key, scale[key]) for key in defaults if key in changed)
 
 
-def _parse(words: str) -> dict[str, Any]:
+def _parse(text: str) -> dict[str, Any]:
     try:
-        call = ast.parse(f"f({words})", mode="eval").body
+        call = ast.parse(f"f({text})", mode="eval").body
         assert isinstance(call, ast.Call)
         assert not call.args
         return {str(item.arg): ast.literal_eval(item.value) for item in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise ValueError(
-            f"parameters must be given as in (frames=20, noise=0.05), got ({words})"
+            f"parameters must be given as in (frames=20, noise=0.05), got ({text})"
         ) from error
 
 
@@ -126,7 +126,7 @@ def _load_without_reference(name: str, scale: Scale) -> Problem:
     # A single thread makes problems bit-identical across processes of a comparison.
     with one_thread():
         if name not in _GAITS:
-            return _OTHERS[name][1]()
+            return _OTHER_PROBLEMS[name][1]()
         if not scale:
             return _GAITS[name]()
         parameters = ", ".join(f"{key}={value}" for key, value in scale)

@@ -9,11 +9,11 @@ from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Likelihood, MotionPrior
 
-__all__ = ["Conditions", "conditioned"]
+__all__ = ["Conditionable", "conditioned"]
 
 
 @runtime_checkable
-class Conditions(Protocol):
+class Conditionable(Protocol):
     """A prior that can be conditioned on observations."""
 
     def given(self, likelihood: Likelihood) -> MotionPrior:
@@ -23,14 +23,14 @@ class Conditions(Protocol):
 def conditioned(posterior: MotionPosterior) -> MotionPosterior:
     """Return the posterior as a prior conditioned on the observations, without likelihood.
 
-    Raises ``ValueError`` if there are observations, but the prior is no Gaussian mixture and has no
-    ``given``. Raises ``NotConjugate`` if a mixture's observations are not linear in the positions
-    with Gaussian noise.
+    Raises ``ValueError`` if there are observations, but the prior is not a Gaussian mixture and
+    has no ``given``. Raises ``NotConjugate`` if a mixture's observations are not linear in the
+    positions with Gaussian noise.
     """
     prior, likelihood = posterior.prior, posterior.likelihood
     if likelihood is None:
         return posterior
-    if isinstance(prior, Conditions):
+    if isinstance(prior, Conditionable):
         return MotionPosterior(prior.given(likelihood))
     if isinstance(prior, GaussianMixtureMotion):
         return MotionPosterior(ConditionedMixture(prior, likelihood))

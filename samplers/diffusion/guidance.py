@@ -251,8 +251,8 @@ def guide_towards(
     if isinstance(guidance, MomentMatched | DPS) and not isinstance(posterior.prior, protocol):
         raise UnsupportedPosterior(
             sampler.name,
-            f"with guidance {guidance.kind} needs a prior with {protocol.__name__}, got "
-            f"{type(posterior.prior).__name__}; use guidance replacement or weighted-triangulation",
+            f"with guidance {guidance.kind} requires a prior that implements {protocol.__name__}, "
+            f"got {type(posterior.prior).__name__}; use replacement or weighted-triangulation",
             word=protocol.__name__,
         )
     return guidance.prepare(observations, denoiser)
@@ -267,7 +267,7 @@ def conjugate_gradients(
     """Return ``spread(u)`` where u + ``whiten(spread(u))`` = ``residual``, (B, …).
 
     Entries of the first axis are independent systems. A system stops on convergence, or when its
-    matrix is not the identity plus a covariance (:func:`_of_covariance`). Each step evaluates
+    matrix is not the identity plus a covariance (:func:`_is_consistent`). Each step evaluates
     ``spread`` once.
     """
     size = _products(residual, residual)
@@ -276,12 +276,12 @@ def conjugate_gradients(
     direction, before = residual, (np.zeros_like(residual), np.zeros(len(residual)))
     solution: np.ndarray | None = None
     for _ in range(steps):
-        moved = spread(direction)
-        image = direction + whiten(moved)
+        change = spread(direction)
+        image = direction + whiten(change)
         curvature = _products(direction, image)
-        active &= (size > tolerance) & _of_covariance(direction, image, curvature, *before)
+        active &= (size > tolerance) & _is_consistent(direction, image, curvature, *before)
         length = np.where(active, size / np.where(active, curvature, 1.0), 0.0)
-        part = moved * _rows(length, moved)
+        part = change * _rows(length, change)
         solution = part if solution is None else solution + part
         residual = residual - image * _rows(length, image)
         after = _products(residual, residual)
@@ -297,7 +297,7 @@ _ROUNDING = 1e-9  # Relative rounding error of inner products.
 _CONJUGATE = 0.3  # Maximum cosine between directions that count as conjugate.
 
 
-def _of_covariance(
+def _is_consistent(
     direction: np.ndarray,
     image: np.ndarray,
     curvature: np.ndarray,

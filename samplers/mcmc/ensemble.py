@@ -20,7 +20,7 @@ from probmotion.validation import check_count
 
 __all__ = ["Ensemble"]
 
-_LEAST_TIMES = 3
+_MIN_RUN_LENGTH = 3
 """Minimum run length, in autocorrelation times, for a reliable estimate of that time."""
 
 
@@ -249,13 +249,13 @@ class _Run:
         if len(self.trace) < 4:
             return {"autocorrelation_time": np.full(len(self.chains), np.nan)}
         # An accepted stretch move changes every coordinate.
-        moved = np.diff(np.array(self.first_coordinates), axis=0) != 0
+        accepted = np.diff(np.array(self.first_coordinates), axis=0) != 0
         traces = [np.array(trace) for trace in zip(*self.trace, strict=True)]
         slowest = np.array([autocorrelation_time(trace).max() for trace in traces])
         times = np.maximum(slowest * self._stride / self.thin, 1.0)
-        too_short = len(self.trace) < _LEAST_TIMES * slowest
+        too_short = len(self.trace) < _MIN_RUN_LENGTH * slowest
         times = np.where(too_short, np.maximum(times, len(self.recorded)), times)
-        return {"acceptance": moved.mean(axis=(0, 2)), "autocorrelation_time": times}
+        return {"acceptance": accepted.mean(axis=(0, 2)), "autocorrelation_time": times}
 
     @property
     def _stride(self) -> int:

@@ -118,7 +118,7 @@ class MetropolisHastings:
             setting = "pseudo_marginal=True" if self.pseudo_marginal else name
             raise UnsupportedPosterior(
                 self.name,
-                f"with {setting} needs a likelihood with ComparesViews, got "
+                f"with {setting} requires a likelihood that implements ComparesViews, got "
                 f"{type(posterior.likelihood).__name__}",
                 word="views",
             )

@@ -39,7 +39,7 @@ class NutsKernel:
         import jax
         from numpyro.infer import NUTS as Kernel  # noqa: N811
 
-        to_jax = _bridge(posterior)
+        to_jax = _to_jax(posterior)
         log_density = to_jax(posterior.log_density)
         self.warmup = warmup
         self.kernel = Kernel(
@@ -143,7 +143,9 @@ class NutsKernel:
         return jax.lax.fori_loop(0, draws, draw, (state, empty))
 
 
-def _bridge(posterior: MotionPosterior) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
+def _to_jax(
+    posterior: MotionPosterior,
+) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
     """Return the conversion of densities to JAX: the identity, or :func:`jax_from_torch`.
 
     Raises :class:`UnsupportedPosterior` if neither JAX nor torch can differentiate the density.

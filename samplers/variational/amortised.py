@@ -32,12 +32,12 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["AmortisedPosterior", "AmortisedSettings"]
 
 # Number of pairs used to compute the principal coordinates.
-_FIRST = 12_000
+_BASIS_PAIRS = 12_000
 # Fraction of pairs held out to estimate the covariance of the decoder.
 _HELD_OUT = 0.1
 _WARMUP = 100  # Number of steps in which the learning rate increases linearly.
 # Initial weight of the KL divergence, and the fraction of steps in which it increases to 1.
-_FIRST_WEIGHT, _ANNEALED = 0.05, 0.3
+_INITIAL_KL_WEIGHT, _ANNEALED_FRACTION = 0.05, 0.3
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class AmortisedSettings:
 
     def weight(self, step: int) -> float:
         """Return the weight of the KL divergence; small at first to avoid posterior collapse."""
-        progress = min(1.0, step / (_ANNEALED * self.steps))
-        return _FIRST_WEIGHT + (1 - _FIRST_WEIGHT) * progress
+        progress = min(1.0, step / (_ANNEALED_FRACTION * self.steps))
+        return _INITIAL_KL_WEIGHT + (1 - _INITIAL_KL_WEIGHT) * progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ def _coordinates(
     """Return the coordinate systems of motions and observations, and x and y of all pairs."""
     chunks = simulate_pairs(posterior, seed, settings.pairs)
     first_chunks: list[SimulatedPairs] = []
-    while sum(len(pairs.positions) for pairs in first_chunks) < min(_FIRST, settings.pairs):
+    while sum(len(pairs.positions) for pairs in first_chunks) < min(_BASIS_PAIRS, settings.pairs):
         first_chunks.append(next(chunks))
     first = SimulatedPairs(
         np.concatenate([pairs.positions for pairs in first_chunks]),

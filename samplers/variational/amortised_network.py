@@ -15,7 +15,7 @@ from torch import nn
 __all__ = ["ConditionalVAE"]
 
 # Bounds of log scales, for stability early in training.
-_LEAST, _MOST = -7.0, 2.0
+_LOG_SCALE_BOUNDS = -7.0, 2.0
 
 
 class ConditionalVAE(nn.Module):
@@ -58,7 +58,7 @@ class ConditionalVAE(nn.Module):
     def encode(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a and log b of r(z | x, y), (B, latent) each, from x, (B, C), and y, (B, E)."""
         mean, log_scale = self.encoder(torch.cat([x, y], dim=1)).chunk(2, dim=1)
-        return mean, log_scale.clamp(_LEAST, _MOST)
+        return mean, log_scale.clamp(*_LOG_SCALE_BOUNDS)
 
     def decode(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Return μ(z, y): ``(B, latent), (B, E) → (B, C)``."""
@@ -112,7 +112,7 @@ class _MixtureOfGaussians(nn.Module):
             weight_shift, mean_shift, scale_shift = self.network(y).split(self.sizes, dim=1)
             log_weight = log_weight + weight_shift
             mean, log_scale = mean + mean_shift[:, None], log_scale + scale_shift[:, None]
-        return torch.log_softmax(log_weight, dim=1), mean, log_scale.clamp(_LEAST, _MOST)
+        return torch.log_softmax(log_weight, dim=1), mean, log_scale.clamp(*_LOG_SCALE_BOUNDS)
 
     def log_density(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Return log p(z | y) up to a constant: ``(B, latent), (B, E) → (B,)``."""

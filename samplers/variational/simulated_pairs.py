@@ -94,8 +94,8 @@ class PrincipalCoordinates:
     deviation: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray, most: int) -> PrincipalCoordinates:
-        """Compute at most ``most`` coordinates with non-zero variance from arrays ``(n, …)``."""
+    def of(cls, values: np.ndarray, max_coordinates: int) -> PrincipalCoordinates:
+        """Compute up to ``max_coordinates`` non-constant coordinates of arrays ``(n, …)``."""
         from scipy.linalg import eigh
 
         flat = values.reshape(len(values), -1)
@@ -104,7 +104,7 @@ class PrincipalCoordinates:
         if D == 0:
             return cls(mean, np.zeros((0, 0)), np.zeros(0))
         covariance = (flat - mean).T @ (flat - mean) / len(flat)
-        variance, axes = eigh(covariance, subset_by_index=[max(0, D - most), D - 1])
+        variance, axes = eigh(covariance, subset_by_index=[max(0, D - max_coordinates), D - 1])
         variance, axes = variance[::-1], axes[:, ::-1]
         varies = (variance > _ROUNDING * variance[0]) & (variance > 0)
         return cls(mean, np.ascontiguousarray(axes[:, varies]), np.sqrt(variance[varies]))
@@ -152,15 +152,15 @@ class MotionCoordinates:
     root: np.ndarray
 
     @classmethod
-    def learn(cls, pairs: SimulatedPairs, y: np.ndarray, most: int) -> MotionCoordinates:
-        """Fit at most ``most`` coordinates x to n pairs with observation coordinates y, (n, E)."""
+    def learn(cls, pairs: SimulatedPairs, y: np.ndarray, max_coordinates: int) -> MotionCoordinates:
+        """Fit up to ``max_coordinates`` coordinates x to pairs with observations y, (n, E)."""
         n, L = pairs.observed.shape[:2]
         flat = pairs.positions.reshape(n, -1)
-        linear = np.linalg.lstsq(_with_one(y), flat, rcond=None)[0]
-        residual = flat - _with_one(y) @ linear
-        basis = PrincipalCoordinates.of(residual, most)
+        linear = np.linalg.lstsq(_with_intercept(y), flat, rcond=None)[0]
+        residual = flat - _with_intercept(y) @ linear
+        basis = PrincipalCoordinates.of(residual, max_coordinates)
         remainder = basis.without(residual - basis.mean).reshape(n, L, -1)
-        inputs = _with_one(y, basis.coordinates(residual))
+        inputs = _with_intercept(y, basis.coordinates(residual))
         explained = np.linalg.lstsq(inputs, pairs.observed.reshape(n, -1), rcond=None)[0]
         unexplained = pairs.observed - (inputs @ explained).reshape(pairs.observed.shape)
         gain = np.stack(
@@ -177,7 +177,7 @@ class MotionCoordinates:
     def coordinates(self, positions: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return x of motions with observations y: ``(n, L, J, 3), (n, E) → (n, C)``."""
         flat = positions.reshape(len(positions), -1)
-        return self.basis.coordinates(flat - _with_one(y) @ self.linear)
+        return self.basis.coordinates(flat - _with_intercept(y) @ self.linear)
 
     def motions(
         self, x: np.ndarray, y: np.ndarray, observed: np.ndarray, normal: np.ndarray
@@ -187,13 +187,13 @@ class MotionCoordinates:
         Motions have coordinates ``x``, (B, C), and observations ``observed``, (L, M), with
         coordinates ``y``, (B, E); ``normal``, (B, L, 3J), are standard normal draws.
         """
-        explained = _with_one(y, x) @ self.explained
+        explained = _with_intercept(y, x) @ self.explained
         unexplained = observed - explained.reshape(len(x), *observed.shape)
         remainder = np.einsum("nlm,lmj->nlj", unexplained, self.gain, optimize=True)
         remainder += np.einsum("lij,nlj->nli", self.root, normal, optimize=True)
         noise = self.basis.without(remainder.reshape(len(x), -1))
-        return _with_one(y) @ self.linear + self.basis.values(x) + noise
+        return _with_intercept(y) @ self.linear + self.basis.values(x) + noise
 
 
-def _with_one(*parts: np.ndarray) -> np.ndarray:
+def _with_intercept(*parts: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones((len(parts[0]), 1)), *parts], axis=1)

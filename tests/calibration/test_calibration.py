@@ -1,4 +1,4 @@
-"""Calibration: exact samplers pass at the nominal level, wrong ones are detected and named."""
+"""Calibration passes exact samplers at the nominal level, and detects and names wrong ones."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -42,7 +42,7 @@ def toy(how="occluded"):
 
 @dataclass(frozen=True)
 class Batch:
-    """Exact draws from one random stream; appends its seeds to a log file."""
+    """Sampler of exact draws from one random stream; appends its seeds to a log file."""
 
     name: ClassVar[str] = "batch"
     requires: ClassVar[tuple[type, ...]] = ()
@@ -76,7 +76,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Unfit(Batch):
+class Unsupported(Batch):
     name: ClassVar[str] = "unfit"
 
     def sample(self, posterior, **options):
@@ -93,7 +93,7 @@ SMALL = {"draws": 30, "chains": 2, "workers": 0, "progress": False}
 
 
 def direct_ranks(seed, shift=0.0, width=1.0, n=150, draws=50):
-    """Ranks for θ ~ N(0, 1), y | θ ~ N(θ, 1), and shifted and scaled draws of the posterior."""
+    """Return ranks for θ ~ N(0, 1), y | θ ~ N(θ, 1) and shifted, scaled posterior draws."""
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=n)
     y = theta + rng.normal(size=n)
@@ -153,7 +153,7 @@ def autoregression(rng, n, draws, memory):
 
 
 def run(times=None):
-    """A Markov chain run, of an ensemble if there are autocorrelation times."""
+    """Return a stand-in for the draws of a chain, or of an ensemble if ``times`` is given."""
     dataset = {} if times is None else {"autocorrelation_time": pd.Series(times)}
     return SimpleNamespace(independent=False, dataset=dataset)
 
@@ -187,9 +187,9 @@ def calibration(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def odd():
+def mixed():
     brittle = Batch(fails_above=0.7)
-    samplers = {"prior": Batch(prior_only=True), "brittle": brittle, "unfit": Unfit()}
+    samplers = {"prior": Batch(prior_only=True), "brittle": brittle, "unfit": Unsupported()}
     return calibrate(toy(), samplers, simulations=30, **SMALL)
 
 
@@ -212,36 +212,36 @@ def test_exact_draws_pass_and_the_negative_control_fails(calibration):
     assert sentence.endswith(" % (p < .001, 60 simulations)")
 
 
-def test_prior_draws_are_detected_by_the_likelihood_and_failures_counted(odd):
-    p_values = scores(odd, "prior")["p_value"]
+def test_prior_draws_are_detected_by_the_likelihood_and_failures_counted(mixed):
+    p_values = scores(mixed, "prior")["p_value"]
     names = [quantity.name for quantity in quantities(toy().posterior)]
     assert list(p_values.index) == ["all", *names, "log likelihood", "log density", "distance"]
     assert (p_values.drop(["all", "log likelihood", "log density"]) > 0.005).all()
     assert p_values["log likelihood"] < 1e-4
-    assert "no deviation" not in odd.verdict("toy", "prior")
-    brittle, unfit = scores(odd, "brittle"), scores(odd, "unfit")
+    assert "no deviation" not in mixed.verdict("toy", "prior")
+    brittle, unfit = scores(mixed, "brittle"), scores(mixed, "unfit")
     failed = int(brittle.loc["all", "failed"])
     assert 2 < failed < 20
     assert brittle.loc["all", "simulations"] == 30 - failed
-    assert len(odd.ranks("toy", "brittle")["direction 1"]) == 30 - failed
+    assert len(mixed.ranks("toy", "brittle")["direction 1"]) == 30 - failed
     sentence = f"{failed} of 30 simulations failed, the first: division by zero"
-    assert sentence in odd.verdict("toy", "brittle")
+    assert sentence in mixed.verdict("toy", "brittle")
     assert list(unfit.index) == ["all"]
     assert (unfit.loc["all", "failed"], unfit.loc["all", "simulations"]) == (30, 0)
     assert math.isnan(unfit.loc["all", "p_value"])
-    assert odd.verdict("toy", "unfit").startswith("unfit on toy: not supported, unfit accepts")
-    assert f"brittle on toy: division by zero ({failed} of 30 simulations)" in odd.notes
-    assert any("accepts no likelihood; try exact (30 of 30 sim" in note for note in odd.notes)
-    assert len(odd.failures) == failed + 30
+    assert mixed.verdict("toy", "unfit").startswith("unfit on toy: not supported, unfit accepts")
+    assert f"brittle on toy: division by zero ({failed} of 30 simulations)" in mixed.notes
+    assert any("accepts no likelihood; try exact (30 of 30 sim" in note for note in mixed.notes)
+    assert len(mixed.failures) == failed + 30
 
 
-def test_the_table_prints_a_line_per_sampler(odd):
-    table = odd.table()
+def test_the_table_prints_a_line_per_sampler(mixed):
+    table = mixed.table()
     lines = str(table).splitlines()
     assert lines[0] == "toy"
-    assert [line.split()[0] for line in lines[2:5]] == list(odd.plan.samplers)
-    assert {odd.verdict("toy", sampler) for sampler in odd.plan.samplers} < {*lines}
-    stored = pd.read_csv(odd.folder / "table.csv")
+    assert [line.split()[0] for line in lines[2:5]] == list(mixed.plan.samplers)
+    assert {mixed.verdict("toy", sampler) for sampler in mixed.plan.samplers} < {*lines}
+    stored = pd.read_csv(mixed.folder / "table.csv")
     assert list(stored.columns) == list(table.columns)
     assert stored["p_value"].to_numpy() == pytest.approx(table["p_value"].to_numpy(), nan_ok=True)
 

@@ -25,7 +25,7 @@ decompose = partial(decompose_error, progress=False)
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Independent joints N(mean_j, covariance), metres, in one frame."""
+    """Prior of independent joints N(mean_j, covariance), metres, in one frame."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -56,8 +56,8 @@ class Points:
         axes, target, precision = likelihood.linear()
         information = np.linalg.inv(self.covariance) + precision.flat[0] * axes[0].T @ axes[0]
         covariance = np.linalg.inv(information)
-        seen = precision.flat[0] * target[0, 0] @ axes[0]
-        mean = (self.mean @ np.linalg.inv(self.covariance) + seen) @ covariance
+        observed = precision.flat[0] * target[0, 0] @ axes[0]
+        mean = (self.mean @ np.linalg.inv(self.covariance) + observed) @ covariance
         return replace(self, mean=mean, covariance=covariance)
 
     def exact_posterior(self, likelihood):
@@ -83,7 +83,7 @@ class Points:
 
 
 def gain(S, alpha_bar):
-    """G with E[x₀ | x_t] = x_t G for x₀ ~ N(0, S)."""
+    """Return G with E[x₀ | x_t] = x_t G for x₀ ~ N(0, S)."""
     noisy = alpha_bar * S + (1 - alpha_bar) * np.eye(len(S))
     return math.sqrt(alpha_bar) * np.linalg.solve(noisy, S)
 
@@ -97,7 +97,7 @@ def problem_of(prior, likelihood=None):
 
 
 def covariance_after(S, T, views=None, shared_noise=True):
-    """Covariance of a joint after T steps of `ancestral3d`, or with views of `mas`."""
+    """Return the covariance of a joint after T steps of `ancestral3d`, or of `mas` in views."""
     schedule = NoiseSchedule.cosine(T)
     axes = np.eye(3)[None] if views is None else views
     inverse = np.linalg.inv(np.einsum("vcx,vcy->xy", axes, axes))
@@ -116,9 +116,9 @@ def covariance_after(S, T, views=None, shared_noise=True):
     covariance = np.eye(len(embed))
     for t in range(T, 1, -1):
         step = schedule.posterior(t)
-        move = step.clean * embed @ estimate(schedule.alpha_bar[t])
-        move = move + step.noisy * np.eye(len(embed))
-        covariance = move @ covariance @ move.T + step.deviation**2 * np.eye(len(embed))
+        transition = step.clean * embed @ estimate(schedule.alpha_bar[t])
+        transition = transition + step.noisy * np.eye(len(embed))
+        covariance = transition @ covariance @ transition.T + step.deviation**2 * np.eye(len(embed))
     last = estimate(schedule.alpha_bar[1])
     return last @ covariance @ last.T
 
@@ -137,17 +137,17 @@ def means(decomposition, measure):
 
 
 def test_isotropic_prior_shrinks_by_discretisation_alone():
-    # Variance .955 at T = 100 and .995 at 1000; limit M⁻¹ for independent noise.
+    # The variance is .955 at T = 100 and .995 at 1000; with independent noise its limit is M⁻¹.
     S, T = np.eye(3), 30
     assert log_trace(covariance_after(S, 100), S) == pytest.approx(math.log(0.955), abs=1e-3)
     assert log_trace(covariance_after(S, 1000), S) == pytest.approx(math.log(0.995), abs=1e-3)
     result = decompose(problem_of(centred(1, 1, 1)), steps=T, seeds=2, draws=100)
     spread = means(result, "spread")
     error = 4 * math.sqrt(2) * math.sqrt(2 / (100 * 2 * JOINTS * 3))
-    many, few = (log_trace(covariance_after(S, steps), S) for steps in (10 * T, T))
-    assert spread["remainder"] == pytest.approx(many, abs=error)
-    assert spread["remainder"] + spread["discretisation"] == pytest.approx(few, abs=error)
-    # The view denoisers then agree with the 3D one.
+    fine, coarse = (log_trace(covariance_after(S, steps), S) for steps in (10 * T, T))
+    assert spread["remainder"] == pytest.approx(fine, abs=error)
+    assert spread["remainder"] + spread["discretisation"] == pytest.approx(coarse, abs=error)
+    # The denoisers of the views then agree with the 3D denoiser.
     assert spread["single view"] == pytest.approx(0, abs=1e-10)
     views = ring(5, math.pi / 16)
     coarse, here, fine = (covariance_after(S, T, views, shared_noise=False) for T in (200, T, 400))
@@ -162,9 +162,9 @@ def test_isotropic_prior_shrinks_by_discretisation_alone():
 @pytest.mark.parametrize(
     ("true", "elevation", "drawn"),
     [
-        # Elevation mixes vertical and horizontal.
+        # Elevation mixes the vertical and horizontal directions.
         ((1, 0.05, 1), math.radians(15), (0.835, 0.114, 0.835)),
-        # Large directions shrink, small ones inflate; nearly level views.
+        # Directions of large variance shrink and others inflate, also in level views.
         ((0.01, 0.01, 1), 1e-9, (0.055, 0.01, 0.675)),
     ],
 )
@@ -182,7 +182,7 @@ def test_single_view_conditioning_shrinks_large_and_inflates_small_directions(
     before = covariance_after(S, T)
     spread = means(result, "spread")
     assert spread["single view"] == pytest.approx(log_trace(after, before), abs=0.01)
-    # Small directions mix joints, and axes of equal variance.
+    # The directions of small variance mix joints, and axes of equal variance.
     small = ErrorMeasures(problem_of(prior)).small.reshape(JOINTS, 3, -1)
     inflated, right = (
         np.einsum("jxd,xy,jyd->d", small, covariance, small) for covariance in (after, before)
@@ -199,15 +199,15 @@ def test_parts_add_up_exactly_seed_by_seed():
     assert list(table.columns) == ["setting", "measure", "part", "mean", "low", "high"]
     assert set(table["setting"]) == {"points, V = 5, T = 5"}
     for measure, links in result.values.items():
-        whole = links["noise sharing"] - links["exact"]
+        total_error = links["noise sharing"] - links["exact"]
         parts = np.sum(list(result.differences(measure).values()), axis=0)
-        np.testing.assert_allclose(parts, whole, atol=1e-12)
+        np.testing.assert_allclose(parts, total_error, atol=1e-12)
         rows = table[table["measure"] == measure].set_index("part")
         np.testing.assert_allclose(rows.loc[result.parts, "mean"].sum(), rows.loc["whole", "mean"])
         assert (rows["low"] < rows["high"]).all()
-    sentences = {words.partition(":")[0]: words for words in result.findings}
+    sentences = {line.partition(":")[0]: line for line in result.findings}
     assert "discretisation -" in sentences["spread"]
-    assert sentences["mean"].startswith("mean: not significant in all; not significant: ")
+    assert sentences["mean"].startswith("mean: total not significant; not significant: ")
 
 
 def test_measures_of_shifted_and_scaled_draws():
@@ -217,19 +217,19 @@ def test_measures_of_shifted_and_scaled_draws():
     total = 1.4 * JOINTS
     floor = measures.of(exact, seed=2)
     shift = np.random.default_rng(0).normal(size=exact.shape[1:])
-    moved = measures.of(exact + shift, seed=2)
-    apart = float((shift**2).sum()) / total
-    # W₂² of a shift along a direction is its square, ‖shift‖² / D on average.
+    shifted = measures.of(exact + shift, seed=2)
+    expected_shift = float((shift**2).sum()) / total
+    # W₂² of a shift along a direction is its square; the mean over directions is ‖shift‖² / D.
     for measure in ("mean", "distance"):
-        assert moved[measure] - floor[measure] == pytest.approx(apart, rel=0.15)
+        assert shifted[measure] - floor[measure] == pytest.approx(expected_shift, rel=0.15)
     stretched = measures.of(1.5 * exact, seed=2)
     for measure in ("spread", "small"):
-        assert moved[measure] == pytest.approx(floor[measure], abs=1e-9)
+        assert shifted[measure] == pytest.approx(floor[measure], abs=1e-9)
         assert stretched[measure] - floor[measure] == pytest.approx(2 * math.log(1.5), abs=1e-9)
-    # Of Gaussians: (1.5 σ − σ)² along every direction.
+    # For Gaussians, W₂² is (1.5 σ − σ)² along every direction.
     assert stretched["distance"] - floor["distance"] == pytest.approx(0.25, rel=0.1)
     assert abs(stretched["mean"]) < 0.005
-    # The small directions hold the last 5 % of the variance, on the axis of variance .1.
+    # The small directions contain the last 5 % of the variance, on the axis of variance .1.
     assert 0.048 * total < measures.small_variances.sum() < 0.051 * total
     small = measures.small.reshape(JOINTS, 3, -1)
     assert (small[:, 2] ** 2).sum() > 0.98 * small.shape[-1]
@@ -281,13 +281,13 @@ def test_interrupted_runs_resume(tmp_path):
     prior = centred(1, 0.3, 0.1)
     run = partial(decompose, problem_of(prior), steps=4, seeds=2, draws=12)
     uninterrupted = run(out=tmp_path / "uninterrupted")
-    calls, of = [], ErrorMeasures.of
+    calls, original = [], ErrorMeasures.of
 
     def stop_at_the_sixth(self, positions, seed):
         calls.append(seed)
         if len(calls) == 6:
             raise KeyboardInterrupt
-        return of(self, positions, seed)
+        return original(self, positions, seed)
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ErrorMeasures, "of", stop_at_the_sixth)
@@ -307,16 +307,16 @@ def test_gaits_have_a_manifold_measure_and_a_plot(tmp_path):
     problem = load_problem("gait", frames=4, components=3)
     result = decompose(problem, steps=8, seeds=2, draws=40)
     assert list(result.values) == ["spread", "small", "off", "mean", "distance"]
-    off = result.table().set_index(["measure", "part"]).loc["off"]
-    assert abs(off.loc["floor", "mean"]) < 0.1
-    assert off.loc["discretisation", "high"] < 0
-    assert off.loc["single view", "low"] > 0
+    rows = result.table().set_index(["measure", "part"]).loc["off"]
+    assert abs(rows.loc["floor", "mean"]) < 0.1
+    assert rows.loc["discretisation", "high"] < 0
+    assert rows.loc["single view", "low"] > 0
     path = result.plot(tmp_path / "budget.png")
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-class Flat:
-    """A prior without density or denoiser."""
+class NoDensity:
+    """Prior without density or denoiser."""
 
     skeleton, frames, fps, dim = centred(1, 1, 1).skeleton, 1, 20.0, 3 * JOINTS
 
@@ -327,16 +327,16 @@ class Flat:
 def test_invalid_arguments():
     prior = centred(1, 1, 1)
     problem = problem_of(prior)
-    seen = problem_of(prior, observed(prior, 0.1))
-    for of, options, message in (
+    with_data = problem_of(prior, observed(prior, 0.1))
+    for case, options, message in (
         (problem, {"seeds": 1}, "seeds must be an integer of at least 2, got 1"),
         (problem, {"draws": 3}, "draws must be an integer of at least 10, got 3"),
         (problem, {"settings": {"perspective": True}}, "settings must be among .*, got 'perspec"),
         (problem, {"learnt": replace(prior, mean=np.zeros((3, 3)))}, "got 1 frames and 3 joints"),
-        (problem_of(Flat()), {}, "problem must have an exact posterior, got 'points'"),
-        (seen, {"shared_noise": False}, "shared_noise must be True with observations"),
+        (problem_of(NoDensity()), {}, "problem must have an exact posterior, got 'points'"),
+        (with_data, {"shared_noise": False}, "shared_noise must be True with observations"),
     ):
         with pytest.raises(ValueError, match=message):
-            decompose(of, **options)
-    with pytest.raises(UnsupportedPosterior, match="mas needs a prior with Denoises2D, got Flat"):
-        decompose(problem, learnt=Flat())
+            decompose(case, **options)
+    with pytest.raises(UnsupportedPosterior, match="a prior with Denoises2D, got NoDensity"):
+        decompose(problem, learnt=NoDensity())

@@ -15,7 +15,7 @@ from probmotion.io.files import save
 
 @pytest.fixture
 def fails(capsys):
-    """Run a command that must fail with one line on standard error, and return the line."""
+    """Return a function that runs a failing command and returns its one-line error message."""
 
     def run(*words):
         assert main([str(word) for word in words]) == 2, words
@@ -28,7 +28,7 @@ def fails(capsys):
 
 @pytest.fixture(scope="session")
 def interrupted():
-    """Press Ctrl-C once a command has written a path; return its message."""
+    """Return a function that interrupts a command once a path exists and returns its message."""
     script = "import sys; from probmotion.cli.main import main; sys.exit(main())"
 
     def run(words, path):
@@ -40,7 +40,7 @@ def interrupted():
         limit = time.monotonic() + 60
         while not path.exists() and process.poll() is None and time.monotonic() < limit:
             time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the whole process group
+        os.killpg(process.pid, signal.SIGINT)  # to the whole process group, as a terminal does
         _, errors = process.communicate(timeout=60)
         assert process.returncode == 130
         assert "Traceback" not in errors
@@ -52,7 +52,7 @@ def interrupted():
 
 @pytest.fixture(scope="session")
 def write_walks():
-    """Write walk0.npz, walk1.npz, … to a folder and return a pattern of them."""
+    """Return a function that writes walk0.npz, walk1.npz, … and returns their pattern."""
 
     def write(folder, n=5, frames=40, fps=30.0):
         folder.mkdir(exist_ok=True)
@@ -65,5 +65,5 @@ def write_walks():
 
 @pytest.fixture(scope="session")
 def walks(write_walks, tmp_path_factory):
-    """A pattern of five clips of two seconds."""
+    """File name pattern of five clips of two seconds."""
     return write_walks(tmp_path_factory.mktemp("walks"), frames=60)

@@ -31,14 +31,14 @@ def test_reference_writes_draws_and_their_certificate(tmp_path, capsys, monkeypa
 def test_disagreeing_runs_fail_and_write_nothing(tmp_path, capsys, monkeypatch):
     original = references._run
 
-    def narrow(problem, sampler, n, seed, half, *rest):
+    def narrowed(problem, sampler, n, seed, half, *rest):
         run = original(problem, sampler, n, seed, half, *rest)
         positions = run.dataset["positions"]
         if half:
             run.dataset["positions"] = positions.mean() + 0.9 * (positions - positions.mean())
         return run
 
-    monkeypatch.setattr(references, "_run", narrow)
+    monkeypatch.setattr(references, "_run", narrowed)
     assert main(["reference", SMALL, "--draws", "80", "--out", str(tmp_path)]) == 2
     assert "two runs" in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
@@ -74,6 +74,6 @@ def test_interrupted_command_continues_after_the_first_run(tmp_path, capsys, mon
         (["walk2d"], "MotionDiffusion"),
     ],
 )
-def test_invalid_options_are_one_line(words, expected, tmp_path, fails):
+def test_invalid_options_give_one_error_line(words, expected, tmp_path, fails):
     assert expected in fails("reference", *words, "--out", tmp_path)
     assert not list(tmp_path.iterdir())

@@ -20,22 +20,22 @@ FILES = {"losses.csv", "model.safetensors", "state.safetensors"}
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
 
-def words(kind, walks, out, *more):
-    given = ["train", kind, "--clips", walks, "--views", "2", "--size", "tiny", *PARTS]
-    return [*given, "--out", str(out), *map(str, more)]
+def command(kind, walks, out, *more):
+    args = ["train", kind, "--clips", walks, "--views", "2", "--size", "tiny", *PARTS]
+    return [*args, "--out", str(out), *map(str, more)]
 
 
 @pytest.fixture(scope="module")
 def trained(walks, tmp_path_factory):
-    """The folder of a run of 20 steps."""
+    """Folder of a run of 20 steps."""
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(words("diffusion", walks, out, "--steps", 20, "--checkpoint-every", 10)) == 0
+    assert main(command("diffusion", walks, out, "--steps", 20, "--checkpoint-every", 10)) == 0
     return out
 
 
 @pytest.fixture
 def copied(trained, tmp_path):
-    """A copy of the run, to be continued."""
+    """Folder of a copy of the run, to be continued."""
     return shutil.copytree(trained, tmp_path / "run")
 
 
@@ -58,8 +58,8 @@ def test_run_writes_a_prior_that_denoises(trained):
 
 
 def test_default_data_are_synthetic_walks(tmp_path, capsys):
-    given = ["train", "diffusion", "--out", str(tmp_path / "run"), "--size", "tiny"]
-    assert main([*given, "--steps", "5", "--views", "1", "--frames", "12"]) == 0
+    args = ["train", "diffusion", "--out", str(tmp_path / "run"), "--size", "tiny"]
+    assert main([*args, "--steps", "5", "--views", "1", "--frames", "12"]) == 0
     printed = capsys.readouterr().out
     assert "\nshort " in printed  # the table of preparation steps
     for part in ("train: 48 tracks of 48 clips", "validation: 6 tracks of 6", "test: 6 tracks"):
@@ -71,39 +71,39 @@ def test_default_data_are_synthetic_walks(tmp_path, capsys):
 def test_data_and_training_options_take_effect(walks, tmp_path):
     more = ["--fps", 15, "--centre", "sequence", "--threshold", 0.4, "--skeleton", "h36m17"]
     steps = ["--steps", 3, "--batch", 7, "--learning-rate", 0.003, "--seed", 4]
-    assert main(words("diffusion", walks, tmp_path, *more, *steps)) == 0
+    assert main(command("diffusion", walks, tmp_path, *more, *steps)) == 0
     card = MotionDiffusion.load(tmp_path).card
     assert card["network"]["fps"] == 15
     assert card["network"]["threshold"] == 0.4
     assert card["network"]["joint_names"] == list(Skeleton.preset("h36m17").joint_names)
     assert card["network"]["augmentation"]["shift"] > 0
     assert max(np.ravel(card["network"]["deviation"][0])) > 0
-    # The decay of the average is the default of the size.
+    # Without an option, the decay of the average is the default of the size.
     training = {"batch": 7, "learning_rate": 0.003, "seed": 4, "ema": 0.99}
     assert training.items() <= card["training"].items()
 
 
 def test_evaluator_on_a_random_split_of_six_clips(write_walks, tmp_path):
     clips = write_walks(tmp_path, 6, frames=60)
-    given = ["train", "evaluator", "--clips", clips, "--views", "1", "--size", "tiny"]
-    assert main([*given, "--steps", "5", "--out", str(tmp_path / "run")]) == 0
+    args = ["train", "evaluator", "--clips", clips, "--views", "1", "--size", "tiny"]
+    assert main([*args, "--steps", "5", "--out", str(tmp_path / "run")]) == 0
     assert TrackEvaluator.load(tmp_path / "run").skeleton == PERSON
 
 
-def test_lifter_is_trained_after_its_flow_and_extended_alone(walks, tmp_path, capsys, fails):
+def test_lifter_is_trained_after_its_flow_and_extended_without_it(walks, tmp_path, capsys, fails):
     flow, lifter = tmp_path / "flow", tmp_path / "lifter"
-    assert main(words("lifter", walks, tmp_path, "--steps", 5)) == 0
+    assert main(command("lifter", walks, tmp_path, "--steps", 5)) == 0
     before = contents(flow)
     # An interrupted lifter continues with the finished flow.
     shutil.rmtree(lifter)
     for steps in (5, 8):
-        assert main(words("lifter", walks, tmp_path, "--steps", steps)) == 0
+        assert main(command("lifter", walks, tmp_path, "--steps", steps)) == 0
         last = capsys.readouterr().out.splitlines()[-1]
         assert last.startswith(f"wrote {lifter / 'model.safetensors'}: step {steps}, loss ")
     PoseLifter.load(lifter)
     # Other data are rejected before the flow is changed.
     assert "data must be the same" in fails(
-        *words("lifter", walks, tmp_path, "--steps", 9, "--data-seed", 1)
+        *command("lifter", walks, tmp_path, "--steps", 9, "--data-seed", 1)
     )
     assert contents(flow) == before
 
@@ -111,7 +111,7 @@ def test_lifter_is_trained_after_its_flow_and_extended_alone(walks, tmp_path, ca
 def test_finished_run_writes_nothing(walks, copied, capsys):
     before = contents(copied)
     for steps in (20, 15):
-        assert main(words("diffusion", walks, copied, "--steps", steps)) == 0
+        assert main(command("diffusion", walks, copied, "--steps", steps)) == 0
         printed = capsys.readouterr().out.splitlines()[-1]
         assert printed.endswith(f"is finished: 20 of {steps} steps")
         assert contents(copied) == before
@@ -123,7 +123,7 @@ def test_finished_run_writes_nothing(walks, copied, capsys):
 )
 def test_folder_of_another_run_is_rejected(walks, copied, fails, option, value, named):
     before = contents(copied)
-    message = fails(*words("diffusion", walks, copied, "--steps", 40, option, value))
+    message = fails(*command("diffusion", walks, copied, "--steps", 40, option, value))
     assert re.match(rf"{named} must be .* to resume {re.escape(str(copied))}, got", message)
     assert contents(copied) == before
 
@@ -131,7 +131,7 @@ def test_folder_of_another_run_is_rejected(walks, copied, fails, option, value, 
 def test_folder_of_another_kind_is_rejected(walks, copied, fails):
     for missing in ("losses.csv", "state.safetensors"):
         (copied / missing).unlink()
-        message = fails(*words("evaluator", walks, copied, "--steps", 40))
+        message = fails(*command("evaluator", walks, copied, "--steps", 40))
         assert "motion-diffusion" in message
         assert "track-evaluator" in message
     assert MotionDiffusion.load(copied).card["step"] == 20
@@ -139,19 +139,19 @@ def test_folder_of_another_kind_is_rejected(walks, copied, fails):
 
 def test_ctrl_c_stores_a_checkpoint_to_continue_from(walks, tmp_path, capsys, interrupted):
     out = tmp_path / "run"
-    given = words("diffusion", walks, out, "--checkpoint-every", 5)
-    message = interrupted([*given, "--steps", "100000"], out / "state.safetensors")
+    args = command("diffusion", walks, out, "--checkpoint-every", 5)
+    message = interrupted([*args, "--steps", "100000"], out / "state.safetensors")
     step = int(MotionDiffusion.load(out).card["step"])
     assert message.startswith(f"probmotion: stopped at step {step} of 100000")
     assert str(out) in message
     assert {file.name for file in out.iterdir()} == FILES
-    assert main([*given, "--steps", "1"]) == 0
+    assert main([*args, "--steps", "1"]) == 0
     assert f"{step} of 1 steps" in capsys.readouterr().out
-    assert main([*given, "--steps", str(step + 7)]) == 0
+    assert main([*args, "--steps", str(step + 7)]) == 0
     assert MotionDiffusion.load(out).card["step"] == step + 7
 
 
-def test_invalid_options_are_one_line_and_write_nothing(walks, tmp_path, monkeypatch, fails):
+def test_invalid_options_give_one_error_line_and_no_files(walks, tmp_path, monkeypatch, fails):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out, table = tmp_path / "run", tmp_path / "table.csv"
     table.write_text("a,b\n")
@@ -181,8 +181,8 @@ def test_invalid_options_are_one_line_and_write_nothing(walks, tmp_path, monkeyp
     for options, expected in cases.items():
         assert expected in fails(*base, *options.split()), options
         assert not out.exists()
-    for given, got in {("train",): "none", ("train", "vae"): "'vae'"}.items():
-        assert fails(*given) == f"kind must be one of {', '.join(KINDS)}, got {got}"
+    for args, got in {("train",): "none", ("train", "vae"): "'vae'"}.items():
+        assert fails(*args) == f"kind must be one of {', '.join(KINDS)}, got {got}"
 
 
 @pytest.mark.parametrize(
@@ -190,20 +190,20 @@ def test_invalid_options_are_one_line_and_write_nothing(walks, tmp_path, monkeyp
 )
 def test_options_are_checked_before_data_are_read(kind, tmp_path, monkeypatch, fails):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    taken = tmp_path / "run"
-    taken.write_text("mine")
-    given = ["train", *kind, "--clips", str(tmp_path / "no.npz")]
+    file = tmp_path / "run"
+    file.write_text("mine")
+    args = ["train", *kind, "--clips", str(tmp_path / "no.npz")]
     cases = {
-        ("--out", str(taken)): f"out must be a folder, got {taken}; {taken} is a file",
-        ("--out", f"{taken}/a/b"): f"out must be a folder, got {taken}/a/b; {taken} is a file",
+        ("--out", str(file)): f"out must be a folder, got {file}; {file} is a file",
+        ("--out", f"{file}/a/b"): f"out must be a folder, got {file}/a/b; {file} is a file",
         ("--out", str(tmp_path / "new"), "--device", "cuda"): "device",
     }
     if kind[0] not in ("dvae", "denoiser"):
         cases["--out", str(tmp_path / "new"), "--threshold", "nan"] = "threshold must be a finite"
     for more, expected in cases.items():
-        assert fails(*given, *more).startswith(expected)
-    assert taken.read_text() == "mine"
-    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+        assert fails(*args, *more).startswith(expected)
+    assert file.read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize("kind", ["", *KINDS])

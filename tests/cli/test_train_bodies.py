@@ -30,25 +30,25 @@ def clips(write_walks, tmp_path_factory):
     return write_walks(tmp_path_factory.mktemp("walks"))
 
 
-def words(kind, clips, out, *more):
-    given = ["train", kind, "--clips", clips, "--size", "tiny", *PARTS, "--batch", "4"]
-    return [*given, "--out", str(out), *map(str, more)]
+def command(kind, clips, out, *more):
+    args = ["train", kind, "--clips", clips, "--size", "tiny", *PARTS, "--batch", "4"]
+    return [*args, "--out", str(out), *map(str, more)]
 
 
 @pytest.fixture(scope="module")
 def prior(clips, tmp_path_factory):
-    """The folder of a prior's run of 4 steps."""
+    """Folder of a prior trained for 4 steps."""
     out = tmp_path_factory.mktemp("runs") / "prior"
-    assert main(words("dvae", clips, out, "--steps", 4, "--checkpoint-every", 2)) == 0
+    assert main(command("dvae", clips, out, "--steps", 4, "--checkpoint-every", 2)) == 0
     return out
 
 
 @pytest.fixture(scope="module")
 def denoiser(clips, prior, tmp_path_factory):
-    """The folder of a denoiser's run of 4 steps."""
+    """Folder of a denoiser trained for 4 steps."""
     out = tmp_path_factory.mktemp("runs") / "denoiser"
-    given = words("denoiser", clips, out, "--prior", prior, "--steps", 4, "--hidden", 0.25)
-    assert main([*given, "--checkpoint-every", "2"]) == 0
+    args = command("denoiser", clips, out, "--prior", prior, "--steps", 4, "--hidden", 0.25)
+    assert main([*args, "--checkpoint-every", "2"]) == 0
     return out
 
 
@@ -60,9 +60,9 @@ def test_run_writes_a_prior_that_samples(prior):
     data = {"clips": ["walk0", "walk1", "walk2"], "frames": 3 * 40}
     assert data.items() <= network["data"].items()
     assert network["validation_data"]["clips"] == ["walk3"]
-    usual, annealing = usual_dvae_training("tiny")
+    defaults, annealing = usual_dvae_training("tiny")
     assert network["annealing"] == annealing
-    assert (dvae.card["training"]["batch"], dvae.card["training"]["ema"]) == (4, usual.ema)
+    assert (dvae.card["training"]["batch"], dvae.card["training"]["ema"]) == (4, defaults.ema)
     assert {file.name for file in prior.iterdir()} == FILES
 
 
@@ -78,14 +78,14 @@ def test_run_writes_a_denoiser_of_its_prior(prior, denoiser):
 
 def test_default_data_are_synthetic_people(tmp_path, capsys):
     out = tmp_path / "run"
-    given = f"train dvae --size tiny --steps 1 --fps 10 --out {out}"
-    assert main(given.split()) == 0
+    args = f"train dvae --size tiny --steps 1 --fps 10 --out {out}"
+    assert main(args.split()) == 0
     expected = [
-        "resampled to 10 fps: 84 clips at 30 fps",
+        "resampled from 30 to 10 fps: 84 of 84 clips",
         "train: 2400 frames of 60 clips: walk-0, run-0, march-0, walk-1, run-1, march-1, …",
         "validation: 480 frames of 12 clips: walk-20, ",
         "test: 480 frames of 12 clips: walk-24, ",
-        f"KL weight: annealed over {usual_dvae_training('tiny')[1]} steps, more than the 1 of this",
+        f"KL annealing takes {usual_dvae_training('tiny')[1]} steps, but this run has 1",
         f"wrote {out / 'model.safetensors'}: step 1, loss ",
     ]
     for line, beginning in zip(capsys.readouterr().out.splitlines(), expected, strict=True):
@@ -96,25 +96,25 @@ def test_default_data_are_synthetic_people(tmp_path, capsys):
 def test_resampled_and_skipped_clips_are_printed(write_walks, tmp_path, capsys):
     files = write_walks(tmp_path / "clips", 6, frames=80, fps=60.0)
     save(make_gait("walk", 6, frames=8, fps=15), tmp_path / "clips" / "walk6.npz")
-    assert main(words("dvae", files, tmp_path / "run", "--steps", 1, "--fps", 15)) == 0
+    assert main(command("dvae", files, tmp_path / "run", "--steps", 1, "--fps", 15)) == 0
     assert capsys.readouterr().out.splitlines()[:4] == [
-        "resampled to 15 fps: 6 clips at 60 fps",
-        "skipped, shorter than 12 frames: 1 clips: walk6",
+        "resampled from 60 to 15 fps: 6 of 7 clips",
+        "skipped, shorter than 12 frames: 1 clip: walk6",
         "train: 80 frames of 4 clips: walk0, walk1, walk2, walk5",
-        "validation: 20 frames of 1 clips: walk3",
+        "validation: 20 frames of 1 clip: walk3",
     ]
 
 
 def test_denoiser_uses_the_joints_and_frame_rate_of_its_prior(clips, tmp_path, capsys):
     prior, out = tmp_path / "prior", tmp_path / "run"
     more = ["--skeleton", "h36m17", "--fps", 20, "--steps", 1]
-    assert main(words("dvae", clips, prior, *more)) == 0
+    assert main(command("dvae", clips, prior, *more)) == 0
     assert MotionDVAE.load(prior).skeleton == Skeleton.preset("h36m17")
     capsys.readouterr()
-    assert main(words("denoiser", clips, out, "--prior", prior, "--steps", 1)) == 0
+    assert main(command("denoiser", clips, out, "--prior", prior, "--steps", 1)) == 0
     assert capsys.readouterr().out.splitlines()[:2] == [
         "prior: 17 joints, windows of 12 frames at 20 fps",
-        "resampled to 20 fps: 5 clips at 30 fps",
+        "resampled from 30 to 20 fps: 5 of 5 clips",
     ]
     assert MotionDenoiser.load(out, MotionDVAE.load(prior)).prior.fps == 20
 
@@ -122,10 +122,10 @@ def test_denoiser_uses_the_joints_and_frame_rate_of_its_prior(clips, tmp_path, c
 def test_data_seed_splits_six_clips(write_walks, tmp_path, capsys):
     clips, parts = write_walks(tmp_path, 6), []
     for run, seed in enumerate((0, 0, 1)):
-        given = f"train dvae --clips {clips} --size tiny --steps 1 --data-seed {seed} --out"
-        assert main([*given.split(), str(tmp_path / f"run{run}")]) == 0
+        args = f"train dvae --clips {clips} --size tiny --steps 1 --data-seed {seed} --out"
+        assert main([*args.split(), str(tmp_path / f"run{run}")]) == 0
         printed = capsys.readouterr().out
-        parts.append(re.findall(r"(?:train|validation|test): .* clips: (.*)", printed))
+        parts.append(re.findall(r"(?:train|validation|test): .* clips?: (.*)", printed))
     assert [len(names.split(", ")) for names in parts[0]] == [4, 1, 1]
     assert sorted(", ".join(parts[0]).split(", ")) == [f"walk{n}" for n in range(6)]
     assert parts[0] == parts[1] != parts[2]
@@ -136,7 +136,7 @@ def test_more_steps_extend_a_run(kind, clips, prior, denoiser, tmp_path, capsys)
     more = ["--prior", prior, "--hidden", 0.25] if kind == "denoiser" else []
     out = shutil.copytree(denoiser if kind == "denoiser" else prior, tmp_path / "run")
     for steps, expected in ((4, "is finished: 4 of 4 steps"), (6, ": step 6, loss ")):
-        assert main(words(kind, clips, out, "--steps", steps, *more)) == 0
+        assert main(command(kind, clips, out, "--steps", steps, *more)) == 0
         assert expected in capsys.readouterr().out.splitlines()[-1]
 
 
@@ -167,8 +167,8 @@ def test_show_summarises_priors_and_denoisers(prior, denoiser, capsys):
 
 
 def test_compare_samples_a_trained_prior(prior, tmp_path):
-    words = f"compare --samplers mh mas --draws 12 --workers 0 --prior {prior} --out {tmp_path}"
-    assert main([*words.split(), "--settings.mh.warmup", "10", "--settings.mh.thin", "2"]) == 0
+    command = f"compare --samplers mh mas --draws 12 --workers 0 --prior {prior} --out {tmp_path}"
+    assert main([*command.split(), "--settings.mh.warmup", "10", "--settings.mh.thin", "2"]) == 0
     table = pd.read_csv(tmp_path / "table.csv")
     assert set(table["problem"]) == {"prior"}
     assert "density_evaluations" in set(table[table["sampler"] == "mh"]["metric"])
@@ -177,7 +177,7 @@ def test_compare_samples_a_trained_prior(prior, tmp_path):
     assert list(table[table["sampler"] == "mas"]["metric"]) == ["unsupported"]
 
 
-def test_compare_rejects_networks_that_are_no_prior(denoiser, tmp_path, fails):
+def test_compare_rejects_networks_that_are_not_priors(denoiser, tmp_path, fails):
     out = tmp_path / "out"
     for source, kind in ((str(denoiser), DENOISER), ("walk2d-evaluator", "track-evaluator")):
         message = fails("compare", "--prior", source, "--out", out)
@@ -189,7 +189,7 @@ def test_compare_rejects_networks_that_are_no_prior(denoiser, tmp_path, fails):
     assert not out.exists()
 
 
-def test_invalid_clips_are_one_line_and_write_nothing(write_walks, clips, tmp_path, fails):
+def test_invalid_clips_give_one_error_line_and_no_files(write_walks, clips, tmp_path, fails):
     out = tmp_path / "run"
     short = write_walks(tmp_path / "short", 6, frames=7)
     twin = shutil.copy(tmp_path / "short" / "walk1.npz", tmp_path / "walk1.npz")
@@ -205,23 +205,23 @@ def test_invalid_clips_are_one_line_and_write_nothing(write_walks, clips, tmp_pa
     np.savez(torn, **arrays)
     missing = tmp_path / "no.npz"
     known = "walk0, walk1, walk2, walk3, walk4"
-    given = f"--clips {clips}"
+    args = f"--clips {clips}"
     cases = {
         f"--clips {short}": "clips must include one of at least 12 frames at 30 fps, got at most 7",
-        given: f"clips must be at least 6 for a random split, got 5 ({known}); name held-out",
-        f"{given} --validation walk1": "validation requires test",
-        f"{given} --validation walk1 --test walk1": "validation and test must be disj",
-        f"{given} --validation walk9 --test walk1": "validation must name clips among "
+        args: f"clips must be at least 6 for a random split, got 5 ({known}); name held-out",
+        f"{args} --validation walk1": "validation requires test",
+        f"{args} --validation walk1 --test walk1": "validation and test must be disj",
+        f"{args} --validation walk9 --test walk1": "validation must name clips among "
         f"{known}, got 'walk9'",
-        f"{given} --validation walk0 walk1 walk2 --test walk4 walk3": "validation and test must "
+        f"{args} --validation walk0 walk1 walk2 --test walk4 walk3": "validation and test must "
         "exclude at least one clip for training",
         "--validation walk-0": "validation requires --clips",
         "--test walk-0": "test requires --clips",
-        f"{given} {twin}": "files must have unique names, got ",
+        f"{args} {twin}": "files must have unique names, got ",
         f"--clips {missing}": f"{missing}: No such file or directory",
-        f"{given} {large}": "large must have bones",
-        f"{given} {torn}": str(torn),
-        f"{given} {kneeless}": "clip kneeless cannot be retargeted: ",
+        f"{args} {large}": "large must have bones",
+        f"{args} {torn}": str(torn),
+        f"{args} {kneeless}": "clip kneeless cannot be retargeted: ",
         "--steps 0": "steps must be an integer of at least 1, got 0",
         "--data-seed -1": "data_seed must be an integer of at least 0, got -1",
         "--fps 0": "fps must be a finite number above 0, got 0.0",
@@ -245,6 +245,6 @@ def test_invalid_options_of_the_denoiser(denoiser, tmp_path, fails):
         "x --outliers 2": "outliers",
         "x --hidden -1": "hidden",
     }.items():
-        given = f"train denoiser --size tiny --out {out} --prior {options}"
-        assert expected in fails(*given.split())
+        args = f"train denoiser --size tiny --out {out} --prior {options}"
+        assert expected in fails(*args.split())
         assert not out.exists()

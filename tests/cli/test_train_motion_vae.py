@@ -24,7 +24,7 @@ def write(track, path):
 
 @pytest.fixture(scope="module")
 def tracks(tmp_path_factory):
-    """A pattern of files of 2D tracks: five clips, each from six sides."""
+    """File name pattern of 2D tracks of five clips, each from six sides."""
     folder = tmp_path_factory.mktemp("tracks")
     clips = [clip.retarget(PERSON) for clip in make_gaits(5, styles={"walk": 1.0}, frames=60)]
     for track in project_clips(clips, views=6, noise=DetectorNoise.none()):
@@ -32,15 +32,15 @@ def tracks(tmp_path_factory):
     return str(folder / "walk-*.npz")
 
 
-def words(tracks, out, *more):
+def command(tracks, out, *more):
     parts = ["--validation", "walk-3-0", "walk-3-1", "--test", "walk-4-0"]
-    given = ["train", "motion-vae", "--tracks", tracks, "--size", "tiny", *parts]
-    return [*given, "--out", str(out), *map(str, more)]
+    args = ["train", "motion-vae", "--tracks", tracks, "--size", "tiny", *parts]
+    return [*args, "--out", str(out), *map(str, more)]
 
 
 def test_prior_of_3d_motion_from_2d_tracks(tracks, tmp_path, capsys, fails):
     out = tmp_path / "run"
-    assert main(words(tracks, out, "--steps", 4)) == 0
+    assert main(command(tracks, out, "--steps", 4)) == 0
     printed = capsys.readouterr().out
     assert "rest pose: the mean pose, estimated from the tracks" in printed
     assert f"wrote {out / 'poses' / 'model.safetensors'}: step 4" in printed
@@ -48,15 +48,15 @@ def test_prior_of_3d_motion_from_2d_tracks(tracks, tmp_path, capsys, fails):
     assert (prior.skeleton, prior.fps, prior.frames) == (PERSON, 10.0, 10)
     assert prior.sample(np.random.default_rng(0), 2).shape == (2, 10, 14, 3)
     assert prior.card["network"]["distance"] is None
-    # More steps extend the VAE; the poses stay.
+    # More steps extend the training of the VAE and leave the pose network unchanged.
     poses = (out / "poses" / "model.safetensors").read_bytes()
-    assert main(words(tracks, out, "--steps", 6)) == 0
+    assert main(command(tracks, out, "--steps", 6)) == 0
     assert "step 6, loss" in capsys.readouterr().out
     assert (out / "poses" / "model.safetensors").read_bytes() == poses
-    assert "size" in fails(*words(tracks, out, "--steps", 6), "--size", "small")
+    assert "size" in fails(*command(tracks, out, "--steps", 6), "--size", "small")
 
 
-def test_invalid_options_are_one_line(tracks, tmp_path, fails):
+def test_invalid_options_give_one_error_line(tracks, tmp_path, fails):
     for options, expected in {
         "--frames 80": "80",
         "--centre sequence": "centre must be 'frame', got 'sequence'",
@@ -65,7 +65,7 @@ def test_invalid_options_are_one_line(tracks, tmp_path, fails):
         "--rest no.npz": "no.npz",
         "--kl -1": "kl must be a finite number of at least 0, got -1.0",
     }.items():
-        assert expected in fails(*words(tracks, tmp_path / "run", "--steps", 2), *options.split())
+        assert expected in fails(*command(tracks, tmp_path / "run", "--steps", 2), *options.split())
 
 
 def changed(pattern, folder, change):
@@ -85,13 +85,13 @@ def test_short_motions_with_a_given_rest_pose_and_weight(tracks, tmp_path, capsy
 
     short = changed(tracks, tmp_path, shortened)
     more = ["--steps", 2, "--frames", 5, "--rest", pose, "--kl", 0.02]
-    assert main(words(short, out, *more)) == 0
+    assert main(command(short, out, *more)) == 0
     assert f"rest pose: the first frame of {pose}" in capsys.readouterr().out
     prior = MotionVAE.load(out / "vae")
     assert prior.settings.kl == 0.02
     expected = walk.retarget(PERSON).positions[0]
     np.testing.assert_allclose(prior.body.rest_positions, expected - expected[0], atol=1e-6)
-    message = fails(*words(short, tmp_path / "other", "--steps", 2))
+    message = fails(*command(short, tmp_path / "other", "--steps", 2))
     assert message.endswith("10 frames at 10 fps; the longest track has 5")
 
 
@@ -101,8 +101,8 @@ def test_tracks_without_the_root_are_rejected(tracks, tmp_path, fails):
         confidence[:, PERSON.index("pelvis")] = 0.0
         return replace(track, confidence=confidence)
 
-    given = words(changed(tracks, tmp_path, without_root), tmp_path / "run", "--steps", 2)
-    assert "tracks never show the root (pelvis)" in fails(*given)
+    args = command(changed(tracks, tmp_path, without_root), tmp_path / "run", "--steps", 2)
+    assert "tracks without the root (pelvis)" in fails(*args)
 
 
 @pytest.mark.filterwarnings("always:body is not left-right symmetric")
@@ -115,7 +115,7 @@ def test_own_skeleton_without_left_right_pairs(tracks, tmp_path, capsys):
         keypoints, confidence = track.keypoints[:, index], track.confidence[:, index]
         return replace(track, keypoints=keypoints, confidence=confidence, skeleton=leg)
 
-    given = words(changed(tracks, tmp_path, one_leg), tmp_path / "run", "--steps", 2)
-    assert main([*given, "--skeleton", "own", "--front", "knee"]) == 0
+    args = command(changed(tracks, tmp_path, one_leg), tmp_path / "run", "--steps", 2)
+    assert main([*args, "--skeleton", "own", "--front", "knee"]) == 0
     assert "body is not left-right symmetric" in capsys.readouterr().err
     assert MotionVAE.load(tmp_path / "run" / "vae").skeleton == leg

@@ -4,8 +4,8 @@ import pytest
 
 
 @pytest.fixture
-def nowhere(tmp_path, monkeypatch):
-    """A working folder without shared data beside it, and an empty cache."""
+def no_data(tmp_path, monkeypatch):
+    """Return the parent of a working folder without shared data, with an empty cache."""
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path / "cache"))

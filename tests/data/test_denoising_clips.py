@@ -1,4 +1,4 @@
-"""Clips for training denoisers: held-out clips are no copies of training clips."""
+"""Clips for training denoisers: held-out clips are not excerpts of training clips."""
 
 import numpy as np
 import pytest
@@ -15,14 +15,11 @@ from probmotion.motion.distances import windows, yaw_aligned_distances
 PERSON = Skeleton.preset("person14")
 
 
-def nearest(some, others, stride, step):
-    """Return the distance of windows of 30 frames to the closest of others, metres.
-
-    Minimised over mirror images.
-    """
+def nearest(queries, others, stride, step):
+    """Return distances of 30-frame windows or their mirror images to the closest of others, m."""
     these, those = (
         np.concatenate([windows(clip.positions, 30, by) for clip in clips])
-        for clips, by in ((some, stride), (others, step))
+        for clips, by in ((queries, stride), (others, step))
     )
     mirrored = these[:, :, list(PERSON.mirrored_order)] * np.array([-1.0, 1.0, 1.0])
     return np.minimum(
@@ -40,27 +37,27 @@ def test_parts_are_disjoint_and_exclude_three_clips(real_data):
     names = [name for part in DENOISING_CLIPS.values() for name in part]
     assert len(set(names)) == len(names) == 45
     paths = [*real_data.glob("cmu_single/*.npz"), *real_data.glob("deepmimic_human/*.npz")]
-    every = {f"{path.parent.name}/{path.stem}" for path in paths}
+    all_clips = {f"{path.parent.name}/{path.stem}" for path in paths}
     excluded = {f"deepmimic_human/humanoid3d_{name}" for name in ("jog", "walk", "zombie_walk")}
-    assert every - set(names) == excluded
+    assert all_clips - set(names) == excluded
     assert load(real_data / "deepmimic_human" / "humanoid3d_jog.npz").frames < 30
 
 
 def test_recorded_clips(clips):
     assert list(clips) == ["train", "validation", "test"]
-    every = [clip for part in clips.values() for clip in part]
-    assert {(clip.skeleton, clip.fps) for clip in every} == {(PERSON, 30.0)}
-    assert min(clip.frames for clip in every) >= 30
+    all_clips = [clip for part in clips.values() for clip in part]
+    assert {(clip.skeleton, clip.fps) for clip in all_clips} == {(PERSON, 30.0)}
+    assert min(clip.frames for clip in all_clips) >= 30
     assert [sum(clip.frames for clip in part) for part in clips.values()] == [16349, 1333, 2441]
-    assert len({clip.name for clip in every}) == len(every)
-    assert sum(clip.name[-2:] in ("-0", "-1") for clip in every) >= 3
-    for clip in every:
-        # Marker jumps exceed 9 m/s, which no joint of these subjects reaches without flips.
+    assert len({clip.name for clip in all_clips}) == len(all_clips)
+    assert sum(clip.name[-2:] in ("-0", "-1") for clip in all_clips) >= 3
+    for clip in all_clips:
+        # Marker jumps exceed 9 m/s; without flips, joints of these subjects are slower.
         speed = np.linalg.norm(np.diff(clip.positions, axis=0), axis=-1).max() * 30
         assert speed < 6 or not clip.name.startswith("cmu"), clip.name
 
 
-def test_held_out_clips_are_no_excerpts(clips):
+def test_held_out_clips_are_not_excerpts(clips):
     seen = {"validation": clips["train"], "test": clips["train"] + clips["validation"]}
     for part, others in seen.items():
         for clip in clips[part]:
@@ -68,7 +65,7 @@ def test_held_out_clips_are_no_excerpts(clips):
             # Repetitions by the same person are at 3 to 10 cm, excerpts at most at 2.3 cm.
             assert result.min() > 0.035, clip.name
             assert np.median(result) > 0.04, clip.name
-            if part == "test":  # only one is unlike the training clips
+            if part == "test":  # only one test clip differs from all training clips
                 getup = clip.name == "humanoid3d_getup_faceup"
                 assert (np.median(result) > 0.3) == getup, clip.name
 
@@ -105,9 +102,9 @@ def test_segments_between_suspect_frames(tmp_path, monkeypatch):
 def test_synthetic_parts_have_all_styles_and_are_distinct():
     parts = synthetic_denoising_clips(15, seconds=2)
     assert [len(clips) for clips in parts.values()] == [15, 3, 3]
-    every = [clip for clips in parts.values() for clip in clips]
-    assert len({clip.name for clip in every}) == 21
-    assert {(clip.frames, clip.fps, clip.skeleton) for clip in every} == {(60, 30.0, PERSON)}
+    all_clips = [clip for clips in parts.values() for clip in clips]
+    assert len({clip.name for clip in all_clips}) == 21
+    assert {(clip.frames, clip.fps, clip.skeleton) for clip in all_clips} == {(60, 30.0, PERSON)}
     for clips in parts.values():
         assert {clip.name.partition("-")[0] for clip in clips} == {"walk", "run", "march"}
     again = synthetic_denoising_clips(15, seconds=2)

@@ -39,7 +39,7 @@ class Handler(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def server(tmp_path):
-    """A server of ``tmp_path/served`` with attributes ``url`` and ``handler``."""
+    """Server of ``tmp_path/served`` with attributes ``url`` and ``handler``."""
     served = tmp_path / "served"
     served.mkdir()
     handler = type("OwnHandler", (Handler,), {"requests": [], "broken": False})
@@ -72,9 +72,9 @@ def registry(server, tmp_path, monkeypatch):
     downloads._registry.cache_clear()
 
 
-def test_files_are_downloaded_once(server, registry, nowhere):
+def test_files_are_downloaded_once(server, registry, no_data):
     paths = download("sample", base_url=server.url + "/")
-    assert paths == [nowhere / "cache" / "sample" / name for name in registry]
+    assert paths == [no_data / "cache" / "sample" / name for name in registry]
     assert [path.read_bytes() for path in paths] == list(registry.values())
     assert len(server.handler.requests) == 2
     assert server.handler.requests[1] == f"/some/where/{COMMIT}/deep/b%20c.bvh"
@@ -121,7 +121,7 @@ def test_invalid_folder_and_names(server, registry, tmp_path):
             download(**{"dataset": "sample", "base_url": server.url} | options)
 
 
-def test_registry_matches_the_originals(real_data):
+def test_registry_matches_the_original_files(real_data):
     with open(real_data / "registry.csv", newline="") as file:
         known = [tuple(line.values()) for line in csv.DictReader(file)]
     assert list(downloads._registry()) == known
@@ -140,7 +140,7 @@ def test_registry_is_complete():
         assert {f"60_{trial}_scaled.bvh", f"61_{trial}_scaled.bvh"} <= names
 
 
-def put_archives(folder, frames):
+def write_archives(folder, frames):
     folder.mkdir(parents=True, exist_ok=True)
     dances = synthetic_dances(10, frames=frames)
     for trial, dance in zip(downloads.SALSA_TRIALS, dances, strict=True):
@@ -148,23 +148,23 @@ def put_archives(folder, frames):
         save(dance, folder / f"cmu_60_61_{trial}.npz")
 
 
-def test_folders_are_searched_in_order(nowhere):
+def test_folders_are_searched_in_order(no_data):
     with pytest.raises(FileNotFoundError, match=r'downloads\.download\("cmu-salsa"\) downloads'):
         salsa_pairs()
-    places = ("shared/data/cmu_salsa_pairs", "cache", "cache/cmu_salsa_pairs")
-    for frames, place in enumerate(places):
-        put_archives(nowhere / place, frames + 1)
+    folders = ("shared/data/cmu_salsa_pairs", "cache", "cache/cmu_salsa_pairs")
+    for frames, folder in enumerate(folders):
+        write_archives(no_data / folder, frames + 1)
         clips = salsa_pairs()
         assert [clip.name for clip in clips] == [f"cmu_60_61_{t}" for t in downloads.SALSA_TRIALS]
         assert clips[0].frames == frames + 1
     with pytest.raises(FileNotFoundError, match="the ten salsa clips are not in mine; "):
         salsa_pairs("mine")
-    put_archives(nowhere / "mine", 5)
-    assert salsa_pairs(nowhere / "mine")[0].frames == 5
+    write_archives(no_data / "mine", 5)
+    assert salsa_pairs(no_data / "mine")[0].frames == 5
 
 
-def test_bvh_files_are_found(nowhere, real_data, monkeypatch):
-    cache = nowhere / "cache" / "cmu-salsa"
+def test_bvh_files_are_found(no_data, real_data, monkeypatch):
+    cache = no_data / "cache" / "cmu-salsa"
     cache.mkdir(parents=True)
     for trial in downloads.SALSA_TRIALS:
         for subject in (60, 61):

@@ -22,7 +22,7 @@ def rng():
 
 @pytest.fixture
 def track(rng):
-    """Random joints and confidences, with missing entries (NaN)."""
+    """Return random joints and confidences, with missing entries (NaN)."""
     joints = np.array([5.0, -1.0, 2.0]) + np.cumsum(0.05 * rng.normal(size=(L, J, 3)), axis=0)
     confidence = rng.uniform(0.3, 2.0, size=(L, J))
     confidence[8:18, 1] = 0
@@ -37,8 +37,8 @@ def dense_prior(frames, fps, acceleration):
     """
     time = np.arange(frames) / fps
     s, t = np.meshgrid(time, time, indexing="ij")
-    least = np.minimum(s, t)
-    white = s * t * least - (s + t) * least**2 / 2 + least**3 / 3
+    end = np.minimum(s, t)
+    white = s * t * end - (s + t) * end**2 / 2 + end**3 / 3
     return 100 + 100 * s * t + acceleration**2 * white
 
 
@@ -68,17 +68,17 @@ def test_kalman_smooth_is_the_exact_posterior(track, acceleration):
     given = {"noise": NOISE, "fps": FPS, "acceleration": acceleration}
     result = kalman_smooth(joints, confidence, **given)
     likelihood = log_marginal_likelihood(joints, confidence, **given)
-    for joint, each in enumerate(np.broadcast_to(acceleration, J)):
-        one = slice(joint, joint + 1)
-        mean, deviation, exact = dense(joints[:, one], confidence[:, one], each)
-        np.testing.assert_allclose(result[0][:, one], mean, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(result[1][:, one], deviation, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(likelihood[one], exact, rtol=1e-9)
+    for joint, value in enumerate(np.broadcast_to(acceleration, J)):
+        index = slice(joint, joint + 1)
+        mean, deviation, exact = dense(joints[:, index], confidence[:, index], value)
+        np.testing.assert_allclose(result[0][:, index], mean, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(result[1][:, index], deviation, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(likelihood[index], exact, rtol=1e-9)
 
 
 def test_fit_recovers_the_acceleration_and_is_calibrated(rng):
     accelerations = np.array([0.5, 2.0, 8.0, 30.0])
-    # Samples of the model started at rest, the prior without the variance of the first state.
+    # Draw trajectories from the prior with zero initial position and velocity.
     time = np.arange(400) / FPS
     covariance = dense_prior(400, FPS, 1.0) - 100 * (1 + np.multiply.outer(time, time))
     normal = rng.multivariate_normal(np.zeros(400), covariance, size=(4, 3), method="eigh")
@@ -99,14 +99,14 @@ def test_fit_maximises_the_marginal_likelihood(track):
     joints, confidence = track
     best = fit_acceleration(joints, confidence, noise=NOISE, fps=FPS)
     given = {"noise": NOISE, "fps": FPS}
-    least, top, most = (
+    lower, maximum, higher = (
         log_marginal_likelihood(joints, confidence, acceleration=best * factor, **given)
         for factor in (0.9, 1.0, 1.1)
     )
-    assert (np.maximum(least, most) < top).all()
-    by_default = kalman_smooth(joints, confidence, **given)
-    with_it = kalman_smooth(joints, confidence, acceleration=best, **given)
-    np.testing.assert_array_equal(by_default, with_it)
+    assert (np.maximum(lower, higher) < maximum).all()
+    default = kalman_smooth(joints, confidence, **given)
+    explicit = kalman_smooth(joints, confidence, acceleration=best, **given)
+    np.testing.assert_array_equal(default, explicit)
 
 
 def test_savitzky_golay_is_a_local_regression(rng):
@@ -116,8 +116,8 @@ def test_savitzky_golay_is_a_local_regression(rng):
     design = np.arange(-3, 4)[:, None] ** np.arange(3)
     for frame in range(L):
         middle = min(max(frame, 3), L - 4)
-        around = joints[middle - 3 : middle + 4].reshape(7, -1)
-        fitted = design @ np.linalg.lstsq(design, around, rcond=None)[0]
+        window = joints[middle - 3 : middle + 4].reshape(7, -1)
+        fitted = design @ np.linalg.lstsq(design, window, rcond=None)[0]
         np.testing.assert_allclose(result[frame].ravel(), fitted[frame - middle + 3], atol=1e-12)
 
 
@@ -140,7 +140,7 @@ JOINTS, ONES, SEEN = np.zeros((L, J, 3)), np.ones((L, J)), np.ones((L, J), dtype
 @pytest.mark.parametrize(
     ("call", "change", "message"),
     [
-        (kalman_smooth, {"confidence": 0 * ONES}, "confidence must observe every joint .* joint 0"),
+        (kalman_smooth, {"confidence": 0 * ONES}, "confidence must be positive .* for joint 0"),
         (kalman_smooth, {"confidence": -ONES}, "confidence must be non-negative, got -1"),
         (kalman_smooth, {"confidence": ONES[:, :2]}, r"confidence must have shape \(24, 3\)"),
         (kalman_smooth, {"joints": JOINTS[..., :2]}, "joints must have shape"),
@@ -149,7 +149,7 @@ JOINTS, ONES, SEEN = np.zeros((L, J, 3)), np.ones((L, J)), np.ones((L, J), dtype
         (kalman_smooth, {"fps": -30.0}, "fps must be a finite number above 0"),
         (kalman_smooth, {"acceleration": 0.0}, "acceleration must be a finite number above 0"),
         (kalman_smooth, {"acceleration": np.ones(2)}, "acceleration must have shape"),
-        (savitzky_golay, {"seen": SEEN & [True, False, True]}, "seen must observe .* joint 1"),
+        (savitzky_golay, {"seen": SEEN & [True, False, True]}, "seen must be positive .* joint 1"),
         (savitzky_golay, {"seen": SEEN[:2]}, r"seen must have shape \(24, 3\), got \(2, 3\)"),
         (savitzky_golay, {"window_seconds": 1.0}, r"at most .*, got 1 \(29 frames\)"),
         (savitzky_golay, {"order": 15}, "order must be less than the window's 15 frames, got 15"),

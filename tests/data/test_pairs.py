@@ -1,4 +1,4 @@
-"""Clips of two people: joint matching, dance frames, held-out clips, heights and the seed pose."""
+"""Clips of two people: joint matching, dance frames, held-out clips, heights and seed pose."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
 PAIR = Skeleton.preset("pair17")
-ONE = Skeleton.preset("person17")
+PERSON = Skeleton.preset("person17")
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +36,10 @@ def salsa(real_data):
     return load_pairs(real_data / "cmu_salsa_pairs")
 
 
-def alone(motion, person):
+def one_person(motion, person):
     """Return one person of a pair, named as in BVH files."""
-    words = {"pelvis": "Hips", "left_hip": "LeftUpLeg", "left_knee": "LeftLeg"}
-    skeleton = Skeleton([words.get(name, name) for name in ONE.joint_names], ONE.parents)
+    bvh_names = {"pelvis": "Hips", "left_hip": "LeftUpLeg", "left_knee": "LeftLeg"}
+    skeleton = Skeleton([bvh_names.get(name, name) for name in PERSON.joint_names], PERSON.parents)
     positions = motion.positions[:, 17 * person :][:, :17]
     return Motion(positions, skeleton, motion.fps, name=f"p{person}")
 
@@ -92,12 +92,12 @@ def test_dance_frames_of_salsa(salsa):
 
 
 def test_held_out_salsa_shares_no_frame_with_training_clips(salsa):
-    held_in, held_out = hold_out(salsa)
+    training, held_out = hold_out(salsa)
     assert [m.name for m in held_out] == list(SALSA_HELD_OUT)
-    inside, outside = ground_truth(held_in, 3000)[0], ground_truth(held_out)[0]
-    assert inside.shape == (3000, 34, 3)
-    assert len(outside) == 2658
-    assert not {pose.tobytes() for pose in inside} & {pose.tobytes() for pose in outside}
+    training_poses, held_out_poses = ground_truth(training, 3000)[0], ground_truth(held_out)[0]
+    assert training_poses.shape == (3000, 34, 3)
+    assert len(held_out_poses) == 2658
+    assert not {p.tobytes() for p in training_poses} & {p.tobytes() for p in held_out_poses}
 
 
 # Data sets of pose pairs.
@@ -112,8 +112,8 @@ def test_excluded_frames_and_their_description(dances):
     excluded = set(range(7)) | set(range(19, 24)) | {29, 30, 31}
     assert set(np.flatnonzero(~dance_frames(broken))) == excluded
     assert describe_dance_frames(broken) == (
-        "broken: 30 of 45 frames are dance; excluded are 6 of the opening, 3 with partners over "
-        "1.2 m apart and 6 next to a step faster than 7 m/s"
+        "broken: 30 of 45 frames show the dance; excluded: 6 of the opening, 3 with partners over "
+        "1.2 m apart, 6 next to a step faster than 7 m/s"
     )
     assert dance_frames(dances[0]).all()
     assert not dance_frames(dances[0], farthest=0.1).any()
@@ -128,25 +128,25 @@ def test_ground_truth_is_evenly_spaced(dances):
     np.testing.assert_array_equal(positions[50], dances[clip[50]].positions[frame[50]])
 
 
-def standing():
+def standing_pose():
     """Return a pose whose bones in the height chain add up to 1.5 m."""
     up = {"spine": 1.2, "chest": 1.3, "neck": 1.5, "head": 1.6, "pelvis": 1.0}
     down = {"hip": 0.9, "knee": 0.5, "ankle": 0.1, "shoulder": 1.4, "elbow": 1.1, "wrist": 0.9}
     pose = np.zeros((17, 3))
-    for joint, name in enumerate(ONE.joint_names):
+    for joint, name in enumerate(PERSON.joint_names):
         side, _, part = name.rpartition("_")
         pose[joint] = [{"left": 0.1, "right": -0.1}.get(side, 0), (up | down)[part], 0]
     return pose
 
 
-def test_height_is_invariant_to_pose_and_rotation_and_scales(dances):
-    turn = vector_to_matrix(np.array([0.7, -1.1, 2.0]))
+def test_height_depends_on_the_scale_but_not_on_pose_or_rotation(dances):
+    rotation = vector_to_matrix(np.array([0.7, -1.1, 2.0]))
     heights = person_height(dances[0].positions, PAIR)
     assert heights.shape == (45, 2)
-    moved = dances[0].positions @ turn.T + 3.0
-    np.testing.assert_allclose(person_height(moved, PAIR), heights, rtol=1e-9)
+    transformed = dances[0].positions @ rotation.T + 3.0
+    np.testing.assert_allclose(person_height(transformed, PAIR), heights, rtol=1e-9)
     np.testing.assert_allclose(np.ptp(heights, axis=0), 0, atol=1e-9)
-    np.testing.assert_allclose(person_height(standing(), ONE), [1.5 / (1 - 0.039 - 0.1)])
+    np.testing.assert_allclose(person_height(standing_pose(), PERSON), [1.5 / (1 - 0.039 - 0.1)])
     # Both people are scaled by one factor.
     scaled = scaled_to_height(dances[1], 1.5)
     factor = scaled.positions[0, 0, 1] / dances[1].positions[0, 0, 1]
@@ -157,16 +157,16 @@ def test_height_is_invariant_to_pose_and_rotation_and_scales(dances):
 def test_seed_is_the_medoid_after_alignment(dances):
     rng = np.random.default_rng(0)
     poses = ground_truth(dances, 30)[0]
-    moved = np.stack(
+    transformed = np.stack(
         [p @ vector_to_matrix(rng.normal(size=3)).T + rng.normal(size=3) for p in poses]
     )
     centred = poses - poses.mean(axis=1, keepdims=True)
     total = [sum(Rotation.align_vectors(a, b)[1] for b in centred if b is not a) for a in centred]
-    assert choose_seed(poses) == choose_seed(moved) == int(np.argmin(total))
+    assert choose_seed(poses) == choose_seed(transformed) == int(np.argmin(total))
     assert choose_seed(poses[:1]) == 0
     # Reflections do not count as alignment.
     mirrored = poses[0] * [-1, 1, 1]
-    poses = np.stack([mirrored, poses[0], moved[0], mirrored + 1, poses[0]])
+    poses = np.stack([mirrored, poses[0], transformed[0], mirrored + 1, poses[0]])
     assert choose_seed(poses) in (1, 2, 4)
 
 
@@ -174,7 +174,7 @@ def test_seed_is_the_medoid_after_alignment(dances):
 
 
 def test_motions_are_converted_to_pairs(dances):
-    people = [alone(dances[0], person) for person in range(2)]
+    people = [one_person(dances[0], person) for person in range(2)]
     pair = pair_motion(*people)
     np.testing.assert_array_equal(pair.positions, dances[0].positions)
     assert (pair.skeleton, pair.name) == (PAIR, "p0 & p1")
@@ -186,8 +186,8 @@ def test_motions_are_converted_to_pairs(dances):
     names = [PAIR.joint_names[j].replace("person", "dancer").replace("knee", "shin") for j in order]
     parents = [-1 if PAIR.parents[j] < 0 else list(order).index(PAIR.parents[j]) for j in order]
     shuffled = Motion(dances[0].positions[:, order], Skeleton(names, parents), 30.0)
-    back = pair_of(shuffled)
-    np.testing.assert_array_equal(back.positions, dances[0].positions[:, np.r_[17:34, 0:17]])
+    converted = pair_of(shuffled)
+    np.testing.assert_array_equal(converted.positions, dances[0].positions[:, np.r_[17:34, 0:17]])
 
 
 def test_pairs_from_folders_files_and_patterns(dances, tmp_path):
@@ -203,20 +203,20 @@ def test_pairs_from_folders_files_and_patterns(dances, tmp_path):
             load_pairs(path)
 
 
-POSE = standing()
+POSE = standing_pose()
 
 
 def with_second(dances, second):
-    return pair_motion(alone(dances[0], 0), second)
+    return pair_motion(one_person(dances[0], 0), second)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda d: dance_frames(alone(d[0], 0)), "motion must have at least 2 people"),
+        (lambda d: dance_frames(one_person(d[0], 0)), "motion must have at least 2 people"),
         (lambda d: ground_truth(d, 181), "n must be at most the 180 dance frames, got 181"),
         (lambda d: ground_truth([]), "motions must contain at least one"),
-        (lambda d: ground_truth([d[0], alone(d[1], 0)]), "motions must share one skeleton"),
+        (lambda d: ground_truth([d[0], one_person(d[1], 0)]), "motions must share one skeleton"),
         (lambda d: hold_out(d, ["dance-9"]), r"one motion each \(dance-0, .*'dance-9'.* of 0"),
         (lambda d: hold_out([d[0], *d], ["dance-0"]), "the name of 2"),
         (lambda d: hold_out(d, [m.name for m in d]), "got 4 names"),
@@ -224,19 +224,19 @@ def with_second(dances, second):
         (lambda d: hold_out(d, "dance-1"), "names must be a list of names, got 'dance-1'"),
         (lambda d: scaled_to_height(d[1], 0), "height must be a finite number above 0, got 0"),
         (lambda d: choose_seed(d[0].positions[:0]), "positions must contain at least one pose"),
-        (lambda d: person_height(POSE[1:], ONE.subset(range(1, 17))), "must have hips, .* lacks"),
-        (lambda d: check_close_people("pose", POSE * 10, ONE), "0.5 to 3 m tall, got 17"),
+        (lambda d: person_height(POSE[1:], PERSON.subset(range(1, 17))), "have hips, .* lacks"),
+        (lambda d: check_close_people("pose", POSE * 10, PERSON), "0.5 to 3 m tall, got 17"),
         (lambda d: check_close_people("pose", np.r_[POSE, POSE + 9], PAIR), "5 m apart, got 15.6"),
         (
-            lambda d: with_second(d, alone(d[0], 1).resample(60)),
+            lambda d: with_second(d, one_person(d[0], 1).resample(60)),
             r"got 30 and 60; use second\.res",
         ),
         (
-            lambda d: with_second(d, alone(d[0], 1).window(0, 40)),
+            lambda d: with_second(d, one_person(d[0], 1).window(0, 40)),
             r"got 45 and 40; use first\.win",
         ),
         (lambda d: with_second(d, d[0]), "second must have one root, got 2"),
-        (lambda d: pair_of(alone(d[0], 0)), "motion must have 2 roots, one per person, got 1"),
+        (lambda d: pair_of(one_person(d[0], 0)), "motion must have 2 roots, one per person, got 1"),
     ],
 )
 def test_invalid_input(dances, call, message):

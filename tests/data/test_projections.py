@@ -15,11 +15,11 @@ NO_NOISE = DetectorNoise.none()
 
 @pytest.fixture(scope="module")
 def clips():
-    moved = []
+    shifted = []
     for number, clip in enumerate(make_gaits(3, frames=24, seed=1)):
-        away = clip.positions + np.array([3.0 * number, 1.0, -2.0])
-        moved.append(replace(clip, positions=away, rotations=None, rest_offsets=None))
-    return moved
+        positions = clip.positions + np.array([3.0 * number, 1.0, -2.0])
+        shifted.append(replace(clip, positions=positions, rotations=None, rest_offsets=None))
+    return shifted
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -55,13 +55,13 @@ def test_camera_elevations_and_azimuths():
 
 
 def test_tracks_do_not_depend_on_other_clips(clips):
-    together = {track.name: track for track in project_clips(clips, views=3, seed=5)}
-    for some in (clips[::-1], clips[1:2]):
-        for track in project_clips(some, views=3, seed=5):
-            np.testing.assert_array_equal(track.keypoints, together[track.name].keypoints)
-            np.testing.assert_array_equal(track.confidence, together[track.name].confidence)
+    by_name = {track.name: track for track in project_clips(clips, views=3, seed=5)}
+    for selection in (clips[::-1], clips[1:2]):
+        for track in project_clips(selection, views=3, seed=5):
+            np.testing.assert_array_equal(track.keypoints, by_name[track.name].keypoints)
+            np.testing.assert_array_equal(track.confidence, by_name[track.name].confidence)
     other = project_clips(clips, views=3, seed=6)
-    assert all((track.confidence != together[track.name].confidence).any() for track in other)
+    assert all((track.confidence != by_name[track.name].confidence).any() for track in other)
 
 
 def test_frequency_and_duration_of_losses():

@@ -13,8 +13,8 @@ def points(*shape, seed=0):
     return np.random.default_rng(seed).standard_normal((*shape, 3))
 
 
-def by_definition(cameras, world):
-    """x = f (X, Y) / Z + c (orthographic: without Z) for (X, Y, Z) = R X + t, point by point."""
+def projected(cameras, world):
+    """Return f (X, Y) / Z + c (orthographic: without Z), with (X, Y, Z) = R X + t, per point."""
     frames, joints = world.shape[:2]
     image = np.zeros((cameras.n_views, frames, joints, 2))
     for view, frame, joint in np.ndindex(image.shape[:3]):
@@ -44,7 +44,7 @@ def test_projection_agrees_with_its_definition(library, orthographic):
     assert image.shape == (2, 3, 4, 5, 2)
     size = float(np.abs(np.asarray(image)).max())
     for batch in range(2):
-        library.assert_close(image[batch, ...] / size, by_definition(cameras, world[batch]) / size)
+        library.assert_close(image[batch, ...] / size, projected(cameras, world[batch]) / size)
     assert cameras.project(np.zeros((2, 4, 0, 3))).shape == (2, 3, 4, 0, 2)
     assert cameras.project(np.zeros((0, 5, 3))).shape == (3, 0, 5, 2)
 
@@ -68,9 +68,9 @@ def test_perspective_differs_from_orthographic_by_at_most_one_over_distance(
 ):
     """|p_orth(X) − p_persp(X)| ≤ 1/(d − 1) for ‖X‖ ≤ 1 (MAS, appendix C)."""
     point = point / max(1.0, float(np.linalg.norm(point)))
-    placed = {"elevation": elevation, "start": start, "distance": distance}
-    perspective = Cameras.ring(3, perspective=True, **placed)
-    flat = Cameras.ring(3, **placed).project(point[None, None])
+    placement = {"elevation": elevation, "start": start, "distance": distance}
+    perspective = Cameras.ring(3, perspective=True, **placement)
+    flat = Cameras.ring(3, **placement).project(point[None, None])
     gap = np.linalg.norm(flat - perspective.project(point[None, None]), axis=-1)
     assert gap.max() <= 1 / (distance - 1) + 1e-12
     np.testing.assert_allclose(perspective.as_orthographic().project(point[None, None]), flat)
@@ -84,10 +84,10 @@ def test_rotating_the_world_equals_moving_the_camera(azimuth, psi, elevation, pe
         return Rotation.from_rotvec([0, angle, 0]).as_matrix()
 
     world = points(1, 6)
-    placed = {"elevation": elevation, "perspective": perspective, "distance": 9.0}
-    moved = Cameras.ring(1, start=azimuth, **placed).project(world @ yaw(psi).T)
-    front = Cameras.ring(1, **placed).project(world @ yaw(psi - azimuth).T)
-    np.testing.assert_allclose(moved, front, atol=1e-12)
+    placement = {"elevation": elevation, "perspective": perspective, "distance": 9.0}
+    from_side = Cameras.ring(1, start=azimuth, **placement).project(world @ yaw(psi).T)
+    from_front = Cameras.ring(1, **placement).project(world @ yaw(psi - azimuth).T)
+    np.testing.assert_allclose(from_side, from_front, atol=1e-12)
 
 
 def test_ring_placement_and_image_axes():

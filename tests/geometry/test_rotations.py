@@ -14,7 +14,7 @@ ORDERS = ["".join(o) for o in product("XYZ", repeat=3) if o[0] != o[1] and o[1] 
 
 
 def rotation_vectors():
-    """Rotation vectors from zero through tiny angles up to half turns."""
+    """Return rotation vectors with angles from 0 to π, including very small ones."""
     rng = np.random.default_rng(3)
     axes = rng.standard_normal((60, 3))
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -34,11 +34,11 @@ def test_conversions_agree_with_scipy(library):
     run = library.compiled
     library.assert_close(run(r.vector_to_matrix)(vectors), ORACLE.as_matrix())
     library.assert_close(run(r.quaternion_to_matrix)(3.0 * quaternions), ORACLE.as_matrix())
-    six = run(r.matrix_to_rotation_6d)(matrices)
+    six_d = run(r.matrix_to_rotation_6d)(matrices)
     np.testing.assert_allclose(
-        np.asarray(six), np.asarray(matrices)[..., :2].swapaxes(-1, -2).reshape(-1, 6)
+        np.asarray(six_d), np.asarray(matrices)[..., :2].swapaxes(-1, -2).reshape(-1, 6)
     )
-    library.assert_close(run(r.rotation_6d_to_matrix)(2.0 * six), ORACLE.as_matrix())
+    library.assert_close(run(r.rotation_6d_to_matrix)(2.0 * six_d), ORACLE.as_matrix())
     # Products of entries are equal for q and −q.
     expected = ORACLE.as_quat(scalar_first=True)
     expected = expected[..., :, None] * expected[..., None, :]
@@ -56,9 +56,9 @@ def test_conversions_agree_with_scipy(library):
 
 def test_small_angles_are_exact_to_double_precision():
     np.testing.assert_allclose(r.vector_to_matrix(VECTORS), ORACLE.as_matrix(), rtol=0, atol=2e-15)
-    there = r.quaternion_to_vector(r.vector_to_quaternion(VECTORS))
+    recovered = r.quaternion_to_vector(r.vector_to_quaternion(VECTORS))
     short = np.linalg.norm(VECTORS, axis=-1) < 3.1
-    np.testing.assert_allclose(there[short], VECTORS[short], rtol=1e-14, atol=0)
+    np.testing.assert_allclose(recovered[short], VECTORS[short], rtol=1e-14, atol=0)
 
 
 def euler_samples(order):
@@ -116,10 +116,10 @@ def test_invalid_orders_and_shapes_are_refused():
 def test_round_trip_has_identity_gradient(differentiable, form):
     sizes = np.array([0.0, 1e-20, 1e-9, 9.99e-4, 1.001e-3, 0.5, 3.0, np.pi - 1e-5])
     vectors = np.broadcast_to(sizes[:, None, None] * np.array([0.48, -0.6, 0.64]), (8, 3, 3))
-    there = getattr(r, f"vector_to_{form}")
-    back = getattr(r, f"{form}_to_vector")
+    forward = getattr(r, f"vector_to_{form}")
+    inverse = getattr(r, f"{form}_to_vector")
     weights = differentiable.array(np.eye(3))
-    gradient = differentiable.gradient(lambda v: (weights * back(there(v))).sum(), vectors)
+    gradient = differentiable.gradient(lambda v: (weights * inverse(forward(v))).sum(), vectors)
     np.testing.assert_allclose(gradient, np.tile(np.eye(3), (8, 1, 1)), rtol=0, atol=1e-8)
 
 
@@ -128,7 +128,7 @@ def test_gradients_are_finite_at_singularities(differentiable):
     locked = r.euler_to_matrix(np.array([0.3, np.pi / 2, 0.2]), "XYZ")
     eye = differentiable.array(np.eye(3))
 
-    def everything(m):
+    def sum_of_outputs(m):
         return (
             r.matrix_to_vector(m).sum()
             + r.matrix_to_euler(m, "XYZ").sum()
@@ -137,22 +137,22 @@ def test_gradients_are_finite_at_singularities(differentiable):
         )
 
     at = np.stack([np.eye(3), half_turn, locked])
-    assert np.isfinite(differentiable.gradient(everything, at)).all()
+    assert np.isfinite(differentiable.gradient(sum_of_outputs, at)).all()
 
 
-def test_empty_batches_stay_empty():
-    none = np.zeros((0, 3, 3))
-    assert r.vector_to_matrix(none[:, 0]).shape == (0, 3, 3)
+def test_empty_batches_yield_empty_results():
+    empty = np.zeros((0, 3, 3))
+    assert r.vector_to_matrix(empty[:, 0]).shape == (0, 3, 3)
     assert r.vector_to_quaternion(np.zeros((2, 0, 3))).shape == (2, 0, 4)
     assert r.rotation_6d_to_matrix(np.zeros((0, 6))).shape == (0, 3, 3)
-    assert r.matrix_to_euler(none, "ZXY").shape == r.matrix_to_vector(none).shape == (0, 3)
-    assert r.geodesic_angle(none, none).shape == (0,)
-    assert r.slerp(none, none, np.zeros(0)).shape == (0, 3, 3)
+    assert r.matrix_to_euler(empty, "ZXY").shape == r.matrix_to_vector(empty).shape == (0, 3)
+    assert r.geodesic_angle(empty, empty).shape == (0,)
+    assert r.slerp(empty, empty, np.zeros(0)).shape == (0, 3, 3)
 
 
 def test_slerp_and_geodesic_angle_agree_with_scipy(library):
     first = Rotation.random(30, rng=1)
-    # Random rotations and, at the end, close ones.
+    # The last six pairs of rotations are close to each other.
     sizes = np.where(np.arange(30) < 24, 1.0, 1e-4)
     step = sizes[:, None] * (first.inv() * Rotation.random(30, rng=2)).as_rotvec()
     fraction = np.linspace(0, 1, 30)
@@ -164,13 +164,13 @@ def test_slerp_and_geodesic_angle_agree_with_scipy(library):
     library.assert_close(angle, np.linalg.norm(step, axis=-1))
 
 
-turns = arrays(np.float64, 3, elements=st.floats(-1, 1, width=64)).map(
+random_rotations = arrays(np.float64, 3, elements=st.floats(-1, 1, width=64)).map(
     lambda v: r.vector_to_matrix(np.pi * v)
 )
 
 
 @settings(max_examples=60)
-@given(turns, turns)
+@given(random_rotations, random_rotations)
 def test_matrices_are_rotations_and_quaternions_multiply_like_them(a, b):
     np.testing.assert_allclose(a @ a.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(a) == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Triangulation against SciPy's least squares, in every library, and its errors and warnings."""
+"""Triangulation: agreement with SciPy and between array libraries, errors and warnings."""
 
 import warnings
 
@@ -33,7 +33,7 @@ def cameras(request):
 def test_exact_projections_recover_the_points(cameras, library):
     points = motion(2, 1, 4, 3)
     if library.dtype == "float32" and cameras.focal[0] > 100:
-        pytest.skip("micrometres from pixels are beyond single precision")
+        pytest.skip("single precision does not resolve micrometres in pixels")
     run = library.compiled(lambda keypoints: triangulate(keypoints, cameras))
     library.assert_close(run(library.array(cameras.project(points))), points)
 
@@ -51,13 +51,13 @@ def test_libraries_agree_on_noisy_weighted_keypoints(cameras, library):
         return triangulate(images, cameras, weight, initial, iterations=3)
 
     got = library.compiled(run)(*(library.array(x) for x in (seen, weights, start)))
-    # Single precision: metres out of hundreds of pixels.
+    # In single precision, metres from hundreds of pixels are less accurate.
     tolerance = 1e-3 if library.dtype == "float32" and noise > 1 else library.tolerance
     library.assert_close(got, expected, tolerance)
 
 
 def scipy_solution(seen, cameras, weights):
-    """argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for one joint by SciPy."""
+    """Return argmin_X Σ_v w_v ‖p(X, v) − x_v‖² for one joint, by SciPy."""
     root = np.sqrt(weights)[:, None]
 
     def residual(x):
@@ -72,10 +72,10 @@ def test_result_is_the_least_squares_solution(cameras):
     noise = 0.05 * cameras.focal[0] / (1 if cameras.orthographic else 5)
     seen = cameras.project(points) + noise * rng.normal(size=(cameras.n_views, 3, 2, 2))
     weights = rng.uniform(0.2, 2, size=seen.shape[:-1])
-    found = triangulate(seen, cameras, weights, iterations=30)
+    result = triangulate(seen, cameras, weights, iterations=30)
     for frame, joint in np.ndindex(3, 2):
         expected = scipy_solution(seen[:, frame, joint], cameras, weights[:, frame, joint])
-        np.testing.assert_allclose(found[frame, joint], expected, atol=2e-7)
+        np.testing.assert_allclose(result[frame, joint], expected, atol=2e-7)
         assert np.linalg.norm(expected - points[frame, joint]) > 1e-3
 
 
@@ -128,8 +128,8 @@ def test_gradients_agree_with_finite_differences(differentiable):
     direction = np.random.default_rng(5).normal(size=seen.shape)
 
     def total(images):
-        found = triangulate(images, cameras, iterations=2)
-        return (found * found).sum()
+        result = triangulate(images, cameras, iterations=2)
+        return (result * result).sum()
 
     slope = (differentiable.gradient(total, seen) * direction).sum()
     step = 1e-6
@@ -137,7 +137,7 @@ def test_gradients_agree_with_finite_differences(differentiable):
     assert slope == pytest.approx(numerical, rel=1e-6)
 
 
-def test_empty_batches_stay_empty(cameras):
+def test_empty_batches_yield_empty_results(cameras):
     for *batch, L, J in [(0, 4, 3), (4, 0), (0, 3)]:
         points = triangulate(np.zeros((*batch, cameras.n_views, L, J, 2), np.float32), cameras)
         assert (points.shape, points.dtype) == ((*batch, L, J, 3), np.float32)
@@ -154,14 +154,14 @@ def test_nearly_parallel_views_warn_with_condition_number(perspective):
         warnings.simplefilter("error")
         triangulate(wide.project(points), wide)
     with pytest.warns(UserWarning, match="nearly parallel") as caught:
-        found = triangulate(narrow.project(points), narrow)
-    np.testing.assert_allclose(found, points, atol=1e-9)
-    number = float(str(caught[0].message).split("number ")[1].split(" at")[0])
+        result = triangulate(narrow.project(points), narrow)
+    np.testing.assert_allclose(result, points, atol=1e-9)
+    condition = float(str(caught[0].message).split("number ")[1].split(" at")[0])
     if perspective:
-        assert 5e3 < number < 5e4
+        assert 5e3 < condition < 5e4
     else:
         normal = np.einsum("vcx,vcy->xy", narrow.image_axes, narrow.image_axes)
-        assert number == pytest.approx(np.linalg.cond(normal), rel=1e-2)
+        assert condition == pytest.approx(np.linalg.cond(normal), rel=1e-2)
 
 
 @pytest.mark.parametrize("angle", [0.0, np.pi])
@@ -173,7 +173,7 @@ def test_parallel_views_are_refused(angle, dtype):
         triangulate(seen, cameras)
 
 
-def test_joint_in_a_single_view_is_named(cameras):
+def test_error_names_a_joint_seen_in_a_single_view(cameras):
     weights = np.ones((cameras.n_views, 3, 4))
     weights[1:, 2, 3] = 0
     with pytest.raises(ValueError, match="joint 3 in frame 2 do not determine a point"):

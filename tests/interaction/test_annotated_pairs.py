@@ -1,4 +1,4 @@
-"""Likelihood of annotated pairs: eqs. 6 and 9 by reference formulas, fixed and fresh views."""
+"""Likelihood of annotated pairs: equations 6 and 9, fixed and fresh views."""
 
 from __future__ import annotations
 
@@ -52,32 +52,32 @@ def test_density_with_fixed_views_depends_on_the_seed_only():
 
 @pytest.mark.slow
 def test_fresh_views_are_unbiased():
-    """The mean of many estimates equals the density with many views; that of the log is lower."""
-    few = AnnotatedPairs(ANNOTATIONS, n_views=4, n_near=8, noise=0.1)
-    many = AnnotatedPairs(ANNOTATIONS, n_views=40_000, n_near=8, noise=0.1)
+    """The mean of many estimates is the density with many views; the mean logarithm is lower."""
+    estimator = AnnotatedPairs(ANNOTATIONS, n_views=4, n_near=8, noise=0.1)
+    accurate = AnnotatedPairs(ANNOTATIONS, n_views=40_000, n_near=8, noise=0.1)
     generators = [np.random.default_rng(k) for k in range(4000)]
-    log_density, closest = few.evaluate(np.repeat(POSES[:1], 4000, axis=0), generators)
+    log_density, closest = estimator.evaluate(np.repeat(POSES[:1], 4000, axis=0), generators)
     assert closest.shape == (4000, 4)
     estimates = np.exp(log_density)
-    truth = np.exp(many.log_density(POSES[:1]))[0]
+    truth = np.exp(accurate.log_density(POSES[:1]))[0]
     error = np.hypot(estimates.std() / np.sqrt(4000), estimates.std() * 2 / np.sqrt(40_000))
     assert abs(estimates.mean() - truth) < 4 * error
     assert abs(np.exp(log_density.mean()) - truth) > 4 * error
 
 
 def test_each_estimate_depends_on_its_generator_only():
-    few = AnnotatedPairs(ANNOTATIONS, n_views=4, n_near=8)
-    alone, _ = few.evaluate(POSES[2:3], [np.random.default_rng(7)])
-    batch, _ = few.evaluate(POSES, [np.random.default_rng(k) for k in (1, 2, 7, 9)])
-    assert alone[0] == batch[2]
+    estimator = AnnotatedPairs(ANNOTATIONS, n_views=4, n_near=8)
+    single, _ = estimator.evaluate(POSES[2:3], [np.random.default_rng(7)])
+    batch, _ = estimator.evaluate(POSES, [np.random.default_rng(k) for k in (1, 2, 7, 9)])
+    assert single[0] == batch[2]
 
 
 def test_joint_speeds_are_means_over_the_closest_annotations(likelihood):
-    turn, stretch = ANNOTATIONS.local_differences()
+    turns, stretch = ANNOTATIONS.local_differences()
     closest = np.array([[0, 3, 3, 7, 1, 2], [5, 5, 5, 5, 5, 5]])
     speeds = likelihood.joint_speeds(closest)
     assert speeds.shape == (2, 34, 2)
-    assert np.allclose(speeds[0, :, 0], (turn[closest[0]] ** 2).mean(axis=0))
+    assert np.allclose(speeds[0, :, 0], (turns[closest[0]] ** 2).mean(axis=0))
     assert np.allclose(speeds[1, :, 1], stretch[5] ** 2)
 
 

@@ -23,49 +23,49 @@ from probmotion.interaction.retrieval import view_grid, views_around
 PAIR = Skeleton.preset("pair17")
 DANCES = synthetic_dances(9)
 DRAWS = np.concatenate([dance.positions[::5] for dance in DANCES[:8]])
-FEW = np.concatenate([dance.positions[::9] for dance in DANCES[:4]])
+POSES = np.concatenate([dance.positions[::9] for dance in DANCES[:4]])
 TRUTH = DANCES[8].positions[40]
 VIEWS = view_grid(6, 1)
-HIDDEN = np.isin(np.arange(34), [6, 7, 12, 13, 26, 27])
+OCCLUDED = np.isin(np.arange(34), [6, 7, 12, 13, 26, 27])
 
 
-def masked(pose, hidden=HIDDEN):
+def masked(pose, hidden=OCCLUDED):
     """Set the occluded joints to NaN."""
     return np.where(hidden[:, None], np.nan, pose)
 
 
-def completed(draws=DRAWS, pose=TRUTH, visible=~HIDDEN, **options):
+def completed(draws=DRAWS, pose=TRUTH, visible=~OCCLUDED, **options):
     return complete(masked(pose, ~visible), visible, draws, PAIR, **{"n_nearest": 10} | options)
 
 
-def turned(poses, seed=0):
+def transformed(poses, seed=0):
     rng = np.random.default_rng(seed)
     matrices = Rotation.random(len(poses), rng=rng).as_matrix()
     return poses @ np.swapaxes(matrices, 1, 2) + rng.normal(size=(len(poses), 1, 3))
 
 
 def test_true_pose_among_the_draws_is_recovered():
-    draws = np.concatenate([turned(DRAWS[:60]), turned(np.repeat(TRUTH[None], 20, axis=0), 1)])
+    draws = transformed(np.concatenate([DRAWS[:60], np.repeat(TRUTH[None], 20, axis=0)]))
     result = completed(draws, n_nearest=20)
     np.testing.assert_allclose(result.positions, TRUTH, atol=1e-9)
     assert sorted(result.indices) == list(range(60, 80))
 
 
 def test_completion_is_invariant_to_rigid_motion_and_better_than_the_mean_pose():
-    result, moved = completed(), completed(turned(DRAWS))
-    np.testing.assert_array_equal(result.positions[~HIDDEN], TRUTH[~HIDDEN])
-    np.testing.assert_array_equal(moved.indices, result.indices)
-    np.testing.assert_allclose(moved.positions, result.positions, atol=1e-9)
-    error = occluded_joint_error(TRUTH, result.positions, HIDDEN)
+    result, other = completed(), completed(transformed(DRAWS))
+    np.testing.assert_array_equal(result.positions[~OCCLUDED], TRUTH[~OCCLUDED])
+    np.testing.assert_array_equal(other.indices, result.indices)
+    np.testing.assert_allclose(other.positions, result.positions, atol=1e-9)
+    error = occluded_joint_error(TRUTH, result.positions, OCCLUDED)
     mean_pose = completed(n_nearest=len(DRAWS)).positions
-    assert error < 0.8 * occluded_joint_error(TRUTH, mean_pose, HIDDEN)
+    assert error < 0.8 * occluded_joint_error(TRUTH, mean_pose, OCCLUDED)
 
 
 def test_median_is_robust_to_an_outlier():
     draws = TRUTH + np.random.default_rng(0).normal(scale=0.005, size=(9, 34, 3))
-    draws[0, HIDDEN] += 5.0
+    draws[0, OCCLUDED] += 5.0
     result = completed(draws, n_nearest=9)
-    assert occluded_joint_error(TRUTH, result.positions, HIDDEN) < 0.02
+    assert occluded_joint_error(TRUTH, result.positions, OCCLUDED) < 0.02
 
 
 def test_blend_moves_occluded_joints_by_the_gaussian_weighted_mean():
@@ -82,7 +82,7 @@ def test_blend_moves_occluded_joints_by_the_gaussian_weighted_mean():
 def test_projection_of_a_draw_is_recovered():
     projection = project_to_views(DRAWS[[7]], VIEWS[[2]], PAIR)[0, 0]
     result = complete_keypoints(
-        masked(projection), ~HIDDEN, DRAWS[:40], PAIR, views=VIEWS, n_nearest=1
+        masked(projection), ~OCCLUDED, DRAWS[:40], PAIR, views=VIEWS, n_nearest=1
     )
     np.testing.assert_allclose(result.positions, projection, atol=1e-9)
     assert result.indices.tolist() == [7]
@@ -92,7 +92,7 @@ def test_nearest_annotation_completes_occluded_joints():
     annotated = project_to_views(DRAWS[:30], VIEWS[[1]], PAIR)[:, 0]
     c, s = np.cos(0.4), np.sin(0.4)
     query = annotated[12] @ np.array([[c, s], [-s, c]]) + 1.0
-    given = masked(query), ~HIDDEN, annotated, PAIR
+    given = masked(query), ~OCCLUDED, annotated, PAIR
     result = nearest_annotation_completion(*given)
     np.testing.assert_allclose(result.positions, query, atol=1e-9)
     assert result.indices.tolist() == [12]
@@ -100,7 +100,7 @@ def test_nearest_annotation_completes_occluded_joints():
     known[12, 6] = False
     other = nearest_annotation_completion(*given, known)
     assert other.indices.tolist() != [12]
-    np.testing.assert_array_equal(other.positions[~HIDDEN], query[~HIDDEN])
+    np.testing.assert_array_equal(other.positions[~OCCLUDED], query[~OCCLUDED])
     known[:, 26] = False
     with pytest.raises(ValueError, match="annotated must contain a pair with every occluded joint"):
         nearest_annotation_completion(*given, known)
@@ -110,18 +110,18 @@ def test_error_is_the_mean_distance_of_occluded_joints():
     estimate = TRUTH.copy()
     estimate[6] += [0.3, 0.0, 0.4]
     estimate[0] += 9.0
-    assert occluded_joint_error(TRUTH, estimate, HIDDEN) == pytest.approx(0.5 / 6)
+    assert occluded_joint_error(TRUTH, estimate, OCCLUDED) == pytest.approx(0.5 / 6)
 
 
-def retrieve(keypoints, draws=FEW, **options):
+def retrieve(keypoints, draws=POSES, **options):
     return retrieval.retrieve(keypoints, draws, PAIR, **{"views": VIEWS} | options)
 
 
-def projection(draw, view, turn=0.0, shift=(0.0, 0.0)):
+def projection(draw, view, angle=0.0, shift=(0.0, 0.0)):
     """Project a draw, then rotate and shift it in the image."""
-    seen = project_to_views(FEW[draw][None], VIEWS[view][None], PAIR)[0, 0]
-    c, s = np.cos(turn), np.sin(turn)
-    return seen @ np.array([[c, s], [-s, c]]) + np.array(shift)
+    image = project_to_views(POSES[draw][None], VIEWS[view][None], PAIR)[0, 0]
+    c, s = np.cos(angle), np.sin(angle)
+    return image @ np.array([[c, s], [-s, c]]) + np.array(shift)
 
 
 @pytest.mark.parametrize(("draw", "view"), [(0, 0), (13, 4), (39, 5)])
@@ -135,32 +135,32 @@ def test_projection_retrieves_its_draw_and_view(draw, view):
 
 def test_distances_are_minima_over_views():
     query = projection(5, 2) + np.random.default_rng(0).normal(scale=0.05, size=(34, 2))
-    result = retrieve(query, FEW[:4], n=4)
-    expected = interaction_distance(query, project_to_views(FEW[:4], VIEWS, PAIR))
+    result = retrieve(query, POSES[:4], n=4)
+    expected = interaction_distance(query, project_to_views(POSES[:4], VIEWS, PAIR))
     np.testing.assert_array_equal(result.indices, expected.min(axis=1).argsort())
     np.testing.assert_allclose(result.distances, np.sort(expected.min(axis=1)), atol=1e-9)
     np.testing.assert_array_equal(result.views, VIEWS[expected.argmin(axis=1)[result.indices]])
 
 
 def test_occluded_joints_are_ignored():
-    result = retrieve(masked(projection(8, 1)), visible=~HIDDEN)
+    result = retrieve(masked(projection(8, 1)), visible=~OCCLUDED)
     assert result.indices[0] == 8
     assert result.distances[0] < 1e-9
 
 
 def test_batches_and_blocks_do_not_change_the_result(monkeypatch):
     queries = np.stack([[projection(1, 0), projection(2, 1), projection(30, 5)]])
-    together = retrieve(queries, n=2)
-    assert together.indices.shape == (1, 3, 2)
-    assert together.views.shape == (1, 3, 2, 2)
+    batch = retrieve(queries, n=2)
+    assert batch.indices.shape == (1, 3, 2)
+    assert batch.views.shape == (1, 3, 2, 2)
     monkeypatch.setattr(retrieval, "_BLOCK", 13)
     for index, query in enumerate(queries[0]):
-        for many, one in zip(together, retrieve(query, n=2), strict=True):
-            np.testing.assert_array_equal(many[0, index], one)
+        for of_batch, of_query in zip(batch, retrieve(query, n=2), strict=True):
+            np.testing.assert_array_equal(of_batch[0, index], of_query)
 
 
 def test_repeated_poses_count_once_by_their_first_index():
-    repeated = FEW[[4, 4, 9, 4, 9, 2]]
+    repeated = POSES[[4, 4, 9, 4, 9, 2]]
     result = retrieve(projection(9, 3), repeated, n=3)
     assert result.indices[0] == 2
     assert sorted(result.indices) == [0, 2, 5]
@@ -185,7 +185,7 @@ FOURTH = np.arange(34) == 3
         (lambda: completed(visible=FOURTH), "visible must mark at least 4 joints, got 1"),
         (lambda: completed(DRAWS[:20], n_nearest=100), "n_nearest must be at most 20, .*, got 100"),
         (lambda: completed(pose=masked(TRUTH, FOURTH)), "pose must be finite, got 3 values"),
-        (lambda: occluded_joint_error(TRUTH, TRUTH, HIDDEN & ~HIDDEN), "must mark at least one"),
+        (lambda: occluded_joint_error(TRUTH, TRUTH, OCCLUDED & False), "must mark at least one"),
         (lambda: retrieve(TRUTH[:, :2], views=np.empty((0, 2))), "must contain at least one view"),
         (lambda: retrieve(TRUTH[:, :2], visible=FOURTH), "visible must share an edge with"),
     ],

@@ -1,4 +1,4 @@
-"""Errors against the truth: known values, roma as an oracle, every array library."""
+"""Errors against the truth: known values, agreement with roma and between array libraries."""
 
 import array_api_strict
 import jax
@@ -28,11 +28,11 @@ def truth(rng):
 
 def test_means_of_the_errors_of_shifted_joints(truth):
     np.testing.assert_allclose(mean_over(joint_errors(truth + np.array([3, 0, 4]), truth)), 5)
-    moved = truth.copy()
-    moved[2, 1, 0] += 0.5
+    changed = truth.copy()
+    changed[2, 1, 0] += 0.5
     mask = np.zeros((L, J), dtype=bool)
     mask[2, :2] = True
-    errors = joint_errors(np.stack([moved, truth]), truth)
+    errors = joint_errors(np.stack([changed, truth]), truth)
     np.testing.assert_allclose(mean_over(errors, mask), [0.25, 0])
     np.testing.assert_allclose(mean_over(errors, ~mask), [0, 0])
     with pytest.raises(ValueError, match="mask must select at least one joint"):
@@ -49,8 +49,8 @@ def test_root_alignment_is_invariant_to_the_root_path(truth, rng):
 def test_similarity_alignment_agrees_with_roma(truth, rng):
     motions = rng.normal(size=(4, L, J, 3))
     x, y = torch.asarray(motions), torch.asarray(truth).expand(4, L, J, 3)
-    turn, shift, scale = roma.rigid_points_registration(x, y, compute_scaling=True)
-    expected = scale[..., None, None] * (x @ turn.mT) + shift[..., None, :]
+    rotation, shift, scale = roma.rigid_points_registration(x, y, compute_scaling=True)
+    expected = scale[..., None, None] * (x @ rotation.mT) + shift[..., None, :]
     np.testing.assert_allclose(aligned_by_similarity(motions, truth), expected, atol=1e-12)
     # Coincident joints are translated only.
     expected = np.broadcast_to(truth.mean(axis=1, keepdims=True), truth.shape)
@@ -72,9 +72,9 @@ def test_acceleration_ratio_by_hand():
     steady = np.array([1.0, 2.0, 3.0]) * time + 4
     motions = np.stack([falls, steady + 2 * falls, -0.5 * falls, falls[:, ::-1], 0 * falls])
     np.testing.assert_allclose(acceleration_ratio(motions, falls), [1, 2, 0.5, 1, 0], atol=1e-10)
-    one = np.stack([falls[:, 0], steady[:, 0]], axis=1)
-    assert acceleration_ratio(one, falls) == pytest.approx(9.81 / 14.81)
-    # A joint displaced in one frame: second differences 1, 2 and 1.
+    pair = np.stack([falls[:, 0], steady[:, 0]], axis=1)
+    assert acceleration_ratio(pair, falls) == pytest.approx(9.81 / 14.81)
+    # A joint displaced in one frame has the second differences 1, 2 and 1.
     jump = np.zeros((5, 1, 3))
     jump[2, 0, 0] = 1
     curve = np.arange(5.0)[:, None, None] ** 2 * [0, 0, 0.5]

@@ -78,8 +78,8 @@ def test_only_principal_coordinates_are_monitored_in_high_dimension(rng):
 def test_constant_coordinates_are_dropped_except_the_first(rng, varying, expected):
     values = np.zeros((2, 50, 40))
     values[..., :varying] = 1e6 * rng.normal(size=(2, 50, varying))
-    turned = values @ np.linalg.qr(rng.normal(size=(40, 40)))[0]
-    assert chains.principal_coordinates(turned).shape == (2, 50, expected)
+    rotated = values @ np.linalg.qr(rng.normal(size=(40, 40)))[0]
+    assert chains.principal_coordinates(rotated).shape == (2, 50, expected)
 
 
 def test_ensembles_use_their_autocorrelation_time(rng):
@@ -88,12 +88,12 @@ def test_ensembles_use_their_autocorrelation_time(rng):
     def diagnose(theta, times):
         return chain_diagnostics(run(theta, {"autocorrelation_time": np.asarray(times)}))
 
-    together = diagnose(theta, [2.0, 5.0, 1.0, 4.0])
-    assert set(together) == {"ess_bulk", "rhat"}
-    assert together["ess_bulk"] == CHAINS * DRAWS / 5
-    assert together["rhat"] < 1.01
+    result = diagnose(theta, [2.0, 5.0, 1.0, 4.0])
+    assert set(result) == {"ess_bulk", "rhat"}
+    assert result["ess_bulk"] == CHAINS * DRAWS / 5
+    assert result["rhat"] < 1.01
     assert diagnose(theta[:1], [2.0]) == {"ess_bulk": DRAWS / 2}
-    # A single unknown time leaves no ESS.
+    # The ESS is omitted if a single time is unknown.
     assert set(diagnose(theta, [1.0, 1.0, 1.0, np.nan])) == {"rhat"}
     assert diagnose(theta[:1], [np.nan]) == {}
     theta[0] += 5
@@ -114,8 +114,8 @@ def test_the_limit_of_r_hat_is_a_quantile_over_runs(monkeypatch):
     from arviz_stats.base import array_stats
 
     runs = [seeds.generator(7, "rhat", k).standard_normal((2, 12, 33)) for k in range(12)]
-    monkeypatch.setattr(chains, "_RUNS", 12)
-    together = array_stats.rhat(np.concatenate(runs, axis=2), chain_axis=0, draw_axis=1)
-    greatest = np.sort(together.reshape(12, 33).max(axis=1))
+    monkeypatch.setattr(chains, "_SIMULATED_RUNS", 12)
+    result = array_stats.rhat(np.concatenate(runs, axis=2), chain_axis=0, draw_axis=1)
+    maxima = np.sort(result.reshape(12, 33).max(axis=1))
     limit = rhat_of_independent(2, 12, level=0.5, seed=7)
-    assert limit == pytest.approx((greatest[5] + greatest[6]) / 2, rel=1e-12)
+    assert limit == pytest.approx((maxima[5] + maxima[6]) / 2, rel=1e-12)

@@ -20,26 +20,26 @@ BROKEN = DRAWS.copy()
 BROKEN[4, 2, 1] = np.nan
 
 
-def moved(poses, seed=0, upright=False):
-    """Poses, each rotated and translated at random."""
+def displaced(poses, seed=0, upright=False):
+    """Return the poses, each rotated and translated at random."""
     rng = np.random.default_rng(seed)
-    turns = Rotation.random(len(poses), rng=rng)
+    rotations = Rotation.random(len(poses), rng=rng)
     if upright:
-        turns = Rotation.from_rotvec(rng.uniform(0, 6, (len(poses), 1)) * [0.0, 1.0, 0.0])
-    return poses @ np.swapaxes(turns.as_matrix(), 1, 2) + rng.normal(size=(len(poses), 1, 3))
+        rotations = Rotation.from_rotvec(rng.uniform(0, 6, (len(poses), 1)) * [0.0, 1.0, 0.0])
+    return poses @ np.swapaxes(rotations.as_matrix(), 1, 2) + rng.normal(size=(len(poses), 1, 3))
 
 
 def plain_interaction(first, second):
-    """Eq. 8 in 3D, from SciPy's tetrahedra and rotation."""
+    """Return the distance of eq. 8 in 3D, with the triangulation and rotation of SciPy."""
     first, second = first - first.mean(axis=0), second - second.mean(axis=0)
     second = Rotation.align_vectors(first, second)[0].apply(second)
     total = 0.0
     for pose in (first, second):
         pairs = (itertools.permutations(simplex, 2) for simplex in Delaunay(pose).simplices)
         i, j = np.unique(np.sort([edge for edges in pairs for edge in edges]), axis=0).T
-        apart = np.linalg.norm(first[i] - first[j] - second[i] + second[j], axis=1)
+        differences = np.linalg.norm(first[i] - first[j] - second[i] + second[j], axis=1)
         lengths = np.linalg.norm(pose[i] - pose[j], axis=1)
-        total += np.average(apart, weights=1 / np.maximum(0.05, lengths))
+        total += np.average(differences, weights=1 / np.maximum(0.05, lengths))
     return total
 
 
@@ -62,18 +62,18 @@ def plain_shape_context(first, second):
     ],
 )
 def test_distances_agree_with_the_plain_formula(measure, plain):
-    first, second = moved(TRUTHS[:3], 1), moved(DRAWS[:4], 2)
-    wanted = [[plain(a, b) for b in second] for a in first]
-    np.testing.assert_allclose(pose_distances(first, second, measure), wanted, atol=1e-7)
+    first, second = displaced(TRUTHS[:3], 1), displaced(DRAWS[:4], 2)
+    expected = [[plain(a, b) for b in second] for a in first]
+    np.testing.assert_allclose(pose_distances(first, second, measure), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("measure", MEASURES)
 def test_distances_are_invariant_to_rigid_motion_but_not_reflection(measure):
     table = pose_distances(TRUTHS, DRAWS, measure)
-    np.testing.assert_allclose(pose_distances(TRUTHS, moved(DRAWS), measure), table, atol=1e-10)
+    np.testing.assert_allclose(pose_distances(TRUTHS, displaced(DRAWS), measure), table, atol=1e-10)
     # Shape contexts use the first pose's vertical.
-    turned = moved(TRUTHS, 3, upright=measure == "shape-context")
-    np.testing.assert_allclose(pose_distances(turned, DRAWS, measure), table, atol=1e-10)
+    rotated = displaced(TRUTHS, 3, upright=measure == "shape-context")
+    np.testing.assert_allclose(pose_distances(rotated, DRAWS, measure), table, atol=1e-10)
     assert table.min() > 0.01
     if measure != "shape-context":
         transposed = pose_distances(DRAWS, TRUTHS, measure).T
@@ -86,15 +86,15 @@ def test_distances_of_a_scaled_pose_by_hand():
     pose = np.zeros((4, 3))
     pose[:3] = np.eye(3)
     centred = pose - pose.mean(axis=0)
-    wanted = 0.1 * np.sqrt((centred**2).sum() / 4)
+    expected = 0.1 * np.sqrt((centred**2).sum() / 4)
     result = {m: pose_distances(pose[None], 1.1 * pose[None], m)[0, 0] for m in MEASURES}
-    assert result["cartesian"] == pytest.approx(wanted)
+    assert result["cartesian"] == pytest.approx(expected)
     lengths = np.array([1.0, 1.0, 1.0, np.sqrt(2), np.sqrt(2), np.sqrt(2)])
     mean = np.average(0.1 * lengths, weights=1 / lengths)
     assert result["interaction"] == pytest.approx(2 * mean)
 
 
-def test_the_rotation_is_the_best_proper_one_of_any_poses():
+def test_alignment_finds_the_best_proper_rotation():
     rng = np.random.default_rng(4)
     rotation, horn = np.empty((3, 3)), np.empty((4, 4))
     for trial in range(100):
@@ -112,11 +112,11 @@ def test_the_rotation_is_the_best_proper_one_of_any_poses():
         second -= second.mean(axis=0)
         left, sizes, right = np.linalg.svd(second.T @ first)
         sizes[2] *= np.sign(np.linalg.det(left @ right))
-        least = (first**2).sum() + (second**2).sum() - 2 * sizes.sum()
-        apart = np.empty_like(first)
-        assert abs(align(first, second, rotation, horn) - least) < 1e-10
-        assert abs(residual(first, second, rotation, apart) - least) < 1e-10
-        np.testing.assert_allclose(apart, first - second @ rotation.T, atol=1e-14)
+        minimum = (first**2).sum() + (second**2).sum() - 2 * sizes.sum()
+        differences = np.empty_like(first)
+        assert abs(align(first, second, rotation, horn) - minimum) < 1e-10
+        assert abs(residual(first, second, rotation, differences) - minimum) < 1e-10
+        np.testing.assert_allclose(differences, first - second @ rotation.T, atol=1e-14)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-13)
         assert np.linalg.det(rotation) > 0
 
@@ -127,10 +127,10 @@ def test_coverage_is_the_mean_distance_to_the_nearest_draw(measure):
     assert coverage(TRUTHS, DRAWS, measure) == pytest.approx(table.min(axis=1).mean(), abs=1e-12)
     counts = [20, 1, 10, 3]
     result = nearest_draw_distances(TRUTHS, DRAWS, measure, counts)
-    wanted = [table[:, :count].min(axis=1) for count in counts]
-    np.testing.assert_allclose(result, wanted, atol=1e-12)
+    expected = [table[:, :count].min(axis=1) for count in counts]
+    np.testing.assert_allclose(result, expected, atol=1e-12)
     np.testing.assert_array_equal(coverage(TRUTHS, DRAWS, measure, counts), result.mean(axis=1))
-    assert coverage(TRUTHS, np.concatenate([DRAWS, moved(TRUTHS, 5)]), measure) < 1e-7
+    assert coverage(TRUTHS, np.concatenate([DRAWS, displaced(TRUTHS, 5)]), measure) < 1e-7
 
 
 def test_blocks_and_repeated_draws():
@@ -139,8 +139,8 @@ def test_blocks_and_repeated_draws():
     repeated[400:] += 0.01 * rng.normal(size=(300, 34, 3))
     table = pose_distances(TRUTHS, repeated, "cartesian")
     for count in (100, 255, 256, 257, 600, 700):
-        wanted = table[:, :count].min(axis=1).mean()
-        assert coverage(TRUTHS, repeated, counts=[count])[0] == pytest.approx(wanted, abs=1e-13)
+        expected = table[:, :count].min(axis=1).mean()
+        assert coverage(TRUTHS, repeated, counts=[count])[0] == pytest.approx(expected, abs=1e-13)
     # Poses that agree in one joint only are not repeated.
     truth = rng.standard_normal((4, 6, 3))
     draws = np.concatenate([rng.standard_normal((3, 6, 3)), truth])

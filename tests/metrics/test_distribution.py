@@ -28,7 +28,7 @@ def directions(rng):
 def test_directions_are_uniform_on_the_sphere(rng):
     directions = random_directions(rng, 4000, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-12)
-    # Each coordinate has mean 0 and variance 1/3: four standard errors.
+    # Each coordinate has mean 0 and variance 1/3; the tolerance is four standard errors.
     assert np.abs(directions.mean(axis=0)).max() < 4 * math.sqrt(1 / 3 / 4000)
     assert np.abs((directions**2).mean(axis=0) - 1 / 3).max() < 4 * math.sqrt(4 / 45 / 4000)
 
@@ -49,9 +49,9 @@ def test_the_ratio_is_one_for_exact_draws_and_grows_with_an_error(rng, direction
         ]
         for error in (0.0, 0.5, 1.0)
     ]
-    exact, half, one = np.mean(ratios, axis=1)
+    exact, half, full = np.mean(ratios, axis=1)
     assert abs(exact - 1) < 4 * np.std(ratios[0], ddof=1) / math.sqrt(20)
-    assert 2 < half < one - 1
+    assert 2 < half < full - 1
 
 
 def test_trace_ratio_and_mean_error_of_a_scaled_and_shifted_set(rng):

@@ -25,11 +25,11 @@ def test_frechet_distance_agrees_with_the_matrix_square_root(rng):
     b = rng.normal(size=(50, 6)) @ rng.normal(size=(6, 6)) + 1
     covariances = np.cov(a.T), np.cov(b.T)
     root = scipy.linalg.sqrtm(covariances[0] @ covariances[1])
-    apart = ((a.mean(axis=0) - b.mean(axis=0)) ** 2).sum()
-    expected = apart + np.trace(covariances[0] + covariances[1] - 2 * root).real
+    differences = ((a.mean(axis=0) - b.mean(axis=0)) ** 2).sum()
+    expected = differences + np.trace(covariances[0] + covariances[1] - 2 * root).real
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-10)
     assert frechet_distance(b, a) == pytest.approx(expected, rel=1e-10)
-    # Equal sets of fewer motions than features.
+    # Equal sets have distance 0 even with fewer motions than features.
     features = 100 * rng.normal(size=(5, 20))
     assert 0 <= frechet_distance(features, features[::-1]) < 1e-12 * features.var(axis=0).sum()
 
@@ -37,8 +37,8 @@ def test_frechet_distance_agrees_with_the_matrix_square_root(rng):
 def test_diversity_is_the_mean_distance_of_different_motions(rng):
     assert diversity(np.array([[0.0, 0.0], [3.0, 4.0]]), rng) == 5
     features = rng.normal(size=(2000, 3))
-    apart = features[:, None] - features[None, :100]
-    expected = np.linalg.norm(apart, axis=-1).sum() / (100 * 1999)
+    differences = features[:, None] - features[None, :100]
+    expected = np.linalg.norm(differences, axis=-1).sum() / (100 * 1999)
     assert diversity(features, rng, pairs=20_000) == pytest.approx(expected, rel=0.02)
 
 
@@ -56,15 +56,15 @@ def test_views_agree_with_cameras_around_the_root(rng):
 
 
 def test_azimuths_are_uniform(rng):
-    around = random_azimuths(rng, 4000) / (2 * math.pi)
+    any_side = random_azimuths(rng, 4000) / (2 * math.pi)
     side = (random_azimuths(rng, 4000, "side") - math.pi / 4) / (math.pi / 2)
-    for values in (around, side):
+    for values in (any_side, side):
         assert scipy.stats.kstest(values, "uniform").pvalue > 1e-4
     assert (random_azimuths(rng, 3, "reference-code-side") == math.pi / 2).all()
 
 
 class Plain:
-    """Features of a motion: coordinates of its first and last frame."""
+    """Evaluator whose features are the coordinates of the first and last frame."""
 
     skeleton = Skeleton(["ankle", "knee", "hip"], [1, 2, -1])
     frames = 10
@@ -73,19 +73,19 @@ class Plain:
         return views[:, [0, -1], :2].reshape(len(views), -1)
 
 
-def drawn(rng, n):
+def random_motions(rng, n):
     return 0.5 * rng.normal(size=(n, 4, 3, 3))
 
 
 @pytest.fixture
 def reference(rng):
-    views = film_motions(drawn(rng, 200), rng, elevation=0.2, distance=9.0, root=2)
+    views = film_motions(random_motions(rng, 200), rng, elevation=0.2, distance=9.0, root=2)
     return GenerationReference(Plain(), Plain().features(views), elevation=0.2, distance=9.0)
 
 
 def test_views_use_the_cameras_of_the_reference(rng, reference):
     side = "reference-code-side"
-    motions = drawn(rng, 30)
+    motions = random_motions(rng, 30)
     scores = reference.score_motions(motions, seed=0, repeats=2, angles=side)
     views = film_motions(motions, rng, elevation=0.2, distance=9.0, angles=side, root=2)
     expected = frechet_distance(Plain().features(views), reference.held_out_features)
@@ -109,7 +109,7 @@ def test_scores_are_means_and_standard_deviations_over_subsets(rng, reference):
 
 
 def test_repeats_differ_in_views_and_subsets_only(rng, reference):
-    motions = drawn(rng, 100)
+    motions = random_motions(rng, 100)
     scores = reference.score_motions(motions, seed=1, samples=50, repeats=3)
     assert scores == reference.score_motions(motions, seed=1, samples=50, repeats=3)
     assert all(deviation > 0 for _, deviation in scores.values())
@@ -126,7 +126,7 @@ def test_the_chamfer_distance_uses_complete_windows(rng, reference, frames, used
     real = film_motions(motions, seeds.generator(3, "chamfer"), **filming) + np.array([0.1, 0.0])
     real[:, used:] = 50.0
     result = replace(reference, held_out_views=real).chamfer(motions, seed=3)
-    # The nearest window of each is its copy, 10 cm away.
+    # The nearest window to each window is its copy, 10 cm away.
     assert result.of_generated == pytest.approx(0.01)
 
 

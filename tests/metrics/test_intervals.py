@@ -1,4 +1,4 @@
-"""Coverage of confidence intervals, and ties with known answers."""
+"""Coverage of confidence intervals, and ties in cases with known results."""
 
 import math
 
@@ -17,31 +17,31 @@ def test_intervals_agree_with_scipy(rng):
 
 
 def test_the_truly_best_is_rarely_excluded(rng):
-    # Equal to all but one: the hardest case.
-    excluded = alone = 0
+    # The hardest case: all samplers but one are equally good.
+    excluded = unique = 0
     for _ in range(400):
         rows = {str(i): rng.normal(5.0 if i == 4 else 0.0, 1, 4) for i in range(5)}
         _, tied = best_and_tied(rows, target=None)
         excluded += "0" not in tied
-        alone += len(tied) == 1
-    # At most 5 % each, and four standard errors.
-    assert max(excluded, alone) / 400 < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 400)
+        unique += len(tied) == 1
+    # Each rate is at most 5 %, plus four standard errors.
+    assert max(excluded, unique) / 400 < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 400)
 
 
 def test_holms_levels_by_hand():
-    # Differences with mean 1 and standard deviation s over 4 seeds: t = 2/s, 3 degrees of freedom.
-    def shaped(p):
+    # Differences of mean 1 and standard deviation s over 4 seeds have t = 2/s, 3 d.o.f.
+    def differing(p):
         spread = 2 / stats.t.isf(p / 2, 3)
         return 1 + spread * np.array([-1.0, -1.0, 1.0, 1.0]) / math.sqrt(4 / 3)
 
     best = np.zeros(4)
-    # .02 < .05/2, then .04 < .05: both are worse; with .03 first, neither is.
-    both = {"best": best, "b": shaped(0.02), "c": shaped(0.04)}
+    # Since .02 < .05/2 and .04 < .05, both are worse; with .03 first, neither is.
+    both = {"best": best, "b": differing(0.02), "c": differing(0.04)}
     assert best_and_tied(both, target=None) == ("best", {"best"})
-    neither = {"best": best, "b": shaped(0.03), "c": shaped(0.04)}
+    neither = {"best": best, "b": differing(0.03), "c": differing(0.04)}
     assert best_and_tied(neither, target=None) == ("best", {"best", "b", "c"})
-    # .06 > .05, whatever the order of the mapping.
-    one = {"c": shaped(0.06), "b": shaped(0.02), "best": best}
+    # The p-value .06 exceeds .05 for any order of the mapping.
+    one = {"c": differing(0.06), "b": differing(0.02), "best": best}
     assert best_and_tied(one, target=None) == ("best", {"best", "c"})
 
 
@@ -53,7 +53,7 @@ def test_single_seeds_and_equal_values_are_tied_and_constant_differences_are_not
 
 
 def test_differences_of_one_rounding_step():
-    # Two roundings to 1 have standard deviation √(1/6): t = √3 · √6 = 4.24, p = .051.
+    # Two roundings to 1 have standard deviation √(1/6), so t = √3 · √6 = 4.24 and p = .051.
     rows = {"a": [1.0, 2.0, 3.0], "c": [2.0, 3.0, 4.0]}
     assert 2 * stats.t.sf(math.sqrt(18), 2) == pytest.approx(0.0513, abs=1e-4)
     assert best_and_tied(rows, target=None, step=1.0)[1] == {"a", "c"}

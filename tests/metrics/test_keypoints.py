@@ -1,4 +1,4 @@
-"""Keypoint errors by hand, against plain loops, and invariances."""
+"""Keypoint errors: hand-computed values, plain loops and invalid arguments."""
 
 from functools import partial
 
@@ -36,7 +36,7 @@ def occluded(keypoints, visible):
 
 def test_pck_by_hand():
     truth = np.zeros((1, 4, 2))
-    # Errors 0.5, 0.9, 1 and 5; the threshold for size 10 is 1, exclusive.
+    # The errors are 0.5, 0.9, 1 and 5; the threshold for size 10 is 1, exclusive.
     predicted = np.array([[[0.5, 0], [0, -0.9], [1, 0], [3, 4]]])
     assert pck(predicted, truth, 10.0) == 50
     assert pck(predicted, truth, 10.1) == 75
@@ -65,7 +65,7 @@ def test_pck_agrees_with_a_plain_loop(predicted, truth, visible):
 
 
 def test_image_extent_by_hand():
-    # x from 0 to 4, y from -1 to 2 over both frames; without the last keypoint x ends at 1.
+    # Over both frames x is in [0, 4] and y in [-1, 2]; without the last keypoint x is in [0, 1].
     keypoints = np.array([[[0, 0], [1, 2]], [[0.5, -1], [4, 0]]])
     assert image_extent(keypoints) == 4
     seen = np.array([[True, True], [True, False]])
@@ -86,9 +86,9 @@ def test_velocity_error_agrees_with_a_plain_loop(predicted, truth, visible):
         for t in range(1, L):
             both = visible[n, t] & visible[n, t - 1]
             step = (truth[n, t] - truth[n, t - 1])[both]
-            guess = (predicted[n, t] - predicted[n, t - 1])[both]
+            estimate = (predicted[n, t] - predicted[n, t - 1])[both]
             if both.any():
-                ratios.append(np.linalg.norm(guess - step) / np.linalg.norm(step))
+                ratios.append(np.linalg.norm(estimate - step) / np.linalg.norm(step))
         means.append(np.mean(ratios))
     result = velocity_error(predicted, occluded(truth, visible), visible)
     assert result == pytest.approx(np.mean(means))

@@ -84,9 +84,9 @@ def test_errors_are_detected(generation, prior):
     rough = exact + 0.1 * np.random.default_rng(2).normal(size=exact.shape)
     calm = exact[prior.style_responsibilities(exact)[:, 0] > 0.5]
     calm = np.concatenate([calm, calm])[:N]
-    narrow, rough, calm = (measured(generation, some, 3) for some in (narrow, rough, calm))
+    narrow, rough, calm = (measured(generation, x, 3) for x in (narrow, rough, calm))
     assert narrow["variance_ratio"] == pytest.approx(0.25, rel=0.1)
-    # Noise of twice δ on top: five times the variance off the manifold.
+    # Added noise of sd 2 δ multiplies the variance off the manifold by five.
     assert rough["off_manifold_ratio"] == pytest.approx(5, rel=0.1)
     assert rough["log_density_gap"] < -50
     assert rough["c2st"] > 0.7
@@ -110,7 +110,7 @@ def test_stein_discrepancy_of_stored_theta(occluded, prior):
     theta = np.random.default_rng(5).normal(size=(1, 60, prior.dim))
     expected = kernel_stein_discrepancy(theta[0], score_of(occluded.posterior, theta[0]))
     assert measured(occluded, exact, theta=theta)["ksd"] == pytest.approx(expected)
-    # Undefined for a chain that rarely moves, unlike other metrics.
+    # The discrepancy is undefined for a chain that rarely moves, unlike other metrics.
     theta[0, :54] = 0
     stuck = measured(occluded, exact, theta=theta)
     assert math.isnan(stuck["ksd"])
@@ -122,13 +122,13 @@ def test_image_errors_against_the_projected_truth(occluded):
     truth, posterior = occluded.truth, occluded.posterior
     far = truth.copy()
     far[:, ::2] += 10.0  # three of five joints are outside the image
-    still = np.repeat(truth[:1], L, axis=0)
-    right, still, far = (measured(occluded, np.stack([m] * 9)) for m in (truth, still, far))
+    static = np.repeat(truth[:1], L, axis=0)
+    right, static, far = (measured(occluded, np.stack([m] * 9)) for m in (truth, static, far))
     assert (right["pck"], right["velocity_error"]) == (100, 0)
     assert far["pck"] == pytest.approx(40)
-    assert still["velocity_error"] == pytest.approx(1)
+    assert static["velocity_error"] == pytest.approx(1)
     assert far["velocity_error"] == pytest.approx(0, abs=1e-9)
-    # Undefined behind a camera.
+    # Image errors are undefined for motions behind a camera.
     camera = Cameras.ring(1, distance=5.0, perspective=True)
     motion = Motion(truth, posterior.skeleton, posterior.fps)
     keypoints = Keypoints2D.observe(motion, camera, noise=0.05, seed=0)
@@ -158,19 +158,19 @@ def test_samplers_share_the_exact_draws_of_a_seed(generation):
 def test_alignment_before_comparison(generation, prior):
     rng = np.random.default_rng(0)
     aligned = replace(generation, aligned_to=prior.means[0])
-    turns, _ = np.linalg.qr(rng.normal(size=(N, 1, 3, 3)))
-    turns *= np.linalg.det(turns)[..., None, None]
+    rotations, _ = np.linalg.qr(rng.normal(size=(N, 1, 3, 3)))
+    rotations *= np.linalg.det(rotations)[..., None, None]
     shifts = 10 * rng.normal(size=(N, 1, 1, 3))
     right = generation.reference(100, N)
     wrong = prior.means[0] + 1.5 * (right - prior.means[0])
-    result = measured(aligned, right @ turns + shifts)
+    result = measured(aligned, right @ rotations + shifts)
     assert result["swd_ratio"] == pytest.approx(1, abs=0.4)
     assert result["variance_ratio"] == pytest.approx(1, abs=0.2)
     assert result["c2st"] == pytest.approx(0.5, abs=0.1)
-    result = measured(aligned, wrong @ turns + shifts)
+    result = measured(aligned, wrong @ rotations + shifts)
     assert result["swd_ratio"] > 2
     assert result["variance_ratio"] > 1.5
-    assert measured(generation, right @ turns + shifts)["swd_ratio"] > 5
+    assert measured(generation, right @ rotations + shifts)["swd_ratio"] > 5
     with pytest.raises(ValueError, match="aligned_to must have shape"):
         replace(generation, aligned_to=prior.means)
 
@@ -200,26 +200,26 @@ def check(errors, **expected):
 
 def test_errors_by_hand(occluded):
     truth, posterior = occluded.truth, occluded.posterior
-    hidden = ~posterior.likelihood.entries.visible[0]
-    n_hidden = hidden.sum()
-    assert n_hidden == 2 * (L // 2)
+    mask = ~posterior.likelihood.entries.visible[0]
+    n_occluded = mask.sum()
+    assert n_occluded == 2 * (L // 2)
     # One draw is right; in the other, joints except the root are 3 cm to the side, occluded ones
     # 6 cm; both are translated by 1 m.
     wrong = truth.copy()
     wrong[:, 1:, 0] += 0.03
-    wrong[hidden, 0] += 0.03
+    wrong[mask, 0] += 0.03
     errors = accuracy_of(np.stack([truth, wrong]) + np.array([0, 0, 1.0]), truth, posterior)
-    away = 30.0 * (L * (J - 1) + n_hidden) / (L * J)
-    visible = 30.0 * (L * (J - 1) - n_hidden) / (~hidden).sum()
-    check(errors, mpjpe=away / 2, mpjpe_mean=away / 2, mpjpe_best=0)
+    distance = 30.0 * (L * (J - 1) + n_occluded) / (L * J)
+    visible = 30.0 * (L * (J - 1) - n_occluded) / (~mask).sum()
+    check(errors, mpjpe=distance / 2, mpjpe_mean=distance / 2, mpjpe_best=0)
     check(errors, mpjpe_occluded=30, mpjpe_visible=visible / 2)
     assert errors["g_mpjpe_mm"] > 1000
-    assert errors["pa_mpjpe_mm"] < away / 2
-    # Two draws 10 cm to either side, with occluded joints 40 cm lower.
+    assert errors["pa_mpjpe_mm"] < distance / 2
+    # Two draws are 10 cm to either side, with occluded joints 40 cm lower.
     draws = truth + np.array([0.1, -0.1])[:, None, None, None] * [1.0, 0, 0]
-    draws[:, hidden, 1] -= 0.4
+    draws[:, mask, 1] -= 0.4
     errors = accuracy_of(draws, truth, posterior)
-    below, portion = 1000 * np.hypot(0.1, 0.4), n_hidden / (L * J)
+    below, portion = 1000 * np.hypot(0.1, 0.4), n_occluded / (L * J)
     check(errors, g_mpjpe=100 * (1 - portion) + below * portion)
     check(errors, g_mpjpe_visible=100, g_mpjpe_occluded=below)
     check(errors, g_mpjpe_mean=400 * portion)
@@ -228,15 +228,15 @@ def test_errors_by_hand(occluded):
 
 def test_accelerations_and_joints_that_any_camera_observes(prior, occluded):
     truth, posterior = occluded.truth, MotionPosterior(prior)
-    middle = truth.mean(axis=0)
-    scaled = np.stack([middle + 2 * (truth - middle), middle + 0.5 * (truth - middle)])
+    centre = truth.mean(axis=0)
+    scaled = np.stack([centre + 2 * (truth - centre), centre + 0.5 * (truth - centre)])
     assert accuracy_of(scaled, truth, posterior)["acceleration_ratio"] == pytest.approx(1.25)
     errors = accuracy_of(truth[None], np.zeros_like(truth), posterior)
     assert "acceleration_error" in errors
     assert "acceleration_ratio" not in errors
-    hidden = np.zeros((2, L, J), dtype=bool)
-    hidden[0, 0, 1] = hidden[1, 0, 2] = True
+    mask = np.zeros((2, L, J), dtype=bool)
+    mask[0, 0, 1] = mask[1, 0, 2] = True
     motion = Motion(truth, prior.skeleton, 30.0)
-    likelihood = Keypoints2D.observe(motion, Cameras.ring(2), 0.05, 0, hidden=hidden)
+    likelihood = Keypoints2D.observe(motion, Cameras.ring(2), 0.05, 0, hidden=mask)
     errors = accuracy_of(truth[None], truth, MotionPosterior(prior, likelihood))
     assert "mpjpe_occluded_mm" not in errors

@@ -1,4 +1,4 @@
-"""Motion Chamfer Distance by hand, against a plain double loop, and invariances."""
+"""Motion Chamfer Distance: hand-computed values, a plain double loop and windows."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ from probmotion.metrics.motion_chamfer import motion_chamfer_distance
 
 
 def pair_error(generated, real, visible):
-    """Mean over frames with a visible keypoint of the mean square over those."""
+    """Return the mean over frames of the mean squared error of visible keypoints."""
     squares = ((generated - real) ** 2).sum(axis=-1)
     return np.mean([squares[t][visible[t]].mean() for t in range(len(real)) if visible[t].any()])
 
 
-def plain(generated, real, visible):
+def double_loop(generated, real, visible):
     errors = np.array(
         [[pair_error(g, r, v) for r, v in zip(real, visible, strict=True)] for g in generated]
     )
@@ -20,7 +20,7 @@ def plain(generated, real, visible):
 
 
 def test_both_directions_by_hand():
-    # One frame, one joint: generated at 0 and 10, real at 1, 4 and 10 on a line.
+    # One frame of one joint on a line: generated at 0 and 10, real at 1, 4 and 10.
     generated = np.array([0.0, 10.0]).reshape(2, 1, 1, 1) * [1, 0]
     real = np.array([1.0, 4.0, 10.0]).reshape(3, 1, 1, 1) * [1, 0]
     result = motion_chamfer_distance(generated, real, frames=1)
@@ -30,7 +30,7 @@ def test_both_directions_by_hand():
 
 
 def test_frames_have_equal_weight():
-    # Two frames of two joints; squares 9 and 1 in the first, 4 and (occluded) 100 in the second.
+    # The squared errors are 9 and 1 in the first frame, 4 and (occluded) 100 in the second.
     generated = np.zeros((1, 2, 2, 2))
     real = np.array([[[[3, 0], [0, 1]], [[0, 2], [10, 0]]]], float)
     visible = np.array([[[True, True], [True, False]]])
@@ -47,18 +47,18 @@ def test_agreement_with_a_plain_double_loop(rng, n, m):
     generated, real = rng.normal(size=(n, 3, 3, 2)), rng.normal(size=(m, 3, 3, 2))
     visible = rng.random((m, 3, 3)) < 0.5
     visible[:, 0, 0] = True
-    unseen = np.where(visible[..., None], real, np.nan)
-    result = motion_chamfer_distance(generated, unseen, visible=visible, frames=3)
-    np.testing.assert_allclose(result, plain(generated, real, visible), rtol=1e-12)
+    masked = np.where(visible[..., None], real, np.nan)
+    result = motion_chamfer_distance(generated, masked, visible=visible, frames=3)
+    np.testing.assert_allclose(result, double_loop(generated, real, visible), rtol=1e-12)
 
 
 def test_longer_sequences_are_split_into_windows(rng):
     generated, real = rng.normal(size=(5, 9, 2, 2)), rng.normal(size=(4, 6, 2, 2))
     windows = real.reshape(8, 3, 2, 2)
     seen = np.ones((8, 3, 2), bool)
-    places = [plain(generated[:, start : start + 3], windows, seen) for start in (0, 3, 6)]
+    results = [double_loop(generated[:, start : start + 3], windows, seen) for start in (0, 3, 6)]
     result = motion_chamfer_distance(generated, real, frames=3)
-    np.testing.assert_allclose(result, np.mean(places, axis=0))
+    np.testing.assert_allclose(result, np.mean(results, axis=0))
 
 
 GOOD = np.zeros((3, 10, 2, 2))

@@ -35,9 +35,9 @@ def test_agreement_with_derivatives_by_torch(rng):
 
 
 def double_integral(mean, spread, length_scale):
-    """∬ q(x) q(x') δ(x) δ(x') k(x, x') dx dx', δ = ∇log p − ∇log q, times ℓ²; p is N(0, 1).
+    """Return ∬ q(x) q(x') δ(x) δ(x') k(x, x') dx dx', δ = ∇log p − ∇log q, times ℓ²; p is N(0, 1).
 
-    Stein's identity (Liu et al. 2016, definition 3.2), without derivatives of k.
+    By Stein's identity (Liu et al. 2016, definition 3.2), no derivatives of k are needed.
     """
     x = mean + spread * np.linspace(-8, 8, 801)
     q = np.exp(-0.5 * ((x - mean) / spread) ** 2)
@@ -59,9 +59,9 @@ def test_agreement_with_quadrature(rng, mean, spread):
 
 def test_invariance_to_units_and_axes(rng):
     theta, score = rng.normal(size=(2, 30, 4))
-    turned = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    rotation = np.linalg.qr(rng.normal(size=(4, 4)))[0]
     expected = kernel_stein_discrepancy(theta, score)
-    result = kernel_stein_discrepancy(1000 * theta @ turned + 7, score @ turned / 1000)
+    result = kernel_stein_discrepancy(1000 * theta @ rotation + 7, score @ rotation / 1000)
     assert result == pytest.approx(expected, rel=1e-9)
 
 
@@ -72,7 +72,7 @@ def test_invariance_to_units_and_axes(rng):
         (np.zeros(3), np.zeros(3), r"points must have shape \(n, D\), got \(3,\)"),
         (np.zeros((3, 2)), np.full((3, 2), np.inf), "score must be finite, got 6 values"),
         (np.zeros((1, 2)), np.zeros((1, 2)), "points must have at least 2 points, got 1"),
-        (np.zeros((3, 2)), np.zeros((3, 2)), "points must mostly differ, got median distance 0"),
+        (np.zeros((3, 2)), np.zeros((3, 2)), "points must have a median distance above 0, got 0"),
     ],
 )
 def test_invalid_arguments(theta, score, match):
@@ -84,8 +84,8 @@ SKELETON = pm.Skeleton(("hip", "head"), (-1, 0))
 
 
 @dataclass(frozen=True)
-class Bent:
-    """A density with a nonlinear score, differentiable by one library or all."""
+class Quartic:
+    """Prior with a nonlinear score, differentiable by one array library or all."""
 
     library: str = "any"
 
@@ -112,7 +112,7 @@ class Bent:
 def finite_differences(posterior, theta, step=1e-5):
     columns = []
     for axis in np.eye(posterior.dim):
-        ahead, back = (posterior.log_density(theta + way * step * axis) for way in (1, -1))
+        ahead, back = (posterior.log_density(theta + sign * step * axis) for sign in (1, -1))
         columns.append((ahead - back) / (2 * step))
     return np.stack(columns, axis=-1)
 
@@ -121,7 +121,7 @@ def finite_differences(posterior, theta, step=1e-5):
 def test_scores_agree_with_finite_differences(rng, library):
     theta = rng.normal(size=(300, 12))
     joints = pm.Joints3D(rng.normal(size=(2, 2, 3)), 0.5, skeleton=SKELETON)
-    posterior = pm.MotionPosterior(Bent(library), None if library == "jax" else joints)
+    posterior = pm.MotionPosterior(Quartic(library), None if library == "jax" else joints)
     score = score_of(posterior, theta)
     assert score.dtype == np.float64
     expected = finite_differences(posterior, theta)
@@ -129,29 +129,29 @@ def test_scores_agree_with_finite_differences(rng, library):
 
 
 def test_missing_and_infinite_gradients():
-    class Stepped(Bent):
+    class NoDerivative(Quartic):
         differentiable = False
 
-    class Unclosed(Bent):
+    class Intractable(Quartic):
         def log_density(self, theta):
             raise NotConjugate("noise is Student's")
 
-    class Mute:
+    class NoDensity:
         skeleton, frames, fps, dim = SKELETON, 2, 10.0, 12
-        motion = Bent.motion
+        motion = Quartic.motion
 
-    class Cornered(Bent):
+    class Kinked(Quartic):
         def log_density(self, theta):
             return (theta**2).sum(-1) ** 0.5
 
     zero = np.zeros((3, 12))
     for prior, theta, error, message in (
-        (Bent("numpy"), zero, NoGradient, "Bent with no likelihood is not differentiable, torch r"),
-        (Stepped(), zero, NoGradient, "posterior has no score: Stepped has no gradient"),
-        (Unclosed(), zero, NoGradient, "posterior has no score: noise is Student's"),
-        (Mute(), zero, NoGradient, "posterior has no score: Mute has no log density"),
-        (Cornered(), zero, ValueError, "score must be finite, got 36 values"),
-        (Bent(), zero[:, :5], ValueError, r"theta must have shape \(n, 12\), got \(3, 5\)"),
+        (Quartic("numpy"), zero, NoGradient, "got Quartic with no likelihood: torch raised"),
+        (NoDerivative(), zero, NoGradient, "must be .*, but NoDerivative has no gradient"),
+        (Intractable(), zero, NoGradient, "posterior must be differentiable: noise is Stud"),
+        (NoDensity(), zero, NoGradient, "posterior must have a log density, got NoDensity"),
+        (Kinked(), zero, ValueError, "score must be finite, got 36 values"),
+        (Quartic(), zero[:, :5], ValueError, r"theta must have shape \(n, 12\), got \(3, 5\)"),
     ):
         with pytest.raises(ValueError, match=message) as raised:
             score_of(pm.MotionPosterior(prior), theta)

@@ -16,57 +16,57 @@ from probmotion.metrics.uniformity import (
 )
 
 
-def counted(values):
+def cumulative(values):
     return np.searchsorted(np.sort(values), evaluation_points(len(values)), side="right")
 
 
-def by_counting(n):
-    """γ and probability of every way to distribute n numbers over n equal bins."""
+def enumeration(n):
+    """Return all distributions of n numbers over n equal bins, with γ and probability."""
     points = evaluation_points(n)
-    ways = [bins for bins in product(range(n + 1), repeat=n) if sum(bins) == n]
-    gammas, chances = [], []
-    for bins in ways:
+    histograms = [bins for bins in product(range(n + 1), repeat=n) if sum(bins) == n]
+    gammas, masses = [], []
+    for bins in histograms:
         counts = np.cumsum(bins)[:-1]
         below, above = binom.cdf(counts, n, points), binom.sf(counts - 1, n, points)
         gammas.append(2 * np.minimum(below, above).min())
-        chances.append(factorial(n) / prod(map(factorial, bins)) / n**n)
-    return ways, np.array(gammas), np.array(chances)
+        masses.append(factorial(n) / prod(map(factorial, bins)) / n**n)
+    return histograms, np.array(gammas), np.array(masses)
 
 
 def test_p_values_agree_with_enumeration():
-    ways, gammas, chances = by_counting(5)
-    assert chances.sum() == pytest.approx(1)
-    for bins, gamma in zip(ways, gammas, strict=True):
+    histograms, gammas, masses = enumeration(5)
+    assert masses.sum() == pytest.approx(1)
+    for bins, gamma in zip(histograms, gammas, strict=True):
         values = np.repeat((np.arange(5) + 0.5) / 5, bins)
-        expected = chances[gammas <= gamma * (1 + 1e-9)].sum()
+        expected = masses[gammas <= gamma * (1 + 1e-9)].sum()
         assert uniformity_p_value(values) == pytest.approx(expected, abs=1e-12)
 
 
 def test_the_band_is_left_if_and_only_if_p_is_small():
     rng = np.random.default_rng(1)
     lower, upper = ecdf_band(80, 0.9)
-    left = 0
+    exits = 0
     for _ in range(150):
         values = rng.random(80) ** rng.uniform(0.7, 1.4)
-        ecdf = counted(values) / 80
+        ecdf = cumulative(values) / 80
         outside = bool(((ecdf < lower) | (ecdf > upper)).any())
         assert outside == (uniformity_p_value(values) <= 0.1)
-        left += outside
-    assert 15 < left < 135
+        exits += outside
+    assert 15 < exits < 135
 
 
 def test_the_band_agrees_with_arviz():
     rng = np.random.default_rng(2)
     points, _, *theirs = ecdf_pit(rng.random(100), 0.95, 2000, rng=rng)
     np.testing.assert_allclose(points, evaluation_points(100))
-    # ArviZ simulates 2000 times: a count more or less.
-    apart = 100 * np.abs(np.array(ecdf_band(100, 0.95)) - theirs)
-    assert apart.max() < 1.01
-    assert (apart < 0.01).mean() > 0.8
+    # ArviZ uses 2000 simulations, so its counts may differ by one.
+    differences = 100 * np.abs(np.array(ecdf_band(100, 0.95)) - theirs)
+    assert differences.max() < 1.01
+    assert (differences < 0.01).mean() > 0.8
 
 
 def test_very_small_p_values_are_exact():
-    # All n numbers below 1/m: the least likely count at the first point.
+    # All n numbers are below 1/m, which is the least likely count at the first point.
     n = 150
     values = np.full(n, 0.001)
     assert evaluation_points(n)[0] == 0.01
@@ -75,7 +75,7 @@ def test_very_small_p_values_are_exact():
     assert uniformity_p_value(np.full(1000, 0.5)) < 1e-290
 
 
-def test_holm():
+def test_holm_adjustment():
     p = np.array([0.04, 0.01, 0.03, 0.9])
     np.testing.assert_allclose(adjusted_p_values(p), [0.09, 0.04, 0.09, 0.9])
     np.testing.assert_allclose(adjusted_p_values(np.array([0.6, 0.7])), [1, 1])

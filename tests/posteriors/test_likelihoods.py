@@ -24,7 +24,7 @@ def some_positions(*batch, seed=0):
 
 
 def arguments(shape, freedom, changes):
-    """Noisy numbers, NaN where occluded, and the arguments of the noise."""
+    """Random observations, NaN where occluded, and keyword arguments of the likelihood."""
     confidence = some_confidence(*shape[:-1])
     seen = np.random.default_rng(1).standard_normal(shape)
     seen[confidence == 0] = np.nan
@@ -71,7 +71,7 @@ def test_densities_agree_with_scipy(library, likelihood):
 
 @pytest.mark.parametrize("freedom", [None, 3.0])
 @pytest.mark.parametrize("make", [keypoints, joints])
-def test_gradients_are_finite_differences(differentiable, make, freedom):
+def test_gradients_match_finite_differences(differentiable, make, freedom):
     likelihood = make(freedom)
     positions, direction = some_positions(), some_positions(seed=1)
     gradient = differentiable.gradient(likelihood.log_density, positions)

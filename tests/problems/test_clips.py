@@ -24,12 +24,12 @@ def gaits(n=6, frames=60):
 def test_prior_does_not_depend_on_the_held_out_clip():
     clips = gaits()
     other = Motion(5 * clips[-1].positions[::-1], clips[-1].skeleton, 30.0, name="other")
-    one = clips_problem(clips, **SMALL).posterior.prior
-    two = clips_problem([*clips[:-1], other], **SMALL).posterior.prior
-    three = clips_problem([*clips[1:], clips[0]], **SMALL).posterior.prior
+    first = clips_problem(clips, **SMALL).posterior.prior
+    second = clips_problem([*clips[:-1], other], **SMALL).posterior.prior
+    third = clips_problem([*clips[1:], clips[0]], **SMALL).posterior.prior
     for name in ("means", "factors", "weights"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-    assert (one.means != three.means).any()
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert (first.means != third.means).any()
 
 
 def test_truth_is_the_centred_middle_window():
@@ -62,7 +62,7 @@ def test_clips_are_resampled_on_request_only():
     assert problem.truth.shape == (10, 17, 3)
 
 
-def test_joints_are_the_common_ones_and_short_clips_are_reported():
+def test_common_joints_are_used_and_short_clips_are_reported():
     clips = gaits()
     skeleton = clips[0].skeleton
     others = [joint for joint in range(17) if skeleton.joint_names[joint] != "head"]
@@ -73,7 +73,7 @@ def test_joints_are_the_common_ones_and_short_clips_are_reported():
     assert "(1 shorter than 10 frames left out)" in problem.description
 
 
-STILL = replace(gaits()[0], positions=np.repeat(gaits()[0].positions[:1], 60, axis=0))
+STATIC = replace(gaits()[0], positions=np.repeat(gaits()[0].positions[:1], 60, axis=0))
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ STILL = replace(gaits()[0], positions=np.repeat(gaits()[0].positions[:1], 60, ax
     [
         (gaits()[:1], {}, "motions must contain at least 2 clips, .* got 1"),
         ([*gaits(), gaits()[-1]], {}, r"motions must be distinct, .* twice \(as run-2 and run-2\)"),
-        ([STILL, gaits()[0]], {}, "motions must contain different windows"),
+        ([STATIC, gaits()[0]], {}, "motions must contain different windows"),
         (gaits(), {"frames": 61}, "held_out must be a clip of at least frames=61"),
         (
             [*gaits(frames=20), gaits()[0]],

@@ -93,9 +93,9 @@ def test_observations_have_the_stated_noise(prior, walks):
     np.testing.assert_array_equal(repeated.joints, likelihood.joints)
     other = denoising_problem(truth, prior, noise=0.04, seed=1).posterior.likelihood
     assert (other.joints != likelihood.joints).all()
-    heavy = denoising_problem(truth, prior, noise=0.04, degrees_of_freedom=3.0)
-    outliers = abs(heavy.posterior.likelihood.joints - truth.positions) > 5 * 0.04
-    # P(|t| > 5) of 3 degrees of freedom is 1.5 %, of a Gaussian nothing.
+    heavy_tailed = denoising_problem(truth, prior, noise=0.04, degrees_of_freedom=3.0)
+    outliers = abs(heavy_tailed.posterior.likelihood.joints - truth.positions) > 5 * 0.04
+    # P(|t| > 5) is 1.5 % with 3 degrees of freedom and negligible for a Gaussian.
     assert outliers.mean() == pytest.approx(0.0154, abs=0.006)
     assert (abs(residual) < 5).all()
     simulated = problem.simulate(3)
@@ -105,7 +105,7 @@ def test_observations_have_the_stated_noise(prior, walks):
 
 @pytest.mark.parametrize(("freedom", "error"), [(None, 0.0045), (3.0, 0.006)])
 def test_body_has_the_observed_bone_lengths(prior, walks, freedom, error):
-    """Standard errors of 90 lengths: √2 σ/√90 of the mean, 1/(2 p √90) of the median, density p."""
+    """Standard errors of 90 lengths are √2 σ/√90 (mean) and 1/(2 p √90) (median, density p)."""
     truth = replace(walks[1], positions=1.15 * walks[1].positions)
     problem = denoising_problem(truth, prior, noise=0.03, degrees_of_freedom=freedom)
     body = problem.posterior.prior.body
@@ -128,12 +128,12 @@ def test_body_has_the_observed_hips(prior, walks):
     low = replace(walks[1], positions=positions)
     likelihood = Joints3D.observe(low, 0.02, seed=0)
     true_body = prior.states.body(positions)
-    usual = prior.states.of_lengths(np.linalg.norm(true_body, axis=-1))
-    error, usual_error = (
-        np.linalg.norm(body - true_body) for body in (body_of(likelihood, prior), usual)
+    by_lengths = prior.states.of_lengths(np.linalg.norm(true_body, axis=-1))
+    error, by_lengths_error = (
+        np.linalg.norm(body - true_body) for body in (body_of(likelihood, prior), by_lengths)
     )
-    assert usual_error > 0.05
-    assert error < 0.6 * usual_error
+    assert by_lengths_error > 0.05
+    assert error < 0.6 * by_lengths_error
     hidden = np.zeros(positions.shape[:2], dtype=bool)
     hidden[:, BODY.index("left_ankle")] = True
     body = body_of(Joints3D.observe(low, 0.02, seed=0, hidden=hidden), prior)
@@ -142,7 +142,7 @@ def test_body_has_the_observed_hips(prior, walks):
 
 
 def test_invisible_limb_has_the_length_of_its_mirror_image(prior, walks):
-    """Or that of the prior if both are occluded."""
+    """If both are occluded, the length is that of the prior."""
     truth = replace(walks[1], positions=1.2 * walks[1].positions)
     hidden = np.zeros(truth.positions.shape[:2], dtype=bool)
     wrists = [BODY.index("left_wrist"), BODY.index("right_wrist")]
@@ -219,17 +219,17 @@ def test_samplers_improve_on_the_prior(prior, walks, sampler):
 def test_truth_is_the_middle_of_the_clip_at_the_origin(
     prior, monkeypatch, name, noise, freedom, n_hidden
 ):
-    """Uses a synthetic clip far from the origin."""
+    """The clip is synthetic and far from the origin."""
     clip = synthetic_walks(1, BODY, seconds=3.0)[0]
-    far = replace(clip, positions=clip.positions + np.array([70.0, 0.3, -20.0]))
+    distant = replace(clip, positions=clip.positions + np.array([70.0, 0.3, -20.0]))
     monkeypatch.setattr(denoising, "body_prior", lambda: prior)
-    monkeypatch.setattr(denoising, "cmu_clip", {"cmu_02_02": far}.__getitem__)
+    monkeypatch.setattr(denoising, "cmu_clip", {"cmu_02_02": distant}.__getitem__)
     description, make = DENOISING_PROBLEMS[name]
     problem = make()
     assert (problem.name, problem.description) == (name, description)
-    middle = far.retarget(BODY).positions[39:51]
-    ground = middle[:, 0].mean(axis=0) * [1.0, 0.0, 1.0]
-    np.testing.assert_allclose(problem.truth, middle - ground, atol=1e-9)
+    window = distant.retarget(BODY).positions[39:51]
+    ground = window[:, 0].mean(axis=0) * [1.0, 0.0, 1.0]
+    np.testing.assert_allclose(problem.truth, window - ground, atol=1e-9)
     likelihood = problem.posterior.likelihood
     assert (likelihood.noise, likelihood.entries.degrees_of_freedom) == (noise, freedom)
     assert (~likelihood.entries.visible).sum() == n_hidden

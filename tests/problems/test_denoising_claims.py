@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def errors(real_data):
-    """Mean error of all and of occluded joints, by estimator, metres."""
+    """Return the mean error of all and of occluded joints by estimator, metres."""
     prior = body_prior()
     fit = DVAEInference(mode="optimization")
     errors = {}
@@ -50,20 +50,20 @@ def errors(real_data):
 ALL, OCCLUDED = 0, 1
 
 
-def of_best_filter(errors, joints):
+def best_filter(errors, joints):
     return min(errors[name][joints] for name in FILTERS)
 
 
 def test_optimisation_beats_filters_on_occluded_joints_and_is_on_par_on_all(errors):
-    assert errors["optimization"][OCCLUDED] < 0.9 * of_best_filter(errors, OCCLUDED)
-    assert errors["optimization"][ALL] < of_best_filter(errors, ALL)
+    assert errors["optimization"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)
+    assert errors["optimization"][ALL] < best_filter(errors, ALL)
 
 
 @pytest.mark.xfail(strict=True, reason="29.5 mm against 30.8 mm; trained on half an hour of motion")
 def test_optimisation_beats_filters_on_all_joints(errors):
-    assert errors["optimization"][ALL] < 0.9 * of_best_filter(errors, ALL)
+    assert errors["optimization"][ALL] < 0.9 * best_filter(errors, ALL)
 
 
 @pytest.mark.xfail(strict=True, reason="networks generalise poorly to unseen actions")
 def test_regression_beats_filters_on_occluded_joints(errors):
-    assert errors["regression"][OCCLUDED] < 0.9 * of_best_filter(errors, OCCLUDED)
+    assert errors["regression"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)

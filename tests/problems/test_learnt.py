@@ -39,9 +39,9 @@ def draws(problem):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("walk2d", ("Learnt from: cmu_02_01", "Held out: humanoid3d_long_walk3", "MIT", "NSF")),
-        ("walk-vae", ("MIT licence", "depth right", "Not for")),
-        ("animal-vae", ("MIT licence", "depth right", "Not for")),
+        ("walk2d", ("Training clips: cmu_02_01", "Test clips: humanoid3d_long_walk3", "NSF")),
+        ("walk-vae", ("MIT licence", "correct depth", "Not for")),
+        ("animal-vae", ("MIT licence", "correct depth", "Not for")),
     ],
 )
 def test_shipped_files_and_held_out_clips(name, words):
@@ -148,17 +148,17 @@ def test_view_selection_is_accurate(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_draws_are_closer_to_held_out_motion_than_a_still_body(name, real_data):
+def test_draws_are_closer_to_held_out_motion_than_a_static_body(name, real_data):
     prior = MotionVAE.load(name)
     clips = (walk_clips if name == "walk-vae" else animal_clips)(real_data)["test"]
     motions = [centre_motion(clip.retarget(prior.skeleton).resample(prior.fps)) for clip in clips]
     real = np.concatenate([windows(motion.positions, prior.frames, 3) for motion in motions])
     drawn = prior.sample(np.random.default_rng(0), 300)
-    still = np.broadcast_to(drawn.mean(axis=(0, 1)), drawn[:1].shape)
+    static = np.broadcast_to(drawn.mean(axis=(0, 1)), drawn[:1].shape)
     speeds = [np.linalg.norm(np.diff(motion, axis=1), axis=-1).mean() for motion in (drawn, real)]
     assert 0.3 < speeds[0] / speeds[1] < 2
-    # Distance of real motions to the closest draw.
-    assert nearest_distances(drawn, real)[1] < 0.8 * nearest_distances(still, real)[1]
+    # Compare the distances of real motions to the closest draw.
+    assert nearest_distances(drawn, real)[1] < 0.8 * nearest_distances(static, real)[1]
 
 
 def test_held_out_views_add_the_chamfer_distance():
@@ -169,16 +169,16 @@ def test_held_out_views_add_the_chamfer_distance():
     problem = replace(plain, generation=replace(plain.generation, held_out_views=views))
     draws = load_sampler("exact")().sample(problem.posterior, draws=40, progress=False)
     metrics = measure(problem, draws, 0)
-    still = draws.flat().mean(axis=(0, 1), keepdims=True).repeat(prior.frames, axis=1)
-    assert metrics["mcd_cm2"] < 1e4 * problem.generation.chamfer(still, seed=0).mean
+    static = draws.flat().mean(axis=(0, 1), keepdims=True).repeat(prior.frames, axis=1)
+    assert metrics["mcd_cm2"] < 1e4 * problem.generation.chamfer(static, seed=0).mean
     # Exact draws have the reference distribution.
     assert 0.7 < metrics["swd_ratio"] < 1.4
 
 
-def test_fid_distinguishes_draws_from_a_still_body():
+def test_fid_distinguishes_draws_from_a_static_body():
     problem = load_problem("walk-vae")
     prior = problem.posterior.prior
     drawn = prior.sample(np.random.default_rng(0), 200)
-    still = np.repeat(prior.motion(np.zeros((1, prior.dim))), 200, axis=0)
-    scores = [problem.generation.score_motions(m, seed=0)["fid"][0] for m in (drawn, still)]
+    static = np.repeat(prior.motion(np.zeros((1, prior.dim))), 200, axis=0)
+    scores = [problem.generation.score_motions(m, seed=0)["fid"][0] for m in (drawn, static)]
     assert scores[0] < 0.5 * scores[1]

@@ -32,7 +32,7 @@ def test_problems_are_listed_with_descriptions(problem):
 
 
 def test_clips_are_held_out_completely(problem):
-    """Neither annotations nor seed come from clips to be covered."""
+    """Neither the annotations nor the seed come from held-out clips."""
     dances = [dance.positions for dance in synthetic_dances(8)]
     training, test = np.concatenate(dances[:6]), np.concatenate(dances[6:])
     assert problem.held_out.shape == (60, 1, 34, 3)
@@ -56,15 +56,15 @@ def test_metrics_include_coverage_and_are_invariant_to_translation(problem):
     assert 0 <= metrics["at_cap"] <= 1
     assert 0 <= metrics["near_floor"] <= 1
     positions = draws.dataset["positions"].values + np.array([50.0, 0.0, -50.0])
-    moved = MotionDraws.of(problem.posterior, sampler, positions, seed=0, seconds=1.0)
-    swd_ratio = measure(problem, moved, seed=0)["swd_ratio"]
+    translated = MotionDraws.of(problem.posterior, sampler, positions, seed=0, seconds=1.0)
+    swd_ratio = measure(problem, translated, seed=0)["swd_ratio"]
     assert swd_ratio == pytest.approx(metrics["swd_ratio"], rel=1e-6)
     assert swd_ratio > 1.5
 
 
 @pytest.mark.slow
 def test_posterior_draws_cover_better_than_seed_and_prior(problem):
-    """On synthetic data; the ablations measure real data."""
+    """This test uses synthetic data; the ablations use real data."""
     sampler = MetropolisHastings(Isotropic(0.02), warmup=1000, thin=4)
     truth, prior = problem.held_out[:, 0], problem.posterior.prior
     posterior_coverage, prior_coverage = (

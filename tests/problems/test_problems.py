@@ -17,7 +17,7 @@ from probmotion.problems.gait import GAIT_PROBLEMS
 OBSERVED = ["gait-monocular", "gait-occluded", "gait-sparse", "quadruped-monocular"]
 
 
-def seen(problem):
+def visible(problem):
     return problem.posterior.likelihood.entries.visible
 
 
@@ -39,7 +39,7 @@ def test_truth_is_typical_and_noise_has_the_stated_scale(name):
     exact = problem.posterior.prior.exact_posterior(likelihood)
     at_draws = exact.log_density(problem.reference(0, 500))
     assert abs(exact.log_density(problem.truth) - at_draws.mean()) < 4 * at_draws.std()
-    residual = (likelihood.keypoints - likelihood.cameras.project(problem.truth))[seen(problem)]
+    residual = (likelihood.keypoints - likelihood.cameras.project(problem.truth))[visible(problem)]
     assert abs((residual / likelihood.noise).var() - 1) < 4 * np.sqrt(2 / residual.size)
 
 
@@ -60,8 +60,8 @@ def test_sparse_observations_leave_many_modes_and_every_style():
     assert np.exp(entropy) > 9
     assert weights.sum(axis=1).min() > 0.05
     dense = load_problem("gait-monocular")
-    one = dense.posterior.prior.exact_posterior(dense.posterior.likelihood)
-    assert one.component_probabilities.max() > 0.99
+    dense_posterior = dense.posterior.prior.exact_posterior(dense.posterior.likelihood)
+    assert dense_posterior.component_probabilities.max() > 0.99
 
 
 def test_non_conjugate_problems_have_no_reference():
@@ -78,8 +78,8 @@ def test_non_conjugate_problems_have_no_reference():
     with pytest.raises(ValueError, match="problem plain must have reference draws"):
         problem.reference(0, 5)
     observed = load_problem("gait-monocular").posterior
-    heavy = replace(observed.likelihood, degrees_of_freedom=4.0)
-    assert not Problem("heavy", "", MotionPosterior(observed.prior, heavy)).has_reference
+    student_t = replace(observed.likelihood, degrees_of_freedom=4.0)
+    assert not Problem("heavy", "", MotionPosterior(observed.prior, student_t)).has_reference
     with pytest.raises(ValueError, match=r"truth must have shape \(30, 17, 3\), got \(29, 17, 3\)"):
         Problem("bad", "", observed, np.zeros((29, 17, 3)))
 
@@ -91,10 +91,10 @@ def test_parameters_change_the_problem():
     prior = problem.posterior.prior
     assert (prior.frames, len(prior.styles), prior.azimuths) == (8, 3, 2)
     assert problem.posterior.likelihood.noise == 0.05
-    assert seen(problem).any(axis=(0, 1)).sum() == 12
-    limb = {(~seen(load_problem("gait-occluded", frames=8, hidden=h)))[0].any(-1).sum()
+    assert visible(problem).any(axis=(0, 1)).sum() == 12
+    occluded = {(~visible(load_problem("gait-occluded", frames=8, hidden=h)))[0].any(-1).sum()
             for h in (0.0, 0.25, 0.5, 1.0)}  # fmt: skip
-    assert limb == {0, 2, 4, 8}
+    assert occluded == {0, 2, 4, 8}
     other = load_problem("gait-occluded", frames=8, seed=4)
     assert (other.truth != load_problem("gait-occluded", frames=8).truth).any()
 
@@ -153,17 +153,17 @@ def test_simulated_problem_has_its_own_truth_and_observations(name):
     first, second = problem.simulate(1), problem.simulate(2)
     assert (first.truth != second.truth).any()
     np.testing.assert_array_equal(first.truth, second.simulate(1).truth)
-    np.testing.assert_array_equal(seen(first), seen(problem))
+    np.testing.assert_array_equal(visible(first), visible(problem))
     for simulated in (first, second):
         likelihood = simulated.posterior.likelihood
         residual = likelihood.keypoints - likelihood.cameras.project(simulated.truth)
-        residual = residual[seen(simulated)] / likelihood.noise
+        residual = residual[visible(simulated)] / likelihood.noise
         assert abs(residual.var() - 1) < 4 * np.sqrt(2 / residual.size)
     assert load_problem("gait", frames=6).simulate(0).posterior.likelihood is None
 
 
 def test_ranks_of_simulated_truths_are_uniform():
-    """Simulation-based calibration (Talts et al. 2018) of exact draws, on a height and a depth."""
+    """Exact draws pass simulation-based calibration (Talts et al. 2018) of height and depth."""
     problem = load_problem("gait-sparse", frames=2, components=6, noise=0.2)
     ranks = []
     for k in range(200):
@@ -176,7 +176,7 @@ def test_ranks_of_simulated_truths_are_uniform():
 
 
 def test_observations_of_another_truth_are_not_calibrated():
-    """Negative control of the test above."""
+    """This is the negative control of the test above."""
     problem = load_problem("gait-monocular", frames=2, components=6)
     ranks = [
         (problem.reference(k, 9)[:, 0, 3, 2] < problem.simulate(k).truth[0, 3, 2]).sum()

@@ -16,7 +16,7 @@ from probmotion.samplers.variational.amortised import AmortisedPosterior
 
 @dataclass(frozen=True, eq=False)
 class GaussianMotion:
-    """X ~ N(mean, covariance) over (L, J, 3) positions, metres; coordinates ordered as in X."""
+    """Prior X ~ N(mean, covariance) over positions (L, J, 3), metres, with coordinates as in X."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -86,13 +86,13 @@ class GaussianMotion:
 
 @pytest.fixture(scope="session")
 def gaussian_motion():
-    """The class of Gaussian priors."""
+    """Return the class of Gaussian priors."""
     return GaussianMotion
 
 
 @pytest.fixture(scope="session")
 def gaussian():
-    """A Gaussian without symmetry over 2 frames of 2 joints, with mean and scale."""
+    """Return a Gaussian prior without symmetry over 2 frames of 2 joints, with mean and scale."""
     rng = np.random.default_rng(5)
     root = rng.normal(size=(12, 12)) * 0.3
     return GaussianMotion(
@@ -102,18 +102,18 @@ def gaussian():
 
 @pytest.fixture(scope="session")
 def assert_covariance():
-    """Compare second moments about 0 with a covariance, entry by entry.
+    """Return a function that compares second moments about 0 with a covariance, by entry.
 
     An entry of the sample covariance of n whitened draws has standard deviation 1/√n (√2/√n on the
-    diagonal); in 12 dimensions one exceeds 5 of them with probability 1/20 000.
+    diagonal); in 12 dimensions one exceeds five deviations with probability 1/20 000.
     """
 
     def check(draws, covariance):
         n = len(draws)
         white = np.linalg.solve(np.linalg.cholesky(covariance), draws.reshape(n, -1).T)
-        gap = white @ white.T / n - np.eye(len(covariance))
+        error = white @ white.T / n - np.eye(len(covariance))
         limit = 5 * np.sqrt((1 + np.eye(len(covariance))) / n)
-        worst = np.abs(gap / limit).max()
+        worst = np.abs(error / limit).max()
         assert worst < 1, f"the largest error is {worst:.2g} of the limit"
 
     return check
@@ -121,7 +121,7 @@ def assert_covariance():
 
 @dataclass(frozen=True, eq=False)
 class TwoModes:
-    """A mixture of two Gaussians for the position θ of one joint."""
+    """Prior of one joint at θ, a mixture of two Gaussians."""
 
     weights: np.ndarray
     means: np.ndarray
@@ -154,7 +154,7 @@ class TwoModes:
 
 @pytest.fixture(scope="session")
 def two_modes():
-    """Two Gaussians of different shape that overlap, so that chains mix."""
+    """Return two overlapping Gaussians of different shape, so that chains mix."""
     return TwoModes(
         weights=np.array([0.3, 0.7]),
         means=np.array([[-1.0, 0.0, 0.5], [1.0, 0.3, 0.0]]),
@@ -164,13 +164,13 @@ def two_modes():
 
 @pytest.fixture(scope="session")
 def posterior(two_modes):
-    """The two modes without observations."""
+    """Return the posterior of the two modes without observations."""
     return MotionPosterior(two_modes)
 
 
 @pytest.fixture(scope="session")
 def run(posterior):
-    """A function that samples the two modes with two chains."""
+    """Return a function that samples the two modes with two chains."""
 
     def sample(sampler, draws, **options):
         return sampler.sample(
@@ -182,7 +182,7 @@ def run(posterior):
 
 @pytest.fixture(scope="session")
 def mixture():
-    """A small Gaussian mixture prior, for which every sampler except `sds` has a posterior."""
+    """Return a small Gaussian mixture prior that every sampler except `sds` supports."""
     rng = np.random.default_rng(1)
     return GaussianMixtureMotion(
         skeleton=Skeleton(["a", "b"], [-1, 0]),
@@ -197,28 +197,28 @@ def mixture():
 
 @pytest.fixture(scope="session")
 def mixture_posterior(mixture):
-    """The mixture given keypoints in one view."""
+    """Return the posterior of the mixture given keypoints in one view."""
     truth = Motion(mixture.sample(np.random.default_rng(2), 1)[0], mixture.skeleton, mixture.fps)
     camera = Cameras.ring(1, elevation=0.3)
     return MotionPosterior(mixture, Keypoints2D.observe(truth, camera, 0.3, seed=0))
 
 
 @pytest.fixture(scope="session")
-def mute():
-    """A class of priors that implement no optional protocol."""
+def minimal():
+    """Return a class of priors that implement no optional protocol."""
 
-    class Mute:
+    class Minimal:
         skeleton, frames, fps, dim, scale = Skeleton(["a"], [-1]), 1, 30.0, 3, 1.0
 
         def motion(self, theta):
             return theta.reshape(*theta.shape[:-1], 1, 1, 3)
 
-    return Mute
+    return Minimal
 
 
 @pytest.fixture
 def evaluations(monkeypatch):
-    """Batch sizes of the evaluations of a posterior's log density."""
+    """Record the batch sizes of evaluations of a posterior's log density."""
     sizes = []
 
     def log_density(self, theta):
@@ -231,7 +231,7 @@ def evaluations(monkeypatch):
 
 @pytest.fixture
 def trainings(monkeypatch):
-    """Settings of the networks that `dvae` trains."""
+    """Record the settings of the networks that `dvae` trains."""
     used, fit = [], AmortisedPosterior.fit
 
     def spy(posterior, settings, *rest):

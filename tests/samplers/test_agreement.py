@@ -40,7 +40,7 @@ def slow(*values):
 
 @dataclass(frozen=True)
 class Dense:
-    """A mixture of Gaussians over all positions, with dense covariances."""
+    """Mixture of Gaussians over all positions, with dense covariances."""
 
     log_weights: np.ndarray
     means: np.ndarray
@@ -105,8 +105,8 @@ def scores(dense, positions, walkers):
     return np.array(z)
 
 
-def drawn(name, posterior):
-    """Return positions, and the number of walkers per chain."""
+def draw(name, posterior):
+    """Return the positions of draws and the number of walkers per chain."""
     sampler, draws, chains = SAMPLERS[name]
     result = sampler.sample(posterior, draws=draws, chains=chains, seed=11, progress=False)
     return result.positions.values, getattr(sampler, "walkers", 1)
@@ -123,7 +123,7 @@ def score(values, truth, walkers):
 
 @pytest.fixture(scope="module")
 def posteriors():
-    """Small problems with modes between which chains mix."""
+    """Return small problems with modes between which chains mix."""
     rng = np.random.default_rng(2)
     prior = GaussianMixtureMotion(
         skeleton=Skeleton(["a", "b", "c", "d"], [-1, 0, 1, 2]),
@@ -159,7 +159,7 @@ def posteriors():
 )
 def test_samplers_agree_with_the_exact_posterior(name, problem, posteriors):
     posterior = posteriors[problem]
-    z = scores(Dense.of(posterior), *drawn(name, posterior))
+    z = scores(Dense.of(posterior), *draw(name, posterior))
     assert np.abs(z).max() < LIMIT, f"{np.abs(z).max():.1f} standard errors, limit {LIMIT:.1f}"
 
 
@@ -184,6 +184,6 @@ def test_samplers_of_a_slightly_wrong_posterior_fail(name, problem, posteriors, 
             MotionPosterior, "log_density", lambda self, theta: 0.7 * right(self, theta)
         )
         compiled.cache_clear()
-    z = scores(Dense.of(posterior), *drawn(name, wrong))
+    z = scores(Dense.of(posterior), *draw(name, wrong))
     compiled.cache_clear()
     assert np.abs(z).max() > LIMIT

@@ -1,4 +1,4 @@
-"""Tests of starting points, the evaluations they cost, and the checks of continued runs."""
+"""Tests of starting points, their number of evaluations, and checks of continued runs."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def test_starts_are_resampled_in_proportion_to_their_likelihood(posterior):
     deviation = np.sqrt((probability * (1 - probability)).sum(axis=0))
     assert (deviation > 3.5).all()
     assert (abs((chosen - probability).sum(axis=0)) < 4 * deviation).all()
-    fewer, _ = starts(posterior, (2, posterior.dim), 3)
-    np.testing.assert_array_equal(fewer, points[:2])
+    subset, _ = starts(posterior, (2, posterior.dim), 3)
+    np.testing.assert_array_equal(subset, points[:2])
 
 
 def test_walkers_start_at_distinct_candidates(posterior):
@@ -67,10 +67,10 @@ def test_walkers_start_at_distinct_candidates(posterior):
 
 def test_starts_without_a_choice_are_prior_draws(posterior):
     """With as many candidates as walkers, or without observations, no likelihood is evaluated."""
-    for some, candidates in ((posterior, 7), (MotionPosterior(posterior.prior), 1000)):
-        points, sizes = starts(some, (2, 7, posterior.dim), candidates)
+    for target, candidates in ((posterior, 7), (MotionPosterior(posterior.prior), 1000)):
+        points, sizes = starts(target, (2, 7, posterior.dim), candidates)
         assert sizes == []
-        np.testing.assert_array_equal(points[1], candidates_of(some, 1, 7))
+        np.testing.assert_array_equal(points[1], candidates_of(target, 1, 7))
 
 
 def test_starts_cover_modes_in_proportion_to_their_mass(two_modes):
@@ -92,11 +92,11 @@ def test_starts_cover_modes_in_proportion_to_their_mass(two_modes):
     ids=lambda sampler: sampler.name,
 )
 def test_candidates_are_counted_and_runs_of_other_posteriors_refused(mixture_posterior, sampler):
-    many, few = (
-        one.sample(mixture_posterior, draws=40, chains=2, progress=False)
-        for one in (sampler, replace(sampler, candidates=1))
+    resampled, single = (
+        kind.sample(mixture_posterior, draws=40, chains=2, progress=False)
+        for kind in (sampler, replace(sampler, candidates=1))
     )
-    assert many.counts["density"] - few.counts["density"] == 2 * sampler.candidates
-    moved = MotionDraws(many.dataset.assign(theta=many.dataset["theta"] + 1))
+    assert resampled.counts["density"] - single.counts["density"] == 2 * sampler.candidates
+    shifted = MotionDraws(resampled.dataset.assign(theta=resampled.dataset["theta"] + 1))
     with pytest.raises(ValueError, match="initial must be a run of the same posterior, got one"):
-        sampler.sample(mixture_posterior, draws=5, chains=2, initial=moved, progress=False)
+        sampler.sample(mixture_posterior, draws=5, chains=2, initial=shifted, progress=False)

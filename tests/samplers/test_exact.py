@@ -14,7 +14,7 @@ from probmotion.samplers import ExactSampler
 
 
 class Normal:
-    """N(7, 2²) in every coordinate, with samples and a density but no exact posterior."""
+    """Prior N(7, 2²) in every coordinate, with samples and a density but no exact posterior."""
 
     skeleton, frames, fps, dim = Skeleton(["a"], [-1]), 2, 30.0, 6
 
@@ -48,7 +48,7 @@ def test_posteriors_without_a_closed_form_are_refused(mixture, mixture_posterior
         (MotionPosterior(two_modes), "needs a prior with HasExactPosterior", "HasExactPosterior"),
         (
             MotionPosterior(Normal(), Joints3D(np.zeros((2, 1, 3)), noise=0.5)),
-            "needs a prior with HasExactPosterior to condition on observations, got Normal",
+            "requires a prior that implements HasExactPosterior for observations, got Normal",
             "HasExactPosterior",
         ),
         (MotionPosterior(mixture, outliers), "in closed form, but the noise is", "not-conjugate"),

@@ -43,7 +43,7 @@ def sampler(request):
 
 @pytest.fixture
 def run(sampler, mixture_posterior):
-    """Draws given observations, or from the prior by `sds`, which does not support any here."""
+    """Return a function that draws given observations, or with `sds` from the prior."""
     posterior = mixture_posterior
     if sampler.name == "sds":
         posterior = MotionPosterior(posterior.prior)
@@ -55,7 +55,7 @@ def run(sampler, mixture_posterior):
 
 
 def test_samplers_are_registered_and_their_settings_round_trip(sampler):
-    """Through JSON and text."""
+    """The settings round-trip through JSON and text."""
     assert isinstance(sampler, Sampler)
     assert load_sampler(sampler.name) is type(sampler)
     assert getattr(probmotion.samplers, type(sampler).__name__) is type(sampler)
@@ -75,24 +75,24 @@ def test_samplers_are_registered_and_their_settings_round_trip(sampler):
 
 
 def test_a_draw_depends_only_on_its_seed_chain_and_number(sampler, run):
-    many = run(draws=5, chains=3)
-    values = many.positions.values
+    full = run(draws=5, chains=3)
+    values = full.positions.values
     assert len(np.unique(values.reshape(15, -1), axis=0)) > 1
-    same = run(draws=5, chains=3, progress=True)
-    np.testing.assert_array_equal(same.positions.values, values)
-    assert same.counts == many.counts
+    repeated = run(draws=5, chains=3, progress=True)
+    np.testing.assert_array_equal(repeated.positions.values, values)
+    assert repeated.counts == full.counts
     assert (run(draws=5, chains=3, seed=10).positions.values != values).any()
     for draws, chains in ((5, 1), (2, 3)):
-        few = run(draws=draws, chains=chains).positions.values
-        np.testing.assert_allclose(few, values[:chains, :draws], rtol=0, atol=1e-9)
+        subset = run(draws=draws, chains=chains).positions.values
+        np.testing.assert_allclose(subset, values[:chains, :draws], rtol=0, atol=1e-9)
     if hasattr(sampler, "batch"):
         batched = run(replace(sampler, batch=2), draws=5, chains=3)
         np.testing.assert_allclose(batched.positions.values, values, rtol=0, atol=1e-9)
-        assert batched.counts == many.counts
+        assert batched.counts == full.counts
 
 
 def test_saving_and_continuing(sampler, run, tmp_path):
-    """Positions continue too, where they are random given θ."""
+    """Positions that are random given θ also continue."""
     draws = run(chains=2)
     draws.save(tmp_path / "draws.nc")
     loaded = MotionDraws.load(tmp_path / "draws.nc")
@@ -107,8 +107,8 @@ def test_saving_and_continuing(sampler, run, tmp_path):
     else:
         rest = run(draws=2, chains=2, initial=draws)
         parts = np.concatenate([draws.positions.values, rest.positions.values], axis=1)
-        at_once = run(draws=5, chains=2).positions.values
-        np.testing.assert_allclose(parts, at_once, rtol=0, atol=1e-12)
+        complete = run(draws=5, chains=2).positions.values
+        np.testing.assert_allclose(parts, complete, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -124,22 +124,22 @@ def test_arguments_out_of_range(run, options, message):
         run(**options)
 
 
-def test_missing_protocols_are_named(sampler, mute):
-    posterior = MotionPosterior(mute())
+def test_missing_protocols_are_named(sampler, minimal):
+    posterior = MotionPosterior(minimal())
     assert suited(posterior) == []
     with pytest.raises(
-        UnsupportedPosterior, match=rf"^{sampler.name} needs a prior with \w+( or \w+)?, got Mute$"
+        UnsupportedPosterior, match=rf"^{sampler.name} needs a prior with \w+( or \w+)?, got Mi"
     ):
         sampler.sample(posterior, draws=1, progress=False)
 
 
 @pytest.mark.parametrize("kind", [MultiViewAncestral, MultiViewPredictorCorrector])
-def test_draws_with_an_exact_denoiser_do_not_depend_on_the_batch_to_the_last_bit(kind):
+def test_draws_with_an_exact_denoiser_are_bit_identical_for_any_batch(kind):
     """Rounding errors would be amplified by the steps."""
     posterior, sampler = load_problem("gait").posterior, kind(steps=15)
-    many = sampler.sample(posterior, draws=3, chains=3, progress=False).positions.values
-    fewer = replace(sampler, batch=2).sample(posterior, draws=2, progress=False)
-    np.testing.assert_array_equal(fewer.positions.values[0], many[0, :2])
+    full = sampler.sample(posterior, draws=3, chains=3, progress=False).positions.values
+    subset = replace(sampler, batch=2).sample(posterior, draws=2, progress=False)
+    np.testing.assert_array_equal(subset.positions.values[0], full[0, :2])
 
 
 @pytest.mark.parametrize("name", ["exact", "ancestral3d", "mas", "mvpc", "sds"])
@@ -147,7 +147,7 @@ def test_draws_with_an_exact_denoiser_do_not_depend_on_the_batch_to_the_last_bit
 def test_suited_samplers_are_those_that_sample(problem, name):
     posterior = load_problem(f"{problem}(frames=4, components=3)").posterior
     kind = load_sampler(name)
-    effort = {one: getattr(kind, "least_effort", 1) for one in getattr(kind, "effort", ())}
+    effort = {field: getattr(kind, "least_effort", 1) for field in getattr(kind, "effort", ())}
     if name in suited(posterior):
         kind(**effort).sample(posterior, draws=1, progress=False)
         return

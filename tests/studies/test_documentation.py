@@ -1,4 +1,4 @@
-"""README and documentation: examples run, links resolve, tables stay readable."""
+"""README and documentation: examples run, links resolve, tables have at most six columns."""
 
 from __future__ import annotations
 
@@ -76,14 +76,14 @@ def test_make_targets_exist():
 
 
 def test_every_cited_work_is_listed():
-    words = " ".join((ROOT / "docs" / "citing.md").read_text(encoding="utf-8").split())
+    text = " ".join((ROOT / "docs" / "citing.md").read_text(encoding="utf-8").split())
     for works in [*CITATIONS.values(), *OF_SETTINGS.values(), POSE_PAIRS]:
         for work in works:
-            assert work in words
+            assert work in text
 
 
 def test_stored_tables_are_up_to_date():
-    """The advice tables equal what the script writes from the stored measurements."""
+    """The advice tables equal the output of the script for the stored measurements."""
     sys.path.insert(0, str(ROOT / "notebooks"))
     try:
         import which_sampler
@@ -101,7 +101,7 @@ def test_stored_tables_are_up_to_date():
 @pytest.mark.parametrize(
     "script", sorted((ROOT / "notebooks").glob("[0-9]*.py")), ids=lambda path: path.stem
 )
-def test_executed_notebooks_are_those_of_their_scripts(script):
+def test_executed_notebooks_match_their_scripts(script):
     executed = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
     assert [cell.source for cell in executed.cells] == [
         cell.source for cell in jupytext.read(script).cells
@@ -110,7 +110,7 @@ def test_executed_notebooks_are_those_of_their_scripts(script):
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-def test_nothing_names_the_machine_that_it_was_made_on():
+def test_no_file_contains_paths_of_the_build_machine():
     done = subprocess.run(
         ["git", "grep", "-nIE", "/wo" + "rk/|/ho" + "me/|/ro" + "ot/", "--", "."],
         cwd=ROOT, capture_output=True, text=True, check=False,

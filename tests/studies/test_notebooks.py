@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom, and what its prose claims is what it measures."""
+"""Notebooks run from top to bottom, and their results support their text."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from probmotion.comparison import advise
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 
 
-def run(name: str, folder: Path, pictures: int, monkeypatch) -> str:
-    """Execute a notebook in ``folder``; return all that it printed."""
+def run(name: str, folder: Path, figures: int, monkeypatch) -> str:
+    """Execute a notebook in ``folder``, check its number of figures and return its output."""
     import jupytext
     from nbclient import NotebookClient
 
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(variable, "1")
-    # A kernel of the running interpreter, whatever kernels the machine has.
+    # Use a kernel of the running interpreter, regardless of those installed.
     monkeypatch.setenv("JUPYTER_PATH", str(Path(sys.prefix) / "share" / "jupyter"))
     monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
     notebook = jupytext.read(NOTEBOOKS / name)
@@ -32,15 +32,15 @@ def run(name: str, folder: Path, pictures: int, monkeypatch) -> str:
     )
     client.execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == pictures
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == figures
     return "".join(
         output.get("text", output.get("data", {}).get("text/plain", "")) for output in outputs
     )
 
 
-def played(page: Path) -> dict[str, np.ndarray]:
-    """Return the motions that a page plays, by label, (n, L, J, 3), metres; it fetches nothing."""
-    text = page.read_text(encoding="utf-8")
+def animated_motions(report: Path) -> dict[str, np.ndarray]:
+    """Return the animated motions of a self-contained report by label, (n, L, J, 3), metres."""
+    text = report.read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|href=|@import", text)
     (given,) = re.findall(r"parentElement, (\{.*\})\);</script>", text)
     data = json.loads(given)
@@ -48,7 +48,7 @@ def played(page: Path) -> dict[str, np.ndarray]:
     return {row["label"][0]: np.reshape(row["motions"], shape) / 1000 for row in data["rows"]}
 
 
-# Jupyter's own libraries warn about themselves.
+# Libraries of Jupyter emit warnings.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_one_posterior_many_samplers(tmp_path, monkeypatch):
@@ -76,7 +76,7 @@ def test_pose_pairs(tmp_path, monkeypatch):
     from probmotion.io.files import load
 
     printed = run("02_pose_pairs.py", tmp_path, 5, monkeypatch)
-    assert "90 of 90 frames are dance" in printed
+    assert "90 of 90 frames show the dance" in printed
     assert "108 dimensions" in printed
     assert "200 annotations" in printed
     walk = load(tmp_path / "walk.bvh")
@@ -99,27 +99,27 @@ def test_motion_from_2d(tmp_path, monkeypatch):
     assert len(losses) == 7
 
     def numbers(words: str) -> list[float]:
-        """Return the numbers that follow in the same line."""
+        """Return the numbers after ``words`` in the same line."""
         line = printed.split(words, 1)[1].splitlines()[0]
         return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line)]
 
-    # FID, diversity, precision, recall.
+    # The columns are FID, diversity, precision and recall.
     real, flat, mas = (numbers(row) for row in ("\nreal ", "\n2D model ", "\nmas "))
     assert real[0] < mas[0] < 1.2 * flat[0]
     assert mas[2] > 0.9 * flat[2]
     assert numbers("\nmas, no 3D noise ")[3] > 0.5
-    # To real motion, from it, mirrored.
+    # The columns are the distances to and from real motion, and the mirrored fraction.
     assert numbers("\nmas: ")[0] < 1.3 * numbers("\nreal: ")[0]
     assert numbers("\nmas: ")[2] < 0.1
-    for kind in ("found joints: ", "lost joints: "):
+    for kind in ("detected joints: ", "lost joints: "):
         detected, cleaned = numbers(kind)
         assert cleaned < 0.6 * detected
-    # A draw may be caught in something else, as the prose says; the others answer.
-    misses = np.array(numbers("error against observations, mm: "))
-    caught = misses > 80
-    assert caught.sum() <= 3
-    wrong = np.array(numbers("error against truth, mm: "))
-    assert wrong[~caught].max() < 0.5 * numbers("without observations: ")[0]
+    # As the text says, some draws are stuck in a local optimum; the others match the observations.
+    errors = np.array(numbers("error against observations, mm: "))
+    stuck = errors > 80
+    assert stuck.sum() <= 3
+    truth_errors = np.array(numbers("error against truth, mm: "))
+    assert truth_errors[~stuck].max() < 0.5 * numbers("without observations: ")[0]
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_denoising(tmp_path, monkeypatch):
         )
     }
     for name in ("Savitzky-Golay filter", "Kalman smoother"):
-        assert rows["Motion-DVAE, optimization"][2] < rows[name][2]  # hidden joints
+        assert rows["Motion-DVAE, optimization"][2] < rows[name][2]  # occluded joints
     assert rows["Motion-DVAE, optimization"][0] < rows["Motion-DVAE, regression"][0]
     assert "denoised.html" in {path.name for path in tmp_path.iterdir()}
 
@@ -148,28 +148,28 @@ def test_denoising(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_animals(tmp_path, monkeypatch):
     printed = run("05_animals.py", tmp_path, 1, monkeypatch)
-    assert "21 joints, 10 frames at 10.0 a second" in printed
+    assert "21 joints, 10 frames at 10 fps" in printed
 
     def number(pattern: str) -> float:
         return float(re.search(pattern, printed)[1])
 
-    assert number(r"bones are ([\d.]+) % off") < 10
-    assert number(r"depth is not mirrored in (\d+)%") > 95
-    assert number(r"joints are (\d+) mm from the truth") < 80
-    # As the prose says: at a seam no more than within the pieces.
-    assert number(r"greatest acceleration is ([\d.]+) of that within") <= 1
+    assert number(r"mean error of bone lengths: ([\d.]+) %") < 10
+    assert number(r"correct depth in (\d+)%") > 95
+    assert number(r"mean joint error: (\d+) mm") < 80
+    # The maximum acceleration at segment boundaries does not exceed that within segments.
+    assert number(r"maximum acceleration ([\d.]+) times that within") <= 1
     rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
     assert rows["optimization"] < rows["regression"]
-    assert 0.2 < number(r"new motions are ([\d.]+) as fast") < 1
+    assert 0.2 < number(r"relative to the animals: ([\d.]+)") < 1
     for name, labels in {
         "long": ["several codes"],
-        "animals": ["drawn", "seen by one camera", "the truth"],
-        "own": ["of the prior that ships", "of these animals"],
+        "animals": ["draws", "seen by one camera", "the truth"],
+        "own": ["shipped prior", "prior trained on these animals"],
     }.items():
-        shown = played(tmp_path / f"{name}.html")
-        assert list(shown) == labels
-        for motions in shown.values():
-            # In every skeleton some joint goes somewhere.
+        motions_by_label = animated_motions(tmp_path / f"{name}.html")
+        assert list(motions_by_label) == labels
+        for motions in motions_by_label.values():
+            # In every skeleton at least one joint moves.
             assert (np.ptp(motions, axis=1).max(axis=(1, 2)) > 0.02).all()
 
 
@@ -183,6 +183,6 @@ def test_compare_and_calibrate(tmp_path, monkeypatch):
     assert (used[["mh", "mas"]] <= 20_000).all()
     assert 1e4 < (tmp_path / "report.html").stat().st_size < 15e6
     assert str(advise("gait-monocular")) in printed
-    right, wrong = (line for line in printed.splitlines() if " on gait-monocular(" in line)
-    assert "no deviation found" in right
-    assert "overconfident: 90 % intervals" in wrong
+    exact, narrow = (line for line in printed.splitlines() if " on gait-monocular(" in line)
+    assert "no deviation found" in exact
+    assert "overconfident: 90 % intervals" in narrow

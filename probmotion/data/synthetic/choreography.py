@@ -16,14 +16,14 @@ _TURN_DISTANCE = 0.5  # distance between the roots during a turn, metres
 
 @dataclass(frozen=True)
 class Figure:
-    """Eight-beat figure: hold, distance of the partners (m), displacement (m) and turns."""
+    """Eight-beat figure: hold, distance between the partners (m), displacement (m) and turns."""
 
     hold: str
     distance: float
     forward: float
     aside: float
     turns: int  # index of the person who turns under the arm; 2: neither
-    way: float  # sense of rotation, -1 or 1
+    sense: float  # sense of rotation, -1 or 1
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,21 @@ class Dance:
 
     def raised(self, time: np.ndarray, person: int) -> np.ndarray:
         """Return how far the hands are raised for turns of ``person``, from 0 to 1."""
-        turns = self._turns(time, person)
+        turns = self._beats_into_turns(time, person)
         lifts = (rise((x - 0.4) / 1.6) - rise((x - 6.0) / 1.6) for x in turns)
         return sum(lifts, np.zeros_like(time))
 
-    def turned(self, time: np.ndarray, person: int) -> np.ndarray:
+    def turn_angle(self, time: np.ndarray, person: int) -> np.ndarray:
         """Return the angle by which ``person`` has turned under the raised hands."""
-        angles = [2 * np.pi * figure.way for figure in self.figures if figure.turns == person]
-        turns = zip(angles, self._turns(time, person), strict=True)
+        angles = [2 * np.pi * figure.sense for figure in self.figures if figure.turns == person]
+        turns = zip(angles, self._beats_into_turns(time, person), strict=True)
         return sum((angle * rise((x - 1.9) / 4.2) for angle, x in turns), np.zeros_like(time))
 
-    def _turns(self, time: np.ndarray, person: int) -> list[np.ndarray]:
+    def _beats_into_turns(self, time: np.ndarray, person: int) -> list[np.ndarray]:
         beats = self.beats(time)
         return [beats - _FIGURE * k for k, f in enumerate(self.figures) if f.turns == person]
 
-    def place(self, time: np.ndarray, person: int) -> tuple[np.ndarray, np.ndarray]:
+    def position_and_yaw(self, time: np.ndarray, person: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the ground position (n, 3) of a person's root, y = 0, and the yaw (n,)."""
         weights = self.weights(time)
         starts = _FIGURE * np.arange(len(self.figures))[:, None]
@@ -101,7 +101,7 @@ class Dance:
         yaw = heading + np.pi * person
         root = centre - 0.5 * distance[:, None] * level(yaw)
         root = root + left[:, None] * level(yaw + np.pi / 2)
-        return root, yaw + 0.12 * self.wander(3 + person, time) + self.turned(time, person)
+        return root, yaw + 0.12 * self.wander(3 + person, time) + self.turn_angle(time, person)
 
 
 def draw_dance(rng: np.random.Generator, duration: float) -> Dance:

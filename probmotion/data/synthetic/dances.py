@@ -1,8 +1,8 @@
 """Procedural couple dances: steps, turns under raised arms and changes of hold.
 
-A dance is a sequence of eight-beat figures. Position and heading of the couple and the distance of
-the partners are smooth functions of time. Feet step to points below the hip at mid-stance; the hold
-places the hands. Bones have constant lengths, and elbows and knees bend anatomically.
+A dance is a sequence of eight-beat figures. Position and heading of the couple and the distance
+between the partners are smooth functions of time. Feet step to points below the hip at mid-stance;
+the hold places the hands. Bones have constant lengths, and elbows and knees bend anatomically.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _ARM, _LEG, _ANKLE = (0.170, 0.146), (0.245, 0.246), 0.045
 _SIDES = {"left": 1.0, "right": -1.0}
 _UP = np.array([0.0, 1.0, 0.0])
 
-_SWING = 0.8  # duration of a step, beats
+_STEP_BEATS = 0.8  # duration of a step, beats
 _WRIST_TO_GRIP = 0.05  # metres
-# Largest extension (fraction of the length), softness of limits (m), cosine of the least angle.
-_STRAIGHTEST = 0.99
+# Largest extension (fraction of the length), softness of limits (m), cosine of the smallest angle.
+_MAX_EXTENSION = 0.99
 _SOFTNESS = 0.01
-_FOLD = np.cos(np.deg2rad(30.0))
+_MIN_ANGLE_COSINE = np.cos(np.deg2rad(30.0))
 Joints = dict[str, np.ndarray]
 """Positions (L, 3) by joint; key ``frame`` is the orientation (L, 3, 3) of the chest."""
 
@@ -66,7 +66,7 @@ def _trunk_and_legs(dance: Dance, person: int, time: np.ndarray) -> Joints:
     """Return the joints of a person's trunk and legs, and the chest's orientation."""
     height, beats = dance.heights[person], dance.beats(time)
     mirror = 1.0 - 2.0 * person  # the follower mirrors the leader
-    root, yaw = dance.place(time, person)
+    root, yaw = dance.position_and_yaw(time, person)
     roll = mirror * 2.0 * dance.sway * np.sin(np.pi * beats)
     lean = dance.lean[person] + 0.04 * dance.wander(5 + person, time)
     twist = mirror * dance.twist * np.cos(np.pi * beats)
@@ -103,12 +103,12 @@ def _foot(dance: Dance, person: int, sign: float, time: np.ndarray) -> np.ndarra
     odd = float((sign > 0) == (person == 0))  # the feet step on alternate beats
     beats = dance.beats(time)
     stepped = 2 * np.floor((beats - odd) / 2) + odd
-    progress = rise((beats - stepped) / _SWING)
+    progress = rise((beats - stepped) / _STEP_BEATS)
     footholds = []
     for step in (stepped - 2, stepped):
         # The foothold is below the hip at mid-stance.
-        middle = (step + 1 + _SWING / 2 - dance.start) * dance.beat
-        root, yaw = dance.place(middle, person)
+        middle = (step + 1 + _STEP_BEATS / 2 - dance.start) * dance.beat
+        root, yaw = dance.position_and_yaw(middle, person)
         footholds.append(root + (sign * (_HIP[0] + 0.01) * height) * level(yaw + np.pi / 2))
     move = footholds[1] - footholds[0]
     lift = np.minimum(0.03 + 0.15 * np.linalg.norm(move, axis=-1), 0.1)
@@ -132,15 +132,15 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
             free = _rotated(frame, (0.08 * sign, -0.34, 0.18))
             free = free + swing * _rotated(frame, (0.0, 0.3, 1.0)) + shoulder
             joined = (person, side) in ((0, "left"), (1, "right"))
-            grip = _grip(lead, follow, person, side, dance.hands)
+            grip = _held_hands(lead, follow, person, side, dance.hands)
             if joined:
                 closed = grip + 0.22 * _rotated(lead["frame"], (1.0, 0.6, 0.0))
             else:
-                closed = _on_partner(bodies[1 - person], person)
+                closed = _hand_on_partner(bodies[1 - person], person)
             target = weight["open"][:, None] * grip + weight["closed"][:, None] * closed
             target = target + weight["one hand"][:, None] * (grip if joined else free)
             for turner in range(2):
-                above = _above(bodies[turner], bodies[1 - turner], dance.heights[turner])
+                above = _raised_hands(bodies[turner], bodies[1 - turner], dance.heights[turner])
                 goal = above if joined else free
                 target = target + raised[turner][:, None] * (goal - target)
             back = shoulder - target
@@ -151,7 +151,7 @@ def _join_hands(dance: Dance, bodies: list[Joints], time: np.ndarray) -> None:
             body |= {f"{side}_elbow": elbow, f"{side}_wrist": wrist}
 
 
-def _grip(lead: Joints, follow: Joints, person: int, side: str, higher: float) -> np.ndarray:
+def _held_hands(lead: Joints, follow: Joints, person: int, side: str, higher: float) -> np.ndarray:
     """Return the position of joined hands in an open hold, below the shoulders' midpoint."""
     opposite = "right" if side == "left" else "left"
     lead_side, follow_side = (side, opposite) if person == 0 else (opposite, side)
@@ -159,14 +159,14 @@ def _grip(lead: Joints, follow: Joints, person: int, side: str, higher: float) -
     return middle - _UP * (0.28 - higher)
 
 
-def _on_partner(partner: Joints, person: int) -> np.ndarray:
+def _hand_on_partner(partner: Joints, person: int) -> np.ndarray:
     """Return the position of the free hand on the partner in a closed hold."""
     if person == 0:
         return partner["chest"] + _rotated(partner["frame"], (0.17, -0.02, 0.0))
     return partner["right_shoulder"] + _rotated(partner["frame"], (-0.03, -0.03, 0.05))
 
 
-def _above(turner: Joints, partner: Joints, height: float) -> np.ndarray:
+def _raised_hands(turner: Joints, partner: Joints, height: float) -> np.ndarray:
     """Return the position of raised hands: above the turning head, towards the partner."""
     towards = (partner["chest"] - turner["chest"]) * [1.0, 0.0, 1.0]
     above = turner["chest"] * [1.0, 0.0, 1.0] + 0.3 * towards
@@ -201,8 +201,8 @@ def bent_limb(
     lies on the line to the target; its distance from ``start`` is limited smoothly.
     """
     upper, lower = lengths
-    longest = _STRAIGHTEST * (upper + lower)
-    shortest = np.sqrt(upper**2 + lower**2 - 2 * upper * lower * _FOLD)
+    longest = _MAX_EXTENSION * (upper + lower)
+    shortest = np.sqrt(upper**2 + lower**2 - 2 * upper * lower * _MIN_ANGLE_COSINE)
     offset = target - start
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     along = offset / np.maximum(distance, 1e-9)

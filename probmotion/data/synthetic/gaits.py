@@ -121,8 +121,8 @@ def make_gait(
     skeleton = Skeleton.preset(layout)
     flat = np.stack([joints[name] for name in skeleton.canonical_names], axis=1)
     x, y, z = flat[..., 0], flat[..., 1], flat[..., 2]
-    turned = np.stack([c[:, None] * x + s[:, None] * z, y, c[:, None] * z - s[:, None] * x], -1)
-    return Motion(turned + path[:, None], skeleton, fps, name=f"{style}-{number}")
+    rotated = np.stack([c[:, None] * x + s[:, None] * z, y, c[:, None] * z - s[:, None] * x], -1)
+    return Motion(rotated + path[:, None], skeleton, fps, name=f"{style}-{number}")
 
 
 def _direction(angle: np.ndarray) -> np.ndarray:
@@ -155,11 +155,11 @@ def _flexion(phase: np.ndarray, peak: float) -> np.ndarray:
 
 
 def _person(
-    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, stray: Callable[[], np.ndarray]
+    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, jitter: Callable[[], np.ndarray]
 ) -> dict[str, np.ndarray]:
     joints: dict[str, np.ndarray] = {}
     frames = len(phase)
-    lean = draw["lean"] + 0.5 * stray()
+    lean = draw["lean"] + 0.5 * jitter()
     up = _in_plane(np.cos(lean), np.sin(lean))
     pelvis = np.zeros((frames, 3))
     pelvis[:, 1] = 0.9 + draw["bounce"] * np.cos(2 * phase)
@@ -167,22 +167,22 @@ def _person(
     joints["pelvis"] = pelvis
     joints["spine"] = pelvis + 0.24 * up
     joints["neck"] = joints["spine"] + 0.26 * up
-    tilt = 0.4 * lean + stray()
+    tilt = 0.4 * lean + jitter()
     nod = _in_plane(np.cos(tilt), np.sin(tilt))
     face = _in_plane(-np.sin(tilt), np.cos(tilt))
     joints["nose"] = joints["neck"] + 0.12 * nod + 0.06 * face
     joints["head"] = joints["nose"] + 0.13 * nod - 0.06 * face
     for side, sign, angle in (("left", 1.0, phase), ("right", -1.0, phase + np.pi)):
-        hip = draw["stride"] * np.sin(angle) + 0.15 * draw["lift"] * _flexion(angle, 0.6) + stray()
-        knee = 0.12 + 0.75 * draw["lift"] * _flexion(angle, -0.35) + stray()
+        hip = draw["stride"] * np.sin(angle) + 0.15 * draw["lift"] * _flexion(angle, 0.6) + jitter()
+        knee = 0.12 + 0.75 * draw["lift"] * _flexion(angle, -0.35) + jitter()
         joints[f"{side}_hip"] = pelvis + sign * 0.11 * _across(sway * np.sin(phase), lean)
         joints[f"{side}_knee"] = joints[f"{side}_hip"] + 0.43 * _direction(hip)
         joints[f"{side}_ankle"] = joints[f"{side}_knee"] + 0.42 * _direction(hip - knee)
-        arm = -draw["swing"] * np.sin(angle) + 0.5 * lean + stray()
+        arm = -draw["swing"] * np.sin(angle) + 0.5 * lean + jitter()
         shoulder = joints["neck"] - 0.04 * up + sign * 0.17 * _across(-sway * np.sin(phase), lean)
         out = np.array([0.15 * sign, 0.0, 0.0])
         upper = _unit(_direction(arm) + out)
-        elbow = draw["bend"] + 0.3 * draw["swing"] * np.cos(angle) + stray()
+        elbow = draw["bend"] + 0.3 * draw["swing"] * np.cos(angle) + jitter()
         fore = _unit(_direction(arm + elbow) + 0.3 * out)
         joints[f"{side}_shoulder"] = shoulder
         joints[f"{side}_elbow"] = shoulder + 0.29 * upper
@@ -191,15 +191,15 @@ def _person(
 
 
 def _quadruped(
-    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, stray: Callable[[], np.ndarray]
+    phase: np.ndarray, draw: Mapping[str, float], gait: Gait, jitter: Callable[[], np.ndarray]
 ) -> dict[str, np.ndarray]:
     joints: dict[str, np.ndarray] = {}
     frames = len(phase)
-    nod = draw["bend"] + 0.15 * draw["swing"] * np.cos(2 * phase) + stray()
+    nod = draw["bend"] + 0.15 * draw["swing"] * np.cos(2 * phase) + jitter()
     tail = np.zeros((frames, 3))
     tail[:, 1] = 0.62 + draw["bounce"] * np.cos(2 * phase)
     tail[:, 2] = -0.35
-    slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase) + 0.5 * stray()
+    slope = draw["lean"] + draw["bounce"] * np.sin(2 * phase) + 0.5 * jitter()
     neck = tail + 0.72 * _in_plane(np.sin(slope), np.cos(slope))
     face = _in_plane(np.cos(nod + 0.8), np.sin(nod + 0.8))
     brow = _in_plane(np.sin(nod + 0.8), -np.cos(nod + 0.8))
@@ -216,9 +216,9 @@ def _quadruped(
             (neck, "shoulder", "elbow", "front_paw", fore, -0.1),
         ):
             angle = phase + 2 * np.pi * offset
-            upper = draw["stride"] * np.sin(angle) + 3.0 * start * draw["bend"] + stray()
+            upper = draw["stride"] * np.sin(angle) + 3.0 * start * draw["bend"] + jitter()
             knee = 0.55 * draw["lift"] * _flexion(angle, -0.35) + 4.0 * start * draw["bend"]
-            lower = upper - knee + stray()
+            lower = upper - knee + jitter()
             joints[f"{side}_{first}"] = root + out - np.array([0.0, 0.1, 0.4 * start])
             joints[f"{side}_{second}"] = joints[f"{side}_{first}"] + 0.25 * _direction(upper)
             joints[f"{side}_{third}"] = joints[f"{side}_{second}"] + 0.27 * _direction(lower)

@@ -25,7 +25,7 @@ from probmotion.validation import check_positive
 
 __all__ = ["drop_crowds", "drop_low_quality", "drop_short", "mask_outliers", "mask_uncertain"]
 
-_FEWEST = 3  # detections required for a meaningful median
+_MIN_DETECTIONS = 3  # detections required for a meaningful median
 
 
 def mask_uncertain(tracks: Sequence[KeypointTrack], *, threshold: float = 0.3) -> Step:
@@ -34,9 +34,9 @@ def mask_uncertain(tracks: Sequence[KeypointTrack], *, threshold: float = 0.3) -
     *MAS* uses 0.3 for people, 0.5 for horses and 0.01 for people with a ball.
     """
     check_positive("threshold", threshold)
-    hidden = [track.confidence < threshold for track in tracks]
+    uncertain = [track.confidence < threshold for track in tracks]
     why = f"dropped detections with a confidence below {threshold:g}"
-    return _masked("uncertain", tracks, hidden, why)
+    return _masked("uncertain", tracks, uncertain, why)
 
 
 def mask_outliers(
@@ -50,36 +50,36 @@ def mask_outliers(
     """
     check_positive("distance", distance)
     check_positive("window", window)
-    hidden = [
+    outliers = [
         # Tracks of a single joint have size 0 and no limit.
-        _off_median(track, round(window * track.fps / 2)) > (distance * track_size(track) or np.inf)
+        _median_distance(track, window) > (distance * track_size(track) or np.inf)
         for track in tracks
     ]
     why = f"dropped detections over {distance:g} track sizes from their median in {window:g} s"
-    return _masked("outliers", tracks, hidden, why)
+    return _masked("outliers", tracks, outliers, why)
 
 
 def drop_short(tracks: Sequence[KeypointTrack], *, seconds: float = 1.0) -> Step:
     """Drop tracks shorter than ``seconds`` (number of frames divided by frames per second)."""
     check_positive("seconds", seconds)
     # Tolerance for rounded frame rates: 60 frames of .016666 s count as 1 s.
-    long = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
+    long_enough = [track.frames + 0.01 >= seconds * track.fps for track in tracks]
     why = f"dropped tracks shorter than {seconds:g} s"
-    if tracks and not any(long):
+    if tracks and not any(long_enough):
         longest = max(tracks, key=lambda track: track.frames / track.fps)
         why += (
             f", {math.ceil(seconds * longest.fps - 0.01)} frames at {longest.fps:g} fps; the "
             f"longest track has {longest.frames}"
         )
-    return _selected("short", tracks, long, why)
+    return _selected("short", tracks, long_enough, why)
 
 
 def drop_low_quality(
     tracks: Sequence[KeypointTrack], *, threshold: float = 0.3, share: float = 0.6
 ) -> Step:
-    """Drop tracks with a fraction below ``share`` of entries of confidence ``threshold`` or more.
+    """Drop tracks in which too few joints have a confidence of at least ``threshold``.
 
-    Entries are all joints in all frames of a track; ``share`` is in (0, 1].
+    ``share`` in (0, 1] is the minimum fraction of such joints, counted over all frames.
     """
     check_positive("threshold", threshold)
     _check_fraction("share", share)
@@ -97,8 +97,8 @@ def drop_crowds(
     """Drop tracks that lie largely inside another track's bounding box in the same video.
 
     The overlap of a track with another is the fraction of its box inside the other's box, averaged
-    over the frames in which the track is seen. Of a small person behind a large one, only the track
-    of the small person is dropped.
+    over the frames in which the track is seen. If a small person stands behind a large one, only
+    the track of the small person is dropped.
 
     Parameters
     ----------
@@ -132,20 +132,21 @@ def drop_crowds(
 
 
 def _masked(
-    step: str, tracks: Sequence[KeypointTrack], hidden: Sequence[np.ndarray], why: str
+    step: str, tracks: Sequence[KeypointTrack], dropped: Sequence[np.ndarray], why: str
 ) -> Step:
-    after = [masked(track, entries) for track, entries in zip(tracks, hidden, strict=True)]
+    after = [masked(track, entries) for track, entries in zip(tracks, dropped, strict=True)]
     changed = entries_of(tracks) - entries_of(after)
     return after, StepReport.of(step, tracks, after, why, entries_changed=changed)
 
 
-def _off_median(track: KeypointTrack, side: int) -> np.ndarray:
-    """Return distances (L, J) of entries from their median over ``side`` frames on either side."""
+def _median_distance(track: KeypointTrack, window: float) -> np.ndarray:
+    """Return distances (L, J) of entries from their median in a window of ``window`` seconds."""
+    side = round(window * track.fps / 2)
     visible = seen(track)
     points = np.where(visible[..., np.newaxis], track.keypoints, np.nan)
     padded = np.pad(points, ((side, side), (0, 0), (0, 0)), constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
-    tested = visible & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _FEWEST)
+    tested = visible & (np.isfinite(windows[:, :, 0]).sum(axis=-1) >= _MIN_DETECTIONS)
     medians = np.nanmedian(windows[tested], axis=-1)
     distances = np.zeros(visible.shape)
     distances[tested] = np.linalg.norm(points[tested] - medians, axis=-1)

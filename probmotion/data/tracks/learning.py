@@ -268,8 +268,8 @@ def split_names(
         if unknown := sorted(set(chosen) - names):
             known = ", ".join(sorted(names))
             raise ValueError(f"{part} must name clips among {known}, got {unknown[0]!r}")
-    if twice := sorted(set(validation) & set(test)):
-        raise ValueError(f"validation and test must be disjoint, got {twice[0]!r} in both")
+    if repeated := sorted(set(validation) & set(test)):
+        raise ValueError(f"validation and test must be disjoint, got {repeated[0]!r} in both")
     train = sorted(names - set(validation) - set(test))
     if not train:
         raise ValueError("validation and test must exclude at least one clip for training, got all")

@@ -37,11 +37,11 @@ def centre_tracks(tracks: Sequence[KeypointTrack], *, per: str = "frame") -> Ste
         keypoints = track.keypoints - origin[:, np.newaxis]
         keypoints = np.where((confidence > 0)[..., np.newaxis], keypoints, np.nan)
         centred.append(replace(track, keypoints=keypoints, confidence=confidence))
-    lost = len(tracks) - len(rooted)
+    n_dropped = len(tracks) - len(rooted)
     roots = ", ".join(sorted({t.skeleton.joint_names[t.skeleton.roots[0]] for t in tracks}))
-    why = f"root at the origin per {per}; {lost} tracks never show the root ({roots})"
-    hidden = entries_of(rooted) - entries_of(centred)
-    return centred, StepReport.of("centre", tracks, centred, why, entries_changed=hidden)
+    why = f"root at the origin per {per}; tracks without the root ({roots}): {n_dropped}"
+    changed = entries_of(rooted) - entries_of(centred)
+    return centred, StepReport.of("centre", tracks, centred, why, entries_changed=changed)
 
 
 def mirrored_track(track: KeypointTrack) -> KeypointTrack:

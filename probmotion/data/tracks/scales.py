@@ -37,8 +37,8 @@ def bone_sizes(tracks: Sequence[KeypointTrack]) -> dict[str, float]:
     sizes = {}
     for joint, parent in skeleton.bones:
         bones = [np.diff(track.keypoints[:, [parent, joint]], axis=1)[:, 0] for track in tracks]
-        both = [seen(track)[:, [parent, joint]].all(axis=1) for track in tracks]
-        lengths = np.linalg.norm(np.concatenate(bones)[np.concatenate(both)], axis=-1)
+        visible = [seen(track)[:, [parent, joint]].all(axis=1) for track in tracks]
+        lengths = np.linalg.norm(np.concatenate(bones)[np.concatenate(visible)], axis=-1)
         if len(lengths):
             sizes[skeleton.joint_names[joint]] = float(np.quantile(lengths, _QUANTILE))
     return sizes
@@ -67,9 +67,9 @@ def scale_to_bones(tracks: Sequence[KeypointTrack], sizes: Mapping[str, float]) 
         if ratios:
             factors.append(float(np.median(ratios)))
             scaled.append(replace(track, keypoints=track.keypoints * factors[-1]))
-    lost = len(tracks) - len(scaled)
+    n_dropped = len(tracks) - len(scaled)
     between = f" by {min(factors):.4g} to {max(factors):.4g}" if factors else ""
-    why = f"scaled to the reference bones{between}; {lost} tracks never show one"
+    why = f"scaled to the reference bones{between}; tracks without one: {n_dropped}"
     return scaled, StepReport.of("scale", tracks, scaled, why)
 
 

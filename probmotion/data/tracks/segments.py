@@ -61,8 +61,8 @@ def split_discontinuities(
                 )
             )
     why = (
-        f"cut at {jumps} jumps of over {jump:g} track sizes and at {gaps} gaps of over {unseen:g} "
-        f"s; {n_unseen} tracks were never seen"
+        f"cut at jumps of over {jump:g} track sizes: {jumps}, at gaps of over {unseen:g} s: "
+        f"{gaps}; tracks never seen: {n_unseen}"
     )
     return segments, StepReport.of("segments", tracks, segments, why, tracks_dropped=n_unseen)
 
@@ -73,8 +73,8 @@ def _displacements(track: KeypointTrack, frames: np.ndarray) -> np.ndarray:
     points = np.where(visible[..., np.newaxis], track.keypoints[frames], 0.0)
     centres = points.sum(axis=1) / visible.sum(axis=1)[:, np.newaxis]
     displacements = np.linalg.norm(np.diff(centres, axis=0), axis=-1)
-    both = visible[1:] & visible[:-1]
+    visible = visible[1:] & visible[:-1]
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
-    shared = both.any(axis=1)
-    displacements[shared] = np.nanmedian(np.where(both, steps, np.nan)[shared], axis=1)
+    shared = visible.any(axis=1)
+    displacements[shared] = np.nanmedian(np.where(visible, steps, np.nan)[shared], axis=1)
     return displacements

@@ -15,9 +15,9 @@ from probmotion.validation import check_positive
 
 __all__ = ["fill_gaps", "resample_tracks", "smooth_tracks"]
 
-_HIGHEST_FPS = 10_000
+_MAX_FPS = 10_000
 _ROUNDING = 1e-3  # tolerance of durations, frames, as in probmotion.motion.resampling
-_SAME_TIME = 1e-6  # tolerance of equal times, frames
+_TIME_TOLERANCE = 1e-6  # tolerance of equal times, frames
 _DEGREE = 2  # of the Savitzky–Golay filter
 
 
@@ -78,8 +78,8 @@ def resample_tracks(tracks: Sequence[KeypointTrack], *, fps: float) -> Step:
     frames is seen if it is seen in both; its confidence is interpolated.
     """
     check_positive("fps", fps)
-    if fps > _HIGHEST_FPS:
-        raise ValueError(f"fps must be at most {_HIGHEST_FPS}, got {fps:g}")
+    if fps > _MAX_FPS:
+        raise ValueError(f"fps must be at most {_MAX_FPS}, got {fps:g}")
     resampled = [track if track.fps == fps else _resampled(track, float(fps)) for track in tracks]
     rates = sorted({f"{track.fps:g}" for track in tracks}, key=float)
     why = f"resampled {' and '.join(rates) or 'no'} fps to {fps:g}"
@@ -92,7 +92,7 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
     time = np.minimum(np.arange(frames) * (track.fps / fps), float(last))
     nearest = np.round(time)
     # Frames at the time of an original frame must not depend on a neighbour, which may be unseen.
-    time = np.where(np.abs(time - nearest) < _SAME_TIME, nearest, time)
+    time = np.where(np.abs(time - nearest) < _TIME_TOLERANCE, nearest, time)
     before, after = time.astype(int), np.ceil(time).astype(int)
     weight = (time - before)[:, np.newaxis]
     visible = seen(track)[before] & seen(track)[after]

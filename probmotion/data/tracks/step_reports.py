@@ -78,19 +78,19 @@ def entries_of(tracks: Sequence[KeypointTrack]) -> int:
     return sum(int(seen(track).sum()) for track in tracks)
 
 
-def masked(track: KeypointTrack, hidden: np.ndarray) -> KeypointTrack:
-    """Return a track with the entries ``hidden`` (L, J) marked as unseen."""
+def masked(track: KeypointTrack, entries: np.ndarray) -> KeypointTrack:
+    """Return a track with ``entries`` (L, J) marked as unseen."""
     return replace(
         track,
-        keypoints=np.where(hidden[..., np.newaxis], np.nan, track.keypoints),
-        confidence=np.where(hidden, 0.0, track.confidence),
+        keypoints=np.where(entries[..., np.newaxis], np.nan, track.keypoints),
+        confidence=np.where(entries, 0.0, track.confidence),
     )
 
 
 def boxes_of(track: KeypointTrack) -> np.ndarray:
-    """Return the least and greatest (x, y) of seen joints per frame, (L, 2, 2); NaN if none."""
+    """Return the minimum and maximum (x, y) of seen joints per frame, (L, 2, 2); NaN if none."""
     visible = seen(track)[..., np.newaxis]
-    least = np.where(visible, track.keypoints, np.inf).min(axis=1)
-    greatest = np.where(visible, track.keypoints, -np.inf).max(axis=1)
-    boxes = np.stack([least, greatest], axis=1)
+    minimum = np.where(visible, track.keypoints, np.inf).min(axis=1)
+    maximum = np.where(visible, track.keypoints, -np.inf).max(axis=1)
+    boxes = np.stack([minimum, maximum], axis=1)
     return np.where(visible.any(axis=1, keepdims=True), boxes, np.nan)

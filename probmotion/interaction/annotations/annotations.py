@@ -157,7 +157,7 @@ class Annotations:
     def describe(self) -> str:
         """Return a summary: the number of annotations, occluded joints and dropped frames."""
         occluded = int((~self.visible).sum())
-        text = f"{len(self)} annotations"
+        text = f"{len(self)} annotation{'s' * (len(self) != 1)}"
         text += f", {occluded} of {self.visible.size} joints occluded" if occluded else ""
         dropped = [f"{count} ({why})" for why, count in self.dropped.items() if count]
         return text + (f", frames dropped: {', '.join(dropped)}" if dropped else "")

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["TORSO", "BackboneEstimate", "annotation_views", "lift_torsos"]
 
 # Minimum number of visible torso joints per person; two would leave a rotation undetermined.
-_LEAST_JOINTS = 3
+_MIN_JOINTS = 3
 
 TORSO = {"pelvis", "spine", "chest", "neck", "head"}  # canonical names of the torso joints
 TORSO |= {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
@@ -105,7 +105,7 @@ def lift_torsos(
         )
     torsos = [list(joints) for joints in joints_named(skeleton, TORSO)]
     seen = np.stack([visible[:, joints].sum(axis=-1) for joints in torsos])
-    lifted = np.asarray((seen >= _LEAST_JOINTS).all(axis=0))
+    lifted = np.asarray((seen >= _MIN_JOINTS).all(axis=0))
     shape = (len(keypoints), len(torsos))
     estimate = BackboneEstimate(
         backbones=np.full((*shape, 3), np.nan),

@@ -76,9 +76,9 @@ def chest_joints(skeleton: Skeleton) -> tuple[int, ...]:
 
 def joints_named(skeleton: Skeleton, names: Set[str]) -> tuple[tuple[int, ...], ...]:
     """Return the joints of each tree with a canonical name in ``names``, in the order of roots."""
-    wanted = [j for j, n in enumerate(skeleton.canonical_names) if n.rpartition(":")[2] in names]
+    expected = [j for j, n in enumerate(skeleton.canonical_names) if n.rpartition(":")[2] in names]
     roots = joint_roots(skeleton)
-    return tuple(tuple(j for j in wanted if roots[j] == root) for root in skeleton.roots)
+    return tuple(tuple(j for j in expected if roots[j] == root) for root in skeleton.roots)
 
 
 def valid_frames(frames: np.ndarray) -> np.ndarray:

@@ -76,10 +76,11 @@ def draw_annotations(
     known_views : bool
         Whether the annotations include their true views.
     noise : float
-        Standard deviation of the Gaussian noise of all coordinates and neighbours, metres.
+        Standard deviation of the Gaussian noise of all coordinates, also in the neighbours (the
+        previous and the next frame), metres.
     hidden : float
         Fraction of each person's joints that are occluded, below 1. The joints are drawn for each
-        annotation, and also occluded in its neighbours.
+        annotation and are also occluded in its neighbours.
     """
     skeleton, fps = _common(motions)
     check_count("n", n)

@@ -25,7 +25,7 @@ __all__ = ["BodyFit", "fit_body"]
 _DIRECTIONS = 200  # number of viewing directions in the grid, about 14 degrees apart
 _STEPS = 20  # number of Levenberg-Marquardt steps
 _DAMPING = 1e-3  # initial damping relative to the mean curvature
-_LEAST_DAMPING = 1e-12  # minimum damping relative to the mean curvature
+_MIN_DAMPING = 1e-12  # minimum damping relative to the mean curvature
 _ROWS = 1024  # number of projections per block
 
 
@@ -124,7 +124,7 @@ def _descend(rotations: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[np.nd
         rotations = np.where(better[:, np.newaxis, np.newaxis], trial, rotations)
         residual = np.where(better[:, np.newaxis, np.newaxis], trial_residual, residual)
         squares = np.where(better, trial_squares, squares)
-        damping = np.maximum(np.where(better, damping / 10, damping * 10), _LEAST_DAMPING)
+        damping = np.maximum(np.where(better, damping / 10, damping * 10), _MIN_DAMPING)
     return rotations, squares
 
 

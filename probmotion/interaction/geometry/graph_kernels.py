@@ -82,10 +82,10 @@ def graphs_of_visible(
     the edges (n, E, 2) uint16 and their weights (n, E), which sum to 1 for each graph.
     """
     n, n_joints = visible.shape
-    most = max_edges(n_joints, graph)
+    capacity = max_edges(n_joints, graph)
     n_edges = np.zeros(n, dtype=np.int64)
-    edges = np.zeros((n, most, 2), dtype=np.uint16)
-    weights = np.zeros((n, most))
+    edges = np.zeros((n, capacity, 2), dtype=np.uint16)
+    weights = np.zeros((n, capacity))
     for k in range(n):
         shown = np.flatnonzero(visible[k])
         joints = points[k][shown]

@@ -20,7 +20,7 @@ __all__ = [
 ]  # fmt: skip
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)  # indices into nearest.MEASURES
-_SMALLEST = 1e-300  # avoids division by 0 if there are no edges
+_MIN_TOTAL = 1e-300  # avoids division by 0 if there are no edges
 
 
 class Prepared(NamedTuple):
@@ -169,18 +169,18 @@ def prepare_projection(points: np.ndarray, prepared: Prepared) -> Projection:
     """Return a projection's centred joints and its weighted graph or polar bins."""
     n_joints, joints = points.shape[0], centred(points)
     n_edges = 0
-    most = max_edges(n_joints, prepared.graph) if prepared.measure == INTERACTION else 0
-    edges, weights = np.empty((2, most), dtype=np.uint16), np.empty(most)
+    capacity = max_edges(n_joints, prepared.graph) if prepared.measure == INTERACTION else 0
+    edges, weights = np.empty((2, capacity), dtype=np.uint16), np.empty(capacity)
     bins = np.empty((2, 0, 0))
     if prepared.measure == INTERACTION:
-        rows = np.empty((most, 2), dtype=np.uint16)
+        rows = np.empty((capacity, 2), dtype=np.uint16)
         n_edges, _ = write_graph(points, prepared.graph, prepared.offsets, rows)
         for edge in range(n_edges):
             i, j = rows[edge, 0], rows[edge, 1]
             x, y = joints[0, i] - joints[0, j], joints[1, i] - joints[1, j]
             edges[0, edge], edges[1, edge] = i, j
             weights[edge] = 1.0 / max(prepared.epsilon, np.sqrt(x * x + y * y))
-        total = max(_sum(weights, n_edges), _SMALLEST)
+        total = max(_sum(weights, n_edges), _MIN_TOTAL)
         for edge in range(n_edges):
             weights[edge] /= total
     elif prepared.measure == SHAPE_CONTEXT:

@@ -52,7 +52,7 @@ def context_cost(
     n_joints, n_visible = contexts.shape[0], int(seen.sum())
     if n_visible < 2:
         return np.inf
-    total, n_rows, turned = 0.0, 0, turn * _PER_RADIAN
+    total, n_rows, turn_in_bins = 0.0, 0, turn * _PER_RADIAN
     # The tolerance preserves ties despite rounding errors.
     limit = (best + 1e-9) * n_visible * (n_visible - 1)
     counts = np.empty(contexts.shape[1], dtype=np.uint8)
@@ -62,7 +62,7 @@ def context_cost(
         counts[:] = 0
         for j in range(n_joints):
             if seen[j] > 0 and j != i:
-                sector = np.int64(np.floor(bins[1, i, j] + turned))
+                sector = np.int64(np.floor(bins[1, i, j] + turn_in_bins))
                 # Both angles are in [−π, π], so one turn brings their sum into [0, N_ANGLES).
                 if sector < 0:
                     sector += N_ANGLES

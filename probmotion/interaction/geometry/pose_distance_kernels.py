@@ -21,16 +21,16 @@ _MARGIN = 1.0 + 1e-6
 
 
 @numba.njit(cache=True)
-def cartesian_minima(truths: np.ndarray, draws: np.ndarray, least: np.ndarray) -> None:
-    """Lower ``least`` (G,) to the RMS joint distance of each true pose to its nearest draw."""
+def cartesian_minima(truths: np.ndarray, draws: np.ndarray, minima: np.ndarray) -> None:
+    """Lower ``minima`` (G,) to the RMS joint distance of each true pose to its nearest draw."""
     rotation, horn, difference = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
         for s in range(draws.shape[0]):
             # The sum of squares from the alignment is cheap but less accurate.
-            bound = _MARGIN * least[g] * least[g] * draws.shape[1] + 1e-12
+            bound = _MARGIN * minima[g] * minima[g] * draws.shape[1] + 1e-12
             if align(truths[g], draws[s], rotation, horn) <= bound:
                 square = residual(truths[g], draws[s], rotation, difference)
-                least[g] = min(least[g], math.sqrt(square / draws.shape[1]))
+                minima[g] = min(minima[g], math.sqrt(square / draws.shape[1]))
 
 
 @numba.njit(cache=True)
@@ -43,15 +43,15 @@ def interaction_minima(
     draw_starts: np.ndarray,
     draw_edges: np.ndarray,
     draw_weights: np.ndarray,
-    least: np.ndarray,
+    minima: np.ndarray,
 ) -> None:
-    """Lower ``least`` (G,) to the dissimilarity (eq. 8) of each true pose to its nearest draw."""
+    """Lower ``minima`` (G,) to the dissimilarity (eq. 8) of each true pose to its nearest draw."""
     rotation, horn, difference = np.empty((3, 3)), np.empty((4, 4)), np.empty(draws.shape[1:])
     for g in range(truths.shape[0]):
         truth_slice = slice(truth_starts[g], truth_starts[g + 1])
         for s in range(draws.shape[0]):
             draw_slice = slice(draw_starts[s], draw_starts[s + 1])
-            limit = least[g]
+            limit = minima[g]
             align(truths[g], draws[s], rotation, horn)
             residual(truths[g], draws[s], rotation, difference)
             total = _along(
@@ -61,7 +61,7 @@ def interaction_minima(
                 total = _along(
                     difference, draw_edges[draw_slice], draw_weights[draw_slice], total, limit
                 )
-                least[g] = min(limit, total)
+                minima[g] = min(limit, total)
 
 
 @numba.njit(cache=True)

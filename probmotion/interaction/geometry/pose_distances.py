@@ -1,4 +1,4 @@
-"""Distances of 3D poses, invariant to position and heading (Yin et al. 2018).
+"""Distances between 3D poses, invariant to position and heading (Yin et al. 2018).
 
 The second pose is first rigidly aligned to the first by least squares (no reflection).
 
@@ -30,7 +30,7 @@ _SHORTEST_EDGE = 0.05  # ε of eq. 8, metres
 Measure = tuple[Callable[[np.ndarray], tuple[np.ndarray, ...]], Callable[..., None]]
 """Functions ``prepare`` and ``minima`` of a distance.
 
-``minima(*prepare(truths), *prepare(draws), least)`` lowers ``least`` (n,) to the distance of each
+``minima(*prepare(truths), *prepare(draws), out)`` lowers ``out`` (n,) to the distance of each
 of the truths (n, J, 3) to its nearest draw.
 """
 

@@ -55,8 +55,8 @@ def residual(
     total = 0.0
     for j in range(first.shape[0]):
         for i in range(3):
-            turned = rotation[i, 0] * second[j, 0] + rotation[i, 1] * second[j, 1]
-            difference = first[j, i] - turned - rotation[i, 2] * second[j, 2]
+            rotated = rotation[i, 0] * second[j, 0] + rotation[i, 1] * second[j, 1]
+            difference = first[j, i] - rotated - rotation[i, 2] * second[j, 2]
             differences[j, i] = difference
             total += difference * difference
     return total

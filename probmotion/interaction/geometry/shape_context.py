@@ -97,12 +97,12 @@ def shape_context_distance(
     return np.where(n_visible > 1, mean, np.inf)
 
 
-def shared_table(most: int) -> np.ndarray:
-    """Return ``2 h g / (h + g)`` for counts h, g up to ``most``, shape (most + 1, most + 1).
+def shared_table(max_count: int) -> np.ndarray:
+    """Return ``2 h g / (h + g)`` for counts h, g up to ``max_count``, shape (max_count + 1,) * 2.
 
     For histograms of N counts each, the χ² cost is ``1 − Σ_k 2 h_k g_k / (h_k + g_k) / N``.
     """
-    h, g = np.ogrid[: most + 1, : most + 1]
+    h, g = np.ogrid[: max_count + 1, : max_count + 1]
     return 2.0 * h * g / np.maximum(h + g, 1)
 
 

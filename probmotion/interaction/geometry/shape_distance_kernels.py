@@ -43,37 +43,37 @@ def shape_minima(
     truth_rings: np.ndarray,
     draws: np.ndarray,
     draw_rings: np.ndarray,
-    least: np.ndarray,
+    minima: np.ndarray,
 ) -> None:
-    """Lower ``least`` (G,) to the mean χ² cost of each true pose and its nearest draw.
+    """Lower ``minima`` (G,) to the mean χ² cost of each true pose and its nearest draw.
 
     Draws are rotated onto the true pose, which defines the vertical.
     """
     n_joints = truths.shape[1]
     gains = _gains(n_joints - 1)
-    rotation, horn, turned = np.empty((3, 3)), np.empty((4, 4)), np.empty((n_joints, 3))
+    rotation, horn, rotated = np.empty((3, 3)), np.empty((4, 4)), np.empty((n_joints, 3))
     contexts = np.empty((n_joints, _N_BINS), dtype=np.uint8)
     counts, bins = np.zeros(_N_BINS, dtype=np.uint8), np.empty(n_joints, dtype=np.int64)
-    spare = np.empty(n_joints)
+    rest = np.empty(n_joints)
     for g in range(truths.shape[0]):
         _fill_contexts(truths[g], contexts, bins)
         for s in range(draws.shape[0]):
-            if _ring_costs(truth_rings[g], draw_rings[s], gains, spare) > least[g] + _TOLERANCE:
+            if _ring_costs(truth_rings[g], draw_rings[s], gains, rest) > minima[g] + _TOLERANCE:
                 continue
             align(truths[g], draws[s], rotation, horn)
-            _turn(draws[s], rotation, turned)
-            cost = _cost(turned, contexts, gains, spare, least[g], counts, bins)
-            least[g] = min(least[g], cost)
+            _turn(draws[s], rotation, rotated)
+            cost = _cost(rotated, contexts, gains, rest, minima[g], counts, bins)
+            minima[g] = min(minima[g], cost)
 
 
 @numba.njit(cache=True)
-def _gains(most: int) -> np.ndarray:
+def _gains(max_count: int) -> np.ndarray:
     """Return the cost decrease [h, k] by the k-th joint in a bin with h of the other pose."""
-    gains = np.zeros((most + 1, most + 1))
-    for h in range(1, most + 1):
-        for k in range(1, most + 1):
+    gains = np.zeros((max_count + 1, max_count + 1))
+    for h in range(1, max_count + 1):
+        for k in range(1, max_count + 1):
             before = 2.0 * h * (k - 1) / (h + k - 1)
-            gains[h, k] = (2.0 * h * k / (h + k) - before) / (most * (most + 1))
+            gains[h, k] = (2.0 * h * k / (h + k) - before) / (max_count * (max_count + 1))
     return gains
 
 
@@ -187,10 +187,10 @@ def _octant(across: float, along: float) -> int:
 
 
 @numba.njit(cache=True)
-def _turn(joints: np.ndarray, rotation: np.ndarray, turned: np.ndarray) -> None:
+def _turn(joints: np.ndarray, rotation: np.ndarray, rotated: np.ndarray) -> None:
     for j in range(joints.shape[0]):
         for i in range(3):
-            turned[j, i] = (
+            rotated[j, i] = (
                 rotation[i, 0] * joints[j, 0]
                 + rotation[i, 1] * joints[j, 1]
                 + rotation[i, 2] * joints[j, 2]

@@ -39,10 +39,10 @@ __all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
 
 _CHAINS = 4  # per run
 _RHAT = 1.01  # maximum R-hat
-_LEAST = 4000  # minimum number of draws of both runs before thinning
+_MIN_RUN_DRAWS = 4000  # minimum number of draws of both runs before thinning
 _PROBES = 4  # points of the fingerprint of unfinished runs
 _DIRECTIONS = 128  # random projections of the sliced Wasserstein distance
-_SPREADS, _RATIO = 5.0, 1.5  # limits of the distance: standard deviations, least ratio
+_DEVIATIONS, _MIN_RATIO_LIMIT = 5.0, 1.5  # limits of the distance: deviations, minimum
 _LEVEL = 1e-3  # significance level of the test of means
 _CONSTANT = 1e-9  # range or standard deviation of constant coordinates, metres
 
@@ -100,8 +100,8 @@ def make_reference(
     if problem.exact_source is not None:
         sampler = load_sampler("exact")()
     elif sampler is None:
-        sampler = _long_run(problem)
-    n = max(draws, _LEAST) // 2
+        sampler = _default_sampler(problem)
+    n = max(draws, _MIN_RUN_DRAWS) // 2
     folder = None if unfinished is None else writable_folder(Path(unfinished))
     key = [problem.name, fingerprint, sampler.name, settings_of(sampler), n, seed]
     runs = []
@@ -111,7 +111,7 @@ def make_reference(
     return certify(problem, runs, seed, draws)
 
 
-def _long_run(problem: Problem) -> Sampler:
+def _default_sampler(problem: Problem) -> Sampler:
     samplers: list[OutlierGibbs | TemperedPairs] = [OutlierGibbs(), TemperedPairs()]
     for sampler in samplers:
         if sampler.draws_from(problem.posterior):
@@ -179,7 +179,7 @@ def certify(
     aligned = [align_motions(positions, world[0][0, 0]) for positions in world]
     diagnostics = [chain_diagnostics(run) for run in runs]
     # After alignment a rigid body leaves only rounding errors.
-    deforms = not _alike(aligned)
+    deforms = not _are_equal(aligned)
     if deforms:
         for run, positions in zip(runs, aligned, strict=True):
             flat = positions.reshape(*positions.shape[:2], -1)
@@ -213,8 +213,8 @@ def certify(
         # None if chains start at draws from the prior.
         "seeds": len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None,
         "rhat": max(rhats, default=None),
-        "ess_bulk": _least(diagnostics, "ess_bulk"),
-        "ess_tail": _least(diagnostics, "ess_tail"),
+        "ess_bulk": _minimum(diagnostics, "ess_bulk"),
+        "ess_tail": _minimum(diagnostics, "ess_tail"),
         "agreement": agreed,
         "agreement_wherever_they_stand": agreed_after_alignment,
         "seed": seed,
@@ -236,7 +236,7 @@ def _agreed(name: str, runs: list[np.ndarray], seed: int) -> dict[str, float]:
     return agreed
 
 
-def _alike(aligned: list[np.ndarray]) -> bool:
+def _are_equal(aligned: list[np.ndarray]) -> bool:
     flat = np.concatenate([run.reshape(-1, *run.shape[-3:]) for run in aligned])
     return bool(np.ptp(flat, axis=0).max() < _CONSTANT)
 
@@ -250,7 +250,7 @@ def _is_rigid(problem: Problem) -> bool:
         else prior.motion(rng.standard_normal((8, problem.posterior.dim)))
     )
     positions = to_numpy(drawn)
-    return _alike([align_motions(positions, positions[0])])
+    return _are_equal([align_motions(positions, positions[0])])
 
 
 def _thinned(run: MotionDraws, draws: int | None) -> np.ndarray:
@@ -263,8 +263,8 @@ def _thinned(run: MotionDraws, draws: int | None) -> np.ndarray:
 def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, float]:
     """Return the discrepancy of two runs and its limits.
 
-    - ``swd_ratio``: sliced Wasserstein distance of the runs, relative to its mean over splits of
-      all chains into halves with chains of both runs; ``swd_ratio_at_most`` is 1 plus five
+    - ``swd_ratio``: sliced Wasserstein distance between the runs, relative to its mean over splits
+      of all chains into halves with chains of both runs; ``swd_ratio_at_most`` is 1 plus five
       relative standard deviations over these splits, but at least 1.5
     - ``mean_z``: largest difference of means in standard errors, given effective sample sizes;
       ``mean_z_at_most`` is exceeded with probability 0.001 if the distributions are equal
@@ -286,7 +286,7 @@ def agreement(first: np.ndarray, second: np.ndarray, *, seed: int) -> dict[str, 
     z = _z_scores(*(run[..., varies] for run in runs))
     return {
         "swd_ratio": _sliced_distance(projected, tuple(range(chains))) / floor,
-        "swd_ratio_at_most": max(_RATIO, 1 + _SPREADS * float(np.std(halves)) / floor),
+        "swd_ratio_at_most": max(_MIN_RATIO_LIMIT, 1 + _DEVIATIONS * float(np.std(halves)) / floor),
         "mean_z": float(np.abs(z).max()),
         "mean_z_at_most": float(norm.isf(0.5 * _LEVEL / len(z))),
     }
@@ -320,6 +320,6 @@ def _z_scores(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return difference / np.sqrt(variance)
 
 
-def _least(diagnostics: list[dict[str, float]], name: str) -> float | None:
+def _minimum(diagnostics: list[dict[str, float]], name: str) -> float | None:
     values = [diagnostic[name] for diagnostic in diagnostics if name in diagnostic]
     return min(values) if values and all(map(math.isfinite, values)) else None

@@ -18,7 +18,7 @@ from probmotion.interaction.geometry.nearest_kernels import (
 )
 from probmotion.models.pose_pairs.joint_limits_kernels import LimitArrays, project_poses
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
-from probmotion.problems.references.pair_moves import Body, log_places
+from probmotion.problems.references.pair_moves import Body, log_root_positions
 
 __all__ = [
     "Physics",
@@ -87,17 +87,17 @@ def log_prior(parts: np.ndarray, physics: Physics) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def log_view(
-    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, least: float
+    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations, lower_bound: float
 ) -> float:
     """Return log L(Θ_v; v) of the pose Θ_v in a view v: −d²/2σ_l² (eq. 9).
 
-    d is the distance to the nearest annotation. Returns −∞ below ``least``, to terminate early.
+    d is the distance to the nearest annotation. Values below ``lower_bound`` are returned as −∞.
     """
     distance, nearest = nearest_candidate(
         project_to_view(pose, view, body, views),
         views.near[view],
         views.prepared,
-        views.noise * np.sqrt(-2.0 * least),
+        views.noise * np.sqrt(-2.0 * lower_bound),
     )
     return -0.5 * (distance / views.noise) ** 2 if nearest >= 0 else -np.inf
 
@@ -160,7 +160,7 @@ def log_measure(pose: np.ndarray, body: Body) -> float:
                 square += (pose[joint, i] - pose[parent, i]) ** 2
                 seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
             lengths += (0.5 * np.log(square / seed_square)) ** 2
-    return log_places(pose, body) - 0.5 * lengths / body.bone_noise**2
+    return log_root_positions(pose, body) - 0.5 * lengths / body.bone_noise**2
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,14 +19,14 @@ __all__ = [
     "STRETCH",
     "TURN",
     "Body",
-    "log_places",
+    "log_root_positions",
     "moves_of",
     "propose",
     "resample_placement",
 ]
 
 SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)  # kinds of moves of propose
-_ANY_ANGLE = 0.3
+_UNIFORM_ANGLES = 0.3
 """Probability of a uniform angle for cranks and hinges."""
 
 
@@ -107,7 +107,7 @@ def propose(
                 proposed[k] += vector
     else:
         angle = vector[0]
-        if rng.random() < _ANY_ANGLE:
+        if rng.random() < _UNIFORM_ANGLES:
             angle = np.pi * (2.0 * rng.random() - 1.0)
         # Rotation about the line between two joints preserves both bone lengths.
         axis = pose[other] - pose[parent if kind == CRANK else joint]
@@ -138,23 +138,23 @@ def resample_placement(
     for i in range(3):
         new[i] = start[i] + body.root_noise / np.sqrt(n_roots) * rng.standard_normal()
     turn = np.empty((3, 3))
-    _any_rotation(rng, turn)
+    _random_rotation(rng, turn)
     # The centre is drawn from its conditional; only relative root positions affect acceptance.
     before, after = 0.0, 0.0
     for root in body.roots:
         for i in range(3):
-            turned = 0.0
+            rotated = 0.0
             for m in range(3):
-                turned += turn[i, m] * (pose[root, m] - middle[m])
+                rotated += turn[i, m] * (pose[root, m] - middle[m])
             relative = body.seed[root, i] - start[i]
             before += (pose[root, i] - middle[i] - relative) ** 2
-            after += (turned - relative) ** 2
+            after += (rotated - relative) ** 2
     log_ratio = 0.5 * (before - after) / body.root_noise**2
     if -rng.standard_exponential() < log_ratio:
-        parts[0] -= log_places(pose, body)
+        parts[0] -= log_root_positions(pose, body)
         _turn_about(pose, np.ones(len(pose), dtype=np.bool_), middle, turn)
         pose += new - middle
-        parts[0] += log_places(pose, body)
+        parts[0] += log_root_positions(pose, body)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -172,19 +172,19 @@ def _rotation(vector: np.ndarray, turn: np.ndarray) -> None:
     angle = np.sqrt((vector**2).sum())
     half = 0.5 * angle
     scale = np.sin(half) / angle if angle > 1e-12 else 0.5
-    _of_quaternion(np.cos(half), scale * vector[0], scale * vector[1], scale * vector[2], turn)
+    _write_rotation(np.cos(half), scale * vector[0], scale * vector[1], scale * vector[2], turn)
 
 
 @numba.njit(cache=True, nogil=True)
-def _any_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
+def _random_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
     w, x = rng.standard_normal(), rng.standard_normal()
     y, z = rng.standard_normal(), rng.standard_normal()
     size = np.sqrt(w * w + x * x + y * y + z * z)
-    _of_quaternion(w / size, x / size, y / size, z / size, turn)
+    _write_rotation(w / size, x / size, y / size, z / size, turn)
 
 
 @numba.njit(cache=True, nogil=True)
-def _of_quaternion(w: float, x: float, y: float, z: float, R: np.ndarray) -> None:
+def _write_rotation(w: float, x: float, y: float, z: float, R: np.ndarray) -> None:
     # Row assignments would increase compile time by three seconds.
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
@@ -192,7 +192,7 @@ def _of_quaternion(w: float, x: float, y: float, z: float, R: np.ndarray) -> Non
 
 
 @numba.njit(cache=True, nogil=True)
-def log_places(pose: np.ndarray, body: Body) -> float:
+def log_root_positions(pose: np.ndarray, body: Body) -> float:
     """Return the log density of the root positions, 0 at the seed."""
     total = 0.0
     for root in body.roots:

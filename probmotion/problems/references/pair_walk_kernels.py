@@ -59,14 +59,14 @@ def walk(
     for done in range(0, n_steps, _SURROGATE_STEPS):
         new_pose[:], new_parts[:] = pose, parts
         chosen = _draw_index(power * logs, rng) if power > 0 else 0
-        gained = _surrogate_walk(
+        log_gain = _surrogate_walk(
             new_pose, new_parts, view, views.near[view, chosen], power,
             min(_SURROGATE_STEPS, n_steps - done), moves, sizes, tried, taken, body, physics,
             views, rng,
         )  # fmt: skip
         if power > 0:
             log_annotations(new_pose, view, body, views, new_logs)
-            ratio = power * (new_logs[chosen] - logs[chosen] - gained)
+            ratio = power * (new_logs[chosen] - logs[chosen] - log_gain)
             ratio += _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
             if not -rng.standard_exponential() < ratio:
                 continue
@@ -80,9 +80,9 @@ def walk(
     for _ in range(_VIEW_PROPOSALS):
         # Draw the acceptance threshold first, to terminate the evaluation early.
         other = int(rng.random() * len(views.vectors))
-        least = log_l - rng.standard_exponential() / power
-        other_log_l = log_view(pose, other, body, views, least)
-        if other_log_l >= least:
+        lower_bound = log_l - rng.standard_exponential() / power
+        other_log_l = log_view(pose, other, body, views, lower_bound)
+        if other_log_l >= lower_bound:
             view, log_l = other, other_log_l
     return view, log_l
 
@@ -123,13 +123,13 @@ def _surrogate_walk(
         if not -rng.standard_exponential() < new_parts[0] - parts[0] + power * (new - current):
             continue
         new_parts[1] = log_penetration(proposed, physics)
-        least = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
+        lower_bound = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
         # Joint limits only decrease the density, so penetration alone may suffice to reject.
-        if new_parts[1] < least:
+        if new_parts[1] < lower_bound:
             continue
         if kind != TURN and kind != SHIFT:
             write_limit_terms(proposed, body.person[joint], physics, new_parts)
-        if not log_prior(new_parts, physics) - new_parts[0] >= least:
+        if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
             continue
         pose[:], parts[:], current = proposed, new_parts, new
         taken[number] += 1

@@ -54,11 +54,11 @@ from probmotion.validation import check_count
 
 __all__ = ["TemperedPairs"]
 
-_ACCEPTED = 0.3  # Target acceptance rate of the moves.
-_FIRST_SIZE = 0.1  # Initial step size of every move.
-_LARGEST_SIZE = math.e  # Maximum step size.
-_FIRST_ROUND = 16  # Number of exchanges before the powers are first tuned.
-_SMALLEST_POWER = 1e-5  # Smallest positive power before tuning.
+_TARGET_ACCEPTANCE = 0.3  # Target acceptance rate of the moves.
+_INITIAL_SIZE = 0.1  # Initial step size of every move.
+_MAX_SIZE = math.e  # Maximum step size.
+_INITIAL_ROUND = 16  # Number of exchanges before the powers are first tuned.
+_MIN_POWER = 1e-5  # Smallest positive power before tuning.
 _STATE = (  # Stored attributes of a chain, and those of the truncated state.
     "poses", "parts", "seen", "views", "powers", "log_sizes", "tried", "taken", "rejected", "asked",
     "odd", "been_down", "round_trips", "evaluations",
@@ -93,7 +93,7 @@ class TemperedPairs:
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
         check_count("steps", self.steps)
-        check_count("warmup", self.warmup, least=_FIRST_ROUND)
+        check_count("warmup", self.warmup, least=_INITIAL_ROUND)
         check_count("thin", self.thin)
 
     def draws_from(self, posterior: MotionPosterior) -> bool:
@@ -102,7 +102,7 @@ class TemperedPairs:
             type(posterior) in (MotionPosterior, TruncatedPosterior)
             and type(posterior.prior) is PosePairPrior
             and type(posterior.likelihood) is AnnotatedPairs
-            and _hidden(posterior) == 0
+            and _n_occluded(posterior) == 0
         )
 
     def sample(
@@ -126,7 +126,7 @@ class TemperedPairs:
             raise ValueError(
                 "posterior must have PosePairPrior and AnnotatedPairs without occluded joints, got "
                 f"{type(posterior.prior).__name__} and {type(posterior.likelihood).__name__} with "
-                f"{_hidden(posterior)} occluded joints"
+                f"{_n_occluded(posterior)} occluded joints"
             )
         if initial is not None:
             raise ValueError(f"initial must be None, got {type(initial).__name__}")
@@ -183,9 +183,9 @@ class _Ladder:
         self.sampler, self.arrays, self.rng = sampler, arrays, rng
         body, physics, views = arrays
         levels = sampler.levels
-        self.powers = np.concatenate([[0.0], np.geomspace(_SMALLEST_POWER, 1.0, levels - 1)])
+        self.powers = np.concatenate([[0.0], np.geomspace(_MIN_POWER, 1.0, levels - 1)])
         self.moves = moves_of(body)
-        self.log_sizes = np.full((levels, len(self.moves)), math.log(_FIRST_SIZE))
+        self.log_sizes = np.full((levels, len(self.moves)), math.log(_INITIAL_SIZE))
         self.tried, self.taken = np.zeros_like(self.log_sizes), np.zeros_like(self.log_sizes)
         pose = prior.seed[chain % len(prior.seed)]
         self.poses = np.repeat(pose[None], levels, axis=0)
@@ -196,7 +196,7 @@ class _Ladder:
         # Log likelihood of the view of each level.
         self.seen = np.array([log_view(pose, view, body, views, -np.inf) for view in self.views])
         truncated = isinstance(posterior, TruncatedPosterior) and posterior.truncated
-        self.cut = _Cut(self, posterior) if truncated else None
+        self.cut = _TruncatedState(self, posterior) if truncated else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
         self.odd = False
         # Whether a state has been at power 0 since it was last at power 1.
@@ -247,13 +247,13 @@ class _Ladder:
 
     def _warm_up(self, stop: Event) -> None:
         """Tune step sizes after every exchange and powers after rounds of growing length."""
-        end_of_round = length = _FIRST_ROUND
+        end_of_round = length = _INITIAL_ROUND
         for number in range(1, self.sampler.warmup + 1):
             self._exchange_after_walking(stop)
             tried = self.tried > 0
-            surplus = self.taken / np.where(tried, self.tried, 1) - _ACCEPTED
+            surplus = self.taken / np.where(tried, self.tried, 1) - _TARGET_ACCEPTANCE
             change = np.where(tried, 2 * surplus, 0.0) / math.sqrt(number)
-            self.log_sizes = np.minimum(self.log_sizes + change, math.log(_LARGEST_SIZE))
+            self.log_sizes = np.minimum(self.log_sizes + change, math.log(_MAX_SIZE))
             self.tried[:], self.taken[:] = 0, 0
             if number == end_of_round:
                 self._set_powers()
@@ -311,7 +311,7 @@ class _Ladder:
         self.been_down[-1] = False
 
 
-class _Cut:
+class _TruncatedState:
     """State that targets the truncated density f* and is exchanged with the state at power 1.
 
     The ratio f*/f is 0 for f below the floor, cap/f for f above the cap, and 1 otherwise.
@@ -386,7 +386,7 @@ def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, ViewAnnotati
     return body, physics, views
 
 
-def _hidden(posterior: MotionPosterior) -> int:
+def _n_occluded(posterior: MotionPosterior) -> int:
     """Return the number of occluded annotated joints."""
     annotations = getattr(posterior.likelihood, "annotations", None)
     return 0 if annotations is None else int((~annotations.visible).sum())

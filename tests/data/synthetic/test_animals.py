@@ -37,12 +37,12 @@ def synthetic():
 
 
 def bend(clip, upper, middle, lower):
-    """Return how far the middle joint is in front of the line between the others, metres."""
+    """Return the distance of the middle joint in front of the line between the others, metres."""
     top, joint, end = (path_of(clip, name) for name in (upper, middle, lower))
     trunk = path_of(clip, "neck") - path_of(clip, "pelvis")
     forward = trunk * [1.0, 0.0, 1.0] / np.linalg.norm(trunk[:, [0, 2]], axis=-1)[:, None]
-    share = ((joint - top) * (end - top)).sum(-1) / ((end - top) ** 2).sum(-1)
-    return ((joint - top - share[:, None] * (end - top)) * forward).sum(axis=-1)
+    fraction = ((joint - top) * (end - top)).sum(-1) / ((end - top) ** 2).sum(-1)
+    return ((joint - top - fraction[:, None] * (end - top)) * forward).sum(axis=-1)
 
 
 def assert_quadruped(clip):
@@ -60,7 +60,7 @@ def assert_quadruped(clip):
     for part in ("hip", "shoulder"):
         left = path_of(clip, f"left_{part}") - path_of(clip, f"right_{part}")
         assert left[0, 0] > 0.05
-        # forward × left is up: no clip is mirrored or upside down.
+        # The vector forward × left points up, so no clip is mirrored or upside down.
         assert (np.cross(trunk, left)[:, 1] > 0).all()
     for paw in PAWS:
         assert -0.08 < path_of(clip, paw)[:, 1].min() < 0.08, paw
@@ -124,13 +124,13 @@ def test_dogs_move_as_in_their_cycles(dogs, real_data):
             begin, end = clip.positions[[number * period, (number + 1) * period], 0]
             step = np.linalg.norm((end - begin)[[0, 2]])
             assert step == pytest.approx(travel, abs=1e-6)
-        # Dogs run the way they face.
+        # Dogs run forwards.
         if clip.name != "dog3d_spin":
             assert clip.positions[-1, 0, 2] > 0.95 * travel / period * (clip.frames - 1)
-        # The first cycle is that of the file, rotated, with corrections of centimetres.
+        # The first cycle is that of the file, rotated and corrected by a few centimetres.
         first = clip.positions[: source.frames]
-        moved = source.retarget(ANIMAL_SKELETON).positions
-        heights = first[..., 1] - moved[..., 1]
+        recorded = source.retarget(ANIMAL_SKELETON).positions
+        heights = first[..., 1] - recorded[..., 1]
         assert np.sqrt((heights**2).mean()) < 0.03
 
 

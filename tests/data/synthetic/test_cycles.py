@@ -9,7 +9,7 @@ from probmotion.data.synthetic.cycles import repeated_cycle
 
 
 def sway(frames, degrees=50.0, miss=0.1):
-    """Return a cycle of a trunk with sides and tail that walks a 1 m arc, with a mismatch."""
+    """Return a cycle of a trunk that walks a 1 m arc; its end misses its start by ``miss``."""
     skeleton = Skeleton(
         ["pelvis", "tail", "left_hip", "right_hip", "chest", "neck"], [-1, 0, 0, 0, 0, 4]
     )
@@ -32,7 +32,7 @@ def sway(frames, degrees=50.0, miss=0.1):
 
 
 def test_mismatch_is_distributed_evenly():
-    # About fixed axes the correction is exactly the added drift.
+    # With fixed rotation axes, the correction removes exactly the added drift.
     positions = repeated_cycle(sway(21, degrees=0, miss=0.3), 41).positions
     closed = sway(21, degrees=0, miss=0).positions
     np.testing.assert_allclose(positions[:21], closed, atol=1e-12)
@@ -44,10 +44,10 @@ def test_cycles_are_rigid_motions_of_the_first():
     cycle = sway(period + 1)
     clip = repeated_cycle(cycle, 3 * period + 5)
     first = clip.positions[: period + 1]
-    turn = Rotation.from_rotvec([0.0, np.radians(50), 0.0])
+    yaw = Rotation.from_rotvec([0.0, np.radians(50), 0.0])
     for number in (1, 2):
         later = clip.positions[number * period : (number + 1) * period + 1]
-        expected = (turn**number).apply((first - first[0, 0]).reshape(-1, 3)).reshape(first.shape)
+        expected = (yaw**number).apply((first - first[0, 0]).reshape(-1, 3)).reshape(first.shape)
         np.testing.assert_allclose(later - later[0, 0], expected, atol=2e-2)
     # Every cycle turns by the same angle.
     heading = clip.positions[:, 2] - clip.positions[:, 3]
@@ -64,9 +64,9 @@ def test_groups_stay_rigid_and_seams_are_smooth():
     period = 20
     cycle = sway(period + 1)
     clip = repeated_cycle(cycle, 4 * period)
-    some, others = np.array([*cycle.skeleton.bones, (1, 2), (2, 3)]).T
-    lengths = np.linalg.norm(clip.positions[:, some] - clip.positions[:, others], axis=-1)
-    expected = np.linalg.norm(cycle.positions[0, some] - cycle.positions[0, others], axis=-1)
+    joints, others = np.array([*cycle.skeleton.bones, (1, 2), (2, 3)]).T
+    lengths = np.linalg.norm(clip.positions[:, joints] - clip.positions[:, others], axis=-1)
+    expected = np.linalg.norm(cycle.positions[0, joints] - cycle.positions[0, others], axis=-1)
     np.testing.assert_allclose(lengths, np.tile(expected, (clip.frames, 1)), atol=1e-12)
     bends = np.linalg.norm(np.diff(clip.positions, n=2, axis=0), axis=-1).max(axis=-1)
     within = np.linalg.norm(np.diff(cycle.positions, n=2, axis=0), axis=-1).max()

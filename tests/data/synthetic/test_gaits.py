@@ -7,7 +7,7 @@ from probmotion.data.synthetic.gaits import GAITS, make_gait, make_gaits
 
 
 @pytest.mark.parametrize("style", list(GAITS))
-def test_bodies_have_rigid_bones_are_upright_and_walk_forwards(style):
+def test_bodies_are_rigid_and_upright_and_walk_forwards(style):
     clip = make_gait(style, 1, frames=60)
     positions, skeleton = clip.positions, clip.skeleton
     joint, parent = np.array(skeleton.bones).T
@@ -16,7 +16,7 @@ def test_bodies_have_rigid_bones_are_upright_and_walk_forwards(style):
     np.testing.assert_allclose(lengths, lengths[[0]].repeat(60, axis=0), rtol=1e-9)
     root = positions[:, skeleton.roots[0]]
     assert -0.15 < positions[..., 1].min() < positions[..., 1].max() < 2.0
-    # Moves and faces towards +Z at the start.
+    # At the start the body moves and faces towards +Z.
     assert root[5, 2] > root[0, 2]
     assert positions[0, skeleton.index("nose"), 2] > root[0, 2]
     left, right = (positions[0, skeleton.index(f"{side}_hip"), 0] for side in ("left", "right"))
@@ -41,9 +41,9 @@ def test_opposite_legs_swing_in_opposite_phase():
 
 
 def test_clip_does_not_depend_on_other_clips():
-    many = {clip.name: clip for clip in make_gaits(50, seed=3)}
-    np.testing.assert_array_equal(many["run-4"].positions, make_gait("run", 4, seed=3).positions)
-    assert not np.array_equal(many["run-4"].positions, make_gait("run", 4, seed=4).positions)
+    clips = {clip.name: clip for clip in make_gaits(50, seed=3)}
+    np.testing.assert_array_equal(clips["run-4"].positions, make_gait("run", 4, seed=3).positions)
+    assert not np.array_equal(clips["run-4"].positions, make_gait("run", 4, seed=4).positions)
 
 
 def test_default_style_frequencies():

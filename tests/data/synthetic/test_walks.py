@@ -1,4 +1,4 @@
-"""Walking clips: held-out clips are no copies of training clips."""
+"""Walking clips for training and evaluation: held-out clips are not excerpts of others."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_parts_are_disjoint(walks, tmp_path):
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_held_out_clips_are_similar_to_training_clips_but_no_excerpts(walks, mirrored):
+def test_held_out_clips_resemble_training_clips_but_are_not_excerpts(walks, mirrored):
     for clip in walks["validation"] + walks["test"]:
         distance = np.median(nearest(clip, walks["train"], mirrored))
         assert distance > 0.02, clip.name
@@ -73,7 +73,7 @@ def test_synthetic_walks_are_reproducible_and_distinct():
         assert np.median(nearest(clip, others)) > 0.01
 
 
-def test_quadruped_joints_give_quadrupeds():
+def test_quadruped_skeletons_yield_quadruped_walks():
     horse = Skeleton.preset("apt36k17")
     (clip,) = synthetic_walks(1, horse, seconds=1)
     assert clip.name.startswith("quadruped-walk")

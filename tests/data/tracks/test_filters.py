@@ -20,7 +20,7 @@ CORNERS = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
 
 
 def square(frames=10, at=(0, 0), side=1.0, **more):
-    """Return a static square with its least corner at ``at``."""
+    """Return a static square with the corner of least x and y at ``at``."""
     keypoints = np.tile(CORNERS * side + at, (frames, 1, 1))
     settings = {"fps": 10.0, "name": "square"} | more
     return KeypointTrack(keypoints, np.full((frames, 4), 0.9), SQUARE, **settings)
@@ -30,10 +30,10 @@ def test_uncertain_detections_are_dropped():
     confidence = np.full((10, 4), 0.9)
     confidence[0], confidence[1, 2] = 0.3, 0.29
     (track,), report = mask_uncertain([replace(square(), confidence=confidence)], threshold=0.3)
-    hidden = np.zeros((10, 4), dtype=bool)
-    hidden[1, 2] = True
-    np.testing.assert_array_equal(np.isnan(track.keypoints).all(-1), hidden)
-    np.testing.assert_array_equal(track.confidence, np.where(hidden, 0, confidence))
+    masked = np.zeros((10, 4), dtype=bool)
+    masked[1, 2] = True
+    np.testing.assert_array_equal(np.isnan(track.keypoints).all(-1), masked)
+    np.testing.assert_array_equal(track.confidence, np.where(masked, 0, confidence))
     assert report.entries_changed == 1
 
 
@@ -64,12 +64,12 @@ def test_crowd_keeps_the_large_person():
     inside = square(at=(1, 1), name="video 1")  # a sixteenth of the large one
     beside = square(at=(3.75, 0), name="video 2")  # a quarter inside
     other = square(at=(1, 1), name="another 0")
-    never = replace(square(name="video 3"), confidence=np.zeros((10, 4)))
-    tracks = [large, inside, beside, other, never]
-    assert drop_crowds(tracks, overlap=0.3)[0] == [large, beside, other, never]
+    undetected = replace(square(name="video 3"), confidence=np.zeros((10, 4)))
+    tracks = [large, inside, beside, other, undetected]
+    assert drop_crowds(tracks, overlap=0.3)[0] == [large, beside, other, undetected]
     assert drop_crowds(tracks, overlap=1.0)[0] == tracks
     # The order does not matter.
-    assert drop_crowds(tracks[::-1], overlap=0.2)[0] == [never, other, large]
+    assert drop_crowds(tracks[::-1], overlap=0.2)[0] == [undetected, other, large]
 
 
 def test_crowd_of_twins_is_dropped_and_views_are_not():
@@ -81,8 +81,8 @@ def test_crowd_of_twins_is_dropped_and_views_are_not():
     assert drop_crowds([twins[0], square(11, name="walk 1")])[1].tracks_dropped == 0
 
 
-def test_overlap_is_averaged_over_seen_frames():
-    """The overlap of a track seen in 4 frames with one present in 1 of them is 1/4."""
+def test_overlap_is_averaged_over_frames_with_detections():
+    """The first track has detections in 4 frames, the second in 1 of them: the overlap is 1/4."""
     first, second = np.zeros((2, 10, 4))
     first[:4], second[3:] = 0.9, 0.9
     tracks = [replace(square(name=f"v {c[0, 0]}"), confidence=c) for c in (first, second)]

@@ -37,20 +37,20 @@ def test_retargeting_detector_layouts(layout, derived):
             names = [f"left_{part}", f"right_{part}"]
         sources = [track.skeleton.index(source) for source in names]
         middle = track.keypoints[:, sources].mean(axis=1)
-        least = track.confidence[:, sources].min(axis=1)
+        lowest = track.confidence[:, sources].min(axis=1)
         np.testing.assert_allclose(person.keypoints[:, joint], middle)
-        np.testing.assert_array_equal(person.confidence[:, joint], least)
+        np.testing.assert_array_equal(person.confidence[:, joint], lowest)
 
 
 def test_joint_names_take_precedence_over_canonical_names():
     track = detections("coco17")
     assert retarget_track(track, track.skeleton) is track
     names = track.skeleton.joint_names[::-1]
-    turned = retarget_track(track, Skeleton(names, [-1] * 17))
-    np.testing.assert_array_equal(turned.keypoints, track.keypoints[:, ::-1])
-    odd = Skeleton(["LKnee", "left_knee"], [-1, 0])
-    pair = KeypointTrack(track.keypoints[:, :2], track.confidence[:, :2], odd, 30)
-    for joint, name in enumerate(odd.joint_names):
+    reordered = retarget_track(track, Skeleton(names, [-1] * 17))
+    np.testing.assert_array_equal(reordered.keypoints, track.keypoints[:, ::-1])
+    ambiguous = Skeleton(["LKnee", "left_knee"], [-1, 0])
+    pair = KeypointTrack(track.keypoints[:, :2], track.confidence[:, :2], ambiguous, 30)
+    for joint, name in enumerate(ambiguous.joint_names):
         (chosen,) = retarget_track(pair, Skeleton([name], [-1])).keypoints.swapaxes(0, 1)
         np.testing.assert_array_equal(chosen, pair.keypoints[:, joint])
 

@@ -19,14 +19,14 @@ PERSON = Skeleton.preset("person14")
 
 @pytest.fixture(scope="module")
 def clips():
-    """Walks of two seconds, away from the origin and from each other."""
+    """Return walks of two seconds, away from the origin and from each other."""
     return [
         replace(clip, positions=np.add(clip.positions, [4.0 * number, 1.0, -3.0]), rotations=None)
         for number, clip in enumerate(synthetic_walks(4, seconds=2.0))
     ]
 
 
-def test_projected_clips_are_a_data_set(clips):
+def test_projected_clips_are_prepared_tracks(clips):
     filmed = film_clips(clips, PERSON, 20.0, views=5, seed=1)
     assert [t.name for t in filmed.tracks] == [f"{c.name}/{v}" for c in clips for v in range(5)]
     for track in filmed.tracks:
@@ -44,15 +44,15 @@ def test_without_errors_tracks_are_smoothed_projections(clips):
     result = film_clips(clips, PERSON, 30.0, views=3, seed=2, noise=exact).tracks
     projected = project_clips([c.retarget(PERSON) for c in clips], views=3, seed=2, noise=exact)
     for track, expected in zip(result, projected, strict=True):
-        off = np.linalg.norm(track.keypoints - expected.keypoints, axis=-1)
+        error = np.linalg.norm(track.keypoints - expected.keypoints, axis=-1)
         # Parabolas over 0.25 s approximate a walking foot within millimetres.
-        assert off.max() < 0.03
-        assert off.mean() < 0.003
+        assert error.max() < 0.03
+        assert error.mean() < 0.003
 
 
-def test_centred_sequences_preserve_the_path_and_views_are_no_crowd(clips):
+def test_centred_sequences_preserve_the_path_and_views_are_not_dropped_as_a_crowd(clips):
     filming = Filming(centre="sequence", perspective=False)
-    # The name before a space would elsewhere identify a common video.
+    # Elsewhere, tracks of one video share the name before the first space and may be a crowd.
     clip = replace(clips[0], name="my walk")
     tracks = film_clips([clip], PERSON, 20.0, views=12, filming=filming).tracks
     assert len(tracks) == 12
@@ -61,7 +61,7 @@ def test_centred_sequences_preserve_the_path_and_views_are_no_crowd(clips):
     assert (np.nanmax(paths, axis=1) - np.nanmin(paths, axis=1)).max() > 0.5
 
 
-def test_certain_thresholds_confidences():
+def test_certain_applies_a_threshold_to_confidences():
     confidence = np.array([[0.0, 0.29, 0.3, 1.0]])
     track = KeypointTrack(np.zeros((1, 4, 2)), confidence, Skeleton([*"abcd"], [-1] * 4), 20.0)
     (counted,) = certain([track])
@@ -105,15 +105,15 @@ def test_windows_are_uniform_over_the_complete_windows_of_clips(clips, filmed):
 
 
 def test_windows_repeat_only_if_necessary(clips, filmed, monkeypatch):
-    # 64 windows of 21 frames, one of each view, and their mirror images.
+    # There are 64 windows of 21 frames, one per view, and their mirror images.
     views = [
         replace(track, keypoints=track.keypoints[:21], confidence=track.confidence[:21])
         for track in filmed.tracks[:64]
     ]
     monkeypatch.setattr(learning, "film_clips", lambda *_, **__: replace(filmed, tracks=views))
-    for n, least, most in ((10, 10, 10), (100, 31, 128)):
+    for n, lower, upper in ((10, 10, 10), (100, 31, 128)):
         windows = film_windows(clips, PERSON, 20.0, 21, n, seed=0)
-        assert least <= len({window.tobytes() for window in windows}) <= most
+        assert lower <= len({window.tobytes() for window in windows}) <= upper
     with pytest.raises(ValueError, match="a complete window of 41 frames at 20 fps"):
         film_windows(clips, PERSON, 20.0, 41, 5, seed=0)
 
@@ -128,11 +128,11 @@ def tracks_of(*names):
 
 
 NAMES = [f"clip{number}" for number in range(20)]
-MANY = tracks_of(*[f"{name}/{view}" for view in "xyz" for name in NAMES])
+TRACKS = tracks_of(*[f"{name}/{view}" for view in "xyz" for name in NAMES])
 
 
 def test_random_split_is_disjoint_and_depends_on_names_and_seed_only():
-    result = split_tracks(MANY, seed=3)
+    result = split_tracks(TRACKS, seed=3)
     parts = (result.train, result.validation, result.test)
     assert [len(part) for part in parts] == [48, 6, 6]
     clips = [{clip_of(track.name) for track in part} for part in parts]
@@ -141,8 +141,8 @@ def test_random_split_is_disjoint_and_depends_on_names_and_seed_only():
     split = result.split
     names = [tuple(sorted(names)) for names in clips]
     assert names == [split.train, split.validation, split.test]
-    assert split_tracks(MANY[::-1], seed=3).split == split
-    assert len({split_tracks(MANY, seed=seed).split.test for seed in range(10)}) > 1
+    assert split_tracks(TRACKS[::-1], seed=3).split == split
+    assert len({split_tracks(TRACKS, seed=seed).split.test for seed in range(10)}) > 1
 
 
 def test_named_clips_are_held_out_with_all_their_segments():
@@ -167,4 +167,4 @@ def test_named_clips_are_held_out_with_all_their_segments():
 )
 def test_invalid_parts(validation, test, message):
     with pytest.raises(ValueError, match=f"^{message}"):
-        split_tracks(MANY, validation=validation, test=test)
+        split_tracks(TRACKS, validation=validation, test=test)

@@ -45,16 +45,16 @@ def clean():
 
 @pytest.fixture(scope="module")
 def raw(clean):
-    """Six people, one with a jump, and a poor, a short and an unseen track."""
+    """Tracks of six people, one with a jump, and a poor, a short and an empty track."""
     tracks = [detected(track, seed) for seed, track in enumerate(clean)]
     tracks[2].keypoints[JUMP:] += 900
     factors = np.where(np.arange(14) < 6, 1.0, 0.45)
-    some, other = ((track.keypoints, track.confidence) for track in tracks[:2])
+    first, second = ((track.keypoints, track.confidence) for track in tracks[:2])
     return [
         *tracks,
-        KeypointTrack(some[0], factors * some[1], PERSON, 60, "poor"),
-        KeypointTrack(other[0][:40], other[1][:40], PERSON, 60, "short"),
-        KeypointTrack(some[0], 0 * some[1], PERSON, 60, "never"),
+        KeypointTrack(first[0], factors * first[1], PERSON, 60, "poor"),
+        KeypointTrack(second[0][:40], second[1][:40], PERSON, 60, "short"),
+        KeypointTrack(first[0], 0 * first[1], PERSON, 60, "never"),
     ]
 
 
@@ -93,9 +93,9 @@ def test_known_motions_are_recovered_in_metres(raw, clean, result):
         centred = (truth - truth[:, :1])[::3][: track.frames]
         assert (track.fps, track.frames) == (20, 24 if "/" in track.name else 40)
         assert (track.confidence > 0).mean() > 0.98
-        off = np.linalg.norm(track.keypoints - centred, axis=-1)
-        assert np.nanmean(off) < 0.014  # 0.018 without smoothing
-        assert np.nanmax(off) < 0.1
+        error = np.linalg.norm(track.keypoints - centred, axis=-1)
+        assert np.nanmean(error) < 0.014  # 0.018 without smoothing
+        assert np.nanmax(error) < 0.1
 
 
 def test_options_select_steps(raw, clean, result):
@@ -113,8 +113,8 @@ def test_options_select_steps(raw, clean, result):
     assert len(pixels.tracks) == 2
     assert np.ptp(pixels.tracks[0].keypoints[:, 0, 0]) > 100
     # A track is prepared independently of others.
-    (alone,) = prepared(raw[3:4], clean).tracks
-    np.testing.assert_array_equal(alone.keypoints, result.tracks[3].keypoints)
+    (single,) = prepared(raw[3:4], clean).tracks
+    np.testing.assert_array_equal(single.keypoints, result.tracks[3].keypoints)
     with pytest.raises(ValueError, match="no track remains after step crowds: tracks 2 → 0"):
         prepared([raw[0], raw[0]], clean, videos=["one", "one"])
 

@@ -22,7 +22,7 @@ PIXELS = 183.0  # per metre
 
 
 def detected_walk(number, seconds=4.0, skeleton=COCO, pixels=PIXELS):
-    """Return a walk as detected at 30 fps, in pixels; joints that the walk lacks are unseen."""
+    """Return detections of a walk at 30 fps, in pixels; joints absent from the walk are unseen."""
     body = make_gait("walk", number, frames=round(30 * seconds))
     camera = Cameras.around(np.array([1.2]), np.array([0.2]), distance=7.0, perspective=True)
     root = body.positions[:, :1]
@@ -110,13 +110,13 @@ def test_several_files_and_patterns(person, tmp_path):
     with pytest.raises(ValueError, match="fps"):
         read_tracks(paths, PERSON, 20.0)
     (tmp_path / "other").mkdir()
-    twin = write_archive(person, tmp_path / "other", "a")
-    for paths in ([tmp_path / "a.npz", twin], [twin, twin]):
+    duplicate = write_archive(person, tmp_path / "other", "a")
+    for paths in ([tmp_path / "a.npz", duplicate], [duplicate, duplicate]):
         with pytest.raises(ValueError, match=r"files must have unique names, got .*a\.npz and"):
             read_tracks(paths, PERSON, 20.0)
 
 
-def test_people_in_one_video_may_be_a_crowd_and_views_and_videos_may_not(person, tmp_path):
+def test_only_people_in_one_video_may_be_dropped_as_a_crowd(person, tmp_path):
     tracks = read_tracks([write_archive(person, tmp_path, "rig", views=4)], PERSON, 20.0).tracks
     assert len({track.name for track in tracks}) == 4
     assert {clip_of(track.name) for track in tracks} == {"rig"}
@@ -134,7 +134,7 @@ def test_people_in_one_video_may_be_a_crowd_and_views_and_videos_may_not(person,
         read(*pair(5))
     result = read(detections(person, "a/")[:60], detections(person, "b/")[:90])
     assert [track.frames for track in result] == [40, 60]
-    # Image names contain a slash; the clip is still the file.
+    # The clip is named after the file even if image names contain a slash.
     assert {clip_of(track.name) for track in result} == {"people"}
 
 
@@ -223,32 +223,32 @@ def test_unknown_bodies_are_scaled_to_body_lengths(tmp_path):
         truth = truth - truth[:, :1]
         inner = slice(8, -8)  # smoothing bends the ends
         factor = (track.keypoints * truth)[inner].sum() / (truth**2)[inner].sum()
-        assert factor == pytest.approx(0.1, rel=0.1)  # about ten long
+        assert factor == pytest.approx(0.1, rel=0.1)  # the animal is ten units long
         np.testing.assert_allclose(track.keypoints[inner], factor * truth[inner], atol=0.01)
     assert result.reports[-1].step == "scale"
     for track, again in zip(result.tracks, read(7.0).tracks, strict=True):
         np.testing.assert_allclose(again.keypoints, track.keypoints, atol=1e-9)
 
 
-def straight(scale, places=(0, 3, 8, 10), skeleton=WORM):
-    points = np.stack([scale * np.array(places), np.zeros(len(places))], axis=-1)
-    return KeypointTrack(np.tile(points, (5, 1, 1)), np.ones((5, len(places))), skeleton, 30.0)
+def straight(scale, x=(0, 3, 8, 10), skeleton=WORM):
+    points = np.stack([scale * np.array(x), np.zeros(len(x))], axis=-1)
+    return KeypointTrack(np.tile(points, (5, 1, 1)), np.ones((5, len(x))), skeleton, 30.0)
 
 
 def test_per_track_scales_are_median_proportions():
     tracks = [straight(scale) for scale in (1.0, 1.0, 70.0)]
     assert per_track_scales(tracks) == pytest.approx({"back": 0.3, "rump": 0.5, "tail_tip": 0.2})
-    # By hand: 0.3, 0.5, 0.2 and 0.1, 0.8, 0.1 have the medians 0.2, 0.65, 0.15; scaled to them the
-    # extents are 0.75 and 1.5.
+    # The proportions 0.3, 0.5, 0.2 and 0.1, 0.8, 0.1 have the medians 0.2, 0.65, 0.15; scaled to
+    # these, the extents are 0.75 and 1.5.
     pair = [tracks[0], straight(20.0, (0, 1, 9, 10))]
     expected = {"back": 0.2 / 1.125, "rump": 0.65 / 1.125, "tail_tip": 0.15 / 1.125}
     assert per_track_scales(pair) == pytest.approx(expected)
     # A body without a visible tail is scaled by its other bones.
-    docked = straight(4.0)
-    docked.confidence[:, 3], docked.keypoints[:, 3] = 0, np.nan
-    assert body_extent(docked) == pytest.approx(32)
-    sizes = per_track_scales([*tracks, docked])
-    (scaled,), _ = scale_to_bones([docked], sizes)
+    tailless = straight(4.0)
+    tailless.confidence[:, 3], tailless.keypoints[:, 3] = 0, np.nan
+    assert body_extent(tailless) == pytest.approx(32)
+    sizes = per_track_scales([*tracks, tailless])
+    (scaled,), _ = scale_to_bones([tailless], sizes)
     assert bone_sizes([scaled])["back"] == pytest.approx(sizes["back"], rel=0.05)
 
 

@@ -41,11 +41,11 @@ def test_factor_is_the_median_over_bones():
 
 def test_tracks_without_a_bone_are_dropped():
     shown, flat = leg(np.ones(4), np.ones(4)), leg(np.zeros(4), np.zeros(4))
-    alone = KeypointTrack(np.ones((4, 3, 2)), np.tile([1.0, 0, 0], (4, 1)), CHAIN, 30)
-    (scaled,), report = scale_to_bones([alone, shown, flat], {"knee": 0.4})
+    root_only = KeypointTrack(np.ones((4, 3, 2)), np.tile([1.0, 0, 0], (4, 1)), CHAIN, 30)
+    (scaled,), report = scale_to_bones([root_only, shown, flat], {"knee": 0.4})
     np.testing.assert_allclose(scaled.keypoints, 0.4 * shown.keypoints)
     assert (report.tracks_dropped, report.frames_dropped) == (2, 8)
-    assert "; 2 tracks never show one" in report.why
+    assert "; tracks without one: 2" in report.why
     assert scale_to_bones([], {"knee": 0.4})[0] == []
 
 

@@ -11,7 +11,7 @@ BALL = Skeleton(["ball"], [-1])
 
 
 def ball(path, fps=10.0, gaps=()):
-    """One joint along ``path`` (L, 2), unseen in the frames ``gaps``."""
+    """Return a track of one joint along ``path`` (L, 2), unseen in the frames ``gaps``."""
     confidence = np.linspace(0.5, 0.9, len(path))[:, None]
     confidence[list(gaps)] = 0
     keypoints = np.where(confidence[..., None] > 0, path[:, None], np.nan)
@@ -77,7 +77,7 @@ def test_resampled_frames_are_seen_if_their_neighbours_are():
     np.testing.assert_array_equal(third.confidence[:, 0] > 0, [True, True, False, True, True])
     np.testing.assert_array_equal(third.keypoints[1], track.keypoints[3])
     assert np.isnan(third.keypoints[2]).all()
-    # Rounded frame rates: 3.0000000000000004 old frames per new one are 3.
+    # With rounded frame rates, 3.0000000000000004 old frames per new one count as 3.
     rounded = ball(line(13), 1 / 0.016667, gaps=(4, 8))
     (third,), _ = resample_tracks([rounded], fps=1 / 0.050001)
     np.testing.assert_array_equal(third.confidence[:, 0] > 0, np.ones(5, dtype=bool))

@@ -20,9 +20,9 @@ ARRAYS = ("keypoints", "visible", "neighbours", "views")
 
 
 def smooth_motion(frames=12, seed=0):
-    start, pace = np.random.default_rng(seed).standard_normal((2, 1, 34, 3))
+    start, velocity = np.random.default_rng(seed).standard_normal((2, 1, 34, 3))
     time = np.arange(frames)[:, None, None]
-    positions = start + 0.02 * pace * time + 0.1 * np.sin(time / 3 + pace)
+    positions = start + 0.02 * velocity * time + 0.1 * np.sin(time / 3 + velocity)
     return Motion(positions, PAIR, 30.0, name=f"walk {seed}")
 
 
@@ -109,7 +109,7 @@ def test_damaged_files_are_rejected(tmp_path):
 
 
 def test_differences_are_those_of_angle_length_and_root():
-    """Bones with constant angular velocity and stretch."""
+    """The bones rotate and stretch at constant rates."""
     turn, stretch, time = 0.002 * np.arange(34), 0.01, np.arange(-1, 2)
     keypoints = np.zeros((3, 34, 2))
     for joint, parent in sorted(PAIR.bones):
@@ -131,16 +131,16 @@ def test_differences_are_those_of_angle_length_and_root():
 
 def test_differences_are_one_sided_at_cuts_and_zero_without_neighbours():
     before, current, after = keypoints = smooth_motion().positions[4:7, :, :2]
-    gap = np.full((34, 2), np.nan)
+    missing = np.full((34, 2), np.nan)
     lengths = np.linalg.norm(keypoints[:, 13] - keypoints[:, 12], axis=-1)
     for neighbours, expected in (
         ((before, after), abs(lengths[2] - lengths[0]) / 2),
-        ((gap, after), abs(lengths[2] - lengths[1])),
-        ((before, gap), abs(lengths[1] - lengths[0])),
+        ((missing, after), abs(lengths[2] - lengths[1])),
+        ((before, missing), abs(lengths[1] - lengths[0])),
     ):
         _, stretch = one_annotation(neighbours[0], current, neighbours[1]).local_differences()
         assert stretch[0, 13] == pytest.approx(expected, abs=1e-12)
-    assert (np.stack(one_annotation(gap, current, gap).local_differences()) == 0).all()
+    assert (np.stack(one_annotation(missing, current, missing).local_differences()) == 0).all()
 
 
 def test_differences_are_zero_for_occluded_joints_and_bones_of_length_zero():
@@ -202,17 +202,17 @@ def test_given_views_and_frames_are_used():
 
 
 def test_draws_depend_on_the_seed_only():
-    plain, again, other = (draw_annotations(DANCES, 60, seed) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(plain.annotations.keypoints, again.annotations.keypoints)
-    assert not np.array_equal(plain.frames, other.frames)
+    exact, again, other = (draw_annotations(DANCES, 60, seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(exact.annotations.keypoints, again.annotations.keypoints)
+    assert not np.array_equal(exact.frames, other.frames)
     noisy = draw_annotations(DANCES, 60, 3, noise=0.05, hidden=0.25)
-    np.testing.assert_array_equal(noisy.world_views, plain.world_views)
-    np.testing.assert_array_equal(noisy.frames, plain.frames)
+    np.testing.assert_array_equal(noisy.world_views, exact.world_views)
+    np.testing.assert_array_equal(noisy.frames, exact.frames)
     visible = noisy.annotations.visible
     for person in np.split(visible, 2, axis=1):
         assert ((~person).sum(axis=1) == 4).all()  # a quarter of 17
     assert len(np.unique(visible, axis=0)) > 50
-    errors = (noisy.annotations.keypoints - plain.annotations.keypoints)[visible]
+    errors = (noisy.annotations.keypoints - exact.annotations.keypoints)[visible]
     assert errors.std() == pytest.approx(0.05, rel=0.05)
     occluded = np.broadcast_to(~visible[:, None], noisy.annotations.neighbours.shape[:-1])
     assert np.isnan(noisy.annotations.neighbours[occluded]).all()
@@ -221,7 +221,7 @@ def test_draws_depend_on_the_seed_only():
 TOUCHING = DANCES[0].positions.copy()
 TOUCHING[:, 17] = TOUCHING[:, 0]
 SLOW = Motion(DANCES[0].positions, PAIR, 25.0)
-ALONE = Motion(DANCES[0].positions[:, :17], Skeleton.preset("person17"), 30.0)
+ONE_PERSON = Motion(DANCES[0].positions[:, :17], Skeleton.preset("person17"), 30.0)
 
 
 @pytest.mark.parametrize(
@@ -230,8 +230,8 @@ ALONE = Motion(DANCES[0].positions[:, :17], Skeleton.preset("person17"), 30.0)
         ([], 1, {}, "motions must contain at least one clip, got none"),
         (DANCES, 121, {}, "n must be at most 120, the number of frames, got 121"),
         ([*DANCES, SLOW], 5, {}, r"motions\[3\] .*, got 34 joints and 25 frames per second"),
-        ([*DANCES, ALONE], 5, {}, r"motions\[3\] .*, got 17 joints and 30 frames per second"),
-        ([ALONE], 5, {}, "skeleton must have at least 2 people, got 1"),
+        ([*DANCES, ONE_PERSON], 5, {}, r"motions\[3\] .*, got 17 joints and 30 frames per second"),
+        ([ONE_PERSON], 5, {}, "skeleton must have at least 2 people, got 1"),
         ([Motion(TOUCHING, PAIR, 30.0)], 5, {}, "degenerate pair in frame .* of clip 0"),
         (DANCES, 5, {"noise": -0.1}, "noise must be a finite number of at least 0, got -0.1"),
         (DANCES, 5, {"hidden": 1.0}, "hidden must be at least 0 and below 1, got 1.0"),

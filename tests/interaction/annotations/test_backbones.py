@@ -1,4 +1,4 @@
-"""Backbones and views estimated from 2D annotations: exact and real pairs."""
+"""Backbones and views estimated from 2D annotations of synthetic and recorded pairs."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ TOWARDS = np.array([0.0, 0.0, 1.0])
 SEED = synthetic_dances(1)[0].positions[10]
 
 
-def turned(turns, pair=SEED):
-    """Rotate each person about their pelvis by ``turns`` (n, K, 3, 3)."""
+def rotated(rotations, pair=SEED):
+    """Rotate each person about their pelvis by ``rotations`` (n, K, 3, 3)."""
     people = pair.reshape(2, 17, 3)
     roots = people[:, :1]
-    return (np.einsum("nkij,kmj->nkmi", turns, people - roots) + roots).reshape(-1, 34, 3)
+    return (np.einsum("nkij,kmj->nkmi", rotations, people - roots) + roots).reshape(-1, 34, 3)
 
 
-def random_turns(n, seed):
+def random_rotations(n, seed):
     return Rotation.random(2 * n, rng=seed).as_matrix().reshape(n, 2, 3, 3)
 
 
@@ -42,9 +42,9 @@ def degrees(a, b):
 
 
 def annotated(positions, visible=True):
-    shown = np.broadcast_to(visible, positions.shape[:2])
+    mask = np.broadcast_to(visible, positions.shape[:2])
     missing = np.full((len(positions), 2, 34, 2), np.nan)
-    return Annotations(positions[..., :2], shown, PAIR, missing, 30.0)
+    return Annotations(positions[..., :2], mask, PAIR, missing, 30.0)
 
 
 def lifted(positions, seed=SEED, visible=True):
@@ -54,12 +54,12 @@ def lifted(positions, seed=SEED, visible=True):
 
 
 def test_rotated_torsos_are_recovered_from_any_side():
-    turns = random_turns(200, 0)
-    positions = turned(turns)
+    rotations = random_rotations(200, 0)
+    positions = rotated(rotations)
     estimate = lifted(positions)
     assert estimate.lifted.all()
     assert estimate.residuals.max() < 1e-6
-    np.testing.assert_allclose(estimate.rotations, turns, atol=1e-4)
+    np.testing.assert_allclose(estimate.rotations, rotations, atol=1e-4)
     truth = positions[:, CHESTS] - positions[:, ROOTS]
     np.testing.assert_allclose(estimate.backbones, truth, atol=1e-4)
     occluded = [PAIR.index(f"person1:{name}") for name in ("pelvis", "left_shoulder", "head")]
@@ -70,8 +70,8 @@ def test_rotated_torsos_are_recovered_from_any_side():
 
 
 def test_views_of_the_rotated_seed_are_exact():
-    turns = Rotation.random(100, rng=1).as_matrix()
-    positions = np.einsum("nij,mj->nmi", turns, SEED)
+    rotations = Rotation.random(100, rng=1).as_matrix()
+    positions = np.einsum("nij,mj->nmi", rotations, SEED)
     estimate = lifted(positions)
     depth = positions[:, ROOTS[1], 2] - positions[:, ROOTS[0], 2]
     np.testing.assert_allclose(estimate.roots[:, 1, 2], depth, atol=1e-4)
@@ -80,11 +80,11 @@ def test_views_of_the_rotated_seed_are_exact():
     assert degrees(view_vectors(views), view_vectors(expected)).max() < 0.01
 
 
-def test_depth_ignores_the_torso_of_a_person_who_turned_alone():
-    both = Rotation.from_rotvec(np.linspace(-1.2, -0.3, 40)[:, None] * [0, 1, 0]).as_matrix()
-    second = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    positions = turned(np.tile([np.eye(3), second], (40, 1, 1, 1)))
-    positions = np.einsum("nij,nmj->nmi", both, positions)
+def test_depth_ignores_the_torso_of_a_person_who_rotated_alone():
+    pairs = Rotation.from_rotvec(np.linspace(-1.2, -0.3, 40)[:, None] * [0, 1, 0]).as_matrix()
+    second_rotation = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    positions = rotated(np.tile([np.eye(3), second_rotation], (40, 1, 1, 1)))
+    positions = np.einsum("nij,nmj->nmi", pairs, positions)
     estimate = lifted(positions)
     truth = positions[:, 17, 2] - positions[:, 0, 2]
     mean = (estimate.rotations @ (SEED[17] - SEED[0]))[..., 2].mean(axis=-1)
@@ -93,36 +93,36 @@ def test_depth_ignores_the_torso_of_a_person_who_turned_alone():
 
 
 def test_fit_is_the_global_minimum():
-    """Against the best of several descents from random starts."""
+    """The reference is the best of several descents from random starts."""
     rng = np.random.default_rng(3)
     body = SEED[list(TORSOS[0])]
-    turns = Rotation.random(4, rng=4).as_matrix()
-    points = np.einsum("nij,mj->nmi", turns[:, :2], body) + 0.03 * rng.standard_normal((4, 9, 2))
+    axes = Rotation.random(4, rng=4).as_matrix()[:, :2]
+    points = np.einsum("nij,mj->nmi", axes, body) + 0.03 * rng.standard_normal((4, 9, 2))
     fit = fit_body(points, np.ones((4, 9), dtype=bool), body)
 
     def rms(parameters, observed):
-        turn = Rotation.from_rotvec(parameters[:3]).as_matrix()
-        residual = body @ turn[:2].T + parameters[3:] - observed
+        rotation = Rotation.from_rotvec(parameters[:3]).as_matrix()
+        residual = body @ rotation[:2].T + parameters[3:] - observed
         return float(np.sqrt((residual**2).sum() / 9))
 
     starts = np.concatenate([Rotation.random(8, rng=5).as_rotvec(), np.zeros((8, 2))], axis=1)
     for index, observed in enumerate(points):
         best = min(minimize(rms, start, args=(observed,)).fun for start in starts)
         assert fit.residuals[index] == pytest.approx(best, abs=1e-5)
-        turn = Rotation.from_matrix(fit.rotations[index]).as_rotvec()
-        parameters = np.concatenate([turn, fit.translations[index]])
+        rotation = Rotation.from_matrix(fit.rotations[index]).as_rotvec()
+        parameters = np.concatenate([rotation, fit.translations[index]])
         assert rms(parameters, observed) == pytest.approx(fit.residuals[index])
 
 
 def test_estimates_do_not_depend_on_the_batch():
     noise = 0.02 * np.random.default_rng(0).standard_normal((1100, 34, 3))
-    positions = turned(random_turns(1100, 0)) + noise
+    positions = rotated(random_rotations(1100, 0)) + noise
     single, batch = lifted(positions[1050:1051]), lifted(positions)
     np.testing.assert_allclose(single.rotations[0], batch.rotations[1050], atol=1e-9)
 
 
 def test_annotations_without_a_torso_are_nan():
-    positions = turned(random_turns(6, 7))
+    positions = rotated(random_rotations(6, 7))
     visible = np.ones((6, 34), dtype=bool)
     visible[2, list(TORSOS[1])] = False
     visible[4, list(TORSOS[0][2:])] = False  # two joints are too few
@@ -156,7 +156,7 @@ def errors(drawn, seed):
 
 @pytest.fixture(scope="module")
 def salsa(real_data):
-    """Clips, frames of the dance, and a seed from other clips."""
+    """Return clips, masks of dance frames, and a seed from other clips."""
     motions = load_pairs(real_data / "cmu_salsa_pairs")
     poses, _, _ = ground_truth([motion for n, motion in enumerate(motions) if n % 3], 200)
     frames = [dance_frames(motion) for motion in motions[::3]]
@@ -164,15 +164,15 @@ def salsa(real_data):
 
 
 @pytest.mark.parametrize(
-    ("noise", "hidden", "most"),
+    ("noise", "hidden", "bounds"),
     [(0.0, 0.0, (5, 9, 14, 50)), (0.02, 0.0, (8, 24, 16, 60)), (0.0, 0.3, (5, 13, 14, 55))],
 )
-def test_errors_of_real_pairs_are_small(salsa, noise, hidden, most):
-    """Median and 90 % quantile of the errors of backbones and views."""
+def test_errors_of_real_pairs_are_small(salsa, noise, hidden, bounds):
+    """The bounds are medians and 90 % quantiles of the errors of backbones and of views."""
     clips, frames, seed = salsa
     drawn = draw_annotations(clips, 500, 0, frames=frames, noise=noise, hidden=hidden)
     backbones, views = errors(drawn, seed)
     known = np.isfinite(views)
     assert known.mean() > 0.98
     quantiles = [np.quantile(e[known], level) for e in (backbones, views) for level in (0.5, 0.9)]
-    assert (np.array(quantiles) < most).all(), quantiles
+    assert (np.array(quantiles) < bounds).all(), quantiles

@@ -14,7 +14,7 @@ from probmotion.interaction.annotations.tracks import annotations_of_tracks
 from probmotion.io.files import read_keypoints
 
 PAIR = Skeleton.preset("pair17")
-LINE = ("spine", "left_hip", "right_hip", "left_shoulder", "right_shoulder")
+TRUNK = ("spine", "left_hip", "right_hip", "left_shoulder", "right_shoulder")
 DANCE = synthetic_dances(1, frames=40)[0]
 SEED = DANCE.positions[0]
 
@@ -45,32 +45,32 @@ def annotations(tracks, **options):
 
 @pytest.mark.parametrize("layout", ["body25", "coco17", "body25b", "openpose18", "halpe26"])
 def test_keypoints_are_converted_to_metres_with_y_up(layout):
-    seen = annotations(detections(layout))
-    assert len(seen) == 40
-    assert seen.skeleton == PAIR
-    assert seen.visible.all()
+    result = annotations(detections(layout))
+    assert len(result) == 40
+    assert result.skeleton == PAIR
+    assert result.visible.all()
     truth = DANCE.positions[..., :2] + np.array([1.0, -3.0])
     limbs = [k for k, name in enumerate(PAIR.joint_names) if "left_" in name or "right_" in name]
-    np.testing.assert_allclose(seen.keypoints[:, limbs], truth[:, limbs], atol=1e-9)
+    np.testing.assert_allclose(result.keypoints[:, limbs], truth[:, limbs], atol=1e-9)
     trunk = [joint for joint in range(34) if joint not in limbs]
-    assert np.abs(seen.keypoints[:, trunk] - truth[:, trunk]).max() < 0.08
+    assert np.abs(result.keypoints[:, trunk] - truth[:, trunk]).max() < 0.08
     for person in range(2):
         # The spine divides the line from hips to shoulders as in the seed.
-        spine, *limbs = (PAIR.index(f"person{person}:{name}") for name in LINE)
+        spine, *limbs = (PAIR.index(f"person{person}:{name}") for name in TRUNK)
         (low, high), (seed_low, seed_high) = (
             (pose[..., limbs[:2], :].mean(axis=-2), pose[..., limbs[2:], :].mean(axis=-2))
-            for pose in (seen.keypoints, SEED)
+            for pose in (result.keypoints, SEED)
         )
         line = seed_high - seed_low
         fraction = (SEED[spine] - seed_low) @ line / (line @ line)
-        np.testing.assert_allclose(seen.keypoints[:, spine], low + fraction * (high - low))
-    np.testing.assert_allclose(seen.neighbours[1:, 0], seen.keypoints[:-1])
-    np.testing.assert_allclose(seen.neighbours[:-1, 1], seen.keypoints[1:])
-    assert np.isnan(seen.neighbours[0, 0]).all()
-    assert np.isnan(seen.neighbours[-1, 1]).all()
+        np.testing.assert_allclose(result.keypoints[:, spine], low + fraction * (high - low))
+    np.testing.assert_allclose(result.neighbours[1:, 0], result.keypoints[:-1])
+    np.testing.assert_allclose(result.neighbours[:-1, 1], result.keypoints[1:])
+    assert np.isnan(result.neighbours[0, 0]).all()
+    assert np.isnan(result.neighbours[-1, 1]).all()
 
 
-def test_keypoint_json_of_two_people_becomes_annotations(tmp_path):
+def test_annotations_from_keypoint_json_of_two_people(tmp_path):
     tracks = detections("coco17")
     people = []
     for frame in range(40):
@@ -85,9 +85,9 @@ def test_keypoint_json_of_two_people_becomes_annotations(tmp_path):
 
 @pytest.mark.parametrize("scale", [300.0, 75.0])
 def test_scale_is_estimated_from_limb_lengths(scale):
-    seen = annotations_of_tracks(detections("body25", scale), SEED)
+    result = annotations_of_tracks(detections("body25", scale), SEED)
     knee, ankle = (PAIR.index(f"person0:left_{joint}") for joint in ("knee", "ankle"))
-    shin = np.linalg.norm(seen.keypoints[:, knee] - seen.keypoints[:, ankle], axis=-1).max()
+    shin = np.linalg.norm(result.keypoints[:, knee] - result.keypoints[:, ankle], axis=-1).max()
     assert shin == pytest.approx(np.linalg.norm(SEED[knee] - SEED[ankle]), rel=0.1)
 
 
@@ -96,24 +96,24 @@ def test_frames_with_a_missing_person_are_dropped():
     keypoints, confidence = second.keypoints.copy(), second.confidence.copy()
     confidence[10:13] = np.minimum(confidence[10:13], 0.1)  # below the threshold
     keypoints[20], confidence[20] = np.nan, 0
-    confidence[30, 9] = 0.1  # one wrist
-    seen = annotations([first, replace(second, keypoints=keypoints, confidence=confidence)])
-    assert len(seen) == 36
-    assert seen.dropped == {"one person missing": 4}
-    assert seen.describe() == (
+    confidence[30, 9] = 0.1  # a wrist
+    result = annotations([first, replace(second, keypoints=keypoints, confidence=confidence)])
+    assert len(result) == 36
+    assert result.dropped == {"one person missing": 4}
+    assert result.describe() == (
         "36 annotations, 1 of 1224 joints occluded, frames dropped: 4 (one person missing)"
     )
     # In the frame after the gap, only the second person has no previous position.
-    assert np.isnan(seen.neighbours[10, 0, 17:]).all()
-    assert np.isfinite(seen.neighbours[10, 0, :17]).all()
+    assert np.isnan(result.neighbours[10, 0, 17:]).all()
+    assert np.isfinite(result.neighbours[10, 0, :17]).all()
 
 
 def test_occluded_shoulder_occludes_the_interpolated_trunk():
     first, second = detections("coco17")
     confidence = first.confidence.copy()
     confidence[4, first.skeleton.index("left_shoulder")] = 0
-    seen = annotations([replace(first, confidence=confidence), second])
-    occluded = {PAIR.joint_names[joint] for joint in np.flatnonzero(~seen.visible[4])}
+    result = annotations([replace(first, confidence=confidence), second])
+    occluded = {PAIR.joint_names[joint] for joint in np.flatnonzero(~result.visible[4])}
     trunk = ("pelvis", "spine", "chest", "neck", "left_shoulder")
     assert occluded == {f"person0:{name}" for name in trunk}
 
@@ -124,8 +124,8 @@ def test_tracks_with_every_joint_are_used_directly():
         KeypointTrack(part[..., :2] * [100, -100], np.ones((40, 17)), person, 30.0)
         for part in np.split(DANCE.positions, 2, axis=1)
     ]
-    seen = annotations(tracks, metres_per_pixel=0.01)
-    np.testing.assert_allclose(seen.keypoints, DANCE.positions[..., :2], atol=1e-12)
+    result = annotations(tracks, metres_per_pixel=0.01)
+    np.testing.assert_allclose(result.keypoints, DANCE.positions[..., :2], atol=1e-12)
 
 
 FIRST, SECOND = detections("coco17")

@@ -43,7 +43,7 @@ def test_frame_of_three_people_sums_unit_backbones():
 
 
 def test_view_angles_equal_the_definition():
-    """Solve [i j k](a, b, c) = d, one pair and one direction at a time."""
+    """The definition is [i j k](a, b, c) = d, here solved for one pair and direction at a time."""
     frames = pair_frames(poses(20), PAIR)
     directions = np.random.default_rng(5).standard_normal((20, 3))
     views = view_angles(frames, directions)
@@ -67,8 +67,8 @@ def test_projections_equal_those_of_an_explicit_camera():
         camera = np.stack([np.cross(up, towards), up])
         np.testing.assert_allclose(projections[pose, view], positions[pose] @ camera.T, atol=1e-12)
     for pose in range(5):  # bit-identical for any batch
-        alone = project_to_views(positions[pose : pose + 1], views, PAIR)[0]
-        np.testing.assert_array_equal(alone, projections[pose])
+        single = project_to_views(positions[pose : pose + 1], views, PAIR)[0]
+        np.testing.assert_array_equal(single, projections[pose])
 
 
 def test_image_axes_are_orthonormal_at_the_poles():
@@ -79,7 +79,7 @@ def test_image_axes_are_orthonormal_at_the_poles():
 
 
 def test_degenerate_poses_are_detected_and_have_finite_projections():
-    """Coincident roots, cancelling backbones, and backbones parallel to the line of the roots."""
+    """Roots coincide, backbones cancel, or backbones are parallel to the line between roots."""
     chest, root = [PAIR.index(f"person{p}:chest") for p in range(2)], list(PAIR.roots)
     positions = poses(5)
     positions[2, root[1]] = positions[2, root[0]]
@@ -144,13 +144,13 @@ def test_density_is_periodic():
 
 def test_density_is_bit_identical_for_any_block_size(monkeypatch):
     distribution, queries = ViewDistribution(random_views(300)), random_views(80, seed=4)
-    together = distribution.log_density(queries)
+    batch = distribution.log_density(queries)
     monkeypatch.setattr(module, "_MAX_ELEMENTS", 10 * 300)
-    np.testing.assert_array_equal(distribution.log_density(queries), together)
+    np.testing.assert_array_equal(distribution.log_density(queries), batch)
 
 
 def test_samples_follow_the_density():
-    """χ² test on a grid."""
+    """A χ² test compares the draws with the density on a grid."""
     views = np.array([[2.9, 0.15], [-1.0, 1.6], [0.3, 2.9]])
     distribution, n = ViewDistribution(views, 1.2), 20_000
     draws = distribution.sample(np.random.default_rng(0), n)
@@ -177,10 +177,10 @@ def test_unknown_views_are_ignored():
 
 def test_near_equals_brute_force():
     views, queries = random_views(400), random_views(30, seed=9)
-    apart = angle(view_vectors(queries)[:, np.newaxis], view_vectors(views))
+    angles = angle(view_vectors(queries)[:, np.newaxis], view_vectors(views))
     for n in (12, 500):
         near = ViewDistribution(views).near(queries, n)
-        np.testing.assert_array_equal(near, np.argsort(apart, axis=-1)[:, :n])
+        np.testing.assert_array_equal(near, np.argsort(angles, axis=-1)[:, :n])
 
 
 def test_near_breaks_ties_by_index():

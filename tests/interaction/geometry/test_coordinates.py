@@ -45,28 +45,28 @@ def test_alignment_undoes_a_rigid_motion_and_ignores_occluded_joints(axes):
 def test_alignment_is_the_best_proper_rigid_motion(axes):
     source, target = joints(J, axes), joints(J, axes, seed=1)
     mirror = np.array([-1.0] + [1.0] * (axes - 1))
-    for aim in (target, target * mirror, source * mirror):
-        aligned = align_rigidly(source, aim)
-        least = ((aligned - aim) ** 2).sum()
+    for reference in (target, target * mirror, source * mirror):
+        aligned = align_rigidly(source, reference)
+        minimum = ((aligned - reference) ** 2).sum()
         centre = aligned.mean(axis=0)
-        np.testing.assert_allclose(centre, aim.mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(centre, reference.mean(axis=0), atol=1e-12)
         for seed in range(50):
             other = (source - source.mean(axis=0)) @ rotation(axes, seed) + centre
-            assert ((other - aim) ** 2).sum() >= least - 1e-12
+            assert ((other - reference) ** 2).sum() >= minimum - 1e-12
         matrix = np.linalg.lstsq(source - source.mean(axis=0), aligned - centre)[0]
         assert np.linalg.det(matrix) == pytest.approx(1.0)
 
 
 def test_dissimilarity_by_hand():
-    """Three joints, with one edge shorter than ε."""
+    """Both pairs have three joints; one edge is shorter than ε."""
     first = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.01]])
     second = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]])
     first_edges, second_edges = [[0, 1], [1, 2]], [[0, 1], [0, 2]]
     w_first = np.array([1.0, 1 / 0.05])
-    apart_first = np.array([1.0, 1.99])
+    norms_1 = np.array([1.0, 1.99])
     w_second = np.array([1 / 2, 1 / np.sqrt(8)])
-    apart_second = np.array([1.0, np.hypot(1.0, 1.99)])
-    expected = (w_first @ apart_first) / w_first.sum() + (w_second @ apart_second) / w_second.sum()
+    norms_2 = np.array([1.0, np.hypot(1.0, 1.99)])
+    expected = (w_first @ norms_1) / w_first.sum() + (w_second @ norms_2) / w_second.sum()
     assert dissimilarity(first, second, first_edges, second_edges) == pytest.approx(expected)
     u = interaction_coordinates(first, first_edges)
     np.testing.assert_allclose(u, [[-1.0, 0.0], [0.0, -0.01]])
@@ -79,9 +79,9 @@ def test_distance_is_symmetric_and_invariant(graph, axes):
     distance = interaction_distance(first, second, graph)
     assert distance > 0.1
     assert interaction_distance(second, first, graph) == pytest.approx(distance)
-    moved = second @ rotation(axes) + 5.0
-    assert interaction_distance(first, moved, graph) == pytest.approx(distance)
-    assert interaction_distance(second, moved, graph) == pytest.approx(0.0, abs=1e-12)
+    transformed = second @ rotation(axes) + 5.0
+    assert interaction_distance(first, transformed, graph) == pytest.approx(distance)
+    assert interaction_distance(second, transformed, graph) == pytest.approx(0.0, abs=1e-12)
     swap = np.roll(np.arange(J), J // 2)
     assert interaction_distance(first[swap], second[swap], graph) == pytest.approx(distance)
 
@@ -106,7 +106,7 @@ def test_distance_without_common_edges_is_infinite():
 
 
 def test_cartesian_distance_by_hand():
-    """A square and a rotated square of twice the size."""
+    """The second pair is the first square, rotated and twice as large."""
     first = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     second = 2 * first @ rotation(2) + 7.0
     assert cartesian_distance(first, second) == pytest.approx(np.sqrt(2.0))
@@ -133,7 +133,7 @@ def test_array_libraries_agree(library):
     results = library.compiled(all_three)(library.array(first), library.array(second))
     for got, expected in zip(results, all_three(first, second), strict=True):
         library.assert_close(got, expected)
-    if library.name != "jax":  # op by op, JAX takes seconds
+    if library.name != "jax":  # without jit, JAX takes seconds
         got = interaction_distance(library.array(first), library.array(second))
         library.assert_close(got, interaction_distance(first, second))
 

@@ -33,8 +33,8 @@ def as_set(edges):
 
 def circumball(corners):
     """Return the centre and radius of the sphere through D + 1 points."""
-    legs = corners[1:] - corners[0]
-    to_centre = np.linalg.solve(2 * legs, (legs**2).sum(axis=1))
+    differences = corners[1:] - corners[0]
+    to_centre = np.linalg.solve(2 * differences, (differences**2).sum(axis=1))
     return corners[0] + to_centre, float(np.sqrt((to_centre**2).sum()))
 
 
@@ -91,8 +91,8 @@ def test_edges_are_sorted_connected_and_invariant(graph, axes):
     if graph == "complete":
         assert len(edges) == 34 * 33 // 2
     order = np.random.default_rng(4).permutation(34)
-    turn, _ = np.linalg.qr(joints(axes, axes, seed=5))
-    relabelled = np.sort(order[graph_edges(3.0 * points[order] @ turn + 2.0, graph)], axis=1)
+    rotation, _ = np.linalg.qr(joints(axes, axes, seed=5))
+    relabelled = np.sort(order[graph_edges(3.0 * points[order] @ rotation + 2.0, graph)], axis=1)
     assert as_set(relabelled) == as_set(edges)
 
 
@@ -136,7 +136,7 @@ def test_random_joints_have_scipys_edges(n):
 
 
 def test_collinear_joints_of_annotations_are_not_degenerate():
-    """A pelvis midway between the hips and the spine on a line to the neck; hips on the hull."""
+    """The pelvis is the midpoint of the hips; the spine is on the line from pelvis to neck."""
     rng = np.random.default_rng(1)
     for _ in range(150):
         points = rng.standard_normal((34, 2))

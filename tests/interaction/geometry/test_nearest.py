@@ -46,8 +46,8 @@ def reference(projection, keypoints, visible, measure, graph, epsilon):
         pairs = (np.where(visible[:, None], x, 0.0) for x in (aligned, keypoints))
         first, second = (shape_contexts(pair, visible) for pair in pairs)
         return float(shape_context_distance(first, second, visible))
-    shown = np.flatnonzero(visible)
-    annotated = shown[graph_edges(keypoints[shown], graph)]
+    indices = np.flatnonzero(visible)
+    annotated = indices[graph_edges(keypoints[indices], graph)]
     edges = graph_edges(projection, graph)
     return float(dissimilarity(aligned, keypoints, edges, annotated, epsilon, visible))
 
@@ -61,8 +61,8 @@ def reference(projection, keypoints, visible, measure, graph, epsilon):
 def test_distances_equal_the_reference(measure, graph, hidden):
     keypoints, visible = annotated_pairs(12, hidden, seed=1)
     # Projections close to an annotation exercise early stopping.
-    near = keypoints[:3] + 0.05 * rng(2).standard_normal((3, J, 2))
-    projections = np.concatenate([near, random_pairs(3, seed=3)])
+    close = keypoints[:3] + 0.05 * rng(2).standard_normal((3, J, 2))
+    projections = np.concatenate([close, random_pairs(3, seed=3)])
     candidates = np.array([[0, 5, 2, 9, 1, 7], [11, 3, 4, 2, 1, 0]])
     given = np.where(visible[..., None], keypoints, np.nan), visible
     comparer = PairComparer(*given, measure=measure, graph=graph, epsilon=0.07)
@@ -81,19 +81,19 @@ def test_distances_equal_the_reference(measure, graph, hidden):
 def test_results_are_bit_identical_for_any_threads_and_batch():
     comparer = PairComparer(*annotated_pairs(40, 0.1, seed=5))
     arguments = random_pairs(7, 4, seed=6), rng(7).integers(0, 40, (4, 16))
-    together = comparer.nearest(*arguments)
+    batch = comparer.nearest(*arguments)
     for pose in range(7):
-        alone = comparer.nearest(arguments[0][pose : pose + 1], arguments[1])
-        for one, other in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(one[0], other[pose])
+        single = comparer.nearest(arguments[0][pose : pose + 1], arguments[1])
+        for result, expected in zip(single, batch, strict=True):
+            np.testing.assert_array_equal(result[0], expected[pose])
     before = numba.get_num_threads()
     try:
         for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):
             numba.set_num_threads(threads)
             for kernel in ("nearest_in_batch", "nearest_in_batch_on_threads"):
                 results = getattr(nearest_kernels, kernel)(*arguments, comparer.prepared)
-                for one, other in zip(results, together, strict=True):
-                    np.testing.assert_array_equal(one, other)
+                for result, expected in zip(results, batch, strict=True):
+                    np.testing.assert_array_equal(result, expected)
     finally:
         numba.set_num_threads(before)
 

@@ -20,7 +20,7 @@ def joints(*shape, seed=0):
 
 
 def test_2d_bins_by_hand():
-    """From the first joint: one close to the right, one far above, one in the last ring."""
+    """The other joints are close on the right, far above, and in the outermost ring."""
     points = np.array([[0.0, 0.0], [0.1, 0.01], [-0.01, 1.0], [-9.0, -0.1]])
     first = shape_contexts(points)[0].reshape(5, N_ANGLES)
     assert np.argwhere(first).tolist() == [[0, 0], [3, 3], [4, 6]]
@@ -28,7 +28,7 @@ def test_2d_bins_by_hand():
 
 
 def test_3d_bins_by_hand():
-    """Heading +x: a joint above, one ahead, one beside towards +z."""
+    """With heading +x, the other joints are above, ahead, and to the side (+z)."""
     points = np.array([[0.0, 0.0, 0.0], [0.0, 0.4, 0.001], [0.2, 0.001, 0.01], [9.0, 0.1, 0.1]])
     first = shape_contexts(points)[0].reshape(5, 4, 8)
     rings, bands, _ = np.nonzero(first)
@@ -60,13 +60,13 @@ def test_3d_histograms_are_invariant_to_position_and_heading():
     expected = shape_contexts(points)
     for angle in (0.7, 3.0, 5.5):
         c, s = np.cos(angle), np.sin(angle)
-        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-        np.testing.assert_array_equal(shape_contexts(points @ turn + [4.0, 0.5, -9.0]), expected)
+        matrix = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        np.testing.assert_array_equal(shape_contexts(points @ matrix + [4.0, 0.5, -9.0]), expected)
     assert (shape_contexts(points * [1.0, -1.0, -1.0]) != expected).any()  # upside down
 
 
 def test_distance_by_hand():
-    """½ Σ (h − g)² / (h + g) of two normalised histograms, and its mean over the joints."""
+    """The distance is the mean over joints of ½ Σ (h − g)² / (h + g), normalised histograms."""
     first, second = np.array([[3, 1, 0], [2, 2, 0]]), np.array([[1, 1, 2], [2, 2, 0]])
     expected = 0.5 * (0.5**2 / 1.0 + 0.5**2 / 0.5) / 2
     assert shape_context_distance(first, second) == pytest.approx(expected)
@@ -74,10 +74,10 @@ def test_distance_by_hand():
 
 
 def test_distance_is_one_without_common_bins():
-    """All joints within 10 cm, against the same mirrored and a thousand times as far apart."""
-    near = joints(6, 2) * 0.02
-    apart = shape_contexts(near), shape_contexts(-1000.0 * near)
-    assert shape_context_distance(*apart) == pytest.approx(1.0)
+    """The second pose is the first, mirrored and scaled by 1000."""
+    pose = joints(6, 2) * 0.02
+    contexts = shape_contexts(pose), shape_contexts(-1000.0 * pose)
+    assert shape_context_distance(*contexts) == pytest.approx(1.0)
 
 
 def test_only_visible_joints_are_compared():

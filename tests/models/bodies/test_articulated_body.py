@@ -20,7 +20,7 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 
 
 def random_rest(skeleton):
-    """Return random bones, the right side the mirror image of the left."""
+    """Return random bones of which the right side mirrors the left."""
     rest = 0.3 * np.random.default_rng(0).normal(size=(skeleton.n_joints, 3))
     rest[list(skeleton.roots)] = 0
     return (rest + mirrored(skeleton, rest)) / 2
@@ -43,19 +43,19 @@ def random_pose(body, shape=(5,)):
 
 
 def positions_by_loop(body, turns, rotation, translation, factors):
-    """Return one frame joint by joint; the end of a trunk rotates with its own bone."""
+    """Return one frame, computed joint by joint; a trunk's end rotates with its own bone."""
     skeleton = body.skeleton
     matrices = dict(zip(body.bones, Rotation.from_rotvec(turns).as_matrix(), strict=True))
-    place, turned = {}, {}
+    position, orientation = {}, {}
     for joint in skeleton.topological_order:
         name, parent = skeleton.joint_names[joint], skeleton.parents[joint]
         if parent < 0:
-            place[joint], turned[joint] = translation, rotation
+            position[joint], orientation[joint] = translation, rotation
             continue
-        above = turned[parent] @ matrices.get(f"{name} trunk", np.eye(3))
-        place[joint] = place[parent] + above @ (body.rest[joint] * factors[joint])
-        turned[joint] = above @ matrices.get(name, np.eye(3))
-    return np.stack([place[joint] for joint in range(skeleton.n_joints)])
+        above = orientation[parent] @ matrices.get(f"{name} trunk", np.eye(3))
+        position[joint] = position[parent] + above @ (body.rest[joint] * factors[joint])
+        orientation[joint] = above @ matrices.get(name, np.eye(3))
+    return np.stack([position[joint] for joint in range(skeleton.n_joints)])
 
 
 def test_positions_match_a_loop_over_joints(body):
@@ -87,8 +87,8 @@ def test_mirrored_rotations_give_the_mirrored_motion(body):
     names = ["_".join(swap.get(word, word) for word in name.split("_")) for name in body.bones]
     other = turns[:, [body.bones.index(name) for name in names]] * -FLIP
     joints = body.positions(other, rotation * np.outer(FLIP, FLIP), translation * FLIP)
-    wanted = mirrored(body.skeleton, body.positions(turns, rotation, translation))
-    np.testing.assert_allclose(joints, wanted, atol=1e-12)
+    expected = mirrored(body.skeleton, body.positions(turns, rotation, translation))
+    np.testing.assert_allclose(joints, expected, atol=1e-12)
     np.testing.assert_allclose(body.range_excess(other), body.range_excess(turns), atol=1e-12)
     assert (body.range_excess(3 * turns) > 0).all()
 
@@ -167,7 +167,7 @@ def test_knees_bend_backwards_and_stop_when_straight(skeleton, end, side):
     assert excess_of(body, knee, -0.6, 0, 0) == pytest.approx(0.2**2)
     assert excess_of(body, knee, 2.5, 0, 0) > 0
     assert excess_of(body, knee, 0, 0, 1.0) > 0
-    # Signs: the leg is straight at −0.4 and the ankle is behind at +1.2.
+    # The leg is straight at −0.4, and the ankle is behind the knee at +1.2.
     turns = np.zeros((2, len(body.bones), 3))
     turns[:, body.bones.index(knee), 0] = [-0.4, 1.2]
     joints = body.positions(turns, np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
@@ -210,7 +210,7 @@ ALONG, AHEAD = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.3])
         ("left_knee", STRAIGHT, [1, 0, 0]),
         ("right_knee", STRAIGHT, [1, 0, 0]),
         ("left_elbow", STRAIGHT, [-1, 0, 0]),
-        # Spread arms bend about the vertical, arms that point ahead bend upwards.
+        # Spread arms bend about the vertical axis; arms that point ahead bend upwards.
         ("left_elbow", ALONG, [0, -1, 0]),
         ("right_elbow", ALONG, [0, 1, 0]),
         ("left_elbow", AHEAD, [-1, 0, 0]),
@@ -220,7 +220,7 @@ def test_straight_limbs_of_people_bend_one_way(joint, bone, axis):
     body = body_with(PERSON, knee=bone, ankle=bone, elbow=bone, wrist=bone)
     assert excess_of(body, joint, *(2.5 * np.array(axis))) == 0
     assert excess_of(body, joint, *(-0.3 * np.array(axis))) == pytest.approx(0.09)
-    # Those of animals bend both ways.
+    # Limbs of animals bend both ways.
     animal = body_with(QUADRUPED, elbow=STRAIGHT, front_paw=STRAIGHT)
     assert excess_of(animal, "left_elbow", 2.5, 0, 0) == 0
     assert excess_of(animal, "left_elbow", -2.5, 0, 0) == 0
@@ -242,7 +242,7 @@ def test_named_ranges_are_asymmetric(joint, inside):
 
 
 def mean_excess(clips):
-    """Return the mean squared radians out of range, relative to the mean pose."""
+    """Return the mean squared excess over the ranges, radians², from the mean pose."""
     skeleton = clips[0].skeleton
     rest = rest_pose(skeleton, [clip.positions for clip in clips])
     rest = (rest + mirrored(skeleton, rest)) / 2

@@ -19,11 +19,11 @@ from probmotion.models.dvae.motion_windows import canonical_windows
 from probmotion.motion.kinematics import forward_kinematics
 
 PERSON = Skeleton.preset("person14")
-# Its root is not its first joint, and two joints end trunks.
+# The root is not the first joint, and two joints end trunks.
 QUADRUPED = Skeleton.preset("apt36k17")
 
 
-def at(name):
+def joint(name):
     return PERSON.index(name)
 
 
@@ -63,7 +63,7 @@ def fitted(clips):
 
 @pytest.fixture(scope="module")
 def walkers():
-    """Walks and the states of their mean body."""
+    """Return the states of the mean body, and walks."""
     clips = gaits("walk")
     return fitted(clips), clips
 
@@ -105,19 +105,19 @@ def test_gaits_are_recovered_closely_and_their_states_are_smooth(style, bound):
     for clip in clips:
         body = states.body(clip.positions)
         x = states.states(clip.positions, body)
-        back = states.positions(x, body)
-        assert np.linalg.norm(back - clip.positions, axis=-1).max() < bound
+        restored = states.positions(x, body)
+        assert np.linalg.norm(restored - clip.positions, axis=-1).max() < bound
         assert style != "walk" or abs(np.diff(x[:, 3:], axis=0)).max() < 0.3
 
 
 def test_bow_leaves_the_hips_in_place(walkers):
     """With a single rotation for hips and trunk, the hips would tilt as well."""
     rest = walkers[0].rest.copy()
-    rest[[at("left_hip"), at("right_hip")], 1:] = 0
+    rest[[joint("left_hip"), joint("right_hip")], 1:] = 0
     states = BodyStates(PERSON, rest)
-    still = np.tile(np.eye(3), (1, PERSON.n_joints, 1, 1))
-    upright, _ = forward_kinematics(PERSON, still, np.zeros((1, 1, 3)), rest)
-    upper = [j for j in range(14) if at("neck") in (j, *PERSON.ancestors(j))]
+    identity = np.tile(np.eye(3), (1, PERSON.n_joints, 1, 1))
+    upright, _ = forward_kinematics(PERSON, identity, np.zeros((1, 1, 3)), rest)
+    upper = [j for j in range(14) if joint("neck") in (j, *PERSON.ancestors(j))]
 
     def error(turn):
         bowed = upright.copy()
@@ -125,7 +125,7 @@ def test_bow_leaves_the_hips_in_place(walkers):
         return abs(states.positions(states.states(bowed, rest), rest) - bowed).max()
 
     assert error([1.2, 0, 0]) < 1e-12
-    # Sideways the guide joint pulls the hips slightly.
+    # In sideways bends, the guide joint moves the hips slightly.
     assert 1e-4 < error([0, 0, 0.6]) < 5e-3
 
 
@@ -175,7 +175,7 @@ def test_positions_support_batches_torch_and_single_precision(states):
             got = states.positions(torch.tensor(x, dtype=dtype), body)
             assert got.dtype == dtype
             np.testing.assert_allclose(got.numpy(), batch, atol=tolerance)
-    # Random projections of the outputs instead of all of them.
+    # The fast mode checks random projections of the outputs.
     point = torch.tensor(x[0, :1], requires_grad=True)
     assert torch.autograd.gradcheck(
         lambda x: states.positions(x, states.rest), point, fast_mode=True
@@ -185,20 +185,20 @@ def test_positions_support_batches_torch_and_single_precision(states):
 def test_groups_locate_translation_orientation_and_rotations(states):
     assert [group[1:] for group in states.groups] == [(0, 3), (3, 9), (9, states.dim)]
     x = np.random.default_rng(8).normal(size=(1, states.dim))
-    turned = x.copy()
-    quarter = Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix()
-    turned[:, 3:9] = np.concatenate([quarter @ x[0, 3:6], quarter @ x[0, 6:9]])
-    expected = (states.positions(x, states.rest) - x[0, :3]) @ quarter.T + x[0, :3]
-    np.testing.assert_allclose(states.positions(turned, states.rest), expected, atol=1e-12)
+    rotated = x.copy()
+    rotation = Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix()
+    rotated[:, 3:9] = np.concatenate([rotation @ x[0, 3:6], rotation @ x[0, 6:9]])
+    expected = (states.positions(x, states.rest) - x[0, :3]) @ rotation.T + x[0, :3]
+    np.testing.assert_allclose(states.positions(rotated, states.rest), expected, atol=1e-12)
 
 
 def test_rest_pose_is_upright_and_independent_of_the_heading(walkers):
     states, clips = walkers
-    assert states.rest[at("left_hip"), 0] > 0 > states.rest[at("right_hip"), 0]
-    assert states.rest[at("neck"), 1] > 0.3
-    assert states.rest[at("left_knee"), 1] < -0.2
-    turned = [turned_about_vertical(clip.positions, 2.0) for clip in clips]
-    np.testing.assert_allclose(rest_pose(PERSON, turned), states.rest, atol=1e-9)
+    assert states.rest[joint("left_hip"), 0] > 0 > states.rest[joint("right_hip"), 0]
+    assert states.rest[joint("neck"), 1] > 0.3
+    assert states.rest[joint("left_knee"), 1] < -0.2
+    rotated = [turned_about_vertical(clip.positions, 2.0) for clip in clips]
+    np.testing.assert_allclose(rest_pose(PERSON, rotated), states.rest, atol=1e-9)
 
 
 def test_invalid_bodies_and_motions_are_rejected(walkers):

@@ -29,8 +29,8 @@ TINY = DiffusionSettings.tiny(frames=12)
 CAMERA = Cameras.ring(1, elevation=math.pi / 16)
 
 
-def fresh(size=TINY, seed=0, **options):
-    """An untrained prior with a fixed root."""
+def untrained(size=TINY, seed=0, **options):
+    """Return an untrained prior with a fixed root."""
     rng = np.random.default_rng(seed)
     deviation = rng.uniform(0.1, 0.5, (4, 2))
     deviation[0] = 0
@@ -45,15 +45,15 @@ def noisy(prior, B=3, V=2, L=None, seed=1):
 
 @pytest.fixture(scope="module")
 def prior():
-    return fresh()
+    return untrained()
 
 
 def standard_units(prior):
-    """Mean and standard deviation of the joints, normalised units."""
+    """Return the mean and standard deviation of the joints in normalised units."""
     return prior.standards.mean / prior.scale, prior.standards.deviation / prior.scale
 
 
-def test_theta_is_all_positions_and_the_scale_that_of_moving_joints(prior):
+def test_theta_contains_positions_and_the_scale_is_that_of_moving_joints(prior):
     assert (prior.frames, prior.fps, prior.dim) == (12, 20.0, 12 * 4 * 3)
     theta = np.arange(2.0 * prior.dim).reshape(2, -1)
     np.testing.assert_array_equal(prior.motion(theta).reshape(2, -1), theta)
@@ -85,12 +85,12 @@ def test_levels_invert_the_schedule(power):
     result = [size.level(alpha_bar) for alpha_bar in schedule.alpha_bar]
     np.testing.assert_allclose(result, np.arange(101), atol=1e-9)
     for steps in (7, 20, 50):
-        some = schedule.strided(steps)
-        result = [size.level(alpha_bar) for alpha_bar in some.alpha_bar]
-        np.testing.assert_allclose(result, some.times, atol=1e-9)
-    between = [size.level(alpha_bar) for alpha_bar in np.linspace(1, schedule.alpha_bar[-1], 500)]
-    assert (np.diff(between) >= 0).all()
-    # Other schedules may start beyond the last level.
+        strided = schedule.strided(steps)
+        result = [size.level(alpha_bar) for alpha_bar in strided.alpha_bar]
+        np.testing.assert_allclose(result, strided.times, atol=1e-9)
+    levels = [size.level(alpha_bar) for alpha_bar in np.linspace(1, schedule.alpha_bar[-1], 500)]
+    assert (np.diff(levels) >= 0).all()
+    # Other schedules may start at more noise than the last level.
     assert size.level(0.1 * schedule.alpha_bar[-1]) == 100
     for wrong in (1.1, 0.0, float("nan")):
         with pytest.raises(ValueError, match=r"alpha_bar must be above 0 and at most 1, got .*"):
@@ -100,23 +100,23 @@ def test_levels_invert_the_schedule(power):
 def test_results_do_not_depend_on_batch_threads_or_cameras(prior):
     x_t, vectors = noisy(prior, B=40, V=3), noisy(prior, B=40, V=3, seed=2)
     cameras = Cameras.ring(3, elevation=1.0, perspective=True)
-    together = prior.denoise(x_t, 0.4, cameras)
+    batch = prior.denoise(x_t, 0.4, cameras)
     product = prior.view_covariance_product(x_t, 0.4, cameras, vectors)
-    for some in (slice(0, 1), slice(17, 18), slice(3, 31)):
-        alone = prior.denoise(x_t[some], 0.4, Cameras.ring(3))
-        np.testing.assert_array_equal(alone, together[some])
-        alone = prior.view_covariance_product(x_t[some], 0.4, cameras, vectors[some])
-        np.testing.assert_array_equal(alone, product[some])
+    for rows in (slice(0, 1), slice(17, 18), slice(3, 31)):
+        part = prior.denoise(x_t[rows], 0.4, Cameras.ring(3))
+        np.testing.assert_array_equal(part, batch[rows])
+        part = prior.view_covariance_product(x_t[rows], 0.4, cameras, vectors[rows])
+        np.testing.assert_array_equal(part, product[rows])
     swapped = prior.denoise(np.ascontiguousarray(x_t[:, [2, 0, 1]]), 0.4, cameras)
-    np.testing.assert_array_equal(swapped, together[:, [2, 0, 1]])
+    np.testing.assert_array_equal(swapped, batch[:, [2, 0, 1]])
     torch.set_num_threads(2)
     try:
-        np.testing.assert_array_equal(prior.denoise(x_t, 0.4, cameras), together)
+        np.testing.assert_array_equal(prior.denoise(x_t, 0.4, cameras), batch)
     finally:
         torch.set_num_threads(1)
     single = prior.denoise(x_t.astype(np.float32), 0.4, cameras)
     assert single.dtype == np.float32
-    np.testing.assert_allclose(single, together, atol=1e-5)
+    np.testing.assert_allclose(single, batch, atol=1e-5)
     np.testing.assert_array_equal(prior.denoise(x_t, 1.0, cameras), x_t)
 
 
@@ -127,15 +127,15 @@ def test_padding_has_no_effect():
     levels = torch.tensor([3.0, 50.0, 99.5])
     valid = torch.arange(12)[None] < torch.tensor([[12], [7], [2]])
     with torch.no_grad():
-        wanted = network(motions, levels, valid)
+        expected = network(motions, levels, valid)
         other = torch.where(valid[..., None], motions, 1e3)
-        torch.testing.assert_close(network(other, levels, valid)[valid], wanted[valid])
+        torch.testing.assert_close(network(other, levels, valid)[valid], expected[valid])
         # Padded motions give the same result as shorter ones.
         for row, length in enumerate((12, 7, 2)):
-            alone = network(motions[row : row + 1, :length], levels[row : row + 1])
-            torch.testing.assert_close(alone[0], wanted[row, :length], rtol=1e-4, atol=1e-5)
+            part = network(motions[row : row + 1, :length], levels[row : row + 1])
+            torch.testing.assert_close(part[0], expected[row, :length], rtol=1e-4, atol=1e-5)
         # Without a mask the values matter.
-        assert (network(other, levels)[1, :7] - wanted[1, :7]).abs().max() > 1e-3
+        assert (network(other, levels)[1, :7] - expected[1, :7]).abs().max() > 1e-3
 
 
 def test_network_depends_on_time_and_level(prior):
@@ -143,13 +143,13 @@ def test_network_depends_on_time_and_level(prior):
     backwards = prior.denoise(np.ascontiguousarray(x_t[:, :, ::-1]), 0.4, cameras)[:, :, ::-1]
     assert abs(backwards - prior.denoise(x_t, 0.4, cameras)).max() > 1e-3
     angles = 2.5 * 10_000.0 ** (-np.arange(0, 6, 2) / 6)
-    wanted = np.stack([np.sin(angles), np.cos(angles)], axis=-1).ravel()
+    expected = np.stack([np.sin(angles), np.cos(angles)], axis=-1).ravel()
     result = sinusoids(torch.tensor([0.0, 2.5]), 6)
-    np.testing.assert_allclose(result, [[0, 1, 0, 1, 0, 1], wanted], atol=1e-6)
+    np.testing.assert_allclose(result, [[0, 1, 0, 1, 0, 1], expected], atol=1e-6)
 
 
 class Linear(nn.Module):
-    """A network that multiplies all coordinates of a motion by a matrix."""
+    """Network that multiplies all coordinates of a motion by a matrix."""
 
     def __init__(self, matrix):
         super().__init__()
@@ -160,9 +160,9 @@ class Linear(nn.Module):
 
 
 def test_covariance_product_of_a_linear_network():
-    # J = D W / spread, D and spread diagonal: Jᵀ v = Wᵀ (D v) / spread.
+    # For J = D W / spread with diagonal D and spread, Jᵀ v = Wᵀ (D v) / spread.
     matrix = np.random.default_rng(4).normal(size=(96, 96)) / 10
-    prior = MotionDiffusion(Linear(matrix), TINY, fresh().standards, BODY, 20.0)
+    prior = MotionDiffusion(Linear(matrix), TINY, untrained().standards, BODY, 20.0)
     alpha_bar, cameras = 0.6, Cameras.ring(2)
     x_t, v = noisy(prior, B=3), noisy(prior, B=3, seed=2)
     _, deviation = standard_units(prior)
@@ -203,13 +203,13 @@ def test_trained_priors_are_loaded_from_folder_and_file(trainee, tmp_path):
     assert prior.card["step"] == 2
     assert prior.skeleton == BODY
     x_t = noisy(prior)
-    wanted = prior.denoise(x_t, 0.4, Cameras.ring(2))
+    expected = prior.denoise(x_t, 0.4, Cameras.ring(2))
     again = MotionDiffusion.load(result.model, frames=7)
     assert again.frames == 7
-    np.testing.assert_array_equal(again.denoise(x_t, 0.4, Cameras.ring(2)), wanted)
+    np.testing.assert_array_equal(again.denoise(x_t, 0.4, Cameras.ring(2)), expected)
     again.save(tmp_path / "saved.safetensors")
     saved = MotionDiffusion.load(tmp_path / "saved.safetensors")
-    np.testing.assert_array_equal(saved.denoise(x_t, 0.4, Cameras.ring(2)), wanted)
+    np.testing.assert_array_equal(saved.denoise(x_t, 0.4, Cameras.ring(2)), expected)
 
 
 @pytest.mark.parametrize(
@@ -250,20 +250,20 @@ def test_invalid_input_is_rejected(prior):
 
 
 def projections(gait, n, seed):
-    """Projections of n draws of the exact prior, metres."""
+    """Return projections of n draws of the exact prior, metres."""
     motions = gait.sample(np.random.default_rng(seed), n)
     return CAMERA.project(motions.reshape(n, -1, 3))[0].reshape(*motions.shape[:-1], 2)
 
 
 @pytest.fixture(scope="module")
 def gait():
-    """The exact prior of gaits."""
+    """Return the exact prior of gaits."""
     return load_problem("gait").posterior.prior
 
 
 @pytest.fixture(scope="module")
 def learnt(gait, tmp_path_factory):
-    """A tiny network trained on 2000 projections in about ten seconds."""
+    """Train a tiny network on 2000 projections in about ten seconds."""
     confidence = np.ones((gait.frames, gait.skeleton.n_joints))
     tracks = [
         KeypointTrack(keypoints, confidence, gait.skeleton, gait.fps, f"{number}/0")
@@ -288,13 +288,13 @@ def test_a_trained_network_approaches_the_exact_denoiser(gait, learnt):
         noise = np.random.default_rng(level).standard_normal(clean.shape)
         x_t = math.sqrt(alpha_bar) * clean / learnt.scale + math.sqrt(1 - alpha_bar) * noise
         result = learnt.denoise(x_t[:, None], alpha_bar, CAMERA)[:, 0] * learnt.scale
-        # The same noise in the unit of the exact prior.
+        # Express the same noise in the unit of the exact prior.
         deviation = math.sqrt((1 - alpha_bar) / alpha_bar) * learnt.scale
-        same = 1 / (1 + (deviation / gait.scale) ** 2)
+        abar = 1 / (1 + (deviation / gait.scale) ** 2)
         observed = x_t / math.sqrt(alpha_bar) * learnt.scale
-        exact = gait.denoise(math.sqrt(same) * observed[:, None] / gait.scale, same, CAMERA)[:, 0]
+        exact = gait.denoise(math.sqrt(abar) * observed[:, None] / gait.scale, abar, CAMERA)[:, 0]
         exact *= gait.scale
-        # The best linear estimate of every frame from itself.
+        # Compute the best linear estimate of each frame from that frame alone.
         gain = np.linalg.solve(covariance + deviation**2 * np.eye(len(mean)), covariance)
         linear = mean + (observed.reshape(-1, len(mean)) - mean) @ gain
         error = np.sqrt(((result - exact) ** 2).mean())

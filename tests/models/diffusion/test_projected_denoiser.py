@@ -1,4 +1,4 @@
-"""2D denoiser trained on projections of a prior's motions, and MAS with it."""
+"""2D denoiser trained on projections of draws of a prior, and its use in MAS."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from probmotion.samplers import MultiViewAncestral
 
 ARM = Skeleton(["pelvis", "neck", "left_shoulder", "right_shoulder"], [-1, 0, 1, 1])
 REST = np.array([[0, 0, 0], [0, 0.5, 0], [0.2, 0, 0], [-0.2, 0, 0]])
-BRIEF = TrainingSettings(steps=60, batch=32, learning_rate=5e-3, warmup=5, ema=0.9)
+TRAINING = TrainingSettings(steps=60, batch=32, learning_rate=5e-3, warmup=5, ema=0.9)
 
 
 class Arms:
-    """A body at rest that faces any direction."""
+    """Prior over a body at rest with a random heading."""
 
     skeleton, frames, fps, dim = ARM, 4, 20.0, 48
 
@@ -25,18 +25,18 @@ class Arms:
         return theta.reshape(*theta.shape[:-1], 4, 4, 3)
 
     def sample(self, rng, n):
-        turns = Rotation.from_rotvec(rng.uniform(0, 6, (n, 1)) * [0.0, 1.0, 0.0]).as_matrix()
+        rotations = Rotation.from_rotvec(rng.uniform(0, 6, (n, 1)) * [0.0, 1.0, 0.0]).as_matrix()
         poses = REST + 0.02 * rng.standard_normal((n, 4, 4, 3))
-        return (poses - poses[:, :, :1]) @ turns[:, None]
+        return (poses - poses[:, :, :1]) @ rotations[:, None]
 
 
-def learnt(prior, out, **options):
-    settings = {"size": "tiny", "motions": 20, "views": 4, "training": BRIEF} | options
+def learn(prior, out, **options):
+    settings = {"size": "tiny", "motions": 20, "views": 4, "training": TRAINING} | options
     return denoiser_of(prior, out, progress=False, **settings)
 
 
 def test_learnt_denoisers_are_used_by_mas_and_training_resumes(tmp_path):
-    denoiser = learnt(Arms(), tmp_path)
+    denoiser = learn(Arms(), tmp_path)
     assert (denoiser.skeleton, denoiser.frames, denoiser.fps) == (ARM, 4, 20.0)
     clips = [set(denoiser.card["network"][data]["clips"]) for data in ("data", "validation_data")]
     assert [len(names) for names in clips] == [18, 2]
@@ -47,9 +47,9 @@ def test_learnt_denoisers_are_used_by_mas_and_training_resumes(tmp_path):
     assert draws.positions.shape == (1, 8, 4, 4, 3)
     trunk = np.linalg.norm(draws.positions[..., 1, :] - draws.positions[..., 0, :], axis=-1)
     assert 0.4 < np.median(trunk) < 0.6
-    assert learnt(Arms(), tmp_path).card == denoiser.card
+    assert learn(Arms(), tmp_path).card == denoiser.card
     with pytest.raises(ValueError, match="mean must be the same to resume"):
-        learnt(Arms(), tmp_path, seed=1)
+        learn(Arms(), tmp_path, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -62,6 +62,6 @@ def test_learnt_denoisers_are_used_by_mas_and_training_resumes(tmp_path):
 )
 def test_invalid_options_are_rejected(tmp_path, options, message):
     with pytest.raises(ValueError, match=f"^{message}"):
-        learnt(Arms(), tmp_path, **options)
+        learn(Arms(), tmp_path, **options)
     with pytest.raises(ValueError, match="prior must have a sample method, got object"):
-        learnt(object(), tmp_path)
+        learn(object(), tmp_path)

@@ -26,7 +26,7 @@ def prior():
 
 @pytest.fixture(scope="module")
 def true():
-    """Walks of six people, each from two sides, without errors: three seconds."""
+    """Return error-free tracks of six people who walk for 3 s, each from two sides."""
     bodies = [make_gait("walk", 100 + n, frames=60, fps=20.0).retarget(PERSON) for n in range(6)]
     return project_clips(bodies, views=2, seed=7, noise=DetectorNoise.none())
 
@@ -49,24 +49,24 @@ def clean(prior, noisy):
     return [denoise_track(track, prior, noise=NOISE) for track in noisy]
 
 
-def error(tracks, true, where):
+def error(tracks, true, masks):
     """Return the root mean square distance from the truth along an axis, metres."""
     squares = [
-        ((track.keypoints - truth.keypoints) ** 2)[there]
-        for track, truth, there in zip(tracks, true, where, strict=True)
+        ((track.keypoints - truth.keypoints) ** 2)[mask]
+        for track, truth, mask in zip(tracks, true, masks, strict=True)
     ]
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
 def visible(track):
     """Return the visible joints except the root, which has no error."""
-    there = track.confidence >= 0.3
-    there[:, 0] = False
-    return there
+    mask = track.confidence >= 0.3
+    mask[:, 0] = False
+    return mask
 
 
 def interpolated(track):
-    """Return keypoints of which occluded ones are interpolated linearly in time."""
+    """Return the keypoints with occluded ones interpolated linearly in time."""
     time = np.arange(track.frames)
     filled = track.keypoints.copy()
     for joint, axis in np.ndindex(filled.shape[1:]):
@@ -76,17 +76,17 @@ def interpolated(track):
 
 
 def test_denoising_reduces_the_error(prior, true, noisy, clean):
-    there = [visible(track) for track in noisy]
-    lost = [track.confidence < 0.3 for track in noisy]
-    assert error(noisy, true, there) == pytest.approx(NOISE, rel=0.05)
-    assert error(clean, true, there) < 0.76 * NOISE
-    for track, truth, some in zip(clean, true, there, strict=True):
-        assert error([track], [truth], [some]) < 0.8 * NOISE
+    observed = [visible(track) for track in noisy]
+    occluded = [track.confidence < 0.3 for track in noisy]
+    assert error(noisy, true, observed) == pytest.approx(NOISE, rel=0.05)
+    assert error(clean, true, observed) < 0.76 * NOISE
+    for track, truth, mask in zip(clean, true, observed, strict=True):
+        assert error([track], [truth], [mask]) < 0.8 * NOISE
     mean = np.broadcast_to(prior.standards.mean, true[0].keypoints.shape)
     constant = [replace(track, keypoints=mean) for track in true]
-    assert error(clean, true, lost) < 0.45 * error(constant, true, lost)
+    assert error(clean, true, occluded) < 0.45 * error(constant, true, occluded)
     linear = [replace(track, keypoints=interpolated(track)) for track in noisy]
-    assert error(clean, true, lost) < 0.81 * error(linear, true, lost)
+    assert error(clean, true, occluded) < 0.81 * error(linear, true, occluded)
     for track, raw in zip(clean, noisy, strict=True):
         assert (track.name, track.fps, track.frames) == (raw.name, raw.fps, raw.frames)
         np.testing.assert_array_equal(track.keypoints[:, 0], 0.0)
@@ -97,13 +97,13 @@ def test_denoising_reduces_the_error(prior, true, noisy, clean):
 @pytest.mark.parametrize("noise", [1e-6, 0.02, 20.0])
 def test_visible_joints_move_by_at_most_the_noise(prior, noisy, noise):
     clean = denoise_track(noisy[0], prior, noise=noise)
-    moved = np.where(visible(noisy[0])[..., None], clean.keypoints - noisy[0].keypoints, np.nan)
-    distance = np.sqrt(np.nanmean(moved[:, 1:] ** 2, axis=(0, 2)))
+    change = np.where(visible(noisy[0])[..., None], clean.keypoints - noisy[0].keypoints, np.nan)
+    distance = np.sqrt(np.nanmean(change[:, 1:] ** 2, axis=(0, 2)))
     assert ((distance > 0) & (distance <= noise * (1 + 1e-9))).all()
 
 
 def test_result_is_the_posterior_mean_of_a_gaussian_prior(prior, monkeypatch):
-    # Motions N(0, S) in normalised units, correlated over frames and joints, and noise 1.
+    # Motions follow N(0, S) in normalised units; the noise has standard deviation 1.
     rng = np.random.default_rng(0)
     frames = 30
     time = np.exp(-0.5 * np.subtract.outer(np.arange(frames), np.arange(frames)) ** 2)
@@ -118,14 +118,14 @@ def test_result_is_the_posterior_mean_of_a_gaussian_prior(prior, monkeypatch):
     monkeypatch.setattr(prior, "denoise", exact)
     root = np.linalg.cholesky(S)
     seen = root @ rng.normal(size=(len(S), 2)) + rng.normal(size=(len(S), 2))
-    shown = rng.random((frames, 14)) < 0.7
-    shown[:, 5] = False
-    v = np.flatnonzero(shown)
-    wanted = S[:, v] @ np.linalg.solve(S[np.ix_(v, v)] + np.eye(len(v)), seen[v])
+    present = rng.random((frames, 14)) < 0.7
+    present[:, 5] = False
+    v = np.flatnonzero(present)
+    expected = S[:, v] @ np.linalg.solve(S[np.ix_(v, v)] + np.eye(len(v)), seen[v])
     keypoints = prior.scale * seen.reshape(frames, 14, 2)
-    track = KeypointTrack(keypoints, 1.0 * shown, PERSON, 20.0, "gaussian/0")
+    track = KeypointTrack(keypoints, 1.0 * present, PERSON, 20.0, "gaussian/0")
     clean = denoise_track(track, prior, noise=prior.scale, rounds=150).keypoints / prior.scale
-    np.testing.assert_allclose(clean, wanted.reshape(frames, 14, 2), atol=1e-6)
+    np.testing.assert_allclose(clean, expected.reshape(frames, 14, 2), atol=1e-6)
 
 
 def test_inaccurate_denoiser_is_combined_with_the_detections(prior, monkeypatch):
@@ -134,21 +134,21 @@ def test_inaccurate_denoiser_is_combined_with_the_detections(prior, monkeypatch)
     truth = rng.standard_normal((4000, 14, 2))
     keypoints = truth + 0.03 * rng.standard_normal(truth.shape)
     track = KeypointTrack(keypoints, np.ones((4000, 14)), PERSON, 20.0, "noisy/0")
-    guess = truth + 0.04 * rng.standard_normal(truth.shape)
+    estimate = truth + 0.04 * rng.standard_normal(truth.shape)
     window = prior.settings.frames
 
     def inaccurate(x_t, alpha_bar, cameras):
         starts = [*range(0, 4000 - window + 1, window // 2), 4000 - window]
-        views = [guess[start : start + window] for start in np.unique(starts)]
+        views = [estimate[start : start + window] for start in np.unique(starts)]
         return np.stack(views)[:, None] / prior.scale
 
     monkeypatch.setattr(prior, "denoise", inaccurate)
-    rest = denoise_track(track, prior, noise=0.03).keypoints - truth
-    assert np.sqrt((rest**2).mean()) == pytest.approx(0.024, rel=0.02)
+    residual = denoise_track(track, prior, noise=0.03).keypoints - truth
+    assert np.sqrt((residual**2).mean()) == pytest.approx(0.024, rel=0.02)
 
 
 def test_occluded_joints_have_no_effect(prior, noisy, clean):
-    track, wanted = noisy[0], clean[0].keypoints
+    track, expected = noisy[0], clean[0].keypoints
     occluded = track.confidence < 0.3
     for value, confidence in ((np.nan, 0.0), (1e6, 0.29)):
         other = replace(
@@ -158,9 +158,9 @@ def test_occluded_joints_have_no_effect(prior, noisy, clean):
             confidence=np.where(occluded, confidence, 1.0),
         )
         result = denoise_track(other, prior, noise=NOISE)
-        np.testing.assert_array_equal(result.keypoints, wanted)
+        np.testing.assert_array_equal(result.keypoints, expected)
     stricter = denoise_track(track, prior, noise=NOISE, threshold=0.8).keypoints
-    assert (stricter != wanted).any()
+    assert (stricter != expected).any()
 
 
 def test_long_tracks_have_no_seams(prior):
@@ -172,8 +172,8 @@ def test_long_tracks_have_no_seams(prior):
     # Accelerations do not depend on the position within the half-overlapping windows.
     bend = abs(np.diff(clean.keypoints, n=2, axis=0)).mean(axis=(1, 2))
     half = prior.settings.frames // 2
-    place = np.arange(1, 199) % half * 5 // half
-    means = [bend[place == phase].mean() for phase in range(5)]
+    phases = np.arange(1, 199) % half * 5 // half
+    means = [bend[phases == phase].mean() for phase in range(5)]
     assert np.ptp(means) < 6 * bend.std() / np.sqrt(len(bend) / 5)
     assert max(means) < 1.25 * np.mean(means)
 

@@ -1,4 +1,4 @@
-"""Training of the diffusion model: the loss by hand, inputs without effect and resumption."""
+"""Training of the diffusion model: values of the loss, masked inputs and resumption."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def loss_and_gradient(trainee, seed=0):
 
 
 class Constant(nn.Module):
-    """A network with constant output in standardised units, recording its inputs."""
+    """Network with constant output in standardised units that records its inputs."""
 
     def __init__(self, output=0.0):
         super().__init__()
@@ -68,7 +68,7 @@ def test_loss_is_the_mean_squared_error_of_the_clean_motion():
     moving = standards.deviation > 0
     clean = (track().keypoints - standards.mean) / np.where(moving, standards.deviation, 1)
     clean = clean.reshape(10, 8)
-    # The error of the mean is the variance, 1. The root does not count.
+    # A network that returns the mean has loss 1, the variance; the root is excluded.
     assert Constant().loss(trainee).item() == pytest.approx(1.0, abs=1e-5)
     assert Constant(clean).loss(trainee).item() == pytest.approx(0.0, abs=1e-5)
     clean[2, 5] += 0.6
@@ -85,15 +85,15 @@ def test_inputs_have_unit_variance_at_every_level():
     network.loss(trainee_of(track(), augmentation=NONE), 4000)
     motions, levels, valid = network.inputs[0]
     assert valid.all()
-    # t ~ U{1..100}: about 40 of each, Poisson deviation 6.3.
+    # For t ~ U{1..100}, each level occurs about 40 times, with Poisson deviation 6.3.
     counts = np.bincount(levels.numpy(), minlength=101)
     assert counts[0] == 0
     assert len(counts) == 101
     assert abs(counts[1:] - 40).max() < 6 * math.sqrt(40)
     for low in range(0, 100, 20):
-        some = motions[(levels > low) & (levels <= low + 20)]
-        assert float(some.square().mean()) == pytest.approx(1, abs=0.05)
-        assert float(some.mean()) == pytest.approx(0, abs=0.03)
+        selected = motions[(levels > low) & (levels <= low + 20)]
+        assert float(selected.square().mean()) == pytest.approx(1, abs=0.05)
+        assert float(selected.mean()) == pytest.approx(0, abs=0.03)
 
 
 def test_training_and_sampling_standardise_equally():
@@ -101,7 +101,7 @@ def test_training_and_sampling_standardise_equally():
     network = Constant()
     trainee.training_loss(network, seeds.generator(5), 1, CPU)
     trained, levels, _ = network.inputs[0]
-    # The same noisy motion from the same random numbers.
+    # Compute the same noisy motion from the same random numbers.
     rng = seeds.generator(5)
     drawn = trainee.batches.draw(rng, 1)
     level = int(rng.integers(1, 101, 1)[0])
@@ -127,16 +127,16 @@ def test_joints_below_the_threshold_have_no_effect():
     wild[confidence < 0.3] += 1e3
     pair = [low, replace(low, keypoints=wild)]
     for seed in range(3):
-        ours, theirs = (loss_and_gradient(trainee_of(one), seed) for one in pair)
-        assert all(map(torch.equal, ours, theirs))
-    # Neither have the network's outputs for them.
+        first, second = (loss_and_gradient(trainee_of(one), seed) for one in pair)
+        assert all(map(torch.equal, first, second))
+    # The network's outputs for these joints have no effect either.
     network = Constant()
     network.loss(trainee_of(low, augmentation=NONE), 4).backward()
     gradient = network.output.grad.unflatten(1, (4, 2))
     assert (gradient[torch.tensor(confidence < 0.3)] == 0).all()
     assert (gradient[torch.tensor(confidence >= 0.3)][:, 0] != 0).sum() > 20
-    ours, theirs = (loss_and_gradient(trainee_of(one, threshold=0.05)) for one in pair)
-    assert ours[0] != theirs[0]
+    first, second = (loss_and_gradient(trainee_of(one, threshold=0.05)) for one in pair)
+    assert first[0] != second[0]
 
 
 def test_padding_has_no_effect():
@@ -148,7 +148,7 @@ def test_padding_has_no_effect():
     assert (network.output.grad[6:] == 0).all()
 
 
-def test_validation_loss_is_deterministic_and_of_held_out_tracks():
+def test_validation_loss_depends_on_held_out_tracks_only():
     trainee = trainee_of(track())
     other = trainee_of(track(), track(seed=4, name="clip/1"), augmentation=NONE)
     other.standards = trainee.standards
@@ -164,20 +164,20 @@ def test_run_with_dropout_resumes_bit_identically(tmp_path):
         trainee = trainee_of(track(frames=14), track(seed=seed), size=replace(SIZE, dropout=0.2))
         return train(trainee, replace(settings, steps=steps), tmp_path / folder, progress=False)
 
-    whole = run("whole", 12)
+    full = run("full", 12)
     run("parts", 6)
-    parts = run("parts", 12)
-    assert whole.model.read_bytes()[-20_000:] == parts.model.read_bytes()[-20_000:]
-    assert [row["loss"] for row in whole.history] == [row["loss"] for row in parts.history]
+    resumed = run("parts", 12)
+    assert full.model.read_bytes()[-20_000:] == resumed.model.read_bytes()[-20_000:]
+    assert [row["loss"] for row in full.history] == [row["loss"] for row in resumed.history]
     with pytest.raises(ValueError, match=r"must be .* to resume .*; use another folder"):
         run("parts", 12, seed=2)
 
 
-def test_constant_motion_is_learnt_exactly(tmp_path):
+def test_network_learns_a_single_motion(tmp_path):
     keypoints = np.tile(track(frames=1).keypoints, (10, 1, 1))
     keypoints[5:, 3] += 0.5
-    still = replace(track(), keypoints=keypoints)
-    trainee = DiffusionTrainee([still], [still], SIZE, augmentation=NONE)
+    static = replace(track(), keypoints=keypoints)
+    trainee = DiffusionTrainee([static], [static], SIZE, augmentation=NONE)
     settings = TrainingSettings(
         steps=200, batch=8, learning_rate=5e-3, warmup=10, ema=0.9, checkpoint_every=200
     )
@@ -190,13 +190,13 @@ def test_constant_motion_is_learnt_exactly(tmp_path):
         assert np.sqrt(((clean - keypoints) ** 2).mean()) < 0.005
 
 
-def test_loss_of_shifted_still_people_has_unit_size():
-    # Tracks that are not centred on the root; without the shift in the standards the loss is 800.
+def test_loss_of_shifted_static_tracks_is_about_one():
+    # The tracks are not centred on the root; without the shift in the standards the loss is 800.
     keypoints = 0.3 * np.arange(8.0).reshape(4, 2)
     keypoints = keypoints + 0.002 * np.random.default_rng(0).normal(size=(10, 4, 2))
     keypoints -= keypoints[:, :1].mean(axis=0)
-    still = replace(track(), keypoints=keypoints)
-    loss = Constant().loss(trainee_of(still, augmentation=replace(NONE, shift=0.1)), 2000)
+    static = replace(track(), keypoints=keypoints)
+    loss = Constant().loss(trainee_of(static, augmentation=replace(NONE, shift=0.1)), 2000)
     assert loss.item() == pytest.approx(1, abs=0.1)
 
 
@@ -204,7 +204,7 @@ def test_invalid_arguments_are_rejected():
     confidence = np.ones((10, 4))
     confidence[:, [1, 3]] = 0.1
     low = replace(track(), confidence=confidence)
-    with pytest.raises(ValueError, match=r"never got left_hand, head; choose"):
+    with pytest.raises(ValueError, match=r"got none for left_hand, head; choose"):
         trainee_of(low, augmentation=NONE)
     # Held-out tracks may lack joints.
     trainee = DiffusionTrainee([track()], [low], SIZE)

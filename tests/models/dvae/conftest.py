@@ -1,4 +1,4 @@
-"""A tiny Motion-DVAE with random weights."""
+"""Fixture of a tiny Motion-DVAE with random weights."""
 
 from __future__ import annotations
 

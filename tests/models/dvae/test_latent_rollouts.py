@@ -19,14 +19,14 @@ C = np.array([[1.0, 0.5], [0.4, -0.8], [0.0, 0.3]])
 C[2, 0] = -(C[:2, 0] @ C[:2, 1]) / C[2, 1]
 START = np.array([0.7, -1.2])
 Y = np.random.default_rng(0).normal(size=(T, 3)) + 0.5
-# Moments of all z, from z_t − a z_{t−1} = q ε_t.
+# The moments of all z follow from z_t − a z_{t−1} = q ε_t.
 INVERSE = np.linalg.inv(np.eye(2 * T) - np.diag(np.tile(A, T - 1), -2))
 MEAN = INVERSE[:, :2] @ (A * START)
 COVARIANCE = INVERSE * np.tile(Q**2, T) @ INVERSE.T
 
 
 class Walk:
-    """z_t = a z_{t−1} + q ε, z₀ = x₀."""
+    """Generative model z_t = a z_{t−1} + q ε, z₀ = x₀."""
 
     def start(self, initial):
         return initial
@@ -40,14 +40,14 @@ class Walk:
 
 
 class ExactPosterior:
-    """q(z_t | z_{t−1}, y_{t:T}) = N(gain_t z_{t−1} + offset_t, scale_t²)."""
+    """Inference by q(z_t | z_{t−1}, y_{t:T}) = N(gain_t z_{t−1} + offset_t, scale_t²)."""
 
     def __init__(self):
         """Run a backward information filter."""
         information, shift = np.zeros(2), np.zeros(2)
         self.gain, self.offset, self.scale = torch.zeros((3, T, 2), dtype=torch.float64)
         for t in reversed(range(T)):
-            # Precision and precision times mean of p(y_{t+1:T} | z_t), then of p(y_{t:T} | z_t).
+            # Update precision and precision times mean from p(y_{t+1:T} | z_t) to p(y_{t:T} | z_t).
             spread = 1 + Q**2 * information
             information, shift = A**2 * information / spread, A * shift / spread
             information = information + (C**2).sum(0) / NOISE**2
@@ -60,8 +60,8 @@ class ExactPosterior:
     def start(self, initial):
         return initial
 
-    def posterior(self, state, frame, moved):
-        assert torch.equal(moved, state)
+    def posterior(self, state, frame, generative_state):
+        assert torch.equal(generative_state, state)
         mean = self.gain[frame - 1] * state + self.offset[frame - 1]
         return mean, self.scale[frame - 1].log().expand_as(mean)
 
@@ -78,10 +78,10 @@ def initial(n=N):
 
 
 def test_bound_at_exact_posterior_is_log_marginal_likelihood():
-    """E_q[log p(y | z)] − KL, as in `Denoiser.bound`."""
-    rolled = rollout(Walk(), initial(), standard(), ExactPosterior())
-    residual = torch.tensor(Y) - rolled.latents @ torch.tensor(C.T)
-    bounds = (log_normal(residual, NOISE).sum((1, 2)) - rolled.kl).numpy()
+    """The bound is E_q[log p(y | z)] − KL, as in `Denoiser.bound`."""
+    result = rollout(Walk(), initial(), standard(), ExactPosterior())
+    residual = torch.tensor(Y) - result.latents @ torch.tensor(C.T)
+    bounds = (log_normal(residual, NOISE).sum((1, 2)) - result.kl).numpy()
     observe = np.kron(np.eye(T), C)
     spread = observe @ COVARIANCE @ observe.T + NOISE**2 * np.eye(3 * T)
     log_marginal = stats.multivariate_normal.logpdf(Y.ravel(), observe @ MEAN, spread)
@@ -92,13 +92,13 @@ def test_bound_at_exact_posterior_is_log_marginal_likelihood():
 
 def test_innovations_reproduce_the_latents_without_inference():
     """Innovations are the standard normal coordinates of the prior."""
-    rolled = rollout(Walk(), initial(7), standard(7), ExactPosterior())
-    again = rollout(Walk(), initial(7), rolled.innovations)
-    torch.testing.assert_close(again.latents, rolled.latents)
-    assert torch.equal(again.innovations, rolled.innovations)
+    result = rollout(Walk(), initial(7), standard(7), ExactPosterior())
+    again = rollout(Walk(), initial(7), result.innovations)
+    torch.testing.assert_close(again.latents, result.latents)
+    assert torch.equal(again.innovations, result.innovations)
     assert torch.equal(again.kl, torch.zeros(7, dtype=torch.float64))
     assert len(again.states) == T
-    torch.testing.assert_close(again.states[-1], rolled.states[-1])
+    torch.testing.assert_close(again.states[-1], result.states[-1])
 
 
 def test_draws_without_inference_follow_the_prior():

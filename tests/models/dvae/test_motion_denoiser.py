@@ -56,18 +56,18 @@ def denoiser(prior):
     return TinyDenoiser(networks, prior, card)
 
 
-def observed(prior, freedom=None, frames=L, noise=0.05, place=None):
-    """Return noisy joints of a draw, some occluded (NaN); ``place`` transforms them."""
+def observed(prior, freedom=None, frames=L, noise=0.05, transform=None):
+    """Return noisy joints of a draw, some occluded (NaN), after ``transform``."""
     rng = np.random.default_rng(2)
     clip = prior.of(frames=frames).sample(np.random.default_rng(2), 1)[0]
     joints = clip + noise * rng.normal(size=(frames, J, 3))
     confidence = rng.choice([0.0, 0.5, 1.0, 2.0], (frames, J))
-    joints = joints if place is None else place(joints)
+    joints = joints if transform is None else transform(joints)
     joints[confidence == 0] = np.nan
     return Joints3D(joints, noise, confidence, freedom, prior.skeleton, 30.0)
 
 
-def numbers(inference, n=1, seed=3):
+def normals(inference, n=1, seed=3):
     first, shape = inference.denoiser.noise_numbers(inference.stitching.length)
     rng = np.random.default_rng(seed)
     rows = n * len(inference.windows)
@@ -78,7 +78,7 @@ def numbers(inference, n=1, seed=3):
 def bound_of(inference, n=1):
     windows = inference.windows.repeated(n)
     with torch.no_grad():
-        inferred = inference.denoiser.infer(windows, *numbers(inference, n))
+        inferred = inference.denoiser.infer(windows, *normals(inference, n))
         return inference.denoiser.bound(windows, inferred, first=True), inferred
 
 
@@ -90,25 +90,25 @@ def streams(n, start=0):
 def test_data_term_is_the_likelihood_for_gaussian_noise(prior, denoiser, freedom):
     likelihood = observed(prior)
     bound, inferred = bound_of(denoiser.on(prior, likelihood, degrees_of_freedom=freedom), 5)
-    wanted = likelihood.log_density(inferred.positions.double())
-    torch.testing.assert_close(bound.data.double(), wanted, rtol=1e-4, atol=1e-2)
+    expected = likelihood.log_density(inferred.positions.double())
+    torch.testing.assert_close(bound.data.double(), expected, rtol=1e-4, atol=1e-2)
     assert torch.equal(bound.noise, torch.zeros(5))
-    assert wanted.std() > 1
+    assert expected.std() > 1
 
 
 @pytest.mark.parametrize("freedom", [2.0, 50.0])
 def test_noise_bound_is_at_most_the_student_t_likelihood(prior, denoiser, freedom):
     likelihood = observed(prior, freedom)
     bound, inferred = bound_of(denoiser.on(prior, likelihood), 5)
-    wanted = likelihood.log_density(inferred.positions.double())
+    expected = likelihood.log_density(inferred.positions.double())
     assert (bound.noise > 0).all()
-    torch.testing.assert_close((bound.data - bound.noise).double(), wanted, rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close((bound.data - bound.noise).double(), expected, rtol=1e-4, atol=1e-2)
     # With another network output, q_γ is not the exact conditional.
     other = denoiser.on(prior, likelihood)
     with torch.no_grad():
         other.denoiser.networks.noise[-1].bias.normal_(0, 0.3, generator=torch.Generator())
     lower, _ = bound_of(other, 5)
-    assert (lower.data - lower.noise < wanted - 1).all()
+    assert (lower.data - lower.noise < expected - 1).all()
     # The argument overrides the likelihood's λ.
     other, _ = bound_of(denoiser.on(prior, observed(prior), degrees_of_freedom=freedom), 5)
     torch.testing.assert_close(other.data, bound.data)
@@ -116,11 +116,11 @@ def test_noise_bound_is_at_most_the_student_t_likelihood(prior, denoiser, freedo
 
 
 def test_initial_divergence_matches_monte_carlo_in_world_coordinates(prior, denoiser):
-    """E_q[log q − log p] of ground, heading and pose, by change of variables."""
+    """The reference is E_q[log q − log p] of ground, heading and pose."""
     inference, n = denoiser.on(prior, observed(prior)), 4000
     windows = inference.windows
     bound, inferred = bound_of(inference, n)
-    first_noise = numbers(inference, n)[0].double().numpy()
+    first_noise = normals(inference, n)[0].double().numpy()
     model = prior.model
     trust = torch.where(windows.seen, 1 / (1 + (windows.noise / 0.05) ** 2), 0.0)
     read = model.observed(windows.in_frame(windows.heading, windows.ground), trust, windows.tails)
@@ -141,22 +141,22 @@ def test_initial_divergence_matches_monte_carlo_in_world_coordinates(prior, deno
 def test_inference_is_equivariant(prior, denoiser, freedom, angle):
     """Student-t noise is per world axis and only invariant to half turns."""
 
-    def place(joints):
+    def transform(joints):
         return turned_about_vertical(joints, angle) + np.array([4.0, 0.0, -7.0])
 
-    here = denoiser.on(prior, observed(prior, freedom))
-    there = denoiser.on(prior, observed(prior, freedom, place=place))
-    (before, _), (after, _) = bound_of(here, 5), bound_of(there, 5)
+    original = denoiser.on(prior, observed(prior, freedom))
+    rotated = denoiser.on(prior, observed(prior, freedom, transform=transform))
+    (before, _), (after, _) = bound_of(original, 5), bound_of(rotated, 5)
     torch.testing.assert_close(after.latents, before.latents, rtol=1e-3, atol=2e-3)
     torch.testing.assert_close(after.data, before.data, rtol=1e-3, atol=2e-3)
-    draws, other = (inference.draw(streams(3), 3)[0] for inference in (here, there))
-    np.testing.assert_allclose(other, place(draws), atol=2e-5)
+    draws, other = (inference.draw(streams(3), 3)[0] for inference in (original, rotated))
+    np.testing.assert_allclose(other, transform(draws), atol=2e-5)
     for average in (True, False):
         predicted, other = (
             inference.predict(np.random.default_rng(1), average=average)
-            for inference in (here, there)
+            for inference in (original, rotated)
         )
-        np.testing.assert_allclose(other, place(predicted), atol=1e-4)
+        np.testing.assert_allclose(other, transform(predicted), atol=1e-4)
 
 
 def test_occluded_values_have_no_effect(prior, denoiser):
@@ -168,12 +168,12 @@ def test_occluded_values_have_no_effect(prior, denoiser):
         noise=torch.where(windows.seen, windows.noise, 7.0),
     )
     results = []
-    for some in (inference, other):
-        weights = some.parameters()
-        loss = some.loss(np.random.default_rng(0), initial_entropy=True, latent_weight=1.0)
+    for run in (inference, other):
+        weights = run.parameters()
+        loss = run.loss(np.random.default_rng(0), initial_entropy=True, latent_weight=1.0)
         gradients = torch.autograd.grad(loss, weights)
         assert all(torch.isfinite(part).all() for part in gradients)
-        draws, prediction = some.draw(streams(3), 3)[0], some.predict(np.random.default_rng(1))
+        draws, prediction = run.draw(streams(3), 3)[0], run.predict(np.random.default_rng(1))
         results.append([loss, *gradients, torch.tensor(draws), torch.tensor(prediction)])
     for one, same in zip(*results, strict=True):
         torch.testing.assert_close(one, same, rtol=1e-5, atol=1e-5)
@@ -182,19 +182,19 @@ def test_occluded_values_have_no_effect(prior, denoiser):
 @pytest.mark.parametrize("frames", [L, 20])
 def test_draws_do_not_depend_on_the_batch(prior, denoiser, frames):
     inference = denoiser.on(prior, observed(prior, 4.0, frames))
-    whole, theta = inference.draw(streams(70), 70)
-    assert whole.shape == (70, frames, J, 3)
+    batch, theta = inference.draw(streams(70), 70)
+    assert batch.shape == (70, frames, J, 3)
     before = torch.get_num_threads()
     try:
         for start, n, threads in ((0, 1, 1), (3, 1, 2), (60, 10, 1)):
             torch.set_num_threads(threads)
-            some, some_theta = inference.draw(streams(n, start), n)
-            np.testing.assert_array_equal(some, whole[start : start + n])
+            part, part_theta = inference.draw(streams(n, start), n)
+            np.testing.assert_array_equal(part, batch[start : start + n])
             if theta is not None:
-                np.testing.assert_array_equal(some_theta, theta[start : start + n])
+                np.testing.assert_array_equal(part_theta, theta[start : start + n])
     finally:
         torch.set_num_threads(before)
-    assert abs(whole[0] - whole[1]).max() > 1e-3
+    assert abs(batch[0] - batch[1]).max() > 1e-3
 
 
 def test_theta_reproduces_the_draw(prior, denoiser):
@@ -207,7 +207,7 @@ def test_theta_reproduces_the_draw(prior, denoiser):
 
 
 def test_prediction_is_equation_11(prior, denoiser):
-    """(v M_β(μ_x) + s² y)/(v + s²) over draws; M_β(μ_x) where occluded; M_β(μ_ω) in frame 0."""
+    """Mean of (v M_β(μ_x) + s² y)/(v + s²); M_β(μ_x) if occluded; M_β(μ_ω) in frame 0."""
     likelihood = observed(prior)
     inference = denoiser.on(prior, likelihood)
     rng = np.random.default_rng(4)
@@ -221,18 +221,18 @@ def test_prediction_is_equation_11(prior, denoiser):
     seen = likelihood.confidence > 0
     v = (likelihood.noise**2 / likelihood.confidence.clip(0.1))[..., None]
     y = np.where(seen[..., None], likelihood.joints, 0.0)
-    wanted = np.where(seen[..., None], (v * M + s**2 * y) / (v + s**2), M).mean(axis=0)
-    wanted[0] = inference.predict(rng, average=False)[0]
-    np.testing.assert_allclose(inference.predict(np.random.default_rng(4)), wanted, atol=1e-5)
+    expected = np.where(seen[..., None], (v * M + s**2 * y) / (v + s**2), M).mean(axis=0)
+    expected[0] = inference.predict(rng, average=False)[0]
+    np.testing.assert_allclose(inference.predict(np.random.default_rng(4)), expected, atol=1e-5)
     # Without noise the prediction equals the observed joints.
     inference.windows = replace(inference.windows, noise=1e-6 * inference.windows.noise)
     exact = inference.predict(np.random.default_rng(4))
     seen[0] = False
     np.testing.assert_allclose(exact[seen], likelihood.joints[seen], atol=1e-5)
-    # Without the average it decodes the means of q in every window.
+    # Without averaging, the prediction decodes the means of q in every window.
     inference = denoiser.on(prior, observed(prior, frames=20))
     with torch.no_grad():
-        zeros = (torch.zeros_like(part) for part in numbers(inference))
+        zeros = (torch.zeros_like(part) for part in normals(inference))
         means = inference.denoiser.infer(inference.windows, *zeros).positions
     decoded = inference.predict(np.random.default_rng(0), average=False)
     np.testing.assert_array_equal(decoded, Stitching(20, L, 3).mean(means.double().numpy()))
@@ -242,14 +242,14 @@ def test_variances_follow_the_predicted_inverse_gamma(prior, denoiser):
     inference = denoiser.on(prior, observed(prior, 4.0))
     windows = inference.windows.repeated(2000)
     with torch.no_grad():
-        once = inference.denoiser.infer(inference.windows, *numbers(inference))
+        once = inference.denoiser.infer(inference.windows, *normals(inference))
         residual = inference.windows.joints - once.positions
         squares = (residual / inference.windows.noise[..., None]) ** 2
         shape = inference.denoiser.networks.noise_shape(
             once.hidden, once.observed, torch.tensor([2.0]), squares
         )
         alpha, beta = (part[0, 3, 2, 1].item() for part in shape)
-        same = [part.repeat(2000, *[1] * (part.ndim - 1)) for part in numbers(inference)]
+        same = [part.repeat(2000, *[1] * (part.ndim - 1)) for part in normals(inference)]
         inferred = inference.denoiser.infer(windows, *same)
         v = inference.denoiser.drawn_variance(windows, inferred, np.random.default_rng(0))
     unit = v[:, 3, 2, 1] / windows.noise[:, 3, 2] ** 2
@@ -288,23 +288,23 @@ def test_training_loss_depends_only_on_noisy_joints(prior, clips):
         assert torch.equal(one, other)
 
 
-def test_training_lowers_the_loss_and_checkpoint_round_trip(prior, clips, tmp_path):
+def test_training_lowers_the_loss_and_checkpoints_round_trip(prior, clips, tmp_path):
     trainee = DenoiserTrainee(clips[2:], clips[:2], prior, annealing=20, seed=3)
     weights = {name: value.clone() for name, value in prior.model.state_dict().items()}
     settings = TrainingSettings(
         steps=20, batch=16, learning_rate=5e-3, warmup=2, ema=0.8, checkpoint_every=20
     )
     with torch.no_grad():
-        begun = trainee.validation_loss(trainee.network, torch.device("cpu"))
+        initial = trainee.validation_loss(trainee.network, torch.device("cpu"))
     result = train(trainee, settings, tmp_path, progress=False)
-    assert result.history[-1]["validation_loss"] < 0.7 * begun
+    assert result.history[-1]["validation_loss"] < 0.7 * initial
     for name, value in prior.model.state_dict().items():
         assert torch.equal(value, weights[name])
     loaded = MotionDenoiser.load(tmp_path, prior)
     loaded.save(tmp_path / "half.safetensors", half=True)
     half = MotionDenoiser.load(tmp_path / "half.safetensors", prior)
     draws = [
-        some.on(prior, observed(prior), overlap=3).draw(streams(2), 2)[0] for some in (loaded, half)
+        net.on(prior, observed(prior), overlap=3).draw(streams(2), 2)[0] for net in (loaded, half)
     ]
     np.testing.assert_allclose(*draws, atol=0.02)
     trainee.anneal(5)
@@ -332,7 +332,7 @@ def test_invalid_inputs_are_rejected(prior, make_prior, denoiser, tmp_path):
             denoiser.on(given, seen, overlap=overlap)
     path = tmp_path / "a.safetensors"
     denoiser.save(path)
-    with pytest.raises(CheckpointError, match="must be a denoiser of the given prior"):
+    with pytest.raises(CheckpointError, match="must be a denoiser of prior "):
         MotionDenoiser.load(path, other)
     weights = denoiser.networks.state_dict()
     save_checkpoint(path, Checkpoint(KIND, {"network": {}}, weights))

@@ -27,36 +27,36 @@ RANK = 4
 
 
 @pytest.fixture(scope="module")
-def fresh(make_prior):
+def make(make_prior):
     return partial(make_prior, spread_latents=True)
 
 
-def drawn(prior, n=3, seed=1):
+def random_theta(prior, n=3, seed=1):
     return prior.initial(np.random.default_rng(seed), n)
 
 
 @pytest.fixture(scope="module")
-def prior(fresh):
-    return fresh()
+def prior(make):
+    return make()
 
 
 def test_prior_has_standard_normal_coordinates(prior):
     for protocol in (MotionPrior, Samplable, HasLogDensity, DenoisesCoordinates):
         assert isinstance(prior, protocol)
     assert (prior.frames, prior.fps, prior.rank, prior.dim) == (5, 30.0, RANK, 4 + RANK + 4 * 3)
-    theta = drawn(prior)
+    theta = random_theta(prior)
     np.testing.assert_allclose(prior.log_density(theta), stats.norm.logpdf(theta).sum(-1))
 
 
 @pytest.mark.parametrize("decoder", ["cumulative", "direct"])
-def test_motion_matches_an_explicit_rollout(fresh, decoder):
+def test_motion_matches_an_explicit_rollout(make, decoder):
     """h₀ = d_ini(x₀), z_t = μ_z + σ_z ε_t of h_{t−1}, h_t = LSTM(h_{t−1}, z_t), x_t = d_x(h_t)."""
-    prior = fresh(changes={"decoder": decoder})
-    theta = drawn(prior, 2)
-    model = fresh(changes={"decoder": decoder}).model.double()
+    prior = make(changes={"decoder": decoder})
+    theta = random_theta(prior, 2)
+    model = make(changes={"decoder": decoder}).model.double()
     network = model.generative
     for row in theta:
-        place, first, noise = row[:4], row[4 : 4 + RANK], row[4 + RANK :].reshape(4, 3)
+        placement, first, noise = row[:4], row[4 : 4 + RANK], row[4 + RANK :].reshape(4, 3)
         x = model.initial_mean + model.initial_factor @ torch.tensor(first)
         motion = [x]
         standard = (x - model.state_mean) / model.state_deviation
@@ -72,17 +72,17 @@ def test_motion_matches_an_explicit_rollout(fresh, decoder):
             standard = decoded
             motion.append(model.state_mean + model.state_deviation * standard)
         states = torch.stack(motion).detach().numpy()
-        wanted = prior.states.positions(states, prior.states.rest)
-        wanted = turned_about_vertical(wanted, math.atan2(place[3], place[2]))
-        wanted = wanted + 3.0 * np.array([place[0], 0.0, place[1]])
-        np.testing.assert_allclose(prior.motion(row), wanted, atol=1e-9)
+        expected = prior.states.positions(states, prior.states.rest)
+        expected = turned_about_vertical(expected, math.atan2(placement[3], placement[2]))
+        expected = expected + 3.0 * np.array([placement[0], 0.0, placement[1]])
+        np.testing.assert_allclose(prior.motion(row), expected, atol=1e-9)
 
 
 def test_motion_is_differentiable_and_agrees_between_numpy_and_torch(prior):
-    theta = drawn(prior, 2)
+    theta = random_theta(prior, 2)
     tensor = torch.tensor(theta[:1], requires_grad=True)
     assert torch.autograd.gradcheck(prior.motion, tensor)
-    wanted = prior.motion(theta)
+    exact = prior.motion(theta)
     for given, dtype in (
         (torch.tensor(theta), torch.float64),
         (torch.tensor(theta).float(), torch.float32),
@@ -90,31 +90,31 @@ def test_motion_is_differentiable_and_agrees_between_numpy_and_torch(prior):
     ):
         motion = prior.motion(given)
         assert motion.dtype == dtype
-        np.testing.assert_allclose(motion, wanted, atol=1e-12 if given.dtype.itemsize > 4 else 1e-4)
+        np.testing.assert_allclose(motion, exact, atol=1e-12 if given.dtype.itemsize > 4 else 1e-4)
     integers = np.arange(20) % 3 - 1
     np.testing.assert_array_equal(prior.motion(integers), prior.motion(integers.astype(float)))
 
 
-def test_position_and_heading_coordinates_move_the_body(prior, fresh):
-    theta = drawn(prior)
+def test_position_and_heading_coordinates_move_the_body(prior, make):
+    theta = random_theta(prior)
     before = prior.motion(theta)
-    moved = theta.copy()
-    moved[:, :2] += [0.5, -1.0]
-    there = before + prior.spread * np.array([0.5, 0.0, -1.0])
-    np.testing.assert_allclose(prior.motion(moved), there, atol=1e-12)
-    turned = theta.copy()
+    shifted = theta.copy()
+    shifted[:, :2] += [0.5, -1.0]
+    expected = before + prior.spread * np.array([0.5, 0.0, -1.0])
+    np.testing.assert_allclose(prior.motion(shifted), expected, atol=1e-12)
+    rotated = theta.copy()
     angle = 0.8
-    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    turned[:, 2:4] = 2.5 * theta[:, 2:4] @ turn
+    rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    rotated[:, 2:4] = 2.5 * theta[:, 2:4] @ rotation
     ground = prior.spread * np.stack([theta[:, 0], 0 * theta[:, 0], theta[:, 1]], -1)[:, None, None]
-    wanted = turned_about_vertical(before - ground, np.full(3, angle)) + ground
-    np.testing.assert_allclose(prior.motion(turned), wanted, atol=1e-12)
-    closer = fresh(spread=0.5).motion(theta)
+    expected = turned_about_vertical(before - ground, np.full(3, angle)) + ground
+    np.testing.assert_allclose(prior.motion(rotated), expected, atol=1e-12)
+    closer = make(spread=0.5).motion(theta)
     np.testing.assert_allclose(closer, before - ground + ground / 6, atol=1e-12)
 
 
-def test_coordinates_are_inverted_up_to_the_length_of_the_heading_numbers(prior):
-    theta = drawn(prior)
+def test_coordinates_are_inverted_up_to_the_length_of_the_heading_vector(prior):
+    theta = random_theta(prior)
     ground, heading = 3.0 * theta[:, :2], np.arctan2(theta[:, 3], theta[:, 2])
     innovations = theta[:, 4 + RANK :].reshape(3, 4, 3)
     again = prior.coordinates(ground, heading, theta[:, 4 : 4 + RANK], innovations)
@@ -126,13 +126,13 @@ def test_prior_adapts_to_other_lengths_and_bodies(prior):
     long = prior.of(frames=8)
     assert (long.frames, long.dim, prior.frames) == (8, 4 + RANK + 7 * 3, 5)
     # Longer motions extend shorter ones.
-    theta = drawn(long)
+    theta = random_theta(long)
     np.testing.assert_allclose(
         long.motion(theta)[:, :5], prior.motion(theta[:, : prior.dim]), atol=1e-12
     )
     rest, network = prior.states.rest, object()
     small = prior.of(body=0.5 * rest, frames=2, inference_network=network)
-    motion = small.motion(drawn(small))
+    motion = small.motion(random_theta(small))
     for joint, parent in prior.skeleton.bones:
         bones = np.linalg.norm(motion[..., joint, :] - motion[..., parent, :], axis=-1)
         np.testing.assert_allclose(bones, 0.5 * np.linalg.norm(rest[joint]), atol=1e-9)
@@ -142,7 +142,7 @@ def test_prior_adapts_to_other_lengths_and_bodies(prior):
 
 
 def test_checkpoint_round_trip(prior, tmp_path):
-    theta, rest = drawn(prior), prior.states.rest
+    theta, rest = random_theta(prior), prior.states.rest
     for half, tolerance in ((False, 0.0), (True, 0.02)):
         prior.save(tmp_path / "a.safetensors", half=half)
         loaded = MotionDVAE.load(tmp_path / "a.safetensors")

@@ -44,7 +44,7 @@ def test_windows_cover_motions_of_any_length(window, overlap):
         assert cut.length == min(window, frames)
         assert cut.starts[0] == 0
         assert cut.starts[-1] + cut.length == frames
-        # No gaps, and at least the requested overlap.
+        # There are no gaps, and the overlap is at least the requested one.
         assert all(0 < step <= window - overlap for step in np.diff(cut.starts))
         assert (cut.weights > 0).all()
         motions = np.random.default_rng(0).normal(size=(2, frames, 4, 3))
@@ -82,8 +82,8 @@ def test_heading_is_perpendicular_to_left_right_pairs():
     for left, right in PERSON.mirrored_pairs:
         joints[:, :, left], joints[:, :, right] = [0.2, 1, 0], [-0.2, 1, 0]
     for angle in np.linspace(-3, 3, 7):
-        turned = turned_about_vertical(joints, angle)
-        heading, _ = rough_placement(turned, all_seen(joints), PERSON)
+        rotated = turned_about_vertical(joints, angle)
+        heading, _ = rough_placement(rotated, all_seen(joints), PERSON)
         assert heading[0] == pytest.approx(angle)
 
 
@@ -93,7 +93,7 @@ def test_placement_uses_the_first_visible_frames():
     placement = rough_placement(np.where(late[..., None], joints, np.nan), late, PERSON)
     np.testing.assert_allclose(placement[0], rough_placement(joints[:, 3:], seen[:, 3:], PERSON)[0])
     np.testing.assert_allclose(placement[1], rough_placement(joints[:, 3:], seen[:, 3:], PERSON)[1])
-    # A root occluded for four frames, and one that is never visible.
+    # One root is occluded for four frames, and one is never visible.
     seen[:, :4, PELVIS] = False
     seen[2, :, PELVIS] = False
     _, ground = rough_placement(np.where(seen[..., None], joints, 1e6), seen, PERSON)
@@ -103,8 +103,8 @@ def test_placement_uses_the_first_visible_frames():
     # Pairs with one occluded joint do not contribute to the heading.
     paired[:, :, [PERSON.index("left_wrist"), PERSON.index("right_ankle")]] = False
     heading, _ = rough_placement(np.where(paired[..., None], joints, 1e6), paired, PERSON)
-    whole, _ = rough_placement(joints, all_seen(joints), PERSON)
-    assert np.cos(heading - whole).min() > math.cos(0.3)
+    expected, _ = rough_placement(joints, all_seen(joints), PERSON)
+    assert np.cos(heading - expected).min() > math.cos(0.3)
     seen[1] = False
     with pytest.raises(ValueError, match="must have a visible joint, got none in window 1 of 3"):
         rough_placement(joints, seen, PERSON)
@@ -118,8 +118,8 @@ def test_windows_contain_noise_scales_and_mask_occluded_joints():
     body = rng.normal(size=(14, 3))
     windows = windows_of(likelihood, body, PERSON, cut, 0.25)
     assert len(windows) == 2
-    for number, at in enumerate(cut.starts):
-        part = slice(at, at + 12)
+    for number, start in enumerate(cut.starts):
+        part = slice(start, start + 12)
         seen = confidence[part] > 0
         np.testing.assert_array_equal(windows.seen[number], seen)
         noise = np.where(seen, 0.03 / np.sqrt(confidence[part].clip(0.5)), 1.0)
@@ -129,9 +129,9 @@ def test_windows_contain_noise_scales_and_mask_occluded_joints():
         )
         np.testing.assert_allclose(windows.bodies[number], body, rtol=1e-6)
     assert windows.tails.tolist() == [0.25, 0.25]
-    many = windows.repeated(3)
+    repeated = windows.repeated(3)
     for name in windows.__annotations__:
-        assert torch.equal(getattr(many, name)[2:4], getattr(windows, name))
+        assert torch.equal(getattr(repeated, name)[2:4], getattr(windows, name))
 
 
 def test_canonical_joints_invert_the_placement():
@@ -139,15 +139,15 @@ def test_canonical_joints_invert_the_placement():
     other = (np.full(joints.shape[:-1], 0.01), all_seen(joints), np.zeros(3), np.zeros((3, 14, 3)))
     windows = NoisyWindows.of(joints, *other, PERSON)
     heading, ground = torch.tensor(rng.normal(size=3)), torch.tensor(rng.normal(size=(3, 2)))
-    there = turned_about_vertical(torch.tensor(joints), heading)
-    there = there + on_ground(ground)[:, None, None, :]
-    moved = NoisyWindows.of(there.numpy(), *other, PERSON)
-    inverted = moved.in_frame(heading.float(), ground.float())
+    placed = turned_about_vertical(torch.tensor(joints), heading)
+    placed = placed + on_ground(ground)[:, None, None, :]
+    transformed = NoisyWindows.of(placed.numpy(), *other, PERSON)
+    inverted = transformed.in_frame(heading.float(), ground.float())
     np.testing.assert_allclose(inverted, joints, atol=1e-5)
     # In the estimated frame, a motion starts close to the origin.
     canonical = windows.in_frame(windows.heading, windows.ground)
     np.testing.assert_allclose(canonical[:, :5, PELVIS].mean(1)[:, [0, 2]], 0, atol=1e-5)
-    again = moved.in_frame(moved.heading, moved.ground)
+    again = transformed.in_frame(transformed.heading, transformed.ground)
     np.testing.assert_allclose(again, canonical, atol=1e-4)
 
 

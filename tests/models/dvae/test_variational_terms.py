@@ -38,7 +38,7 @@ def test_gaussian_kl_matches_torch(dtype):
 
 
 def test_gaussian_kl_is_accurate_for_similar_distributions(dtype):
-    """To second order it is ratio² + offset²/2."""
+    """To second order, the KL divergence is ratio² + offset²/2."""
     mean, log_scale = tensors(dtype, [0.3], [-1.0])
     assert gaussian_kl(mean, log_scale, mean, log_scale) == 0
     step = 2.0**-10
@@ -51,16 +51,16 @@ def test_inverse_gamma_kl_matches_torch_gamma(dtype):
     values = np.exp(np.random.default_rng(2).normal(size=(4, 3, 7)))
     alpha, beta, prior_alpha, prior_beta = tensors(dtype, *values)
     result = inverse_gamma_kl(alpha, beta, prior_alpha, prior_beta)
-    wanted = kl_divergence(Gamma(alpha, beta), Gamma(prior_alpha, prior_beta))
+    expected = kl_divergence(Gamma(alpha, beta), Gamma(prior_alpha, prior_beta))
     tolerance = 2e-5 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(result, wanted, atol=tolerance, rtol=0)
+    torch.testing.assert_close(result, expected, atol=tolerance, rtol=0)
 
 
 def test_inverse_gamma_kl_is_accurate_for_almost_gaussian_noise():
     """log Γ is 6·10⁶ at λ = 10⁶, beyond single precision."""
     half = 5e5
     alpha, beta = tensors(torch.float32, [half + 500, half], [half, half - 500])
-    # To second order (α − α₀)²/(2 α₀) and (β − β₀)²/(2 β₀).
+    # To second order, the values are (α − α₀)²/(2 α₀) and (β − β₀)²/(2 β₀).
     np.testing.assert_allclose(inverse_gamma_kl(alpha, beta, half, half), 0.25, rtol=2e-3)
     assert float(inverse_gamma_kl(alpha[1], alpha[1], half, half)) == 0
 
@@ -81,8 +81,8 @@ def test_log_normal_matches_torch(dtype):
     rng = np.random.default_rng(5)
     residual, scale = tensors(dtype, rng.normal(size=(2, 3)), np.exp(rng.normal(size=3)))
     for value in (scale, 0.1):
-        wanted = Normal(0, value).log_prob(residual)
-        torch.testing.assert_close(log_normal(residual, value), wanted)
+        expected = Normal(0, value).log_prob(residual)
+        torch.testing.assert_close(log_normal(residual, value), expected)
 
 
 @pytest.mark.parametrize("degrees", [0.5, 4.0, 1e6])
@@ -95,13 +95,13 @@ def test_tight_bound_is_the_student_t_density(dtype, degrees):
     beta = half + 0.5 * (residual / scale) ** 2
     bound = expected_log_normal(residual, alpha, beta, scale)
     bound = bound - inverse_gamma_kl(alpha, beta, half, half)
-    wanted = stats.t.logpdf(values, degrees, scale=scale)
+    expected = stats.t.logpdf(values, degrees, scale=scale)
     rtol, atol = (1e-7, 3e-8) if dtype == torch.float64 else (1e-5, 1e-4)
-    np.testing.assert_allclose(bound, wanted, rtol=rtol, atol=atol)
+    np.testing.assert_allclose(bound, expected, rtol=rtol, atol=atol)
 
 
 def test_gradients_are_finite_at_extreme_points(dtype):
-    """Zero residuals, tiny and huge variances, Gaussian noise."""
+    """The points have zero residuals, extreme variances or Gaussian noise."""
     alpha, beta, residual = (
         value.requires_grad_()
         for value in tensors(dtype, *[[1e-3, 0.5, 5e5, 5e5, 1e6]] * 2, [0.0, 10.0, 0.0, 1e-6, 1.0])

@@ -42,7 +42,7 @@ def views_of(style, numbers, seed=0):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The result of a short training."""
+    """Result of a short training run."""
     data = tracks_of(range(12)), tracks_of(range(12, 16))
     losses = []
     for seed in (1, 0, 0):
@@ -74,7 +74,7 @@ def test_features_do_not_depend_on_the_batch(evaluator, views):
     features = evaluator.features(np.concatenate([views] * 10))
     assert features.shape == (120, SIZE.latent)
     assert features.dtype == np.float64
-    # A chunk has 56 motions, so copies are at different places.
+    # A chunk has 56 motions, so copies are at different positions in chunks.
     np.testing.assert_array_equal(features, np.tile(features[:12], (10, 1)))
     np.testing.assert_array_equal(evaluator.features(views[7:8]), features[7:8])
     assert evaluator.features(views[:0]).shape == (0, SIZE.latent)
@@ -87,8 +87,8 @@ def test_padding_has_no_effect(evaluator, views):
         motion[length:] = np.nan
     features = evaluator.features(padded, lengths)
     for number, length in enumerate(lengths):
-        alone = evaluator.features(views[number : number + 1, :length])
-        np.testing.assert_array_equal(features[number : number + 1], alone)
+        single = evaluator.features(views[number : number + 1, :length])
+        np.testing.assert_array_equal(features[number : number + 1], single)
     assert np.abs(features - evaluator.features(views)).min(axis=1).max() > 1e-3
 
 
@@ -104,9 +104,9 @@ def test_features_are_the_mean_of_the_encoder(evaluator, run, views):
         expected, _ = network.encoder(motion, torch.ones(1, FRAMES, dtype=torch.bool))
     np.testing.assert_allclose(evaluator.features(views[:1]), expected, atol=1e-5)
     # Joints without variation are ignored.
-    moved = views.copy()
-    moved[:, :, 0] += 1e-7
-    np.testing.assert_array_equal(evaluator.features(moved), evaluator.features(views))
+    shifted = views.copy()
+    shifted[:, :, 0] += 1e-7
+    np.testing.assert_array_equal(evaluator.features(shifted), evaluator.features(views))
 
 
 def test_features_separate_styles(evaluator):
@@ -147,9 +147,9 @@ def test_loss_is_the_error_of_visible_joints_plus_the_divergence():
     torch.testing.assert_close(divergence_from_normal(mean, log_variance), expected.sum(dim=1))
 
 
-def test_saved_encoder_gives_the_same_features(evaluator, views, tmp_path, run, monkeypatch):
+def test_saved_encoder_yields_the_same_features(evaluator, views, tmp_path, run, monkeypatch):
     monkeypatch.setattr(checkpoints, "WEIGHTS", tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"source must be .* one of no names, got 'full'"):
+    with pytest.raises(FileNotFoundError, match="a file or the folder of a training run, got 'f"):
         TrackEvaluator.load("full")
     full, half = tmp_path / "full.safetensors", tmp_path / "half.safetensors"
     evaluator.save(full)

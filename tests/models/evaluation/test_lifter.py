@@ -63,7 +63,7 @@ def trainee(flow):
 
 @pytest.fixture(scope="module")
 def lifter():
-    """A lifter with random weights."""
+    """Lifter with random weights."""
     network = LifterNetwork(TINY, 14, 0)
     generator = seeds.torch_generator(0, "shaken")
     with torch.no_grad():
@@ -77,12 +77,12 @@ def views(n=3):
 
 
 def perspective(points, azimuth, elevation):
-    """Return 2D poses by the package's cameras, one for each pose."""
+    """Return projections by the package's cameras, one camera per pose."""
     cameras = Cameras.around(
         azimuth.numpy(), elevation.numpy(), distance=DISTANCE, perspective=True
     )
-    every = cameras.project(points[:, None].numpy())[:, :, 0]
-    return torch.from_numpy(every[np.arange(len(points)), np.arange(len(points))])
+    projections = cameras.project(points[:, None].numpy())[:, :, 0]
+    return torch.from_numpy(projections[np.arange(len(points)), np.arange(len(points))])
 
 
 def depths(points, azimuth, elevation):
@@ -92,7 +92,7 @@ def depths(points, azimuth, elevation):
 
 @pytest.fixture(scope="module")
 def bodies():
-    """Root-centred 3D poses, and the azimuth and elevation of a camera for each."""
+    """Return root-centred 3D poses, and the azimuth and elevation of a camera for each."""
     rng = seeds.generator(0, "bodies")
     motion = centre_motion(WALKS[0])
     points = motion.positions[rng.integers(motion.frames, size=N)]
@@ -102,17 +102,17 @@ def bodies():
 
 @pytest.fixture
 def losses(bodies, flow):
-    """The loss terms of a lifter with true outputs, except where replaced."""
+    """Return a function for the loss terms of true outputs, except where replaced."""
     points, azimuth, elevation = bodies
-    here = torch.zeros(N, dtype=torch.float64)
+    zero = torch.zeros(N, dtype=torch.float64)
     double = copy.deepcopy(flow).double().requires_grad_(False)
     bones = torch.tensor(PERSON.bones)
     sizes = (points[:, bones[:, 0]] - points[:, bones[:, 1]]).norm(dim=-1).mean(dim=0)
 
     def terms(first=None, second=None):
-        first = first or (depths(points, here, elevation), elevation)
+        first = first or (depths(points, zero, elevation), elevation)
         second = second or (depths(points, azimuth, elevation[ORDER]), elevation[ORDER])
-        poses = perspective(points, here, elevation)
+        poses = perspective(points, zero, elevation)
         outputs = iter((first, second))
         return lifting_losses(
             lambda poses: next(outputs), double, poses, azimuth, ORDER, sizes, DISTANCE
@@ -145,9 +145,9 @@ def test_lifted_motions_project_onto_their_input(lifter):
         np.testing.assert_allclose(camera.project(motion)[0], expected, atol=1e-12)
         assert np.abs(motion @ camera.rotation[0, 2]).max() > 0.05
     # The elevation is the mean over frames.
-    alone = lifter.elevations(poses_2d.reshape(15, 1, 14, 2)).reshape(3, 5)
-    np.testing.assert_allclose(elevations, alone.mean(axis=1), rtol=1e-12)
-    assert 0 < alone.min() < alone.max() < lifter.settings.steepest
+    single = lifter.elevations(poses_2d.reshape(15, 1, 14, 2)).reshape(3, 5)
+    np.testing.assert_allclose(elevations, single.mean(axis=1), rtol=1e-12)
+    assert 0 < single.min() < single.max() < lifter.settings.steepest
 
 
 def test_lifting_does_not_depend_on_the_batch(lifter):
@@ -171,9 +171,9 @@ def test_true_outputs_have_no_loss_except_the_likelihood(bodies, losses, flow):
 def test_inconsistent_second_lifting_has_a_loss(bodies, losses):
     points, azimuth, elevation = bodies
     depth = depths(points, azimuth, elevation[ORDER])
-    moved = depth.clone()
-    moved[:, 3] += 0.2
-    terms = losses(second=(moved, elevation[ORDER]))
+    shifted = depth.clone()
+    shifted[:, 3] += 0.2
+    terms = losses(second=(shifted, elevation[ORDER]))
     # One of 14 joints moves 20 cm in depth, slightly more along its ray.
     assert 0.04 / 14 <= float(terms["points"]) < 1.05 * 0.04 / 14
     assert 0 < float(terms["picture"]) < float(terms["points"])
@@ -196,7 +196,7 @@ def test_bone_loss_is_the_squared_relative_error(bodies, losses):
 
 
 def test_bone_sizes_are_quantiles_of_2d_lengths():
-    """Rods that point in all directions of a horizontal circle."""
+    """The rods point in all horizontal directions."""
     skeleton = Skeleton(["pelvis", "left_hip", "right_hip"], [-1, 0, 0])
     azimuth = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
     rod = np.stack([0.3 * np.cos(azimuth), np.zeros(4000)], axis=-1)
@@ -235,8 +235,8 @@ def test_losses_depend_on_their_generator_only(trainee):
 
 
 def depth_error(lifter, motion):
-    """Return mean errors over 8 views: lifted joints and flat ones, metres; elevation, radians;
-    and the proportion of depths above 5 cm with the correct sign."""
+    """Return means over 8 views: errors of lifted and of flat joints, metres, and of the elevation,
+    radians; and the proportion of depths above 5 cm with the correct sign."""
     results = []
     cameras = Filming().cameras(seeds.generator(0, "test"), 8)
     points = centre_motion(motion).positions
@@ -256,7 +256,7 @@ def depth_error(lifter, motion):
 
 
 def test_depth_is_learnt_from_2d(tmp_path):
-    """From projections of all clips except the last two."""
+    """The lifter is trained on projections of all clips except the last two."""
     clips = walks(14)
     tracks = project_clips(clips[:-2], views=16)
     validation = project_clips(clips[-2:-1], views=16)
@@ -288,8 +288,8 @@ OTHER = [KeypointTrack(np.ones((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "point"
         (lambda lifter, flow: lifter.lift(views()[0]), r"views must have shape .*got \(5, 14, 2\)"),
         (lambda lifter, flow: lifter.lift(views()[:, :0]), "views must contain a motion and a fr"),
         (lambda lifter, flow: lifter.lift(np.nan * views()), "views must be finite"),
-        (lambda _, flow: LifterTrainee(TRACKS, OTHER, flow, TINY), "validation must have the same"),
-        (lambda _, flow: LifterTrainee(OTHER, OTHER, flow, TINY), "flow must have the same skelet"),
+        (lambda _, flow: LifterTrainee(TRACKS, OTHER, flow, TINY), "validation must have the"),
+        (lambda _, flow: LifterTrainee(OTHER, OTHER, flow, TINY), "flow must have the skeleton"),
     ],
 )
 def test_invalid_input_is_rejected(lifter, flow, call, message):

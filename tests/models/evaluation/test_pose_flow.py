@@ -11,7 +11,7 @@ from scipy import stats
 
 from probmotion import seeds
 from probmotion.models.evaluation.pose_flow import CouplingFlow, FlowSettings, PoseFlow
-from probmotion.models.evaluation.pose_flow_training import PoseFlowTrainee, whole_poses
+from probmotion.models.evaluation.pose_flow_training import PoseFlowTrainee, fully_visible_poses
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import train
 from probmotion.motion.motion import KeypointTrack
@@ -20,7 +20,7 @@ from probmotion.motion.skeleton import Skeleton
 PERSON = Skeleton.preset("person14")
 # With one joint besides the root, the density is that of a point in the plane.
 POINT = Skeleton(["root", "tip"], [-1, 0])
-SPOTS = np.array([[1.0, 0.5], [-1.0, 0.5], [0.4, -0.8], [-0.4, -0.8]])
+CENTRES = np.array([[1.0, 0.5], [-1.0, 0.5], [0.4, -0.8], [-0.4, -0.8]])
 SPREAD = 0.25
 TINY = FlowSettings.tiny()
 
@@ -63,7 +63,7 @@ def test_density_integrates_to_one():
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_untrained_density_is_the_gaussian_of_the_data(share):
-    """Principal components outside the flow contribute as well."""
+    """Principal components outside the flow contribute to the density."""
     rng = seeds.generator(0, "poses")
     poses = rng.normal(size=(400, 26)) @ (0.1 * rng.normal(size=(26, 26)))
     poses = np.insert(poses.reshape(400, 13, 2), 0, 0.0, axis=1)
@@ -81,7 +81,7 @@ def test_untrained_density_is_the_gaussian_of_the_data(share):
 def mixture_tracks(seed, frames=3000):
     """Return tracks with the tip at one of four spots, symmetric under mirroring."""
     rng = seeds.generator(seed, "mixture")
-    tip = SPOTS[rng.integers(4, size=frames)] + SPREAD * rng.normal(size=(frames, 2))
+    tip = CENTRES[rng.integers(4, size=frames)] + SPREAD * rng.normal(size=(frames, 2))
     keypoints = np.stack([np.zeros_like(tip), tip], axis=1)
     return [KeypointTrack(keypoints, np.ones((frames, 2)), POINT, 20.0, f"spots-{seed}/0")]
 
@@ -93,7 +93,7 @@ def test_training_recovers_a_mixture(tmp_path):
     variance = SPREAD**2 + settings.blur**2
     rng = seeds.generator(2, "test")
     tip = mixture_tracks(3)[0].keypoints[:, 1] + settings.blur * rng.normal(size=(3000, 2))
-    parts = [stats.multivariate_normal(spot, variance).pdf(tip) for spot in SPOTS]
+    parts = [stats.multivariate_normal(centre, variance).pdf(tip) for centre in CENTRES]
     exact = np.log(np.mean(parts, axis=0))
     poses = poses_of(torch.from_numpy(tip).float())
 
@@ -113,18 +113,18 @@ def test_training_recovers_a_mixture(tmp_path):
     assert abs(result.history[-1]["validation_loss"] + exact.mean() / 2) < 0.1
 
 
-def test_whole_poses_are_centred_and_mirrored():
+def test_fully_visible_poses_are_centred_and_mirrored():
     keypoints = seeds.generator(0, "track").normal(size=(5, 14, 2))
     confidence = np.full((5, 14), 0.9)
     confidence[1, 3], confidence[2, 7], keypoints[2, 7] = 0.2, 0.0, np.nan
     track = KeypointTrack(keypoints, confidence, PERSON, 20.0, "a/0")
-    poses = whole_poses([track], 0.3)
+    poses = fully_visible_poses([track], 0.3)
     assert poses.shape == (6, 14, 2)
     np.testing.assert_allclose(poses[:3], (keypoints - keypoints[:, :1])[[0, 3, 4]])
     left, right = PERSON.index("left_knee"), PERSON.index("right_knee")
     np.testing.assert_array_equal(poses[3:, left], poses[:3, right] * [-1, 1])
     np.testing.assert_array_equal(poses[3:, 1], poses[:3, 1] * [-1, 1])
-    assert len(whole_poses([track], 0.0)) == 8
+    assert len(fully_visible_poses([track], 0.0)) == 8
 
 
 def test_losses_depend_on_their_generator_only():
@@ -144,7 +144,7 @@ def test_losses_depend_on_their_generator_only():
 GOOD = mixture_tracks(0, 20)
 OCCLUDED = [KeypointTrack(np.zeros((3, 2, 2)), np.full((3, 2), 0.1), POINT, 20.0, "dark")]
 OTHER = [KeypointTrack(np.zeros((3, 14, 2)), np.ones((3, 14)), PERSON, 20.0, "person")]
-STILL = [KeypointTrack(np.zeros((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "still")]
+STATIC = [KeypointTrack(np.zeros((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "still")]
 
 
 @pytest.mark.parametrize(
@@ -153,8 +153,8 @@ STILL = [KeypointTrack(np.zeros((3, 2, 2)), np.ones((3, 2)), POINT, 20.0, "still
         ([], GOOD, "tracks must contain at least one track, got none"),
         (OCCLUDED, GOOD, "a frame with every joint at confidence 0.3 or more, got none"),
         (GOOD + OTHER, GOOD, "tracks must share one skeleton, got another in 'person'"),
-        (GOOD, OTHER, "validation must have the same skeleton as tracks"),
-        (STILL, STILL, "blur must be above 0 for poses in a subspace, got 0"),
+        (GOOD, OTHER, "validation must have the skeleton of tracks, got joints"),
+        (STATIC, STATIC, "blur must be larger for poses in a subspace, got 0"),
     ],
 )
 def test_invalid_input_is_rejected(tracks, validation, message):

@@ -11,7 +11,7 @@ from probmotion.posteriors.protocols import DenoisesCoordinates, HasLogDensity, 
 
 
 class Doubled(StandardNormalPrior):
-    """One frame of one joint at 2 θ."""
+    """Prior over one frame of one joint at 2 θ."""
 
     dim = 3
 

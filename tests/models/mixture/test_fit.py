@@ -8,7 +8,7 @@ from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.models import GaussianMixtureMotion
 from probmotion.models.mixture.fit import (
     _common_heading,
-    _turned_to_mean,
+    _rotated_to_mean,
     cut_windows,
     turn_to,
 )
@@ -21,7 +21,7 @@ def synthetic_style(rng, n, turned=True):
     body = np.array([[0.0, 1.0, 0.0], [0.2, 1.0, 0.1], [-0.2, 1.0, 0.1]])
     mean = np.tile(body, (4, 1, 1)) + 0.3 * rng.normal(size=(4, 1, 3))
     factors = rng.normal(size=(2, 4, 3, 3)) * np.array([0.2, 0.1])[:, None, None, None]
-    factors[..., [0, 2]] = 0.0  # Vertical only, so the heading does not change.
+    factors[..., [0, 2]] = 0.0  # Vertical, so the heading is unchanged.
     windows = mean + np.tensordot(rng.normal(size=(n, 2)), factors, 1)
     windows += 0.01 * rng.normal(size=(n, 4, 3, 3))
     motions = [Motion(window, SIDES, 30.0) for window in windows]
@@ -52,7 +52,7 @@ def test_fit_reproduces_the_leading_spectrum_of_the_data():
     W = prior.factors[0].reshape(2, -1)
     model = np.linalg.eigvalsh(W.T @ W + prior.noise**2 * np.eye(36))[::-1]
     windows, _ = cut_windows(motions, 4)
-    aligned = _turned_to_mean(_common_heading(windows, motions[0])).reshape(500, -1)
+    aligned = _rotated_to_mean(_common_heading(windows, motions[0])).reshape(500, -1)
     data = np.linalg.eigvalsh(np.cov(aligned.T))[::-1]
     np.testing.assert_allclose(model[:2], data[:2], rtol=1e-9)
     np.testing.assert_allclose(model.sum(), data.sum(), rtol=1e-9)
@@ -73,7 +73,7 @@ def test_fit_is_invariant_to_clip_headings():
     clips = make_gaits(60, styles={"walk": 1.0}, seed=4)
     rng = np.random.default_rng(5)
     turned = [clip.turned(rng.uniform(0, 2 * np.pi)) for clip in clips]
-    a, b = (GaussianMixtureMotion.fit(some, 30, rank=5, styles=1) for some in (clips, turned))
+    a, b = (GaussianMixtureMotion.fit(motions, 30, rank=5, styles=1) for motions in (clips, turned))
     np.testing.assert_allclose(a.means, b.means, atol=1e-9)
     assert a.noise == pytest.approx(b.noise, rel=1e-9)
 

@@ -33,7 +33,7 @@ def small_prior(coordinates="latent"):
 
 
 class Dense:
-    """The same mixture with explicit covariance matrices."""
+    """Mixture with explicit covariance matrices, as a reference."""
 
     def __init__(self, prior, image=None):
         self.components = []
@@ -64,8 +64,8 @@ class Dense:
 
     def denoise(self, x_t, alpha_bar, scale):
         """Return the mean and covariance of x₀ given one x_t, in normalised units."""
-        one = np.eye(len(x_t))
-        H, noise = np.sqrt(alpha_bar) / scale * one, (1 - alpha_bar) * one
+        identity = np.eye(len(x_t))
+        H, noise = np.sqrt(alpha_bar) / scale * identity, (1 - alpha_bar) * identity
         mean, covariance = moments(*self.given(H, noise, x_t)[:3])
         return mean / scale, covariance / scale**2
 
@@ -181,7 +181,7 @@ def test_posterior_density_satisfies_bayes_rule(prior, motions, kind):
 
 @KINDS
 def test_latent_likelihood_integrates_to_the_marginal_likelihood(prior, motions, kind):
-    """log p(y) = log ∫ p(y|z) p(z) dz by the trapezoidal rule."""
+    """The trapezoidal rule computes log p(y) = log ∫ p(y|z) p(z) dz."""
     posterior = prior.exact_posterior(likelihood_of(kind, prior, motions))
     node, step = np.linspace(-8, 8, 161, retstep=True)
     grid = np.stack(np.meshgrid(node, node), axis=-1).reshape(-1, 2)
@@ -214,13 +214,13 @@ def test_posterior_and_its_draws_match_dense_algebra(prior, motions, kind):
     X = posterior.sample(np.random.default_rng(9), n).reshape(n, -1) - mean
     assert (np.abs(X.mean(axis=0)) < 5 * np.sqrt(np.diag(covariance) / n)).all()
     squares = X[:, :, None] * X[:, None, :]
-    # 171 entries for each kind at 5 standard errors.
+    # The 171 entries for each kind are compared at 5 standard errors.
     error = squares.std(axis=0) / np.sqrt(n)
     assert (np.abs(squares.mean(axis=0) - covariance) < 5 * error).all()
 
 
 def test_completed_draws_of_theta_have_the_posterior_mean(prior, motions):
-    """X ~ p(X|z, y) with z ~ p(z|y) by importance resampling."""
+    """Draw z ~ p(z|y) by importance resampling, then X ~ p(X|z, y)."""
     rng = np.random.default_rng(10)
     likelihood = likelihood_of("joints", prior, motions)
     posterior = prior.exact_posterior(likelihood)
@@ -266,15 +266,15 @@ def test_reduction_commutes_with_projection_and_denoising(alpha_bar):
     outside = x_t.reshape(5, -1, 3) - basis @ y_t[:, 0]
     variance = (prior.noise / prior.scale) ** 2
     fraction = np.sqrt(alpha_bar) * variance / (alpha_bar * variance + 1 - alpha_bar)
-    back = basis @ reduced.denoise_motion(y_t, alpha_bar)[:, 0] + fraction * outside
+    recovered = basis @ reduced.denoise_motion(y_t, alpha_bar)[:, 0] + fraction * outside
     full = prior.denoise_motion(x_t, alpha_bar).reshape(5, -1, 3)
-    np.testing.assert_allclose(back, full, rtol=0, atol=2e-13)
-    seen, seen_small = cameras.project(x_t), cameras.project(y_t)
+    np.testing.assert_allclose(recovered, full, rtol=0, atol=2e-13)
+    projected, projected_small = cameras.project(x_t), cameras.project(y_t)
     np.testing.assert_allclose(
-        basis.T @ seen.reshape(5, 3, -1, 2), seen_small[:, :, 0], rtol=0, atol=1e-13
+        basis.T @ projected.reshape(5, 3, -1, 2), projected_small[:, :, 0], rtol=0, atol=1e-13
     )
-    views = prior.denoise(seen, alpha_bar, cameras).reshape(5, 3, -1, 2)
-    views_small = reduced.denoise(seen_small, alpha_bar, cameras)[:, :, 0]
+    views = prior.denoise(projected, alpha_bar, cameras).reshape(5, 3, -1, 2)
+    views_small = reduced.denoise(projected_small, alpha_bar, cameras)[:, :, 0]
     np.testing.assert_allclose(basis.T @ views, views_small, rtol=0, atol=2e-13)
 
 

@@ -42,10 +42,10 @@ def swings(n, seed=0):
     """Simulate people swinging arms and legs with flexed knees and elbows, (n, 17, 3)."""
     rng = np.random.default_rng(seed)
     degrees = {name: rng.uniform(-8, 8, (n, 3)) for name in PERSON.joint_names}
-    for side, turn in (("left", 1.0), ("right", -1.0)):
+    for side, sign in (("left", 1.0), ("right", -1.0)):
         degrees[f"{side}_knee"] = rng.uniform((-40, -5, -10), (20, 5, 10), (n, 3))
         degrees[f"{side}_ankle"] = rng.uniform(0, 100, (n, 1)) * [1, 0, 0]
-        degrees[f"{side}_elbow"] = rng.uniform((-70, -5, 5), (30, 5, 50), (n, 3)) * [1, turn, turn]
+        degrees[f"{side}_elbow"] = rng.uniform((-70, -5, 5), (30, 5, 50), (n, 3)) * [1, sign, sign]
         degrees[f"{side}_wrist"] = rng.uniform(-120, 0, (n, 1)) * [1, 0, 0]
     poses = np.zeros((n, 17, 3))
     frames = {0: Rotation.random(n, rng=rng)}
@@ -84,9 +84,9 @@ def bent_backwards(poses, joint):
     axis = poses[:, parent] - poses[:, PERSON.parents[parent]]
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     bone = poses[:, joint] - poses[:, parent]
-    turned = poses.copy()
-    turned[:, joint] = poses[:, parent] + 2 * (axis * bone).sum(1, keepdims=True) * axis - bone
-    return turned
+    rotated = poses.copy()
+    rotated[:, joint] = poses[:, parent] + 2 * (axis * bone).sum(1, keepdims=True) * axis - bone
+    return rotated
 
 
 def flexion(poses, joint):
@@ -129,12 +129,12 @@ def test_training_poses_are_valid_and_dilation_enlarges_the_table():
         assert small.sum() < large.sum()
 
 
-def test_hips_keep_their_sides():
+def test_hips_stay_on_their_side():
     wide = learn_limits([swings(30)], dilation=1.4, bin_dilation=0.0)
     assert not wide.allowed[PARTS.index("hip")][:, sphere_rings(22)[1][:, 0] <= 0].any()
 
 
-def test_nearest_valid_pose_is_valid_and_keeps_lengths_and_roots(table, limits):
+def test_nearest_valid_pose_is_valid_and_preserves_lengths_and_roots(table, limits):
     poses = np.concatenate([random_poses(3000), swings(500, seed=2)])
     valid, nearest = table.project(poses)
     assert 0.1 < valid.mean() < 0.9
@@ -155,22 +155,22 @@ def test_knee_bent_forwards_is_invalid_and_only_the_shin_moves(limits, ankle):
     assert not valid[:, joint - 1].any()
     others = np.delete(valid, joint - 1, axis=1).all(axis=1)
     assert others.mean() > 0.9
-    moved = np.abs(nearest - forwards)[others].max(axis=(0, 2)) > 0
-    assert np.flatnonzero(moved).tolist() == [joint]
+    changed = np.abs(nearest - forwards)[others].max(axis=(0, 2)) > 0
+    assert np.flatnonzero(changed).tolist() == [joint]
 
 
 def test_correction_is_the_nearest_valid_direction(limits):
-    """Against a search over directions, up to the size of a cell."""
-    around = sphere_rings(40)[1]
+    """The reference is a search over directions; the tolerance is the size of a cell."""
+    directions = sphere_rings(40)[1]
     joint, parent = JOINT["left_wrist"], JOINT["left_elbow"]
     wrong = bent_backwards(swings(30, seed=4), joint)
     length = np.linalg.norm(bones_of(wrong)[:, joint - 1], axis=1)
     for pose, reach, corrected in zip(wrong, length, limits.nearest_valid(wrong), strict=True):
-        tried = np.repeat(pose[None], len(around), axis=0)
-        tried[:, joint] = pose[parent] + reach * around
-        valid = limits.is_valid(tried)[:, joint - 1]
+        candidates = np.repeat(pose[None], len(directions), axis=0)
+        candidates[:, joint] = pose[parent] + reach * directions
+        valid = limits.is_valid(candidates)[:, joint - 1]
         bone = pose[joint] - pose[parent]
-        nearest = angle(around[valid], bone).min()
+        nearest = angle(directions[valid], bone).min()
         assert angle(corrected[joint] - corrected[parent], bone) <= nearest + np.pi / 22
 
 
@@ -180,12 +180,12 @@ def test_descendants_rotate_with_a_corrected_bone(limits):
     wrong = poses.copy()
     wrong[:, arm] = 2 * poses[:, JOINT["left_shoulder"]][:, None] - poses[:, arm]
     valid, nearest = limits.project(wrong)
-    only = ~valid[:, arm[0] - 1] & np.delete(valid, arm[0] - 1, axis=1).all(axis=1)
-    assert only.sum() > 10
-    before, after = (flexion(p[only], arm[1]) for p in (wrong, nearest))
+    selected = ~valid[:, arm[0] - 1] & np.delete(valid, arm[0] - 1, axis=1).all(axis=1)
+    assert selected.sum() > 10
+    before, after = (flexion(p[selected], arm[1]) for p in (wrong, nearest))
     np.testing.assert_allclose(before, after, atol=1e-7)
-    still = np.delete(np.arange(17), arm)
-    np.testing.assert_array_equal(nearest[only][:, still], wrong[only][:, still])
+    fixed = np.delete(np.arange(17), arm)
+    np.testing.assert_array_equal(nearest[selected][:, fixed], wrong[selected][:, fixed])
 
 
 def test_limits_are_equivariant_to_reflection_and_similarity(table):
@@ -201,23 +201,23 @@ def test_limits_are_equivariant_to_reflection_and_similarity(table):
 
 
 def test_limits_depend_on_the_parents_direction():
-    """Forearms forwards below hanging arms, and straight below raised arms."""
-    still = swings(1, seed=10)[0]
+    """In the training poses, forearms point ahead from hanging arms and from arms ahead."""
+    base = swings(1, seed=10)[0]
     shoulder, elbow, wrist = (JOINT[f"left_{n}"] for n in ("shoulder", "elbow", "wrist"))
-    ahead = np.cross(still[JOINT["left_hip"]] - still[JOINT["right_hip"]], still[1] - still[0])
+    ahead = np.cross(base[JOINT["left_hip"]] - base[JOINT["right_hip"]], base[1] - base[0])
     ahead /= np.linalg.norm(ahead)
-    up = still[JOINT["neck"]] - still[JOINT["chest"]]
+    up = base[JOINT["neck"]] - base[JOINT["chest"]]
     up /= np.linalg.norm(up)
 
     def posed(arm, forearm):
-        pose = still.copy()
+        pose = base.copy()
         pose[elbow] = pose[shoulder] + 0.3 * arm
         pose[wrist] = pose[elbow] + 0.25 * forearm
         return pose
 
-    seen = np.stack([posed(-up, ahead), posed(ahead, ahead)])
-    limits = learn_limits([seen])
-    assert limits.is_valid(seen).all()
+    training = np.stack([posed(-up, ahead), posed(ahead, ahead)])
+    limits = learn_limits([training])
+    assert limits.is_valid(training).all()
     assert not limits.is_valid(posed(-up, -up))[wrist - 1]
     assert not limits.is_valid(posed(ahead, -up))[wrist - 1]
     assert limits.is_valid(posed(ahead, -up))[elbow - 1]
@@ -227,9 +227,9 @@ def test_people_are_independent_for_any_order_of_joints(limits):
     people = 3
     each = [random_poses(50, seed=20 + p) for p in range(people)]
     order = np.random.default_rng(people).permutation(17 * people)
-    place = np.argsort(order)
+    position = np.argsort(order)
     names = [f"p{p}:{name}" for p in range(people) for name in PERSON.joint_names]
-    parents = [-1 if q < 0 else place[q + 17 * p] for p in range(people) for q in PERSON.parents]
+    parents = [-1 if q < 0 else position[q + 17 * p] for p in range(people) for q in PERSON.parents]
     crowd = Skeleton([names[j] for j in order], [parents[j] for j in order])
     poses = np.concatenate(each, axis=1)[:, order]
     valid, nearest = limits.on(crowd).project(poses)
@@ -238,13 +238,13 @@ def test_people_are_independent_for_any_order_of_joints(limits):
     bone = {joint: i for i, (joint, _) in enumerate(crowd.bones)}
     for p, poses in enumerate(each):
         expected, corrected = limits.project(poses)
-        np.testing.assert_array_equal(nearest[:, place[17 * p : 17 * p + 17]], corrected)
-        bones = [bone[place[17 * p + joint]] for joint, _ in PERSON.bones]
+        np.testing.assert_array_equal(nearest[:, position[17 * p : 17 * p + 17]], corrected)
+        bones = [bone[position[17 * p + joint]] for joint, _ in PERSON.bones]
         np.testing.assert_array_equal(valid[:, bones], expected)
 
 
 def test_degenerate_poses_are_corrected(limits):
-    """Coincident joints, coincident hips, a spine along the hips, swapped hips, reflection."""
+    """The poses have coincident joints or hips, a spine along the hips, or are mirrored."""
     poses = np.repeat(swings(1), 5, axis=0)
     poses[0] = 0.0
     hips = [JOINT["left_hip"], JOINT["right_hip"]]

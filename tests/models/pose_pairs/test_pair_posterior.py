@@ -14,14 +14,14 @@ from probmotion.motion.motion import Motion
 from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic
 
-FEW = PairSettings(n_views=4, n_near=8)
+SETTINGS = PairSettings(n_views=4, n_near=8)
 DANCE = synthetic_dances(1)[0]
 SEED = DANCE.positions[choose_seed(DANCE.positions)]
 
 
 @pytest.fixture(scope="module")
 def posterior():
-    return pair_posterior(SEED, draw_annotations([DANCE], 40, seed=0).annotations, FEW)
+    return pair_posterior(SEED, draw_annotations([DANCE], 40, seed=0).annotations, SETTINGS)
 
 
 def run(posterior, **settings):
@@ -43,7 +43,7 @@ def test_pseudo_marginal_chains_use_fresh_views(posterior):
 
 
 def test_unusual_rig_needs_its_own_limits():
-    """Hips far below the pelvis, unlike the clips of the shipped limits."""
+    """The hips are far below the pelvis, unlike in the clips of the shipped limits."""
     unusual = DANCE.positions.copy()
     parts = ("hip", "knee", "ankle")
     legs = [k for k, name in enumerate(DANCE.skeleton.joint_names) if name.endswith(parts)]

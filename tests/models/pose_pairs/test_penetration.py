@@ -1,4 +1,4 @@
-"""Penetration depth: distances of segments and sums over pairs of bones."""
+"""Penetration depth: distances between segments and sums over pairs of bones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def random_poses(n):
 
 
 def reference_distance(p, q, r, s):
-    """Return the distance of two segments by bounded linear least squares."""
+    """Return the distance between two segments by bounded linear least squares."""
     solution = lsq_linear(np.stack([q - p, r - s], axis=1), r - p, (0, 1), method="bvls")
     return np.sqrt(2 * solution.cost)
 
@@ -49,7 +49,7 @@ def test_segment_distance_equals_bounded_least_squares():
 
 
 def test_segment_distance_by_hand():
-    """Skew, collinear, crossing and parallel segments, and points."""
+    """The cases are skew, collinear, crossing and parallel segments, and points."""
     for segment, distance in (
         (([0.5, 2, 0], [0.5, 2, 1]), 2.0),
         (([2, 0, 0], [3, 0, 0]), 1.0),
@@ -77,7 +77,7 @@ def test_segment_distance_of_nearly_parallel_and_tiny_segments(size):
 
 
 def test_depth_by_hand():
-    """Orthogonal capsules of radius 0.1 m at a distance of 0.15 m: depth 0.05 m."""
+    """Orthogonal capsules of radius 0.1 m at 0.15 m from each other have depth 0.05 m."""
     pose = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 0.15, -1], [0, 0.15, 1]])
     assert penetration_depth(pose, rods(2)) == pytest.approx(0.05)
     three = np.concatenate([pose, np.add(pose[:2], [0, 0.3, 0])])
@@ -97,8 +97,8 @@ def test_neighbouring_bones_of_a_tree_are_not_tested():
     names = [PERSON.joint_names[j] for j, _ in PERSON.bones]
     pairs = {frozenset(names[b] for b in pair) for pair in capsules_of(PERSON).pairs}
     assert {frozenset({"left_knee", "right_knee"}), frozenset({"left_wrist", "chest"})} <= pairs
-    for beside in ({"left_knee", "left_hip"}, {"left_knee", "spine"}, {"left_elbow", "chest"}):
-        assert frozenset(beside) not in pairs
+    for adjacent in ({"left_knee", "left_hip"}, {"left_knee", "spine"}, {"left_elbow", "chest"}):
+        assert frozenset(adjacent) not in pairs
 
 
 def test_depth_is_the_sum_over_pairs_of_bones():
@@ -120,8 +120,8 @@ def test_depth_is_the_sum_over_pairs_of_bones():
 def test_depth_is_invariant_to_rigid_motion_and_swapping_people():
     poses = random_poses(200)
     depth = penetration_depth(poses, PAIR)
-    turn = Rotation.from_rotvec([0.3, 1.2, -0.5]).as_matrix()
-    for other in (poses @ turn.T + [3.0, -1.0, 2.0], np.roll(poses, 17, axis=1)):
+    rotation = Rotation.from_rotvec([0.3, 1.2, -0.5]).as_matrix()
+    for other in (poses @ rotation.T + [3.0, -1.0, 2.0], np.roll(poses, 17, axis=1)):
         np.testing.assert_allclose(penetration_depth(other, PAIR), depth, atol=1e-12)
     batch = penetration_depth(poses.reshape(50, 2, 2, 34, 3), PAIR)
     np.testing.assert_array_equal(batch, depth.reshape(50, 2, 2))

@@ -44,41 +44,41 @@ def test_parameters_of_a_bone_rotate_it_with_its_descendants():
         PAIR.index(f"person0:left_{name}") for name in ("shoulder", "elbow", "wrist")
     )
     theta = np.zeros(chart.dim)
-    at = 12 + 3 * [joint for joint, _ in PAIR.bones].index(elbow)
-    theta[at : at + 2] = 0.3, -0.4
-    moved = chart.positions(theta)
-    old, new = chart.seed[elbow] - chart.seed[shoulder], moved[elbow] - moved[shoulder]
+    index = 12 + 3 * [joint for joint, _ in PAIR.bones].index(elbow)
+    theta[index : index + 2] = 0.3, -0.4
+    posed = chart.positions(theta)
+    old, new = chart.seed[elbow] - chart.seed[shoulder], posed[elbow] - posed[shoulder]
     angle = np.arccos(old @ new / (np.linalg.norm(old) * np.linalg.norm(new)))
     assert angle == pytest.approx(0.5)
     assert np.linalg.norm(new) == pytest.approx(np.linalg.norm(old))
     forearm = chart.seed[wrist] - chart.seed[elbow]
-    turn, _ = Rotation.align_vectors([new, moved[wrist] - moved[elbow]], [old, forearm])
-    assert turn.magnitude() == pytest.approx(0.5)
+    rotation, _ = Rotation.align_vectors([new, posed[wrist] - posed[elbow]], [old, forearm])
+    assert rotation.magnitude() == pytest.approx(0.5)
     others = [j for j in range(PAIR.n_joints) if j not in (elbow, wrist)]
-    assert np.allclose(moved[others], chart.seed[others])
+    assert np.allclose(posed[others], chart.seed[others])
     theta[:] = 0
-    theta[at + 2] = np.log(1.1)
+    theta[index + 2] = np.log(1.1)
     longer = chart.positions(theta)
     assert np.allclose(longer[elbow] - longer[shoulder], 1.1 * old)
     assert np.allclose(longer[wrist] - longer[elbow], forearm)
 
 
 def test_measure_is_normalised():
-    """Its factors are independent: integrate over each with the others at 0."""
+    """The factors are independent, so each is integrated with the others at 0."""
     chart = PoseChart(ROD_SEED, ROD, bone_noise=0.2, root_noise=0.7)
-    rest = chart.log_measure(np.zeros(chart.dim))
+    log_peak = chart.log_measure(np.zeros(chart.dim))
 
     def density(index, radius):
         theta = np.zeros(chart.dim)
         theta[index] = radius
-        return np.exp(chart.log_measure(theta) - rest)
+        return np.exp(chart.log_measure(theta) - log_peak)
 
     ball, _ = quad(lambda r: 4 * np.pi * r**2 * density(0, r), 0, np.pi)
     disc, _ = quad(lambda r: 2 * np.pi * r * density(6, r), 0, np.pi)
-    place, _ = quad(lambda x: density(3, x), -np.inf, np.inf)
+    translation, _ = quad(lambda x: density(3, x), -np.inf, np.inf)
     stretch, _ = quad(lambda x: density(8, x), -np.inf, np.inf)
-    assert (place, stretch) == pytest.approx(np.array([0.7, 0.2]) * np.sqrt(2 * np.pi))
-    assert np.log(ball * disc * place**3 * stretch) == pytest.approx(-rest, abs=1e-8)
+    assert (translation, stretch) == pytest.approx(np.array([0.7, 0.2]) * np.sqrt(2 * np.pi))
+    assert np.log(ball * disc * translation**3 * stretch) == pytest.approx(-log_peak, abs=1e-8)
     assert density(0, 3.2) == density(6, 3.2) == 0
 
 

@@ -40,14 +40,14 @@ BROKEN = bent_back(POSES[0])
 
 
 def test_density_equals_equation_2(prior):
-    """Recomputed from joint limits and penetration."""
+    """The reference is computed from joint limits and penetration."""
     theta = 0.25 * np.random.default_rng(0).standard_normal((200, prior.dim))
     motion = prior.motion(theta)
     pose = motion[:, 0]
     valid, nearest = JointLimits.shipped(PAIR).project(pose)
     invalid = (~valid).sum(axis=-1)
-    apart = ((pose - nearest) ** 2).sum(axis=(-2, -1))
-    energy = apart + 10 * penetration_depth(pose, PAIR) ** 2
+    squared = ((pose - nearest) ** 2).sum(axis=(-2, -1))
+    energy = squared + 10 * penetration_depth(pose, PAIR) ** 2
     expected = np.where(invalid > 8, -np.inf, -energy / (2 * 0.05**2))
     assert (invalid > 8).any()
     assert (invalid <= 8).any()
@@ -72,9 +72,9 @@ def test_plausibility_separates_real_and_broken_poses_and_is_rigidly_invariant(p
 def test_walkers_start_at_the_seeds():
     prior = PosePairPrior(POSES[:3], PAIR)
     walkers = prior.motion(prior.initial(np.random.default_rng(0), 40))[:, 0]
-    apart = np.abs(walkers[:, None] - POSES[:3]).max(axis=(-2, -1))
-    assert np.all(apart.min(axis=1) < 0.02)
-    assert set(apart.argmin(axis=1)) == {0, 1, 2}
+    distances = np.abs(walkers[:, None] - POSES[:3]).max(axis=(-2, -1))
+    assert np.all(distances.min(axis=1) < 0.02)
+    assert set(distances.argmin(axis=1)) == {0, 1, 2}
     assert len(np.unique(walkers, axis=0)) == 40
     assert np.allclose(prior.motion(prior.coordinates(POSES[5]))[0], POSES[5])
 
@@ -106,9 +106,9 @@ def test_every_setting_reaches_the_posterior():
     posterior = pair_posterior(POSES[0], annotations, settings, view_seed=7)
     prior, likelihood = posterior.prior, posterior.likelihood
     for name, value in asdict(settings).items():
-        holders = [part for part in (posterior, prior, likelihood) if hasattr(part, name)]
-        assert holders
-        assert all(getattr(part, name) == value for part in holders)
+        owners = [part for part in (posterior, prior, likelihood) if hasattr(part, name)]
+        assert owners
+        assert all(getattr(part, name) == value for part in owners)
     assert (likelihood.seed, likelihood.distribution.bandwidth) == (7, 0.3)
     assert (prior.chart.bone_noise, prior.chart.root_noise) == (0.02, 0.5)
 

@@ -1,4 +1,4 @@
-"""Enhanced lifting: reprojection, bone lengths, joint limits and depth."""
+"""Lifting of single poses: reprojection, bone lengths, joint limits and depth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAIR = Skeleton.preset("pair17")
 DANCE = synthetic_dances(1)[0].positions
 SEED, VIEW = DANCE[10], np.array([0.7, 1.5])
 ALL = np.ones(34, dtype=bool)
-HIDDEN = np.isin(np.arange(34), [7, 13, 26])
+OCCLUDED = np.isin(np.arange(34), [7, 13, 26])
 
 
 def projection(pose):
@@ -43,9 +43,9 @@ def test_bone_lengths_and_depths_of_people_are_those_of_the_seed():
 
 def test_projection_of_the_seed_is_lifted_to_the_seed():
     c, s = np.cos(0.5), np.sin(0.5)
-    turned = projection(SEED) @ np.array([[c, s], [-s, c]]) + [2.0, -1.0]
-    lifted = lift(turned, validity_weight=1e-9)
-    np.testing.assert_allclose(lifted[:, :2], turned, atol=1e-6)
+    rotated = projection(SEED) @ np.array([[c, s], [-s, c]]) + [2.0, -1.0]
+    lifted = lift(rotated, validity_weight=1e-9)
+    np.testing.assert_allclose(lifted[:, :2], rotated, atol=1e-6)
     distances = (np.linalg.norm(pose[:, None] - pose[None], axis=-1) for pose in (lifted, SEED))
     np.testing.assert_allclose(*distances, atol=1e-6)
 
@@ -58,29 +58,29 @@ def test_visible_joints_are_reprojected():
 
 
 def test_occluded_joints_are_ignored_and_stay_close_to_the_seed():
-    near = projection(DANCE[12])
+    keypoints = projection(DANCE[12])
     lifted = [
-        lift(np.where(HIDDEN[:, None], value, near), ~HIDDEN, validity_weight=1e-9)
+        lift(np.where(OCCLUDED[:, None], value, keypoints), ~OCCLUDED, validity_weight=1e-9)
         for value in (np.nan, 3.0)
     ]
     np.testing.assert_array_equal(*lifted)
-    error = occluded_joint_error(near, lifted[0][:, :2], HIDDEN)
-    assert error < 0.1 < occluded_joint_error(near, projection(SEED) + 0.5, HIDDEN)
+    error = occluded_joint_error(keypoints, lifted[0][:, :2], OCCLUDED)
+    assert error < 0.1 < occluded_joint_error(keypoints, projection(SEED) + 0.5, OCCLUDED)
 
 
 def test_joint_limits_pull_bones_into_their_range():
-    """Against the projection of knees bent forwards."""
+    """The keypoints are the projection of a pose with knees bent forwards."""
     limits = JointLimits.shipped(PAIR)
     wrong = DANCE[30].copy()
     for side in ("left", "right"):
         knee, ankle = (PAIR.index(f"person0:{side}_{part}") for part in ("knee", "ankle"))
         wrong[ankle] = wrong[knee] + 0.4 * np.array([0.5, 0.8, 0.3])
 
-    def beyond(weight):
+    def excess(weight):
         lifted = lift(projection(wrong), validity_weight=weight)
         return np.linalg.norm(lifted - limits.nearest_valid(lifted))
 
-    assert beyond(1.0) < 0.7 * beyond(1e-6)
+    assert excess(1.0) < 0.7 * excess(1e-6)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ CHECKPOINT = Checkpoint(
     {"width": 4, "mean": [0.1, 1 / 3], "name": "größe", "deep": {"none": None}},
     {
         "weight": torch.tensor(RNG.normal(size=(3, 4)), dtype=torch.float32),
-        "turned": torch.tensor(RNG.normal(size=(4, 2)), dtype=torch.float32).T,
+        "transposed": torch.tensor(RNG.normal(size=(4, 2)), dtype=torch.float32).T,
         "step": torch.tensor(7.0),
         "order": torch.tensor([2, 0, 1]),
         "mask": torch.tensor([True, False]),
@@ -69,9 +69,9 @@ def test_half_precision_halves_the_file(tmp_path):
 
 def test_flipped_bits_are_detected_or_harmless(path):
     content = path.read_bytes()
-    for place in range(0, len(content), 3):
+    for index in range(0, len(content), 3):
         damaged = bytearray(content)
-        damaged[place] ^= 1
+        damaged[index] ^= 1
         path.write_bytes(damaged)
         with suppress(CheckpointError):
             loaded = load_checkpoint(path, KIND)

@@ -25,7 +25,7 @@ ROOT = PERSON.roots[0]
 
 
 def track(frames=30, seed=0, name="clip/0", skeleton=PERSON, fps=20.0, **confidences):
-    """A track with its root at the origin; confidences of joints by name, 1 by default."""
+    """Return a track with its root at the origin; ``confidences`` by joint name, default 1."""
     rng = np.random.default_rng(seed)
     keypoints = rng.normal(size=(frames, skeleton.n_joints, 2)) + np.array([0.3, -0.2])
     keypoints[:, skeleton.roots[0]] = 0
@@ -39,7 +39,7 @@ POINT = track(skeleton=Skeleton(["point"], [-1]), name="b/0")
 
 
 def numbered(frames, start=1.0):
-    """A track with all coordinates equal to the number of the frame."""
+    """Return a track with all coordinates equal to the number of the frame."""
     shape = (frames, PERSON.n_joints, 2)
     keypoints = np.broadcast_to((start + np.arange(frames))[:, None, None], shape)
     return KeypointTrack(keypoints, np.ones(shape[:2]), PERSON, 20.0, "clip/0")
@@ -85,11 +85,11 @@ def test_joints_below_the_threshold_have_no_effect():
         np.testing.assert_array_equal(
             getattr(first.standards, name), getattr(second.standards, name)
         )
-    whole = draw(batches(low))
-    assert not whole.seen[0, 3:9, 4].any()
-    np.testing.assert_array_equal(whole.confidence[0, 5, 5:7], np.float32([1.0, 0.3]))
-    assert whole.seen.sum() == whole.seen.size - 6
-    # Confidence 0 is never visible.
+    batch = draw(batches(low))
+    assert not batch.seen[0, 3:9, 4].any()
+    np.testing.assert_array_equal(batch.confidence[0, 5, 5:7], np.float32([1.0, 0.3]))
+    assert batch.seen.sum() == batch.seen.size - 6
+    # Joints of confidence 0 are never visible.
     assert not draw(batches(occluded, threshold=0.0)).seen[0, 3:9, 4].any()
 
 
@@ -98,7 +98,7 @@ def test_windows_have_uniform_lengths_and_lie_inside_the_track():
     batch = draw(source, 2000)
     lengths = batch.valid.sum(axis=1)
     assert set(lengths) == set(range(10, 21))
-    # 2000/11 of each length, Poisson deviation 13.
+    # Each length occurs about 2000/11 times, with Poisson deviation 13.
     assert abs(np.bincount(lengths)[10:] - 2000 / 11).max() < 5 * np.sqrt(2000 / 11)
     first = batch.keypoints[:, 0, 0, 0]
     last = batch.keypoints[np.arange(2000), lengths - 1, 0, 0]
@@ -111,7 +111,7 @@ def test_frames_are_equally_likely_across_tracks():
     batch = draw(batches(numbered(400), numbered(20, 1001.0), numbered(5, 2001.0), frames=20), n)
     counts = np.bincount((batch.keypoints[:, 0, 0, 0] // 1000).astype(int))
     expected = n * np.array([20, 1, 1]) / 22
-    # Two degrees of freedom: above 18 once in 8000 times.
+    # χ² with two degrees of freedom exceeds 18 once in 8000 times.
     assert ((counts - expected) ** 2 / expected).sum() < 18
     seen = batch.keypoints[..., 0, 0][batch.valid].astype(int)
     middle = np.bincount(seen[seen <= 400])[20:381]
@@ -126,10 +126,10 @@ def test_mirroring_exchanges_left_and_right():
     given.confidence[7, left] = 0
     source = batches(given, augmentation=replace(NONE, mirror=True))
     batch = draw(source, 400)
-    turned = ~batch.seen[:, 7, right]
-    # 400 fair coins: deviation 10.
-    assert abs(turned.sum() - 200) < 50
-    assert (batch.seen[:, 7, left] == turned).all()
+    is_mirrored = ~batch.seen[:, 7, right]
+    # The number of mirrored windows is binomial with deviation 10.
+    assert abs(is_mirrored.sum() - 200) < 50
+    assert (batch.seen[:, 7, left] == is_mirrored).all()
     swap = {"left": "right", "right": "left"}
     order = [
         PERSON.index("_".join(swap.get(word, word) for word in name.split("_")))
@@ -137,7 +137,7 @@ def test_mirroring_exchanges_left_and_right():
     ]
     image = given.keypoints[:, order] * [-1, 1]
     image[7, right] = 0
-    np.testing.assert_allclose(batch.keypoints[turned][0], image, atol=1e-6)
+    np.testing.assert_allclose(batch.keypoints[is_mirrored][0], image, atol=1e-6)
     standards = source.standards
     np.testing.assert_allclose(standards.mean[order] * [-1, 1], standards.mean, atol=1e-12)
     np.testing.assert_allclose(standards.deviation[order], standards.deviation, atol=1e-12)
@@ -147,23 +147,23 @@ def test_scale_and_shift_apply_to_all_frames():
     given = track()
     batch = draw(batches(given, augmentation=replace(NONE, scale=0.2)), 500)
     factor = batch.keypoints[:, 0, 3, 0] / given.keypoints[0, 3, 0]
-    wanted = factor[:, None, None, None] * given.keypoints
-    np.testing.assert_allclose(batch.keypoints, wanted, atol=1e-5)
+    expected = factor[:, None, None, None] * given.keypoints
+    np.testing.assert_allclose(batch.keypoints, expected, atol=1e-5)
     assert 0.8 <= factor.min() < 0.81
     assert 1.19 < factor.max() <= 1.2
     batch = draw(batches(given, augmentation=replace(NONE, shift=0.5)), 500)
-    moved = batch.keypoints - given.keypoints
-    np.testing.assert_allclose(moved, np.broadcast_to(moved[:, :1, :1], moved.shape), atol=1e-6)
-    assert -0.5 <= moved.min() < -0.49
-    assert 0.49 < moved.max() <= 0.5
+    shift = batch.keypoints - given.keypoints
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[:, :1, :1], shift.shape), atol=1e-6)
+    assert -0.5 <= shift.min() < -0.49
+    assert 0.49 < shift.max() <= 0.5
 
 
 def test_standards_are_mean_and_deviation_of_visible_joints():
     tracks = [track(frames=30, seed=1, left_knee=0.1), track(frames=8, seed=2)]
     standards, knee = batches(*tracks, frames=20).standards, PERSON.index("left_knee")
-    together = np.concatenate([one.keypoints for one in tracks])
-    mean, deviation = together.mean(axis=0), together.std(axis=0)
-    mean[knee], deviation[knee] = together[30:, knee].mean(axis=0), together[30:, knee].std(axis=0)
+    joined = np.concatenate([one.keypoints for one in tracks])
+    mean, deviation = joined.mean(axis=0), joined.std(axis=0)
+    mean[knee], deviation[knee] = joined[30:, knee].mean(axis=0), joined[30:, knee].std(axis=0)
     np.testing.assert_allclose(standards.mean, mean, atol=1e-6)
     np.testing.assert_allclose(standards.deviation, deviation, atol=1e-6)
     np.testing.assert_array_equal(standards.deviation[ROOT], 0)
@@ -172,17 +172,17 @@ def test_standards_are_mean_and_deviation_of_visible_joints():
 
 
 def test_standards_include_the_shift():
-    still = batches(track()).standards.deviation
+    unshifted = batches(track()).standards.deviation
     source = batches(track(), augmentation=replace(NONE, shift=1.0))
     drawn = draw(source, 2000).keypoints.astype(float)
     # The deviation of 2000 uniform numbers has a relative error of 1 %.
     np.testing.assert_allclose(drawn.std(axis=(0, 1)), source.standards.deviation, rtol=0.05)
     np.testing.assert_allclose(drawn.mean(axis=(0, 1)), source.standards.mean, atol=0.07)
-    np.testing.assert_allclose(source.standards.deviation**2, still**2 + 1 / 3, rtol=1e-12)
+    np.testing.assert_allclose(source.standards.deviation**2, unshifted**2 + 1 / 3, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("occluded", "threshold", "augmentation", "never"),
+    ("occluded", "threshold", "augmentation", "missing"),
     [
         (("neck", "left_ankle"), 0.3, NONE, "neck, left_ankle"),
         (("neck", "left_ankle"), 0.2, NONE, None),
@@ -190,10 +190,10 @@ def test_standards_include_the_shift():
         (("left_ankle", "right_ankle"), 0.3, Augmentation(), "left_ankle, right_ankle"),
     ],
 )
-def test_joints_that_are_never_visible_are_named(occluded, threshold, augmentation, never):
+def test_joints_that_are_never_visible_are_named(occluded, threshold, augmentation, missing):
     low = track(**dict.fromkeys(occluded, 0.2))
     source = batches(low, threshold=threshold, augmentation=augmentation)
-    with pytest.raises(ValueError, match=f"never got {never}; cho") if never else nullcontext():
+    with pytest.raises(ValueError, match=f"got none for {missing}; ") if missing else nullcontext():
         source.check_all_seen()
     batches(low, track(), augmentation=augmentation).check_all_seen()
 
@@ -218,18 +218,18 @@ def test_windows_record_their_frames_and_scale(scale):
     assert len(keypoints) == len(seen) == 2 * 56
     batch = draw(source, 100)
     assert batch.valid.any(axis=1).all()
-    there = batch.frames >= 0
-    np.testing.assert_array_equal(batch.valid[there], seen[batch.frames[there]].any(axis=-1))
-    shown = batch.scale[:, None, None, None] * keypoints[batch.frames]
-    np.testing.assert_allclose(batch.keypoints[there], shown[there], rtol=1e-6)
-    assert len(np.unique(batch.frames[there])) > 60
+    valid = batch.frames >= 0
+    np.testing.assert_array_equal(batch.valid[valid], seen[batch.frames[valid]].any(axis=-1))
+    scaled = batch.scale[:, None, None, None] * keypoints[batch.frames]
+    np.testing.assert_allclose(batch.keypoints[valid], scaled[valid], rtol=1e-6)
+    assert len(np.unique(batch.frames[valid])) > 60
     assert np.ptp(batch.scale) == pytest.approx(2 * scale, rel=0.1)
 
 
 def test_validation_batches_are_not_augmented():
-    shown, other = track(), track(seed=1, name="other/0")
+    first, other = track(), track(seed=1, name="other/0")
     varied = Augmentation(mirror=False, shift=0.5)
-    training, held_out = learning_and_held_out([shown], [other], 30, 0.25, varied)
+    training, held_out = learning_and_held_out([first], [other], 30, 0.25, varied)
     np.testing.assert_allclose(draw(held_out).keypoints[0], other.keypoints, atol=1e-6)
     assert (draw(training, 50).valid.sum(axis=1) < 30).any()
     assert (training.threshold, held_out.threshold) == (0.25, 0.25)
@@ -239,8 +239,8 @@ def test_invalid_arguments_are_rejected():
     for call, message in (
         (lambda: batches(), "tracks must contain at least one track, got none"),
         (lambda: batches(track(fps=25.0), track()), "one frame rate, got 20 for .* and 25 for"),
-        (lambda: batches(track(), POINT), "same skeleton, got another for b/0 than for clip/0"),
-        (lambda: held_out(POINT), "validation must have the same skeleton as tracks"),
+        (lambda: batches(track(), POINT), "one skeleton, got different ones for b/0 and clip/0"),
+        (lambda: held_out(POINT), "validation must have the skeleton of tracks"),
         (lambda: held_out(track(fps=25.0)), "the frame rate of tracks, 20, got 25"),
         (lambda: batches(track(), threshold=1.5), r"confidence of at least 1\.5, got none"),
         (lambda: batches(track(), threshold=math.nan), r"^threshold must be .*got nan"),

@@ -47,7 +47,7 @@ class Line:
 
 
 class Curve(Line):
-    """A network with dropout and a running mean, on random batches."""
+    """Network with dropout and a running mean, trained on random batches."""
 
     kind = "curve"
 
@@ -71,7 +71,7 @@ class Curve(Line):
 
 
 class Overfits(Line):
-    """One weight that moves to 1; its validation loss is lowest at 0.4."""
+    """Model of one weight that converges to 1; the validation loss is lowest at 0.4."""
 
     def __init__(self):
         super().__init__()
@@ -86,7 +86,7 @@ class Overfits(Line):
 
 
 SETTINGS = TrainingSettings(steps=30, batch=8, learning_rate=3e-3, warmup=5, checkpoint_every=10)
-PLAIN = TrainingSettings(steps=1, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0)
+BASE = TrainingSettings(steps=1, learning_rate=0.1, warmup=0, weight_decay=0.0, ema=0.0)
 
 
 def run(trainee, folder, settings=SETTINGS, **changes):
@@ -94,8 +94,8 @@ def run(trainee, folder, settings=SETTINGS, **changes):
 
 
 def tensors(folder, name="state", kind="curve"):
-    known = kind if name == "model" else f"{kind} in training"
-    return load_checkpoint(folder / f"{name}.safetensors", known).tensors
+    stored_kind = kind if name == "model" else f"{kind} in training"
+    return load_checkpoint(folder / f"{name}.safetensors", stored_kind).tensors
 
 
 def assert_same(folder, other):
@@ -108,15 +108,15 @@ def assert_same(folder, other):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The folder and result of an uninterrupted run."""
+def full(tmp_path_factory):
+    """Folder and result of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole")
     return folder, run(Curve(), folder)
 
 
 def test_regression_reaches_the_least_squares_solution(tmp_path):
     line = Line()
-    result = run(line, tmp_path, PLAIN, steps=300, ema=0.9, checkpoint_every=150)
+    result = run(line, tmp_path, BASE, steps=300, ema=0.9, checkpoint_every=150)
     saved = tensors(tmp_path, "model", "line")
     design = np.column_stack([line.x.numpy(), np.ones(50)]).astype(float)
     y = line.y.numpy().ravel().astype(float)
@@ -128,10 +128,10 @@ def test_regression_reaches_the_least_squares_solution(tmp_path):
 
 def test_warm_up_clipping_and_weight_decay(tmp_path):
     # The first step of AdamW has the length of its learning rate for every weight.
-    settings = replace(PLAIN, warmup=10)
+    settings = replace(BASE, warmup=10)
     run(Line(), tmp_path / "a", settings)
-    moved = tensors(tmp_path / "a", "model", "line")["weight"]
-    np.testing.assert_allclose(abs(moved.numpy()), 0.01, rtol=1e-4)
+    weight = tensors(tmp_path / "a", "model", "line")["weight"]
+    np.testing.assert_allclose(abs(weight.numpy()), 0.01, rtol=1e-4)
     # The optimiser's moments are those of the clipped gradient.
     run(Line(), tmp_path / "b", settings, clip=1e-3)
     state = tensors(tmp_path / "b", "state", "line")
@@ -141,7 +141,7 @@ def test_warm_up_clipping_and_weight_decay(tmp_path):
     line = Line()
     nn.init.ones_(line.network.weight)
     line.training_loss = lambda network, rng, batch, device: 0 * network(line.x).sum()
-    run(line, tmp_path / "c", PLAIN, weight_decay=0.5)
+    run(line, tmp_path / "c", BASE, weight_decay=0.5)
     np.testing.assert_allclose(tensors(tmp_path / "c", "model", "line")["weight"], 0.95, rtol=1e-6)
 
 
@@ -149,16 +149,16 @@ def test_learning_rate_rises_and_is_halved(tmp_path):
     settings = TrainingSettings(learning_rate=0.8, warmup=4, halve_at=(6, 10))
     rates = [settings.rate(step) for step in (1, 4, 6, 7, 10, 11, 1000)]
     assert rates == pytest.approx([0.2, 0.8, 0.8, 0.4, 0.4, 0.2, 0.2])
-    # Also during warm-up, and for steps in any order.
+    # Halving also applies during warm-up and for steps in any order.
     assert replace(settings, halve_at=(10, 2)).rate(3) == pytest.approx(0.3)
     # With a constant gradient the steps of Adam have the length of the learning rate.
     line = Line()
     line.training_loss = lambda network, rng, batch, device: network.weight.sum()
-    run(line, tmp_path, PLAIN, steps=6, halve_at=(2, 4))
-    moved = tensors(tmp_path, "model", "line")["weight"]
-    np.testing.assert_allclose(moved, -2 * (0.1 + 0.05 + 0.025), rtol=1e-4)
+    run(line, tmp_path, BASE, steps=6, halve_at=(2, 4))
+    weight = tensors(tmp_path, "model", "line")["weight"]
+    np.testing.assert_allclose(weight, -2 * (0.1 + 0.05 + 0.025), rtol=1e-4)
     with pytest.raises(ValueError, match=r"halve_at must be \[2, 4\] to resume .*, got \[2\]"):
-        run(Line(), tmp_path, PLAIN, steps=6, halve_at=(2,))
+        run(Line(), tmp_path, BASE, steps=6, halve_at=(2,))
 
 
 def test_adamax_matches_its_definition(tmp_path):
@@ -168,7 +168,7 @@ def test_adamax_matches_its_definition(tmp_path):
     line.training_loss = lambda network, *_: next(remaining) * network.weight.sum()
     for steps in (2, 3):
         # Resume before the last step.
-        run(line, tmp_path, PLAIN, steps=steps, clip=np.inf, optimiser="adamax")
+        run(line, tmp_path, BASE, steps=steps, clip=np.inf, optimiser="adamax")
     weight = largest = mean = 0.0
     for step, slope in enumerate(slopes, start=1):
         largest, mean = max(0.999 * largest, abs(slope)), 0.9 * mean + 0.1 * slope
@@ -198,12 +198,12 @@ def test_moving_average_matches_its_recursion(tmp_path):
     run(curve, tmp_path / "a", ema=0.5)
     note(curve)
     average = weights[0]
-    for step, now in enumerate(weights[1:], start=1):
+    for step, current in enumerate(weights[1:], start=1):
         decay = min(0.5, (1 + step) / (10 + step))
-        average = [decay * a + (1 - decay) * b for a, b in zip(average, now, strict=True)]
+        average = [decay * a + (1 - decay) * b for a, b in zip(average, current, strict=True)]
     saved = tensors(tmp_path / "a", "model")
-    for (name, _), wanted in zip(curve.network.named_parameters(), average, strict=True):
-        torch.testing.assert_close(saved[name], wanted, rtol=1e-5, atol=1e-6)
+    for (name, _), expected in zip(curve.network.named_parameters(), average, strict=True):
+        torch.testing.assert_close(saved[name], expected, rtol=1e-5, atol=1e-6)
     # Buffers are copied.
     assert torch.equal(saved["1.running_mean"], curve.network.state_dict()["1.running_mean"])
     run(curve := Curve(), tmp_path / "b", ema=0.0)
@@ -212,7 +212,7 @@ def test_moving_average_matches_its_recursion(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_run_resumes_bit_identically(whole, tmp_path, number):
+def test_interrupted_run_resumes_bit_identically(full, tmp_path, number):
     def stop(curve):
         if curve.calls == 13:
             os.kill(os.getpid(), number)
@@ -221,26 +221,26 @@ def test_interrupted_run_resumes_bit_identically(whole, tmp_path, number):
     with pytest.raises(KeyboardInterrupt, match="stopped at step 13 of 30, saved in"):
         run(Curve(stop), tmp_path)
     assert signal.getsignal(number) is before
-    later = Curve()
-    run(later, tmp_path)
-    assert later.calls == 17
-    assert_same(whole[0], tmp_path)
+    resumed = Curve()
+    run(resumed, tmp_path)
+    assert resumed.calls == 17
+    assert_same(full[0], tmp_path)
 
 
-def test_finished_run_takes_no_steps(whole):
+def test_finished_run_takes_no_steps(full):
     again = Curve()
-    second = train(again, SETTINGS, whole[0], progress=True)
+    second = train(again, SETTINGS, full[0], progress=True)
     assert again.calls == second.steps == 0
-    assert second.history == whole[1].history
-    with open(whole[0] / "losses.csv", encoding="utf-8") as file:
+    assert second.history == full[1].history
+    with open(full[0] / "losses.csv", encoding="utf-8") as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
     assert rows == second.history
     assert [row["step"] for row in rows] == [10, 20, 30]
 
 
 @pytest.mark.parametrize(("content", "steps"), [(None, 15), (slice(-50), 40), (slice(9), 15)])
-def test_missing_or_damaged_model_is_restored_from_the_state(whole, tmp_path, content, steps):
-    shutil.copytree(whole[0], tmp_path / "run")
+def test_missing_or_damaged_model_is_restored_from_the_state(full, tmp_path, content, steps):
+    shutil.copytree(full[0], tmp_path / "run")
     model = tmp_path / "run" / "model.safetensors"
     before = model.read_bytes()
     model.unlink()
@@ -254,8 +254,8 @@ def test_missing_or_damaged_model_is_restored_from_the_state(whole, tmp_path, co
         assert_same(tmp_path / "whole", tmp_path / "run")
 
 
-def test_other_settings_or_data_are_rejected(whole, tmp_path):
-    shutil.copytree(whole[0], tmp_path / "run")
+def test_other_settings_or_data_are_rejected(full, tmp_path):
+    shutil.copytree(full[0], tmp_path / "run")
     copied = tmp_path / "run"
     (copied / "model.safetensors").unlink()
     assert (steps_taken(copied, "curve"), steps_taken(tmp_path, "curve")) == (30, 0)
@@ -304,28 +304,28 @@ def test_divergence_leaves_the_last_good_checkpoint(tmp_path, fault, step, messa
             run(Explodes(), tmp_path / "early", checkpoint_every=100)
 
 
-def test_run_does_not_depend_on_thread_global_generator_or_checkpoints(whole, tmp_path):
+def test_run_does_not_depend_on_thread_global_generator_or_checkpoints(full, tmp_path):
     torch.manual_seed(11)
-    wanted = torch.rand(3)
+    expected = torch.rand(3)
     torch.manual_seed(11)
     options = {"checkpoint_every": 3}
     thread = threading.Thread(target=run, args=(Curve(), tmp_path), kwargs=options)
     thread.start()
     thread.join()
-    assert torch.equal(torch.rand(3), wanted)
-    assert_same(whole[0], tmp_path)
+    assert torch.equal(torch.rand(3), expected)
+    assert_same(full[0], tmp_path)
 
 
-EARLY = replace(PLAIN, steps=100, checkpoint_every=1, patience=3)
+EARLY = replace(BASE, steps=100, checkpoint_every=1, patience=3)
 
 
 def test_early_stopping_saves_the_best_model(tmp_path):
-    whole = run(Overfits(), tmp_path / "run", EARLY)
-    losses = [row["validation_loss"] for row in whole.history]
+    full = run(Overfits(), tmp_path / "run", EARLY)
+    losses = [row["validation_loss"] for row in full.history]
     best = int(np.argmin(losses))
-    assert whole.steps == len(losses) == best + 1 + 3 < 100
-    assert whole.saved == whole.history[best]
-    saved = load_checkpoint(whole.model, "line")
+    assert full.steps == len(losses) == best + 1 + 3 < 100
+    assert full.saved == full.history[best]
+    saved = load_checkpoint(full.model, "line")
     assert saved.settings["step"] == best + 1
     assert abs(float(saved.tensors["weight"]) - 0.4) == pytest.approx(min(losses))
     run(Overfits(), tmp_path / "parts", EARLY, steps=3)
@@ -341,7 +341,7 @@ def test_command_reports_early_stopping(tmp_path, capsys):
     best = load_checkpoint(tmp_path / "model.safetensors", "line").settings["step"]
     printed = capsys.readouterr().out
     assert f": step {best}, loss" in printed
-    assert f"stopped early at step {best + 3}: the validation loss" in printed
+    assert f"stopped early at step {best + 3}: validation loss" in printed
     run_training(Overfits(), EARLY, tmp_path, "cpu")
     assert "is finished" in capsys.readouterr().out
 

@@ -37,10 +37,10 @@ def prior():
 
 @pytest.fixture
 def inference(prior):
-    return VAEEncoder().on(prior, seen_of(prior))
+    return VAEEncoder().on(prior, observe(prior))
 
 
-def seen_of(prior, z=(0.7, -0.5), noise=0.03, camera=CAMERA, **options):
+def observe(prior, z=(0.7, -0.5), noise=0.03, camera=CAMERA, **options):
     motion = Motion(prior.motion(np.array(z)), ARM, 20.0)
     return Keypoints2D.observe(motion, camera, noise, seed=1, **options)
 
@@ -48,15 +48,15 @@ def seen_of(prior, z=(0.7, -0.5), noise=0.03, camera=CAMERA, **options):
 def test_encoder_accepts_keypoints_of_one_view(prior):
     encoder = prior.inference_network
     assert isinstance(encoder, VAEEncoder)
-    assert encoder.reads(seen_of(prior))
-    for other in (None, Joints3D(np.zeros((4, 4, 3)), 0.1), seen_of(prior, camera=Cameras.ring(2))):
+    assert encoder.reads(observe(prior))
+    for other in (None, Joints3D(np.zeros((4, 4, 3)), 0.1), observe(prior, camera=Cameras.ring(2))):
         assert not encoder.reads(other)
 
 
 def test_loss_is_minus_the_bound_at_its_draw(prior, inference):
     mean, deviation = inference.mean.numpy(), np.exp(inference.log_deviation.numpy())
     z = mean + deviation * np.random.default_rng(4).standard_normal(2)
-    data = seen_of(prior).log_density(prior.motion(z))
+    data = observe(prior).log_density(prior.motion(z))
     divergence = 0.5 * (deviation**2 + mean**2 - 1 - np.log(deviation**2)).sum()
     for weight in (0.0, 1.0, 0.5):
         loss = inference.loss(np.random.default_rng(4), latent_weight=weight)
@@ -79,20 +79,20 @@ def encoder_inputs(prior, likelihood, rigid):
     return placed.model.vae.inputs
 
 
-def test_inputs_are_scaled_to_the_subject_s_distance(prior):
+def test_inputs_are_scaled_to_the_distance_of_the_subject(prior):
     """Inputs do not depend on focal length and distance of the camera."""
     rotation, centre = np.diag([1.0, -1.0, -1.0])[None], np.array([[320.0, 240.0]])
     camera = Cameras(rotation, np.array([[0, 0, 9.0]]), np.array([700.0]), centre, False)
     path = RigidPath(np.tile(np.eye(3), (4, 1, 1)), np.tile([0.3, 0.1, 4.0], (4, 1)))
     hidden = np.zeros((4, 4), dtype=bool)
     hidden[1, 3] = True
-    seen = seen_of(prior.placed(path), noise=1e-6, camera=camera, hidden=hidden)
-    keypoints, confidence, rest = encoder_inputs(prior, seen, path)
+    likelihood = observe(prior.placed(path), noise=1e-6, camera=camera, hidden=hidden)
+    keypoints, confidence, rest = encoder_inputs(prior, likelihood, path)
     positions = prior.placed(path).motion(np.array([0.7, -0.5]))
     slopes = positions[..., :2] * [1, -1] / (9.0 - positions[..., 2:])
-    wanted = 5.0 * (slopes - slopes[:, :1])
-    wanted[1, 3] = 0
-    np.testing.assert_allclose(keypoints[0], wanted, atol=1e-5)
+    expected = 5.0 * (slopes - slopes[:, :1])
+    expected[1, 3] = 0
+    np.testing.assert_allclose(keypoints[0], expected, atol=1e-5)
     np.testing.assert_array_equal(confidence[0], 1.0 - hidden)
     np.testing.assert_allclose(rest, BODY.rest_positions, atol=1e-6)
 
@@ -101,26 +101,26 @@ def test_inputs_are_scaled_to_the_subject_s_distance(prior):
 def test_joints_of_low_confidence_are_masked(prior, factor):
     confidence = np.ones((1, 4, 4))
     confidence[0, 2, 1], confidence[0, 2, 2] = 0.2, 0.4
-    seen = replace(seen_of(prior), confidence=factor * confidence)
-    shown = encoder_inputs(prior, seen, prior.rigid)[1]
-    np.testing.assert_array_equal(shown[0], (confidence[0] > 0.3).astype(float))
+    likelihood = replace(observe(prior), confidence=factor * confidence)
+    passed = encoder_inputs(prior, likelihood, prior.rigid)[1]
+    np.testing.assert_array_equal(passed[0], (confidence[0] > 0.3).astype(float))
 
 
 def test_draws_follow_q_and_do_not_depend_on_the_batch(prior, inference):
-    def drawn(numbers):
+    def draw(numbers):
         streams = NormalStreams.of_draws(0, [(0, number) for number in numbers])
         return inference.draw(streams, len(numbers))
 
-    positions, theta = drawn(range(70))
+    positions, theta = draw(range(70))
     np.testing.assert_allclose(positions, prior.motion(theta), atol=1e-12)
-    some, some_theta = drawn([67, 3])
-    np.testing.assert_array_equal(some_theta, theta[[67, 3]])
-    np.testing.assert_array_equal(some, positions[[67, 3]])
-    many = inference.draw(np.random.default_rng(0), 5000)[1]
+    part, part_theta = draw([67, 3])
+    np.testing.assert_array_equal(part_theta, theta[[67, 3]])
+    np.testing.assert_array_equal(part, positions[[67, 3]])
+    draws = inference.draw(np.random.default_rng(0), 5000)[1]
     deviation = np.exp(inference.log_deviation.numpy())
     error = 5 * deviation / math.sqrt(5000)
-    assert (np.abs(many.mean(axis=0) - inference.mean.numpy()) < error).all()
-    assert (np.abs(many.std(axis=0) - deviation) < error).all()
+    assert (np.abs(draws.mean(axis=0) - inference.mean.numpy()) < error).all()
+    assert (np.abs(draws.std(axis=0) - deviation) < error).all()
 
 
 def test_prediction_is_the_motion_at_the_mean_or_the_mean_motion(prior, inference):
@@ -141,12 +141,12 @@ def test_optimisation_leaves_the_prior_unchanged(prior, inference):
     assert not torch.equal(inference.mean, mean)
     for name, value in prior.model.state_dict().items():
         assert torch.equal(value, before[name])
-    assert torch.equal(VAEEncoder().on(prior, seen_of(prior)).mean, mean)
+    assert torch.equal(VAEEncoder().on(prior, observe(prior)).mean, mean)
 
 
 def test_optimisation_agrees_with_the_posterior(prior):
     """With informative observations the posterior is nearly Gaussian."""
-    posterior = MotionPosterior(prior, seen_of(prior))
+    posterior = MotionPosterior(prior, observe(prior))
     sampler = DVAEInference(mode="optimization", iterations=120, learning_rate=0.07)
     draws = sampler.sample(posterior, draws=300, chains=1, seed=0, progress=False)
     mean, deviation = on_a_grid(posterior)
@@ -171,8 +171,8 @@ def test_unsuitable_inputs_are_rejected(prior):
     hidden[3] = True
     longer = Motion(np.zeros((5, 4, 3)), ARM, 20.0)
     for given, likelihood, message in (
-        ("prior", seen_of(prior), "prior must be a MotionVAE, got str"),
-        (prior, seen_of(prior, hidden=hidden), "likelihood must have a visible joint per frame"),
+        ("prior", observe(prior), "prior must be a MotionVAE, got str"),
+        (prior, observe(prior, hidden=hidden), "likelihood must have a visible joint per frame"),
         (prior, Keypoints2D.observe(longer, CAMERA, 0.1, seed=0), "the prior's 4 frames, got 5"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -44,9 +44,9 @@ def test_projection_matches_cameras(perspective):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4, 6, 3))
     camera = Cameras.around([0.7], [0.0], distance=7.0, perspective=perspective)
-    # Camera axes with y up and z towards the camera.
-    turned = np.einsum("ij,...j->...i", camera.rotation[0], points) * [1, -1, -1]
-    projected = project_to_image(torch.tensor(turned), 7.0 if perspective else None)
+    # The camera axes have y up and z towards the camera.
+    in_camera = np.einsum("ij,...j->...i", camera.rotation[0], points) * [1, -1, -1]
+    projected = project_to_image(torch.tensor(in_camera), 7.0 if perspective else None)
     np.testing.assert_allclose(projected, camera.project(points)[0], atol=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_roughness_of_a_uniform_rotation():
     rotation = vector_to_matrix(times[:, None] * step)
     turns = (0.1 * times)[:, None, None].expand(L, 2, 3)
     translation = torch.stack([0.3 * times, torch.zeros_like(times)], dim=-1)
-    # ½‖R − I‖² = 2(1 − cos a); six rotation numbers; one of the translation.
+    # Each step adds ½‖R − I‖² = 2(1 − cos a), six terms of bone rotations and one of the path.
     each = 2 * (1 - np.cos(0.2)) + 6 * 0.1**2 + 0.3**2
     loss = float(roughness(turns, rotation, translation))
     assert loss == pytest.approx((L - 1) * each, rel=1e-12)
@@ -88,8 +88,8 @@ def test_loss_terms_of_the_true_hypothesis():
     np.testing.assert_allclose(terms["ranges"], BODY.range_excess(hypotheses.turns).sum(dim=-1))
     lengths = L * (hypotheses.log_lengths**2).sum(dim=-1)
     np.testing.assert_allclose(terms["lengths"], lengths)
-    one = roughness(hypotheses.turns[1, 3], hypotheses.rotation[1, 3], hypotheses.translation[1, 3])
-    assert float(terms["smoothness"][1, 3]) == pytest.approx(float(one))
+    parts = (getattr(hypotheses, name)[1, 3] for name in ("turns", "rotation", "translation"))
+    assert float(terms["smoothness"][1, 3]) == pytest.approx(float(roughness(*parts)))
 
 
 def test_weighted_sum_uses_the_settings():

@@ -37,7 +37,7 @@ BODY = ArticulatedBody(LEGS, REST)
 TINY = replace(MotionVAESettings.tiny(), frames=6, latent=3)
 
 
-def fresh(size=TINY, gain=40.0, **options):
+def build(size=TINY, gain=40.0, **options):
     """Return a prior with random weights and large motions."""
     model = MotionVAEModel.of(size, BODY)
     with torch.no_grad():
@@ -48,24 +48,24 @@ def fresh(size=TINY, gain=40.0, **options):
 
 @pytest.fixture(scope="module")
 def prior():
-    return fresh()
+    return build()
 
 
 def codes(n=4, seed=1, dim=TINY.latent):
     return np.random.default_rng(seed).standard_normal((n, dim))
 
 
-def some_path(frames=TINY.frames, seed=5):
+def make_path(frames=TINY.frames, seed=5):
     rng = np.random.default_rng(seed)
     vectors = np.cumsum(0.1 * rng.standard_normal((frames, 3)), axis=0)
     return RigidPath(vector_to_matrix(vectors), 0.3 * rng.standard_normal((frames, 3)))
 
 
 def test_rest_pose_is_upright_on_the_floor():
-    still = fresh(gain=0.0).motion(np.ones(3))
-    np.testing.assert_allclose(still[:, 3], [[0.1, 0.0, 0.0]] * 6, atol=1e-12)
-    np.testing.assert_allclose(still[:, 0], [[0.0, 0.8, 0.0]] * 6, atol=1e-12)
-    np.testing.assert_allclose(still[:, 8], [[0.0, 1.55, 0.02]] * 6, atol=1e-12)
+    static = build(gain=0.0).motion(np.ones(3))
+    np.testing.assert_allclose(static[:, 3], [[0.1, 0.0, 0.0]] * 6, atol=1e-12)
+    np.testing.assert_allclose(static[:, 0], [[0.0, 0.8, 0.0]] * 6, atol=1e-12)
+    np.testing.assert_allclose(static[:, 8], [[0.0, 1.55, 0.02]] * 6, atol=1e-12)
 
 
 def test_motion_is_the_kinematics_of_decoded_rotations(prior):
@@ -73,40 +73,40 @@ def test_motion_is_the_kinematics_of_decoded_rotations(prior):
     turns = prior.model.vae.decode(torch.as_tensor(z, dtype=torch.float32)).numpy()
     assert turns.std() > 0.05
     np.testing.assert_allclose(prior.turns(z), turns, atol=1e-5)
-    wanted = BODY.positions(prior.turns(z), path.rotations, path.translations)
-    np.testing.assert_allclose(prior.motion(z), wanted, atol=1e-12)
+    expected = BODY.positions(prior.turns(z), path.rotations, path.translations)
+    np.testing.assert_allclose(prior.motion(z), expected, atol=1e-12)
 
 
 def test_rigid_path_and_lengths_transform_the_body(prior):
-    path, z = some_path(), codes()
-    still = RigidPath(np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
-    about = prior.placed(still).motion(z)
-    moved = np.einsum("lik,bljk->blji", path.rotations, about) + path.translations[:, None]
-    np.testing.assert_allclose(prior.placed(path).motion(z), moved, atol=1e-12)
-    longer = prior.placed(still, np.full(BODY.n_groups, math.log(1.5)))
-    np.testing.assert_allclose(longer.motion(z), 1.5 * about, atol=1e-12)
+    path, z = make_path(), codes()
+    static = RigidPath(np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
+    centred = prior.placed(static).motion(z)
+    transformed = np.einsum("lik,bljk->blji", path.rotations, centred) + path.translations[:, None]
+    np.testing.assert_allclose(prior.placed(path).motion(z), transformed, atol=1e-12)
+    longer = prior.placed(static, np.full(BODY.n_groups, math.log(1.5)))
+    np.testing.assert_allclose(longer.motion(z), 1.5 * centred, atol=1e-12)
 
 
 def test_motion_is_differentiable(prior):
     z = torch.as_tensor(codes(2)).requires_grad_()
-    assert torch.autograd.gradcheck(prior.placed(some_path()).motion, z)
+    assert torch.autograd.gradcheck(prior.placed(make_path()).motion, z)
     assert not any(weights.requires_grad for weights in prior.model.parameters())
 
 
 def test_draws_do_not_depend_on_the_batch(prior):
-    many = prior.sample(np.random.default_rng(3), 70)
-    np.testing.assert_array_equal(many[:3], prior.sample(np.random.default_rng(3), 3))
+    draws = prior.sample(np.random.default_rng(3), 70)
+    np.testing.assert_array_equal(draws[:3], prior.sample(np.random.default_rng(3), 3))
     theta = prior.initial(np.random.default_rng(3), 70)
-    np.testing.assert_allclose(many, prior.motion(theta), atol=1e-5)
-    assert many.dtype == np.float64
+    np.testing.assert_allclose(draws, prior.motion(theta), atol=1e-5)
+    assert draws.dtype == np.float64
 
 
 @pytest.mark.parametrize(("half", "tolerance"), [(False, 1e-12), (True, 5e-3)])
 def test_checkpoint_round_trip(prior, tmp_path, half, tolerance):
     prior.save(tmp_path / "model.safetensors", half=half)
-    other = MotionVAE.load(tmp_path, rigid=some_path())
-    wanted = prior.placed(some_path()).motion(codes())
-    np.testing.assert_allclose(other.motion(codes()), wanted, atol=tolerance)
+    other = MotionVAE.load(tmp_path, rigid=make_path())
+    expected = prior.placed(make_path()).motion(codes())
+    np.testing.assert_allclose(other.motion(codes()), expected, atol=tolerance)
     assert (other.skeleton, other.fps, other.settings) == (LEGS, 20.0, TINY)
 
 
@@ -123,9 +123,9 @@ class FixedPoses(torch.nn.Module):
         rotation, turns, lengths = (
             torch.as_tensor(part, dtype=torch.float32)[None] for part in self.poses
         )
-        still = torch.zeros(1, 4, keypoints.shape[1], 2)
+        zero = torch.zeros(1, 4, keypoints.shape[1], 2)
         turns, lengths = turns.expand(1, 4, *turns.shape[1:]), lengths.expand(1, 4, -1)
-        return PoseHypotheses(rotation, still, turns, lengths)
+        return PoseHypotheses(rotation, zero, turns, lengths)
 
 
 def observed_body(prior, camera, path, z, log_lengths=None, **options):
@@ -133,7 +133,7 @@ def observed_body(prior, camera, path, z, log_lengths=None, **options):
     placed = prior.placed(path, log_lengths)
     motion = Motion(placed.motion(z), LEGS, 20.0)
     seen = Keypoints2D.observe(motion, camera, 1e-4, seed=0, **options)
-    # Camera axes with y up and z towards the camera.
+    # The camera axes have y up and z towards the camera.
     relative = np.diag([1.0, -1.0, -1.0]) @ camera.rotation[0] @ path.rotations
     fixed = FixedPoses(relative, prior.turns(z), placed.log_lengths)
     return seen, MotionVAE(prior.model.vae, fixed, TINY, BODY, 20.0)
@@ -142,22 +142,22 @@ def observed_body(prior, camera, path, z, log_lengths=None, **options):
 def test_placement_by_an_orthographic_camera(prior):
     camera = Cameras.around(np.array([2.0]), np.array([0.4]))
     lengths = np.linspace(-0.1, 0.1, BODY.n_groups)
-    seen, other = observed_body(prior, camera, some_path(), codes()[0], lengths)
+    seen, other = observed_body(prior, camera, make_path(), codes()[0], lengths)
     placed = other.placed_by(seen)
-    np.testing.assert_allclose(placed.rigid.rotations, some_path().rotations, atol=1e-5)
+    np.testing.assert_allclose(placed.rigid.rotations, make_path().rotations, atol=1e-5)
     np.testing.assert_allclose(placed.log_lengths, lengths, atol=1e-6)
     # The root depth is not observed and is that of the origin.
-    away = camera.rotation[0, 2]
-    moved = placed.rigid.translations - some_path().translations
-    np.testing.assert_allclose(placed.rigid.translations @ away, 0.0, atol=1e-12)
-    np.testing.assert_allclose(np.cross(moved, away), 0.0, atol=1e-3)
+    axis = camera.rotation[0, 2]
+    transformed = placed.rigid.translations - make_path().translations
+    np.testing.assert_allclose(placed.rigid.translations @ axis, 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(transformed, axis), 0.0, atol=1e-3)
     np.testing.assert_allclose(camera.project(placed.motion(codes()[0])), seen.keypoints, atol=1e-3)
 
 
 def test_placement_by_a_perspective_camera_recovers_the_distance(prior):
     rotation, centre = np.diag([1.0, -1.0, -1.0])[None], np.array([[640.0, 360.0]])
     camera = Cameras(rotation, np.array([[0, 0, 9.0]]), np.array([800.0]), centre, False)
-    path = RigidPath(some_path().rotations, np.tile([0.0, 0.0, 4.0], (6, 1)))
+    path = RigidPath(make_path().rotations, np.tile([0.0, 0.0, 4.0], (6, 1)))
     seen, other = observed_body(prior, camera, path, codes()[1])
     placed = other.placed_by(seen)
     np.testing.assert_allclose(placed.rigid.translations, path.translations, atol=2e-3)
@@ -166,15 +166,15 @@ def test_placement_by_a_perspective_camera_recovers_the_distance(prior):
 
 def test_view_is_centred_on_the_interpolated_root(prior):
     camera = Cameras.around(np.array([0.3]), np.array([0.1]))
-    motion = Motion(prior.placed(some_path()).motion(codes()[0]), LEGS, 20.0)
+    motion = Motion(prior.placed(make_path()).motion(codes()[0]), LEGS, 20.0)
     hidden = occluded([2, 3], [0, 5])
     seen = Keypoints2D.observe(motion, camera, 1e-4, seed=0, hidden=hidden)
     view = observed_view(seen, LEGS)
-    whole = camera.project(motion.positions)[0]
-    np.testing.assert_allclose(view.root[2], (whole[1, 0] + whole[3, 0]) / 2, atol=1e-3)
+    projected = camera.project(motion.positions)[0]
+    np.testing.assert_allclose(view.root[2], (projected[1, 0] + projected[3, 0]) / 2, atol=1e-3)
     np.testing.assert_array_equal(view.confidence, 1.0 - hidden)
-    about = np.where(hidden[..., None], 0.0, whole - view.root[:, None])
-    np.testing.assert_allclose(view.keypoints, about, atol=1e-3)
+    centred = np.where(hidden[..., None], 0.0, projected - view.root[:, None])
+    np.testing.assert_allclose(view.keypoints, centred, atol=1e-3)
 
 
 def observations(prior, frames=6, views=1, hidden=None, fps=20.0):
@@ -204,12 +204,12 @@ def test_unsuitable_observations_are_rejected(prior, options, sentence):
 
 
 def test_observations_require_a_rigid_path(prior):
-    seen, known = observations(prior), prior.placed(prior.rigid)
-    for unplaced in (prior, fresh(log_lengths=np.zeros(BODY.n_groups)), ReducedLatent(prior, 2)):
+    seen, placed_prior = observations(prior), prior.placed(prior.rigid)
+    for unplaced in (prior, build(log_lengths=np.zeros(BODY.n_groups)), ReducedLatent(prior, 2)):
         with pytest.raises(ValueError, match=r"^prior must have a rigid path for obse.*_by\("):
             MotionPosterior(unplaced, seen)
         assert MotionPosterior(unplaced).likelihood is None
-    for placed in (fresh(rigid=some_path()), known, ReducedLatent(known, 2)):
+    for placed in (build(rigid=make_path()), placed_prior, ReducedLatent(placed_prior, 2)):
         assert MotionPosterior(placed, seen).likelihood is seen
 
 
@@ -217,8 +217,8 @@ def test_invalid_arguments_are_rejected(prior, tmp_path):
     unrecorded = MotionVAE(prior.model.vae, prior.model.pose, TINY, BODY, 20.0)
     for call, message in (
         (lambda: prior.placed_by(Joints3D(np.zeros((6, 9, 3)), 0.1)), "must be Keypoints2D, got J"),
-        (lambda: prior.placed(some_path(frames=5)), "rigid must have the prior's 6 frames, got 5"),
-        (lambda: prior.placed(some_path(), np.zeros(1)), "log_lengths must have shape"),
+        (lambda: prior.placed(make_path(frames=5)), "rigid must have the prior's 6 frames, got 5"),
+        (lambda: prior.placed(make_path(), np.zeros(1)), "log_lengths must have shape"),
         (lambda: RigidPath(2 * np.eye(3)[None], np.zeros((1, 3))), "rotations must be orthonormal"),
         (lambda: unrecorded.save(tmp_path), "prior must have a training record"),
     ):
@@ -265,11 +265,11 @@ class LinearMotions:
 
     def __init__(self):
         rng = np.random.default_rng(0)
-        self.turn = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+        self.rotation = np.linalg.qr(rng.standard_normal((5, 5)))[0]
         self.basis = np.linalg.qr(rng.standard_normal((54, 5)))[0]
 
     def motion(self, theta):
-        matrix = self.turn @ (self.gains[:, None] * self.basis.T)
+        matrix = self.rotation @ (self.gains[:, None] * self.basis.T)
         if isinstance(theta, torch.Tensor):
             matrix = torch.as_tensor(matrix, dtype=theta.dtype)
         return (theta @ matrix).reshape(*theta.shape[:-1], 2, 9, 3)
@@ -280,11 +280,11 @@ def test_reduced_directions_span_the_largest_variation():
     prior = LinearMotions()
     reduced = ReducedLatent(prior, 2)
     directions, theta = reduced.directions, codes(dim=2)
-    assert np.linalg.svd(prior.turn[:, [1, 3]].T @ directions)[1].min() > 0.99
+    assert np.linalg.svd(prior.rotation[:, [1, 3]].T @ directions)[1].min() > 0.99
     np.testing.assert_allclose(directions.T @ directions, np.eye(2), atol=1e-12)
     assert reduced.explained == pytest.approx(13 / 13.14, abs=0.005)
-    wanted = prior.motion(theta @ directions.T)
-    np.testing.assert_allclose(reduced.motion(theta), wanted, atol=1e-12)
+    expected = prior.motion(theta @ directions.T)
+    np.testing.assert_allclose(reduced.motion(theta), expected, atol=1e-12)
     np.testing.assert_array_equal(directions, ReducedLatent(prior, 2).directions)
 
 

@@ -39,7 +39,7 @@ def random_features():
 
 
 def amplified(network, size=0.3):
-    """Increase the outputs of random networks."""
+    """Return the network with larger random output weights."""
     with torch.no_grad():
         for part in network.modules():
             if isinstance(part, Readout):
@@ -52,25 +52,25 @@ def as_torch_layer(layer, memory=False):
     width, hidden = layer.attended.in_features, layer.perceptron[0].out_features
     kind = nn.TransformerDecoderLayer if memory else nn.TransformerEncoderLayer
     options = {"activation": functional.gelu, "batch_first": True, "norm_first": True}
-    made = kind(width, layer.heads, hidden, dropout=0.0, dtype=DOUBLE, **options)
+    reference = kind(width, layer.heads, hidden, dropout=0.0, dtype=DOUBLE, **options)
     pairs = [
-        (made.self_attn.out_proj, layer.attended),
-        (made.linear1, layer.perceptron[0]),
-        (made.linear2, layer.perceptron[2]),
-        (made.norm1, layer.attention_norm),
-        (made.norm3 if memory else made.norm2, layer.perceptron_norm),
+        (reference.self_attn.out_proj, layer.attended),
+        (reference.linear1, layer.perceptron[0]),
+        (reference.linear2, layer.perceptron[2]),
+        (reference.norm1, layer.attention_norm),
+        (reference.norm3 if memory else reference.norm2, layer.perceptron_norm),
     ]
-    for one, same in pairs:
-        one.load_state_dict(same.state_dict())
+    for target, source in pairs:
+        target.load_state_dict(source.state_dict())
     with torch.no_grad():
-        made.self_attn.in_proj_weight.copy_(layer.asked_keys_values.weight)
-        made.self_attn.in_proj_bias.copy_(layer.asked_keys_values.bias)
+        reference.self_attn.in_proj_weight.copy_(layer.asked_keys_values.weight)
+        reference.self_attn.in_proj_bias.copy_(layer.asked_keys_values.bias)
         if memory:
-            made.multihead_attn.in_proj_weight[2 * width :].copy_(layer.told.weight)
-            made.multihead_attn.in_proj_bias[2 * width :].copy_(layer.told.bias)
-            made.multihead_attn.out_proj.weight.copy_(torch.eye(width))
-            made.multihead_attn.out_proj.bias.zero_()
-    return made
+            reference.multihead_attn.in_proj_weight[2 * width :].copy_(layer.told.weight)
+            reference.multihead_attn.in_proj_bias[2 * width :].copy_(layer.told.bias)
+            reference.multihead_attn.out_proj.weight.copy_(torch.eye(width))
+            reference.multihead_attn.out_proj.bias.zero_()
+    return reference
 
 
 def random_mask(n):
@@ -82,14 +82,14 @@ def random_mask(n):
 def test_layers_match_torch():
     tokens, seen = torch.randn(6, J, TINY.width, dtype=DOUBLE), random_mask(6)
     layer = TransformerLayer(TINY).double()
-    wanted = as_torch_layer(layer)(tokens, src_key_padding_mask=~seen)
-    torch.testing.assert_close(layer(tokens, seen=seen), wanted)
+    expected = as_torch_layer(layer)(tokens, src_key_padding_mask=~seen)
+    torch.testing.assert_close(layer(tokens, seen=seen), expected)
     for first in (1, 2):
-        torch.testing.assert_close(layer(tokens, seen=seen, first=first), wanted[:, :first])
+        torch.testing.assert_close(layer(tokens, seen=seen, first=first), expected[:, :first])
     memory = torch.randn(6, TINY.width, dtype=DOUBLE)
     layer = TransformerLayer(TINY, TINY.width).double()
-    wanted = as_torch_layer(layer, memory=True)(tokens, memory[:, None])
-    torch.testing.assert_close(layer(tokens, memory), wanted)
+    expected = as_torch_layer(layer, memory=True)(tokens, memory[:, None])
+    torch.testing.assert_close(layer(tokens, memory), expected)
 
 
 @pytest.mark.parametrize("kind", [TimeDecoder, BoneDecoder])
@@ -101,8 +101,8 @@ def test_shared_queries_match_separate_queries(kind):
     tokens = queries.expand(6, -1, -1)
     for layer in decoder.layers:
         tokens = layer(tokens, memory)
-    wanted = decoder.norm(tokens)
-    torch.testing.assert_close(decoder(memory), decoder.leave(wanted) if bones else wanted)
+    expected = decoder.norm(tokens)
+    torch.testing.assert_close(decoder(memory), decoder.leave(expected) if bones else expected)
 
 
 def test_joint_order_matters_only_through_the_embedding():
@@ -129,9 +129,9 @@ def test_occluded_inputs_have_no_effect(spatial):
         outputs = network.encode(torch.where(seen, keypoints, value), confidence, rest, features)
         torch.cat(outputs).sum().backward()
         results.append([*outputs, *(w.grad.clone() for w in network.frame_encoder.parameters())])
-    for one, same in zip(*results, strict=True):
-        assert torch.isfinite(same).all()
-        assert torch.equal(one, same)
+    for first, second in zip(*results, strict=True):
+        assert torch.isfinite(second).all()
+        assert torch.equal(first, second)
 
 
 @pytest.mark.parametrize("spatial", [True, False])
@@ -169,11 +169,11 @@ def test_mixed_precision_applies_in_training_only():
         turns.square().mean().backward()
         gradient = torch.cat([w.grad.flatten() for w in network.parameters() if w.grad is not None])
         results.append((turns, log_variance, gradient))
-    for one, close in zip(*results, strict=True):
-        assert close.dtype == torch.float32
-        assert 0 < (close - one).norm() / one.norm() < 0.05
-    one, same = (torch.cat(network.eval().encode(*random_input())) for network in (single, mixed))
-    assert torch.equal(one, same)
+    for expected, result in zip(*results, strict=True):
+        assert result.dtype == torch.float32
+        assert 0 < (result - expected).norm() / expected.norm() < 0.05
+    means = (torch.cat(network.eval().encode(*random_input())) for network in (single, mixed))
+    assert torch.equal(*means)
 
 
 def test_invalid_inputs_are_rejected():
@@ -223,31 +223,31 @@ def torch_attention(packed, seen):
 def test_attention_and_gradient_match_torch(masked):
     seen = random_mask(3) if masked else None
     half, double = random_heads(torch.bfloat16), random_heads(DOUBLE)
-    result, wanted = short_attention(half, 2, seen), torch_attention(double, seen)
+    result, expected = short_attention(half, 2, seen), torch_attention(double, seen)
     assert result.dtype == torch.bfloat16
-    torch.testing.assert_close(result.double(), wanted, rtol=0.02, atol=0.02)
-    pull = torch.linspace(-1, 1, wanted.numel()).reshape(wanted.shape)
-    result.backward(pull.to(torch.bfloat16))
-    wanted.backward(pull.double())
+    torch.testing.assert_close(result.double(), expected, rtol=0.02, atol=0.02)
+    upstream = torch.linspace(-1, 1, expected.numel()).reshape(expected.shape)
+    result.backward(upstream.to(torch.bfloat16))
+    expected.backward(upstream.double())
     torch.testing.assert_close(half.grad.double(), double.grad, rtol=0.03, atol=0.03)
     if masked:
         assert (half.grad[..., 8:][~seen] == 0).all()
 
 
 def test_gradient_matches_finite_differences(monkeypatch):
-    """In double precision, with the cast to single precision disabled."""
+    """The check uses double precision, with the cast to single precision disabled."""
     monkeypatch.setattr(torch.Tensor, "float", lambda self: self.clone())
     assert torch.autograd.gradcheck(short_attention, (random_heads(DOUBLE), 2, random_mask(3)))
 
 
 def test_common_offset_of_values_has_no_effect_on_scores():
-    """Although rounded weights do not sum to 1."""
+    """The offset cancels although rounded weights do not sum to 1."""
     errors, in_common = [], torch.arange(24) >= 16
-    pull = torch.randn(3, 5, 8, generator=torch.Generator().manual_seed(1))
+    upstream = torch.randn(3, 5, 8, generator=torch.Generator().manual_seed(1))
     for common in (0.0, 8.0):
         half, double = random_heads(torch.bfloat16), random_heads(DOUBLE)
-        short_attention(half + common * in_common, 2).backward(pull.to(torch.bfloat16))
-        torch_attention(double, None).backward(pull.double())
+        short_attention(half + common * in_common, 2).backward(upstream.to(torch.bfloat16))
+        torch_attention(double, None).backward(upstream.double())
         errors.append(float((half.grad.double() - double.grad)[..., :8].norm()))
     assert errors[1] < 6 * errors[0]
 
@@ -261,8 +261,8 @@ def test_initial_hypotheses_lie_in_their_quadrants():
     poses = PoseNetwork(TINY, J, BONES, G)(*random_input())
     for view in range(H):
         angle = math.pi / 4 + view * math.pi / 2
-        turn = vector_to_matrix(torch.tensor([0.0, angle, 0.0])).expand(B, T, 3, 3)
-        assert geodesic_angle(poses.rotation[:, view], turn).max() < 0.3
+        expected = vector_to_matrix(torch.tensor([0.0, angle, 0.0])).expand(B, T, 3, 3)
+        assert geodesic_angle(poses.rotation[:, view], expected).max() < 0.3
         # The front, +Z, faces the camera in the first and last quadrant.
         front = poses.rotation[:, view, :, :, 2]
         assert (front[..., 0].sign() == (1 if view < 2 else -1)).all()
@@ -288,7 +288,7 @@ def test_predicted_rotation_follows_the_quarter_turn():
     with torch.no_grad():
         for weights in network.rigid[-1].parameters():
             weights.zero_()
-        # Rotation about X by 0.2: its first two columns minus those of the identity.
+        # Predict a rotation about X by 0.2: two columns minus those of the identity.
         tilt = [0, 0, 0, 0, math.cos(0.2) - 1, math.sin(0.2)]
         network.rigid[-1].bias[:6] = torch.tensor(tilt)
         rotation = network(*random_input()).rotation
@@ -302,11 +302,11 @@ def test_frames_are_independent_except_for_lengths(pose_network):
     keypoints = torch.where(confidence[..., None] > 0, keypoints, torch.nan)
     keypoints[1, 3] += 0.5
     after = pose_network(keypoints, confidence, rest)
-    elsewhere = torch.ones(B, T, dtype=torch.bool)
-    elsewhere[1, 3] = False
+    others = torch.ones(B, T, dtype=torch.bool)
+    others[1, 3] = False
     for name in ("rotation", "translation", "turns"):
-        one, two = (getattr(poses, name).transpose(1, 2) for poses in (before, after))
-        torch.testing.assert_close(one[elsewhere], two[elsewhere], rtol=1e-5, atol=1e-6)
-        assert (one[1, 3] - two[1, 3]).abs().max() > 1e-3
+        old, new = (getattr(poses, name).transpose(1, 2) for poses in (before, after))
+        torch.testing.assert_close(old[others], new[others], rtol=1e-5, atol=1e-6)
+        assert (old[1, 3] - new[1, 3]).abs().max() > 1e-3
     assert (after.log_lengths - before.log_lengths)[1].abs().min() > 1e-6
     torch.testing.assert_close(after.log_lengths[::2], before.log_lengths[::2])

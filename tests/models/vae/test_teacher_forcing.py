@@ -28,7 +28,7 @@ SIZE = replace(MotionVAESettings.tiny(), frames=8, mixed_precision=True)
 
 @pytest.fixture(scope="module")
 def tracks():
-    """Walks with missing detections."""
+    """Return tracks of walks with missing detections."""
     clips = make_gaits(3, styles={"walk": 1.0}, frames=90, seed=1)
     return film_clips(clips, PERSON, 10.0, views=1, noise=DetectorNoise(share=0.1)).tracks
 
@@ -40,13 +40,13 @@ def body(tracks):
 
 @pytest.fixture(scope="module")
 def network(body):
-    made = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
+    random_network = PoseNetwork(SIZE, PERSON.n_joints, len(body.bones), body.n_groups)
     with torch.no_grad():
-        # Poses that vary between frames and views.
-        made.bone_decoder.leave.weight.mul_(20)
-        made.rigid[-1].weight.mul_(20)
-        made.log_lengths.weight.mul_(10)
-    return made
+        # Make the poses vary between frames and views.
+        random_network.bone_decoder.leave.weight.mul_(20)
+        random_network.rigid[-1].weight.mul_(20)
+        random_network.log_lengths.weight.mul_(10)
+    return random_network
 
 
 @pytest.fixture
@@ -85,11 +85,11 @@ def test_scaled_poses_have_scaled_projections(tracks, network, body, distance, t
     unscaled, scale = teacher_poses(network, body, batches).of(drawn), torch.as_tensor(drawn.scale)
     projections = []
     for poses in (scaled(unscaled, scale), unscaled):
-        moved = torch.nn.functional.pad(poses.translation, (0, 1))
-        positions = body.positions(poses.turns, poses.rotation, moved, poses.log_lengths)
+        translation = torch.nn.functional.pad(poses.translation, (0, 1))
+        positions = body.positions(poses.turns, poses.rotation, translation, poses.log_lengths)
         projections.append(project_to_image(positions, distance))
-    wanted = scale[:, None, None, None, None] * projections[1]
-    assert (projections[0] - wanted).abs().mean() < tolerance * wanted.abs().mean()
+    expected = scale[:, None, None, None, None] * projections[1]
+    assert (projections[0] - expected).abs().mean() < tolerance * expected.abs().mean()
 
 
 def test_selected_view_does_not_depend_on_scale(tracks, trainee):
@@ -97,22 +97,22 @@ def test_selected_view_does_not_depend_on_scale(tracks, trainee):
     batches = batches_of(tracks)
     drawn = batches.draw(np.random.default_rng(0), 40)
     keypoints, seen, rest = trainee._inputs(drawn, CPU)
-    plain = trainee._teacher_poses(batches, drawn, keypoints, seen, rest)
+    unscaled = trainee._teacher_poses(batches, drawn, keypoints, seen, rest)
     scale = np.geomspace(0.05, 20, 40, dtype=np.float32)
-    shown, log_scale = keypoints * torch.as_tensor(scale)[:, None, None, None], np.log(scale)
-    poses = trainee._teacher_poses(batches, drawn._replace(scale=scale), shown, seen, rest)
-    torch.testing.assert_close(poses.turns, plain.turns)
-    torch.testing.assert_close(poses.rotation, plain.rotation)
-    lengths = plain.log_lengths + torch.as_tensor(log_scale)[:, None]
+    larger, log_scale = keypoints * torch.as_tensor(scale)[:, None, None, None], np.log(scale)
+    poses = trainee._teacher_poses(batches, drawn._replace(scale=scale), larger, seen, rest)
+    torch.testing.assert_close(poses.turns, unscaled.turns)
+    torch.testing.assert_close(poses.rotation, unscaled.rotation)
+    lengths = unscaled.log_lengths + torch.as_tensor(log_scale)[:, None]
     torch.testing.assert_close(poses.log_lengths, lengths)
 
 
-def test_loss_ignores_the_trainer_s_autocast(trainee):
+def test_loss_ignores_autocast_of_the_trainer(trainee):
     networks = trainee.network.eval()
-    plain = trainee.training_loss(networks, np.random.default_rng(0), 8, CPU)
+    expected = trainee.training_loss(networks, np.random.default_rng(0), 8, CPU)
     with torch.autocast("cpu", torch.bfloat16):
         direct = trainee.training_loss(networks, np.random.default_rng(0), 8, CPU)
-    assert torch.equal(direct, plain)
+    assert torch.equal(direct, expected)
 
 
 def test_teacher_is_evaluated_once_per_frame(trainee, network):

@@ -50,15 +50,15 @@ def body(tracks):
 
 
 @pytest.fixture(scope="module")
-def usual(tracks, body):
-    """Arguments of both trainees."""
+def base(tracks, body):
+    """Return the arguments of both trainees."""
     validation = filmed(walks(3, seed=1), views=4)
     return {"tracks": tracks, "validation": validation, "size": TINY, "body": body, "distance": 7.0}
 
 
 @pytest.fixture(scope="module")
-def first(usual):
-    return PoseTrainee(**usual)
+def first(base):
+    return PoseTrainee(**base)
 
 
 def shortened(tracks, frames):
@@ -77,22 +77,22 @@ def teacher(first, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def learnt(usual, teacher, tmp_path_factory):
-    """Second phase on four sequences, which the tiny network memorises in seconds."""
-    few = shortened(usual["tracks"][:4], 10)
-    given = usual | {"tracks": few, "validation": few}
+def learnt(base, teacher, tmp_path_factory):
+    """Train the second phase on four sequences, which the tiny network memorises in seconds."""
+    sequences = shortened(base["tracks"][:4], 10)
+    given = base | {"tracks": sequences, "validation": sequences}
     trainee = MotionVAETrainee(**given, pose_network=copy.deepcopy(teacher))
     # E_s and D_s start from the pose network.
     for part in ("frame_encoder", "bone_decoder"):
-        begun = getattr(trainee.network.vae, part).state_dict()
+        initial = getattr(trainee.network.vae, part).state_dict()
         for name, value in getattr(teacher, part).state_dict().items():
-            assert torch.equal(begun[name], value), name
+            assert torch.equal(initial[name], value), name
     with torch.no_grad():
-        begun = trainee.validation_loss(trainee.network.eval(), CPU)
+        initial_loss = trainee.validation_loss(trainee.network.eval(), CPU)
     folder = tmp_path_factory.mktemp("vae")
     settings = replace(usual_motion_vae_training("tiny")[1], steps=180, checkpoint_every=180)
     result = train(trainee, settings, folder, progress=False)
-    return trainee, begun, result, MotionVAE.load(folder)
+    return trainee, initial_loss, result, MotionVAE.load(folder)
 
 
 def test_first_phase_learns_the_view(teacher, body):
@@ -119,7 +119,7 @@ def test_rest_losses_ignore_bone_rotations_and_lengths(first):
 def test_loss_selects_hypotheses_by_the_rest_pose_first(first, step):
     network = copy.deepcopy(first.network)
     with torch.no_grad():
-        # Large bone rotations, so that the two criteria differ.
+        # Make the bone rotations large, so that the two criteria differ.
         network.bone_decoder.leave.weight.mul_(300)
     trainee = copy.copy(first)
     trainee.anneal(step)
@@ -127,10 +127,10 @@ def test_loss_selects_hypotheses_by_the_rest_pose_first(first, step):
     drawn = first.batches.draw(np.random.default_rng(0), 16)
     keypoints, seen, rest = first._inputs(drawn, CPU)
     confidence = torch.as_tensor(drawn.confidence)
-    guesses = network(keypoints, seen, rest)
-    terms = hypothesis_losses(first.body, guesses, keypoints, confidence, 7.0)
+    hypotheses = network(keypoints, seen, rest)
+    terms = hypothesis_losses(first.body, hypotheses, keypoints, confidence, 7.0)
     losses = weighted_sum(terms, TINY)
-    best = first._rest_losses(guesses, keypoints, confidence).argmin(dim=1)
+    best = first._rest_losses(hypotheses, keypoints, confidence).argmin(dim=1)
     assert (best != losses.argmin(dim=1)).any()
     if step > 500:
         best = losses.argmin(dim=1)
@@ -140,15 +140,15 @@ def test_loss_selects_hypotheses_by_the_rest_pose_first(first, step):
 
 
 def test_second_phase_learns_with_a_fixed_teacher(learnt, teacher):
-    _, begun, result, prior = learnt
-    assert result.saved["validation_loss"] < 0.4 * begun
+    _, initial_loss, result, prior = learnt
+    assert result.saved["validation_loss"] < 0.4 * initial_loss
     for name, value in prior.model.pose.state_dict().items():
         assert torch.equal(value, teacher.state_dict()[name]), name
 
 
 @pytest.mark.slow
-def test_short_training_gives_3d_walks(usual, body, tmp_path):
-    given = usual | {"size": MotionVAESettings.small()}
+def test_short_training_yields_3d_walks(base, body, tmp_path):
+    given = base | {"size": MotionVAESettings.small()}
     poses, vae = usual_motion_vae_training("small")
     first = PoseTrainee(**given)
     train(first, replace(poses, steps=800), tmp_path / "poses", progress=False)
@@ -161,9 +161,9 @@ def test_short_training_gives_3d_walks(usual, body, tmp_path):
     drawn = MotionVAE.load(tmp_path / "vae").sample(np.random.default_rng(0), 100)
     left, right = (drawn[:, :, PERSON.index(f"{side}_ankle")] for side in ("left", "right"))
     # The feet alternate in front by decimetres, and left stays left.
-    apart = left[..., 2] - right[..., 2]
-    assert 0.15 < apart.std() < 0.5
-    assert (np.ptp(apart, axis=1) > 0.2).mean() > 0.8
+    offset = left[..., 2] - right[..., 2]
+    assert 0.15 < offset.std() < 0.5
+    assert (np.ptp(offset, axis=1) > 0.2).mean() > 0.8
     assert (left[..., 0] > right[..., 0]).mean() > 0.9
 
 
@@ -196,9 +196,9 @@ def test_training_does_not_depend_on_depth():
     filming = Filming(elevation=0.0, tilt=0.0, perspective=False)
     clips, flat = walks(6), []
     for clip in clips:
-        away = filming.cameras(seeds.generator(0, "filming", clip.name), 1).rotation[0, 2]
+        axis = filming.cameras(seeds.generator(0, "filming", clip.name), 1).rotation[0, 2]
         flat.append(
-            replace(clip, positions=clip.positions - (clip.positions @ away)[..., None] * away)
+            replace(clip, positions=clip.positions - (clip.positions @ axis)[..., None] * axis)
         )
         assert np.linalg.norm(clip.positions - flat[-1].positions, axis=-1).max() > 0.2
     losses = []
@@ -216,14 +216,14 @@ def test_training_does_not_depend_on_depth():
 
 
 @pytest.mark.parametrize("phase", [1, 2])
-def test_loss_is_linear_in_confidence(usual, phase):
-    """This holds for a single view hypothesis."""
+def test_loss_is_linear_in_confidence(base, phase):
+    """The loss is linear for a single view hypothesis only."""
     losses = {}
     for confidence in (1.0, 0.7, 0.4):
-        tracks = [replace(track, confidence=track.confidence.copy()) for track in usual["tracks"]]
+        tracks = [replace(track, confidence=track.confidence.copy()) for track in base["tracks"]]
         for track in tracks:
             track.confidence[:, ANKLES] = confidence * (track.confidence[:, ANKLES] > 0)
-        given = usual | {"tracks": tracks, "size": replace(TINY, hypotheses=1)}
+        given = base | {"tracks": tracks, "size": replace(TINY, hypotheses=1)}
         trainee = PoseTrainee(**given)
         if phase == 2:
             trainee = MotionVAETrainee(**given, pose_network=trainee.network)
@@ -235,9 +235,9 @@ def test_loss_is_linear_in_confidence(usual, phase):
     assert losses[0.7] == pytest.approx((losses[1.0] + losses[0.4]) / 2, rel=1e-5)
 
 
-def test_short_tracks_are_skipped(usual):
-    tracks = usual["tracks"]
-    given = usual | {"tracks": [*tracks, *shortened(tracks[:2], 5)]}
+def test_short_tracks_are_skipped(base):
+    tracks = base["tracks"]
+    given = base | {"tracks": [*tracks, *shortened(tracks[:2], 5)]}
     with pytest.warns(UserWarning, match="2 of .* tracks are shorter than 10 frames and are skip"):
         trainee = PoseTrainee(**given)
     assert trainee.settings["data"]["tracks"] == len(tracks)
@@ -255,12 +255,12 @@ def test_asymmetric_bodies_warn_and_are_not_mirrored(last, parent):
     assert not trainee.batches.augmentation.mirror
 
 
-def test_invalid_inputs_are_rejected(usual, body):
-    occluded = [replace(track, confidence=track.confidence.copy()) for track in usual["tracks"]]
+def test_invalid_inputs_are_rejected(base, body):
+    occluded = [replace(track, confidence=track.confidence.copy()) for track in base["tracks"]]
     for track in occluded:
         track.confidence[:, ANKLES] = 0
     moving = film_clips(walks(3), PERSON, 10.0, views=2, filming=Filming(centre="sequence")).tracks
-    faster = [replace(track, fps=20.0) for track in usual["validation"]]
+    faster = [replace(track, fps=20.0) for track in base["validation"]]
     order = [*range(1, 14), 0]
     parents = [order.index(PERSON.parents[j]) if PERSON.parents[j] >= 0 else -1 for j in order]
     permuted = Skeleton([PERSON.joint_names[j] for j in order], parents)
@@ -269,7 +269,7 @@ def test_invalid_inputs_are_rejected(usual, body):
         ({"size": replace(TINY, image_features=8)}, "size must have image_features=0"),
         ({"distance": -1.0}, "distance must be a finite number above 0"),
         ({"distance": 0.1}, r"distance must exceed the body's reach of .* got 0\.1 m"),
-        ({"tracks": shortened(usual["tracks"], 6)}, "tracks must .* at least 10 frames, got at mo"),
+        ({"tracks": shortened(base["tracks"], 6)}, "tracks must .* at least 10 frames, got at mo"),
         ({"tracks": occluded}, "left_ankle, right_ankle"),
         ({"tracks": moving}, "tracks must have the root at the origin in every frame"),
         ({"validation": moving}, "validation must have the root at the origin in every frame"),
@@ -278,11 +278,11 @@ def test_invalid_inputs_are_rejected(usual, body):
         ({"body": point}, "body must have bones, got one joint point"),
     ):
         with pytest.raises(ValueError, match=message):
-            PoseTrainee(**usual | change)
+            PoseTrainee(**base | change)
     wide = PoseNetwork(replace(TINY, width=64), 14, len(body.bones), body.n_groups)
     other = PoseNetwork(TINY, 12, len(body.bones), body.n_groups)
     for network, message in ((wide, "pose_network must have the width"), (other, r"got \(12,")):
         with pytest.raises(ValueError, match=message):
-            MotionVAETrainee(**usual, pose_network=network)
+            MotionVAETrainee(**base, pose_network=network)
     with pytest.raises(ValueError, match="size must be one of tiny, small, paper, got 'huge'"):
         usual_motion_vae_training("huge")

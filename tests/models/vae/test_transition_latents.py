@@ -32,13 +32,13 @@ REST = np.array(
 BODY = ArticulatedBody(ARMS, REST)
 
 
-def mover(pace=1.0, **options):
-    """Return a prior with random weights and large motions at a given pace."""
+def random_prior(speed=1.0, **options):
+    """Return a prior with random weights and large motions at a given speed."""
     size = replace(MotionVAESettings.tiny(), latent=4, **options)
     model = MotionVAEModel.of(size, BODY)
     with torch.no_grad():
         model.vae.bone_decoder.leave.weight.mul_(40)
-        model.vae.time_decoder.times.mul_(pace)
+        model.vae.time_decoder.times.mul_(speed)
     return MotionVAE(model.vae, model.pose, size, BODY, 20.0)
 
 
@@ -48,7 +48,7 @@ def codes(n=3, seed=0):
 
 @pytest.fixture(scope="module")
 def prior():
-    return mover()
+    return random_prior()
 
 
 def test_segments_are_unchanged(prior):
@@ -59,28 +59,28 @@ def test_segments_are_unchanged(prior):
         np.testing.assert_allclose(result[16 * number : 16 * number + 10], segment, atol=1e-9)
 
 
-def test_acceleration_of_uniform_acceleration():
+def test_acceleration_of_a_parabola():
     path = np.arange(6)[:, None, None] ** 2 * np.array([[0.0, 0, 0], [0.3, 0, -0.4]])
     assert greatest_acceleration(path) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_transitions_accelerate_no_more_than_segments(seed):
-    prior, z = mover(pace=0.5), codes(seed=seed)
+    prior, z = random_prior(speed=0.5), codes(seed=seed)
     segments = prior.motion(z)
     allowed = max(greatest_acceleration(segment) for segment in segments)
-    side_by_side = greatest_acceleration(np.concatenate(segments))
-    assert side_by_side > 1.5 * allowed
+    concatenated = greatest_acceleration(np.concatenate(segments))
+    assert concatenated > 1.5 * allowed
     result = long_motion(prior, z)
     assert greatest_acceleration(result) <= allowed * (1 + 1e-9)
 
 
 def test_unsmooth_transition_warns():
-    """Still bodies in distant poses must accelerate between them."""
-    still, z = mover(pace=0.01), 2 * codes(2)
+    """Static bodies in distant poses must accelerate between them."""
+    static_prior, z = random_prior(speed=0.01), 2 * codes(2)
     with pytest.warns(UserWarning, match=r"after segment 0 has [\d.]+ times the largest accel"):
-        result = long_motion(still, z, iterations=3)
-    within = max(greatest_acceleration(part) for part in still.motion(z))
+        result = long_motion(static_prior, z, iterations=3)
+    within = max(greatest_acceleration(part) for part in static_prior.motion(z))
     assert greatest_acceleration(result) > within
 
 
@@ -93,8 +93,8 @@ def test_exact_transition_needs_no_correction(prior):
     shared = [0, 1, 8, 9]
     corrected = _corrected(other, motion[shared])
     torch.testing.assert_close(corrected[shared], motion[shared])
-    turned = corrected @ corrected.mT
-    torch.testing.assert_close(turned, torch.eye(3, dtype=turned.dtype).expand_as(turned))
+    products = corrected @ corrected.mT
+    torch.testing.assert_close(products, torch.eye(3, dtype=products.dtype).expand_as(products))
 
 
 def test_optimisation_reduces_the_mismatch(prior, monkeypatch):
@@ -108,17 +108,17 @@ def test_optimisation_reduces_the_mismatch(prior, monkeypatch):
 
     monkeypatch.setattr(transition_latents, "_joined", spy)
     long_motion(prior, codes(2), iterations=1, transitions=1)
-    first, few = mismatches[0], mismatches[-1]
+    initial, early = mismatches[0], mismatches[-1]
     long_motion(prior, codes(2), iterations=50, transitions=1)
-    assert mismatches[-1] < 0.8 * few < 0.8 * first
+    assert mismatches[-1] < 0.8 * early < 0.8 * initial
 
 
 def test_root_is_fixed_and_bone_lengths_are_constant(prior):
     result = long_motion(prior, codes(2), iterations=3)
     np.testing.assert_allclose(result[:, 0], np.tile(prior.rigid.translations[0], (len(result), 1)))
     lengths = np.linalg.norm(result[:, 1:] - result[:, ARMS.parents[1:]], axis=-1)
-    want = np.broadcast_to(np.linalg.norm(REST[1:], axis=-1), lengths.shape)
-    np.testing.assert_allclose(lengths, want, atol=1e-9)
+    expected = np.broadcast_to(np.linalg.norm(REST[1:], axis=-1), lengths.shape)
+    np.testing.assert_allclose(lengths, expected, atol=1e-9)
 
 
 def test_invalid_arguments_are_rejected(prior):

@@ -1,4 +1,4 @@
-"""Certified references: correct for known posteriors, refused for wrong runs, resumable."""
+"""Certified references: known posteriors, rejection of wrong runs, and resumption."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def toy(freedom=None):
     return Problem("toy", "", MotionPosterior(prior, likelihood), truth)
 
 
-def spread_out(positions, factor):
-    """Scale the spread of the second half of the draws about the mean."""
+def widened(positions, factor):
+    """Scale deviations of the second half of the draws from the mean by a factor."""
     mean, (first, second) = positions.mean(axis=0), np.split(positions, 2)
     return np.concatenate([first, mean + factor * (second - mean)])
 
@@ -77,7 +77,7 @@ def exact():
 
 
 @pytest.fixture(scope="module")
-def heavy():
+def heavy_tailed():
     return toy(freedom=3.0)
 
 
@@ -96,8 +96,8 @@ def test_exact_problem_gets_an_exact_certificate(certified):
     ("change", "message"),
     [
         (lambda drawn: drawn, None),
-        (lambda drawn: spread_out(drawn, 0.9), "swd_ratio of two runs on toy must be at most"),
-        (lambda drawn: spread_out(drawn, 1.1), "swd_ratio of two runs on toy must be at most"),
+        (lambda drawn: widened(drawn, 0.9), "swd_ratio of two runs on toy must be at most"),
+        (lambda drawn: widened(drawn, 1.1), "swd_ratio of two runs on toy must be at most"),
         (lambda drawn: drawn + 0.15 * drawn.std(axis=0) * of_chains(*"00001111"), "of two runs on"),
         (lambda drawn: drawn + 0.3 * of_chains(*"01010101"), r"R-hat .* got 1"),
     ],
@@ -124,7 +124,7 @@ def test_runs_that_differ_are_refused(exact, change, message):
     ids=["mixed", "unmixed", "constant", "constant per run"],
 )
 def test_poses_are_compared_after_alignment(exact, noise, longer, message):
-    """Some chains have longer bones, hidden by translations of metres."""
+    """Some chains have longer bones, masked by translations of metres."""
     rng = np.random.default_rng(0)
     poses = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 1, 0], [1.2, 1, 0]]]) * np.ones((4000, 1, 1, 1))
     poses[:, :, 1, 0] += 0.5 * of_chains(*longer)[:, 0, 0] + noise * rng.normal(size=(4000, 1))
@@ -148,14 +148,14 @@ def test_equal_distributions_agree():
         assert_agreed(agreement(*pair, seed=0))
 
 
-def test_gibbs_matches_importance_sampling(heavy):
-    """Importance weights relative to the exact posterior with Gaussian noise."""
-    posterior = heavy.posterior
+def test_gibbs_matches_importance_sampling(heavy_tailed):
+    """The reference is importance sampling from the exact posterior with Gaussian noise."""
+    posterior = heavy_tailed.posterior
     run = OutlierGibbs(thin=1).sample(posterior, draws=1000, chains=2, seed=1, progress=False)
     gaussian = replace(posterior.likelihood, degrees_of_freedom=None, noise=0.5)
     proposal = posterior.prior.exact_posterior(gaussian)
     proposed = proposal.sample(np.random.default_rng(0), 20_000)
-    log_weight = heavy.log_density_of(proposed) - proposal.log_density(proposed)
+    log_weight = heavy_tailed.log_density_of(proposed) - proposal.log_density(proposed)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     drawn = run.flat()
@@ -165,16 +165,16 @@ def test_gibbs_matches_importance_sampling(heavy):
         assert (np.abs((drawn**power).mean(axis=0) - expected) < 5 * error).all()
 
 
-def test_saved_reference_is_loaded_and_sampled(tmp_path, heavy):
+def test_saved_reference_is_loaded_and_sampled(tmp_path, heavy_tailed):
     sampler = OutlierGibbs(thin=1)
-    reference = make_reference(heavy, draws=480, seed=1, progress=False, sampler=sampler)
+    reference = make_reference(heavy_tailed, draws=480, seed=1, progress=False, sampler=sampler)
     assert (reference.n, reference.certificate["draws_made"]) == (480, 4000)
     folder = reference.save(tmp_path / "toy")
     assert {path.name for path in folder.iterdir()} == {"certificate.json", "draws.npz"}
-    problem = replace(heavy, stored=StoredReference.load(folder))
+    problem = replace(heavy_tailed, stored=StoredReference.load(folder))
     assert problem.has_reference
-    assert not heavy.has_reference
-    assert (problem.max_references, heavy.max_references) == (480, None)
+    assert not heavy_tailed.has_reference
+    assert (problem.max_references, heavy_tailed.max_references) == (480, None)
     drawn = problem.reference(3, 480)
     np.testing.assert_array_equal(drawn, problem.reference(3, 480))
     assert len(np.unique(drawn.reshape(480, -1), axis=0)) == 480  # without replacement
@@ -217,20 +217,20 @@ def cached(problem, folder, draws=480, seed=1):
 
 
 @pytest.fixture
-def halves(monkeypatch):
+def runs_made(monkeypatch):
     """Record the indices of the runs made during a test."""
     run, indices = making._run, []
-    monkeypatch.setattr(making, "_LEAST", 480)
+    monkeypatch.setattr(making, "_MIN_RUN_DRAWS", 480)
     monkeypatch.setattr(making, "_run", lambda *args: indices.append(args[4]) or run(*args))
     return indices
 
 
-def test_finished_runs_are_reused_for_equal_arguments_only(tmp_path, exact, halves, monkeypatch):
+def test_finished_runs_are_reused_for_equal_arguments_only(tmp_path, exact, runs_made, monkeypatch):
     expected = cached(exact, None)
     for indices in ([0, 1], []):
-        halves.clear()
+        runs_made.clear()
         reference = cached(exact, tmp_path)
-        assert halves == indices
+        assert runs_made == indices
         assert np.array_equal(reference.positions, expected.positions)
         assert reference.certificate["fingerprint"] == expected.certificate["fingerprint"]
     likelihood = exact.posterior.likelihood
@@ -243,27 +243,27 @@ def test_finished_runs_are_reused_for_equal_arguments_only(tmp_path, exact, halv
         (replace(exact, posterior=other, truth=None), {}),
         (replace(exact, name="another toy"), {}),
     ):
-        halves.clear()
+        runs_made.clear()
         cached(problem, tmp_path, **options)
-        assert halves == [0, 1]
-    halves.clear()
+        assert runs_made == [0, 1]
+    runs_made.clear()
     monkeypatch.setattr(making, "library_versions", lambda: {"numpy": "1"})
     cached(exact, tmp_path)
-    assert halves == [0, 1]
+    assert runs_made == [0, 1]
 
 
-def test_file_errors_after_the_start_only_warn(tmp_path, exact, halves, monkeypatch):
+def test_file_errors_after_the_start_only_warn(tmp_path, exact, runs_made, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="writable"):
         cached(exact, tmp_path / "file" / "runs")
-    assert not halves
+    assert not runs_made
     folder = tmp_path / "runs"
     expected = cached(exact, folder)
     for path in folder.iterdir():
         path.write_bytes(path.read_bytes()[:100])
     with pytest.warns(UserWarning, match="the run is repeated"):
         references = [cached(exact, folder)]
-    assert halves == [0, 1, 0, 1]
+    assert runs_made == [0, 1, 0, 1]
     monkeypatch.setattr(MotionDraws, "save", disk_full)
     with pytest.warns(UserWarning, match="cannot store the run in .*: No space left on device"):
         references.append(cached(exact, tmp_path / "other"))
@@ -271,7 +271,7 @@ def test_file_errors_after_the_start_only_warn(tmp_path, exact, halves, monkeypa
         assert np.array_equal(reference.positions, expected.positions)
 
 
-class Moved(StandardNormalPrior):
+class LatentPrior(StandardNormalPrior):
     """Prior of two frames of one joint at ``size`` θ, with a density of θ only."""
 
     skeleton, frames, fps, dim = Skeleton(["hip"], [-1]), 2, 30.0, 3
@@ -283,17 +283,17 @@ class Moved(StandardNormalPrior):
         return self.size * theta[..., None, None, :] * np.ones((2, 1, 1))
 
 
-def observed(size=1.0, at=0.5):
-    """Return a problem with both frames observed at ``at`` · (1, −1, 2) with noise .5."""
-    joints = np.broadcast_to(at * np.array([1.0, -1.0, 2.0]), (2, 1, 3))
-    return Problem("moved", "", MotionPosterior(Moved(size), Joints3D(joints, noise=0.5)))
+def observed(size=1.0, location=0.5):
+    """Return a problem with both frames observed at ``location`` · (1, −1, 2), noise .5."""
+    joints = np.broadcast_to(location * np.array([1.0, -1.0, 2.0]), (2, 1, 3))
+    return Problem("moved", "", MotionPosterior(LatentPrior(size), Joints3D(joints, noise=0.5)))
 
 
 def test_random_walk_reference_of_a_latent_prior_is_correct():
     problem = observed()
     walk = load_sampler("mh")(warmup=1000, thin=10)
     reference = make_reference(problem, draws=4000, seed=1, progress=False, sampler=walk)
-    # Precision 1 + 2 / .5² and mean 2 y / .5² over the precision.
+    # The posterior has precision 1 + 2 / .5² and mean 2 y / .5² over the precision.
     x = reference.positions[:, 0, 0]
     np.testing.assert_allclose(x.mean(axis=0), 0.5 * np.array([1, -1, 2]) * 8 / 9, atol=0.03)
     np.testing.assert_allclose(x.std(axis=0), 1 / 3, rtol=0.06)
@@ -301,13 +301,13 @@ def test_random_walk_reference_of_a_latent_prior_is_correct():
     assert (certificate["exact"], certificate["seeds"]) == (False, None)
     assert certificate["rhat"] <= 1.01
     assert replace(problem, stored=reference).has_reference
-    for other in (observed(size=1.1), observed(at=0.6)):
+    for other in (observed(size=1.1), observed(location=0.6)):
         with pytest.raises(ValueError, match="certificate must have moved's fingerprint"):
             replace(other, stored=reference)
 
 
 def test_prior_draws_are_the_reference_without_observations():
-    problem = Problem("moved", "", MotionPosterior(Moved(2.0)))
+    problem = Problem("moved", "", MotionPosterior(LatentPrior(2.0)))
     assert problem.has_reference
     assert problem.exact is None
     drawn = problem.reference(0, 4000)
@@ -318,8 +318,8 @@ def test_prior_draws_are_the_reference_without_observations():
 
 def test_truncation_changes_the_fingerprint():
     def fingerprint(limit):
-        likelihood = observed(0.1, at=0.0).posterior.likelihood
-        posterior = TruncatedPosterior(Moved(0.1), likelihood, limit=limit)
+        likelihood = observed(0.1, location=0.0).posterior.likelihood
+        posterior = TruncatedPosterior(LatentPrior(0.1), likelihood, limit=limit)
         return stored_references.fingerprint_of(posterior, np.zeros((1, 2, 1, 3)))
 
     assert fingerprint(1e9) != fingerprint(2e9)

@@ -34,8 +34,8 @@ from probmotion.problems.references.pair_moves import HINGE, STRETCH, moves_of, 
 from probmotion.problems.references.pair_walk_kernels import walk
 from probmotion.problems.references.tempered_pairs import TemperedPairs, pair_arrays
 
-# Exceeded by one in 100 000 normal variables.
-_LARGEST_Z = 4.4
+# One in 100 000 normal variables exceeds this z-score.
+_MAX_Z = 4.4
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def prior(dances):
 
 @pytest.fixture(scope="module")
 def exact(prior):
-    """Independent draws of the base measure, without limits or penetration, (n, J, 3)."""
+    """Return independent draws of the base measure, without limits or penetration, (n, J, 3)."""
     rng, n = np.random.default_rng(1), 30_000
     seed, skeleton = prior.seed[0], prior.skeleton
     poses = np.empty((n, *seed.shape))
@@ -81,8 +81,8 @@ def test_compiled_density_matches_the_posterior(prior, likelihood):
     for pose in poses:
         log_prior_terms(pose, body, physics, parts)
         logs.append(log_prior(parts, physics) + logsumexp(log_views(pose, body, views)))
-    stretches, places = theta[:, 12:].reshape(40, -1, 3)[..., 2], theta[:, 6:12]
-    normal = -0.5 * ((stretches / 0.05) ** 2).sum(axis=-1) - 0.5 * (places**2).sum(axis=-1)
+    stretches, translations = theta[:, 12:].reshape(40, -1, 3)[..., 2], theta[:, 6:12]
+    normal = -0.5 * ((stretches / 0.05) ** 2).sum(axis=-1) - 0.5 * (translations**2).sum(axis=-1)
     expected = normal + prior.log_plausibility(poses[:, None])
     allowed = np.isfinite(expected)
     assert 5 < allowed.sum() < 40
@@ -92,20 +92,20 @@ def test_compiled_density_matches_the_posterior(prior, likelihood):
 
 @pytest.mark.parametrize("measure", ["interaction", "cartesian"])
 def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
-    """Uses joints as complex numbers; without a graph, the surrogate is the exact distance."""
+    """The reference uses complex numbers; without a graph, the surrogate is exact."""
     likelihood = replace(likelihood, measure=measure)
     body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
     prepared, view, rng = views.prepared, 3, np.random.default_rng(0)
     pose = prior.seed[0] + 0.1 * rng.standard_normal(prior.seed[0].shape)
-    apart, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(views.near.shape[1])
+    diffs, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(views.near.shape[1])
     log_annotations(pose, view, body, views, logs)
     points = project_to_view(pose, view, body, views) @ [1, 1j]
     points -= points.mean()
     for annotation, exact in zip(views.near[view], logs, strict=True):
         target = prepared.joints[annotation].T @ [1, 1j]
-        turn = np.vdot(points, target)
-        error = points * turn / abs(turn) - target
-        surrogate = log_surrogate(pose, view, annotation, body, views, apart, terms)
+        product = np.vdot(points, target)
+        error = points * product / abs(product) - target
+        surrogate = log_surrogate(pose, view, annotation, body, views, diffs, terms)
         if measure == "cartesian":
             distance = math.sqrt(np.mean(np.abs(error) ** 2))
             assert exact == pytest.approx(surrogate, rel=1e-9)
@@ -117,7 +117,7 @@ def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
 
 
 def test_moves_preserve_bone_lengths(prior, likelihood):
-    """Except for stretches; hinges also preserve the distance of their joints."""
+    """Only stretches change bone lengths; hinges also preserve the distance between joints."""
     body, _, _ = pair_arrays(MotionPosterior(prior, likelihood))
     pose, rng = prior.seed[0], np.random.default_rng(0)
     ends, starts = np.array(prior.skeleton.bones).T
@@ -142,14 +142,14 @@ def test_walk_updates_its_terms_correctly(prior, likelihood):
     rng = np.random.default_rng(0)
     pose, parts, moves = prior.seed[0].copy(), np.zeros(6), moves_of(body)
     log_prior_terms(pose, body, physics, parts)
-    sizes, tried, taken = np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves))
-    counters = (moves, sizes, tried, taken)
+    sizes, trials, accepted = np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves))
+    counters = (moves, sizes, trials, accepted)
     view, log_l = walk(pose, parts, 2, 1.0, 4000, *counters, body, physics, views, rng)
     assert log_l == pytest.approx(log_views(pose, body, views)[view], rel=1e-9)
     expected = np.zeros(6)
     log_prior_terms(pose, body, physics, expected)
     np.testing.assert_allclose(parts, expected, rtol=1e-9, atol=1e-9)
-    assert (taken[tried > 0] > 0).mean() > 0.9
+    assert (accepted[trials > 0] > 0).mean() > 0.9
     assert expected[4:].sum() <= prior.max_invalid
 
 
@@ -159,8 +159,8 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
 
     Many annotations per view test that only the nearest one counts.
     """
-    gentle, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
-    posterior = MotionPosterior(gentle, replace(likelihood, n_near=30, noise=0.3))
+    weak_prior, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
+    posterior = MotionPosterior(weak_prior, replace(likelihood, n_near=30, noise=0.3))
     body, physics, views = pair_arrays(posterior)
 
     def summary(poses: np.ndarray):
@@ -174,7 +174,7 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
         return np.stack([best, n_near, best - best.mean(axis=1, keepdims=True)], axis=-1)
 
     expected = summary(exact)
-    log_weight = gentle.log_plausibility(exact[:, None])[:, None] + power * expected[..., 0]
+    log_weight = weak_prior.log_plausibility(exact[:, None])[:, None] + power * expected[..., 0]
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     mean = np.einsum("nv,nvk->k", weight, expected)
@@ -191,18 +191,18 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
             states.append((pose.copy(), view))
         poses, chosen = zip(*states[100:], strict=True)
         summaries.append(summary(np.array(poses))[np.arange(len(chosen)), list(chosen)])
-    assert np.abs(_z_scores(np.array(summaries), mean, error)).max() < _LARGEST_Z
+    assert np.abs(_z_scores(np.array(summaries), mean, error)).max() < _MAX_Z
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", [2.0, math.inf])
 def test_draws_match_importance_sampling(prior, likelihood, exact, limit):
     """Limits and penetration are weak, so that draws of the base measure cover the posterior."""
-    gentle = replace(prior, position_noise=0.7, max_invalid=24)
-    log_f = gentle.log_plausibility(exact[:, None]) + likelihood.log_density(exact[:, None])
-    # A seed of intermediate density, so that both bounds truncate.
-    seed = gentle.coordinates(exact[np.argsort(log_f)[int(0.97 * len(exact))]])
-    posterior = TruncatedPosterior(gentle, likelihood, seed=seed, limit=limit)
+    weak_prior = replace(prior, position_noise=0.7, max_invalid=24)
+    log_f = weak_prior.log_plausibility(exact[:, None]) + likelihood.log_density(exact[:, None])
+    # Choose a seed of intermediate density, so that both bounds truncate.
+    seed = weak_prior.coordinates(exact[np.argsort(log_f)[int(0.97 * len(exact))]])
+    posterior = TruncatedPosterior(weak_prior, likelihood, seed=seed, limit=limit)
     log_cut = np.where(log_f < posterior.log_floor, -np.inf, np.minimum(log_f, posterior.log_cap))
     weights = np.exp(log_cut - log_cut.max())
     allowed, weights = exact[weights > 0], weights[weights > 0]
@@ -216,7 +216,7 @@ def test_draws_match_importance_sampling(prior, likelihood, exact, limit):
     mean = np.average(expected, axis=0, weights=weights)
     weighted = weights[:, None] * (expected - mean)
     error = np.sqrt((weighted**2).sum(axis=0)) / weights.sum()
-    assert np.abs(_z_scores(drawn, mean, error)).max() < _LARGEST_Z
+    assert np.abs(_z_scores(drawn, mean, error)).max() < _MAX_Z
     if math.isfinite(limit):
         assert log_f.max() > posterior.log_cap
         assert (drawn[..., :2].sum(axis=-1) >= posterior.log_floor - 1e-6).all()
@@ -277,29 +277,29 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
 
 def test_ctrl_c_stops_all_chains(prior, likelihood):
     main, before = threading.main_thread().ident, signal.getsignal(signal.SIGINT)
-    pressed = threading.Timer(0.5, signal.pthread_kill, (main, signal.SIGINT))
+    interrupt = threading.Timer(0.5, signal.pthread_kill, (main, signal.SIGINT))
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        pressed.start()
+        interrupt.start()
         with pytest.raises(KeyboardInterrupt):
             endless(MotionPosterior(prior, likelihood))
     finally:
-        pressed.join()
+        interrupt.join()
         signal.signal(signal.SIGINT, before)
     assert not [thread for thread in threading.enumerate() if "Executor" in thread.name]
 
 
 def test_chains_start_at_successive_seeds(prior, likelihood, dances):
     """The base measure is relative to the first seed."""
-    both = np.stack([prior.seed[0], dances[1].positions[40]])
-    posterior = MotionPosterior(replace(prior, seed=both), likelihood)
+    two_seeds = np.stack([prior.seed[0], dances[1].positions[40]])
+    posterior = MotionPosterior(replace(prior, seed=two_seeds), likelihood)
     arrays, rng = pair_arrays(posterior), np.random.default_rng(0)
     for chain, seed in enumerate((0, 1, 0)):
         ladder = tempered_pairs._Ladder(TemperedPairs(), posterior, arrays, rng, chain)
-        assert (ladder.poses == both[seed]).all()
+        assert (ladder.poses == two_seeds[seed]).all()
         theta = posterior.prior.seed_coordinates()[seed]
-        stretches, places = theta[12:].reshape(-1, 3)[:, 2], theta[6:12]
-        normal = -0.5 * ((stretches / prior.bone_noise) ** 2).sum() - 0.5 * (places**2).sum()
+        stretches, translations = theta[12:].reshape(-1, 3)[:, 2], theta[6:12]
+        normal = -0.5 * ((stretches / prior.bone_noise) ** 2).sum() - 0.5 * (translations**2).sum()
         np.testing.assert_allclose(ladder.parts[:, 0], normal, rtol=1e-9, atol=1e-9)
 
 
@@ -315,7 +315,7 @@ def test_tuned_powers_have_equal_rejection_rates(prior, likelihood):
     rates = ladder.rejected / ladder.asked
     assert rates.max() - rates.min() < 0.25
     assert ladder.barrier == pytest.approx(rates.sum())
-    # Ideal rate of 1 in 2 + 2 Σ r/(1 − r) exchanges (Syed et al. 2022).
+    # The ideal is one round trip in 2 + 2 Σ r/(1 − r) exchanges (Syed et al. 2022).
     ideal = 600 / (2 + 2 * (rates / (1 - rates)).sum())
     assert 0.1 * ideal < ladder.round_trips < 1.5 * ideal
 
@@ -338,7 +338,7 @@ def test_unsuitable_posteriors_are_rejected(prior, likelihood):
 
 
 def _summaries(poses: np.ndarray, posterior: MotionPosterior):
-    """Return log f, log L, and distance and alignment of the two people."""
+    """Return log f, log L, and the distance between and alignment of the two people."""
     skeleton = posterior.likelihood.skeleton
     roots = list(skeleton.roots)
     chests = [k for k, name in enumerate(skeleton.joint_names) if "chest" in name]

@@ -56,26 +56,26 @@ def metrics(prior, sampler, run_seeds, n=DRAWS):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-# 475 calls per draw: 50 predictor and 45 corrector steps, or 95 steps, of 5 views.
+# Both use 475 calls per draw: 50 predictor and 45 corrector steps, or 95 steps, of 5 views.
 EQUAL_COST = (MultiViewPredictorCorrector(), MultiViewAncestral(steps=95))
 
 
 def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
-    """The fast version of the slow test below, in reduced coordinates."""
+    """This is the fast version of the slow test below, in reduced coordinates."""
     reduced, _ = gaits().reduced()
-    ours, mas = (metrics(reduced, sampler, [0], 100) for sampler in EQUAL_COST)
-    assert ours["calls"] == mas["calls"] == 475
+    mvpc, mas = (metrics(reduced, sampler, [0], 100) for sampler in EQUAL_COST)
+    assert mvpc["calls"] == mas["calls"] == 475
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
-        assert abs(np.log(ours[name])) < abs(np.log(mas[name])) - 0.1, name
+        assert abs(np.log(mvpc[name])) < abs(np.log(mas[name])) - 0.1, name
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [gaits, real_clips])
 def test_mvpc_is_more_accurate_than_mas_at_equal_cost(make):
-    """|log| of three mean ratios; 99 % intervals by resampling the seeds."""
+    """The test compares |log| of mean ratios with 99 % intervals by resampling the seeds."""
     prior = make()
-    ours, mas = (metrics(prior, sampler, range(SEEDS)) for sampler in EQUAL_COST)
+    mvpc, mas = (metrics(prior, sampler, range(SEEDS)) for sampler in EQUAL_COST)
     resampled = seeds.generator(0, "resampled").integers(SEEDS, size=(20_000, SEEDS))
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
-        gaps = [abs(np.log(values[name][resampled].mean(axis=1))) for values in (mas, ours)]
+        gaps = [abs(np.log(values[name][resampled].mean(axis=1))) for values in (mas, mvpc)]
         assert np.quantile(gaps[0] - gaps[1], 0.005) > 0, name

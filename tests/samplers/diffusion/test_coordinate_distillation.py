@@ -22,7 +22,7 @@ QUICK = ScoreDistillation(iterations=20)
 
 @dataclass(frozen=True, eq=False)
 class LinearMotion:
-    """θ ~ N(0, I) and X = A θ + b in torch, like a network."""
+    """Prior with θ ~ N(0, I) and X = A θ + b, in torch like a network."""
 
     matrix: np.ndarray
     offset: np.ndarray
@@ -57,7 +57,7 @@ def prior():
 
 @pytest.mark.parametrize("alpha_bar", [0.01, 0.5, 0.999])
 def test_expected_gradient_is_the_negative_score_of_the_noisy_prior(alpha_bar):
-    """E_ε[ε_φ − ε] = −√(1−ᾱ) ∇ log p_t(√ᾱ θ) for θ ~ N(m, S), averaging ε and −ε."""
+    """E_ε[ε_φ − ε] = −√(1−ᾱ) ∇ log p_t(√ᾱ θ) for θ ~ N(m, S); the mean is over ε and −ε."""
     rng = np.random.default_rng(1)
     root = rng.normal(size=(5, 5))
     mean, covariance = rng.normal(size=5), root @ root.T + np.eye(5)
@@ -69,13 +69,13 @@ def test_expected_gradient_is_the_negative_score_of_the_noisy_prior(alpha_bar):
             return mean + (theta_t - alpha_bar**0.5 * mean) @ gain
 
     theta, noise = rng.normal(size=(2, 7, 5))
-    both = [
+    pair = [
         coordinate_distillation_gradient(Correlated(), theta, sign * noise, alpha_bar)
         for sign in (1, -1)
     ]
     score = -math.sqrt(alpha_bar) * np.linalg.solve(noisy, (theta - mean).T).T
-    np.testing.assert_allclose(np.mean(both, axis=0), -((1 - alpha_bar) ** 0.5) * score, atol=1e-9)
-    assert abs(both[0] - both[1]).max() > 1e-3
+    np.testing.assert_allclose(np.mean(pair, axis=0), -((1 - alpha_bar) ** 0.5) * score, atol=1e-9)
+    assert abs(pair[0] - pair[1]).max() > 1e-3
 
 
 def observed(prior, noise, **options):
@@ -139,17 +139,17 @@ def test_modes_without_observations_and_with_outliers(prior):
 
 def test_a_draw_depends_only_on_its_seed_chain_and_number(prior):
     posterior = observed(prior, 0.1)
-    many = distilled(QUICK, posterior, draws=5, chains=3, seed=2)
-    theta = many.dataset["theta"].values
+    full = distilled(QUICK, posterior, draws=5, chains=3, seed=2)
+    theta = full.dataset["theta"].values
     assert len(np.unique(theta.reshape(15, -1), axis=0)) == 15
-    np.testing.assert_allclose(many.positions.values, prior.motion(theta), atol=1e-12)
-    np.testing.assert_allclose(many.dataset["log_density"], posterior.log_density(theta))
-    assert many.counts == {"denoiser": 300, "gradient": 300, "density": 15}
+    np.testing.assert_allclose(full.positions.values, prior.motion(theta), atol=1e-12)
+    np.testing.assert_allclose(full.dataset["log_density"], posterior.log_density(theta))
+    assert full.counts == {"denoiser": 300, "gradient": 300, "density": 15}
     for sampler, draws, chains in ((replace(QUICK, batch=2), 5, 3), (QUICK, 4, 2)):
-        few = distilled(sampler, posterior, seed=2, draws=draws, chains=chains)
+        subset = distilled(sampler, posterior, seed=2, draws=draws, chains=chains)
         for name in ("theta", "positions", "log_density"):
-            expected = many.dataset[name].values[:chains, :draws]
-            np.testing.assert_allclose(few.dataset[name].values, expected, rtol=0, atol=1e-9)
+            expected = full.dataset[name].values[:chains, :draws]
+            np.testing.assert_allclose(subset.dataset[name].values, expected, rtol=0, atol=1e-9)
 
 
 def test_one_of_two_protocols_is_required(prior, gaussian, two_modes):

@@ -23,7 +23,7 @@ from probmotion.samplers.diffusion.views import MotionDenoiser, MultiViewDenoise
 
 @pytest.fixture(scope="module")
 def observations(gaussian):
-    """Two views of a motion, and its joints, each with occluded entries."""
+    """Return two views of a motion, and its joints, each with occluded entries."""
     truth = Motion(gaussian.sample(np.random.default_rng(8), 1)[0], gaussian.skeleton, gaussian.fps)
     hidden = np.zeros((2, 2, 2), dtype=bool)
     hidden[1, 0, 1] = True
@@ -39,7 +39,7 @@ def keypoints(observations):
     return observations["keypoints"]
 
 
-def given_both(prior, likelihood, x_t, alpha_bar):
+def exact_denoiser(prior, likelihood, x_t, alpha_bar):
     """Return E[X₀ | X_t, y] by dense linear algebra."""
     mean, covariance = prior.posterior(likelihood)
     posterior = replace(prior, mean=mean, covariance=covariance)
@@ -53,14 +53,14 @@ def test_moment_matching_is_exact_for_a_gaussian(gaussian, observations, alpha_b
     posterior = MotionPosterior(gaussian, likelihood)
     denoiser = MotionDenoiser(gaussian)
     x_t = np.random.default_rng(0).normal(size=(5, 2, 2, 3))
-    exact = given_both(gaussian, likelihood, x_t, alpha_bar)
-    gaps = []
+    exact = exact_denoiser(gaussian, likelihood, x_t, alpha_bar)
+    errors = []
     for steps in (1, 4, 16):
         guide = guide_towards(Ancestral3D(), posterior, MomentMatched(steps), denoiser)
         guided = guide(x_t, alpha_bar, denoiser.denoise(x_t, alpha_bar), None)
-        gaps.append(abs(guided - exact).max())
-    assert gaps[2] < 1e-9
-    assert gaps[0] > gaps[1] > gaps[2]
+        errors.append(abs(guided - exact).max())
+    assert errors[2] < 1e-9
+    assert errors[0] > errors[1] > errors[2]
     unguided = denoiser.denoise(x_t, alpha_bar)
     assert abs(unguided - exact).max() > 0.01
     assert denoiser.counts == {"denoiser": 20, "covariance": 5 * (1 + 4 + 16)}
@@ -89,10 +89,10 @@ def test_multi_view_covariance_is_the_symmetrised_jacobian(gaussian):
     alpha_bar, step = 0.4, 1e-5
     x = np.random.default_rng(1).normal(size=(1, 2, 2, 3))
     unit = np.eye(12).reshape(12, 2, 2, 3)
-    here = np.repeat(x, 12, axis=0)
+    repeated = np.repeat(x, 12, axis=0)
     up, down = (denoiser.denoise(x + sign * step * unit, alpha_bar) for sign in (1, -1))
     jacobian = ((up - down) / (2 * step)).reshape(12, 12).T
-    matrix = denoiser.covariance_product(here, alpha_bar, unit).reshape(12, 12).T
+    matrix = denoiser.covariance_product(repeated, alpha_bar, unit).reshape(12, 12).T
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
     assert np.linalg.eigvalsh(matrix).min() > 0
     values, vectors = np.linalg.eigh(np.kron(np.eye(4), views.gram))
@@ -114,8 +114,8 @@ def test_dps_descends_the_distance_to_the_observations(gaussian, keypoints, mult
 
     def distance(state):
         predicted = observations.observe(denoiser.denoise(state, alpha_bar))
-        gap = observed * (observations.target - predicted)
-        return np.sqrt((gap**2).sum(axis=(1, 2, 3, 4)))
+        residual = observed * (observations.target - predicted)
+        return np.sqrt((residual**2).sum(axis=(1, 2, 3, 4)))
 
     unit = 1e-5 * np.eye(12).reshape(12, 2, 2, 3)
     gradient = (distance(x + unit) - distance(x - unit)) / 2e-5
@@ -123,8 +123,8 @@ def test_dps_descends_the_distance_to_the_observations(gaussian, keypoints, mult
     step = schedule.posterior(12)
     guide = guide_towards(Ancestral3D(), posterior, DPS(0.7), denoiser)
     clean = denoiser.denoise(x, alpha_bar)
-    moved = step.clean * (guide(x, alpha_bar, clean, step) - clean)
-    np.testing.assert_allclose(moved.ravel(), -0.7 * gradient, atol=1e-8)
+    change = step.clean * (guide(x, alpha_bar, clean, step) - clean)
+    np.testing.assert_allclose(change.ravel(), -0.7 * gradient, atol=1e-8)
 
 
 def test_replacement_changes_only_the_observed_coordinates(gaussian, keypoints):
@@ -135,15 +135,15 @@ def test_replacement_changes_only_the_observed_coordinates(gaussian, keypoints):
     denoiser = MotionDenoiser(gaussian)
     guide = guide_towards(Ancestral3D(), MotionPosterior(gaussian, one), Replacement(), denoiser)
     clean = np.random.default_rng(0).normal(size=(2, 2, 2, 3))
-    out = guide(clean, 0.5, clean, None)
+    result = guide(clean, 0.5, clean, None)
     observations = LinearObservations.of(Ancestral3D(), MotionPosterior(gaussian, one))
-    predicted = observations.observe(out)
+    predicted = observations.observe(result)
     observed = np.broadcast_to((one.confidence > 0)[..., None], predicted[0].shape)
     for motion in predicted:
         np.testing.assert_allclose(motion[observed], observations.target[observed], atol=1e-12)
-    np.testing.assert_array_equal(out[:, 1, 0], clean[:, 1, 0])
+    np.testing.assert_array_equal(result[:, 1, 0], clean[:, 1, 0])
     depth = camera.rotation[0, 2]
-    np.testing.assert_allclose(out @ depth, clean @ depth, atol=1e-12)
+    np.testing.assert_allclose(result @ depth, clean @ depth, atol=1e-12)
     # Inconsistent views are averaged by precision.
     two = Keypoints2D(
         np.concatenate([one.keypoints, one.keypoints + 0.4]),
@@ -152,8 +152,8 @@ def test_replacement_changes_only_the_observed_coordinates(gaussian, keypoints):
         confidence=np.stack([np.ones((2, 2)), 3 * np.ones((2, 2))]),
     )
     guide = guide_towards(Ancestral3D(), MotionPosterior(gaussian, two), Replacement(), denoiser)
-    out = guide(clean, 0.5, clean, None) * gaussian.scale
-    np.testing.assert_allclose(camera.project(out[0])[0], two.keypoints[0] + 0.3, atol=1e-12)
+    result = guide(clean, 0.5, clean, None) * gaussian.scale
+    np.testing.assert_allclose(camera.project(result[0])[0], two.keypoints[0] + 0.3, atol=1e-12)
 
 
 def test_weighted_triangulation_adds_views(gaussian, keypoints):
@@ -163,8 +163,8 @@ def test_weighted_triangulation_adds_views(gaussian, keypoints):
     posterior = MotionPosterior(gaussian, keypoints)
     guide = guide_towards(MultiViewAncestral(), posterior, WeightedTriangulation(2.0), denoiser)
     x_t = np.random.default_rng(0).normal(size=(1, 2, 2, 3))
-    out = guide(x_t, 0.5, denoiser.denoise(x_t, 0.5), None)[0]
-    # Least squares with weight 1 for the denoised views and 2 for the keypoints.
+    result = guide(x_t, 0.5, denoiser.denoise(x_t, 0.5), None)[0]
+    # The expected result is least squares with weight 1 for denoised views, 2 for keypoints.
     clean = gaussian.denoise(views.project(x_t), 0.5, ring)[0]
     for frame, joint in np.ndindex(2, 2):
         rows = [*ring.image_axes]
@@ -174,7 +174,7 @@ def test_weighted_triangulation_adds_views(gaussian, keypoints):
             rows.append(weight * keypoints.cameras.image_axes[v])
             targets.append(weight * keypoints.keypoints[v, frame, joint] / gaussian.scale)
         solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets), rcond=None)[0]
-        np.testing.assert_allclose(out[frame, joint], solution, atol=1e-12)
+        np.testing.assert_allclose(result[frame, joint], solution, atol=1e-12)
 
 
 def test_conjugate_gradients_solve_every_row():
@@ -199,15 +199,15 @@ def test_conjugate_gradients_solve_every_row():
 def solved(system, right, steps):
     """Return K u with (I + K) u = right after ``steps`` steps, for every row."""
     return conjugate_gradients(
-        lambda u: np.einsum("bij,bj->bi", system, u), lambda moved: moved, right, steps
+        lambda u: np.einsum("bij,bj->bi", system, u), lambda v: v, right, steps
     )
 
 
 def test_conjugate_gradients_stop_if_the_system_is_not_positive_or_symmetric():
     """One eigenvalue of K is −0.999, so the solution is large along it."""
     values = np.array([[3.0, 2.0, 1.0, 0.5], [3.0, 2.0, 1.0, -0.999]])
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    systems = np.einsum("ij,bj,kj->bik", turn, values, turn)
+    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    systems = np.einsum("ij,bj,kj->bik", rotation, values, rotation)
     right = np.random.default_rng(1).normal(size=(2, 4))
     expected = np.linalg.solve(np.eye(4) + systems, right[..., None])[..., 0]
     expected = np.einsum("bij,bj->bi", systems, expected)
@@ -249,20 +249,20 @@ def test_guided_draws_do_not_depend_on_the_batch(gaussian, keypoints, guidance):
     posterior = MotionPosterior(gaussian, keypoints)
     for kind in (Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector):
         sampler = kind(steps=6, guidance=guidance)
-        many = sampler.sample(posterior, draws=5, seed=1, progress=False)
+        full = sampler.sample(posterior, draws=5, seed=1, progress=False)
         batched = replace(sampler, batch=2).sample(posterior, draws=5, seed=1, progress=False)
-        np.testing.assert_allclose(batched.flat(), many.flat(), atol=1e-10)
-        assert batched.counts == many.counts
-        free = sampler.sample(MotionPosterior(gaussian), draws=5, seed=1, progress=False)
-        assert abs(free.flat() - many.flat()).max() > 1e-3
-        # Covariance products per estimate: one for DPS, one per conjugate-gradient step.
+        np.testing.assert_allclose(batched.flat(), full.flat(), atol=1e-10)
+        assert batched.counts == full.counts
+        unguided = sampler.sample(MotionPosterior(gaussian), draws=5, seed=1, progress=False)
+        assert abs(unguided.flat() - full.flat()).max() > 1e-3
+        # An estimate takes one covariance product with DPS, or one per conjugate-gradient step.
         products = {"moment-matched": 6, "dps": 1}.get(guidance.kind, 0)
-        assert many.counts.get("covariance", 0) == products * many.counts["denoiser"]
+        assert full.counts.get("covariance", 0) == products * full.counts["denoiser"]
 
 
 def test_guidance_by_covariances_needs_a_prior_that_provides_them(gaussian, keypoints):
     class Plain:
-        """A prior with denoisers but without covariances."""
+        """Prior with denoisers but without covariances."""
 
         def __init__(self, prior):
             self.denoise, self.denoise_motion = prior.denoise, prior.denoise_motion
@@ -276,8 +276,8 @@ def test_guidance_by_covariances_needs_a_prior_that_provides_them(gaussian, keyp
         (MultiViewPredictorCorrector, "DenoiserCovariance2D"),
     ):
         for guidance in (MomentMatched(), DPS()):
-            with pytest.raises(UnsupportedPosterior, match=f"needs a prior with {protocol}") as no:
+            with pytest.raises(UnsupportedPosterior, match=f"that implements {protocol}") as error:
                 sampler(steps=3, guidance=guidance).sample(posterior, draws=1, progress=False)
-            assert no.value.word == protocol
+            assert error.value.word == protocol
         draws = sampler(steps=3, guidance=Replacement()).sample(posterior, draws=2, progress=False)
         assert "covariance" not in draws.counts

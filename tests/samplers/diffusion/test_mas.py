@@ -111,10 +111,10 @@ def test_limit_3_large_directions_shrink_and_null_ones_inflate(gaussian_motion, 
     variance = along**2 @ true
     expected = np.full(3, 0.3)
     for axis in (0, 2):
-        share = along[:, axis] ** 2 / views.gram[axis, axis]
-        # Integrand Π_v [s_v/(s_v+u)]^(2 c_v); the exponents sum to 2.
+        coefficient = along[:, axis] ** 2 / views.gram[axis, axis]
+        # The integrand is Π_v [s_v/(s_v+u)]^(2 c_v); its exponents sum to 2.
         expected[axis] = quad(
-            lambda u, c=share: np.prod((variance / (variance + u)) ** (2 * c)), 0, math.inf
+            lambda u, c=coefficient: np.prod((variance / (variance + u)) ** (2 * c)), 0, math.inf
         )[0]
     if large == 2:
         assert (expected[2], expected[0]) == pytest.approx((0.675, 0.055), abs=3e-3)
@@ -122,7 +122,7 @@ def test_limit_3_large_directions_shrink_and_null_ones_inflate(gaussian_motion, 
 
 
 def test_limit_4_chirality_is_lost(gaussian_motion):
-    # Two joints whose horizontal positions x + iz have the covariance S + iT.
+    # The horizontal positions x + iz of the two joints have the covariance S + iT.
     T = np.array([[0.0, 0.4], [-0.4, 0.0]])
     covariance = np.zeros((2, 3, 2, 3))
     covariance[:, 1, :, 1] = 0.2 * np.eye(2)
@@ -181,7 +181,7 @@ def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
         shared_noise=sampler.shared_noise,
         power=2 if sampler.variance_for_deviation else 1,
     )
-    # The mean is preserved up to √ᾱ_T of it, far below the Monte Carlo error.
+    # The relative error of the mean is √ᾱ_T, far below the Monte Carlo error.
     assert_covariance(draws.flat() - gaussian.mean, expected * gaussian.scale**2)
 
 
@@ -201,14 +201,14 @@ def test_stop_level_returns_the_estimate_at_that_level(gaussian):
 def test_distant_perspective_views_are_orthographic(gaussian):
     posterior = MotionPosterior(gaussian)
     orthographic = MultiViewAncestral(steps=10).sample(posterior, draws=5, progress=False).flat()
-    gaps = []
+    errors = []
     for distance in (1e3, 1e4):
         sampler = MultiViewAncestral(steps=10, perspective=True, distance=distance)
         perspective = sampler.sample(posterior, draws=5, progress=False)
-        gaps.append(abs(perspective.flat() - orthographic).max())
-    assert gaps[0] < 1e-2
+        errors.append(abs(perspective.flat() - orthographic).max())
+    assert errors[0] < 1e-2
     # The difference is O(1/d) (appendix C.2).
-    assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.05)
+    assert errors[1] == pytest.approx(errors[0] / 10, rel=0.05)
 
 
 @pytest.mark.parametrize("perspective", [False, True])

@@ -13,15 +13,15 @@ from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views
 
 
-def test_without_gamma_and_corrector_it_is_mas(gaussian):
+def test_mvpc_without_gamma_and_corrector_equals_mas(gaussian):
     posterior = MotionPosterior(gaussian)
-    bare = MultiViewPredictorCorrector(steps=20, gamma=0.0, corrector_steps=0)
-    ours, mas = (
+    predictor_only = MultiViewPredictorCorrector(steps=20, gamma=0.0, corrector_steps=0)
+    mvpc, mas = (
         sampler.sample(posterior, draws=6, seed=3, progress=False)
-        for sampler in (bare, MultiViewAncestral(steps=20))
+        for sampler in (predictor_only, MultiViewAncestral(steps=20))
     )
-    np.testing.assert_array_equal(ours.positions, mas.positions)
-    assert ours.counts == mas.counts
+    np.testing.assert_array_equal(mvpc.positions, mas.positions)
+    assert mvpc.counts == mas.counts
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_an_isotropic_gaussian_is_not_sampled_exactly(gaussian_motion):
 
 
 def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion):
-    """Langevin dynamics with γ = 1: stationary density Π_v p_v(P_v X)^(1/V), a Gaussian here."""
+    """With γ = 1, Langevin dynamics have the stationary density Π_v p_v(P_v X)^(1/V)."""
     rng = np.random.default_rng(2)
     root = rng.normal(size=(6, 6))
     prior = gaussian_motion(np.zeros((1, 2, 3)), root @ root.T * 0.1 + 0.05 * np.eye(6))
@@ -100,13 +100,13 @@ def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion):
     pool = np.linalg.inv(precision)
     spread = np.kron(np.eye(2), 5 * np.linalg.inv(views.gram))
     unit = np.eye(6).reshape(6, 1, 2, 3)
-    pull = math.sqrt(alpha_bar) * denoiser.denoise(unit, alpha_bar).reshape(6, 6).T - np.eye(6)
+    drift = math.sqrt(alpha_bar) * denoiser.denoise(unit, alpha_bar).reshape(6, 6).T - np.eye(6)
     # The drift is the preconditioned score of the pool.
-    np.testing.assert_allclose(pull, -(1 - alpha_bar) * spread @ precision, atol=1e-12)
+    np.testing.assert_allclose(drift, -(1 - alpha_bar) * spread @ precision, atol=1e-12)
     # One step changes the covariance of the pool only to second order in its size.
-    gaps = []
+    errors = []
     for size in (0.02, 0.01):
-        move = np.eye(6) + size * pull
+        move = np.eye(6) + size * drift
         after = move @ pool @ move.T + 2 * size * (1 - alpha_bar) * spread
-        gaps.append(abs(after - pool).max())
-    assert gaps[0] == pytest.approx(4 * gaps[1], rel=1e-9)
+        errors.append(abs(after - pool).max())
+    assert errors[0] == pytest.approx(4 * errors[1], rel=1e-9)

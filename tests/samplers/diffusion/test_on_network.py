@@ -33,7 +33,7 @@ SIZE = replace(DiffusionSettings.tiny(frames=10), width=24, heads=2, feedforward
 
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory):
-    """A small network trained on waving figures in random views."""
+    """Return a small network trained on random views of waving bodies."""
     rng = np.random.default_rng(0)
     time, tracks = np.arange(10) / 10, []
     for number in range(200):
@@ -56,7 +56,7 @@ def prior(tmp_path_factory):
     return MotionDiffusion.load(result.model)
 
 
-def drawn(sampler, prior, likelihood=None, draws=3, seed=0):
+def draw(sampler, prior, likelihood=None, draws=3, seed=0):
     posterior = MotionPosterior(prior, likelihood)
     result = sampler.sample(posterior, draws=draws, seed=seed, progress=False)
     motions = result.positions.values[0]
@@ -81,11 +81,11 @@ OPTIONS = [
 
 
 @pytest.mark.parametrize(
-    ("kind", "options"), OPTIONS, ids=[f"{kind.name}-{'-'.join(some)}" for kind, some in OPTIONS]
+    ("kind", "options"), OPTIONS, ids=[f"{kind.name}-{'-'.join(o)}" for kind, o in OPTIONS]
 )
 def test_every_option_changes_the_draws(prior, kind, options):
-    plain = {"iterations": 20} if kind is ScoreDistillation else {"steps": 6}
-    default, changed = (drawn(kind(**plain, **some), prior) for some in ({}, options))
+    effort = {"iterations": 20} if kind is ScoreDistillation else {"steps": 6}
+    default, changed = (draw(kind(**effort, **o), prior) for o in ({}, options))
     assert 0.05 < changed.std() < 2
     assert abs(changed[0] - changed[1]).max() > 1e-3
     assert abs(changed - default).max() > 1e-4
@@ -94,7 +94,7 @@ def test_every_option_changes_the_draws(prior, kind, options):
 def test_motions_are_upright(prior):
     for perspective in (False, True):
         sampler = MultiViewAncestral(steps=25, trained_steps=100, perspective=perspective)
-        motions = drawn(sampler, prior, draws=4)
+        motions = draw(sampler, prior, draws=4)
         height = motions[..., 3, 1] - motions[..., 0, 1]
         # Y is up in 3D and down in images.
         assert height.mean() == pytest.approx(0.6, abs=0.15)
@@ -106,8 +106,8 @@ def test_single_views(prior):
     views = sampler.sample_views(posterior, draws=4, progress=False)
     assert views.shape == (4, 10, 4, 2)
     assert views[:, :, 3, 1].mean() == pytest.approx(-0.6, abs=0.15)
-    alone = replace(sampler, batch=1).sample_views(posterior, draws=4, progress=False)
-    np.testing.assert_array_equal(alone, views)
+    single = replace(sampler, batch=1).sample_views(posterior, draws=4, progress=False)
+    np.testing.assert_array_equal(single, views)
 
 
 GUIDED = [
@@ -120,19 +120,19 @@ GUIDED = [
 
 
 @pytest.mark.parametrize("kind", ["keypoints", "joints"])
-@pytest.mark.parametrize("sampler", GUIDED, ids=lambda some: f"{some.name}-{some.guidance.kind}")
+@pytest.mark.parametrize("sampler", GUIDED, ids=lambda s: f"{s.name}-{s.guidance.kind}")
 def test_guided_draws_are_closer_to_the_observations(prior, sampler, kind):
-    truth = drawn(sampler, prior, draws=1, seed=9)[0]
+    truth = draw(sampler, prior, draws=1, seed=9)[0]
     cameras = Cameras.around([0.3], [0.1])
     project = cameras.project if kind == "keypoints" else np.asarray
     likelihood = Joints3D(truth, noise=0.02)
     if kind == "keypoints":
         likelihood = Keypoints2D(cameras.project(truth), cameras, noise=0.02)
-    free, guided = (
+    unguided, guided = (
         np.sqrt(np.mean([(project(motion) - project(truth)) ** 2 for motion in motions]))
-        for motions in (drawn(sampler, prior, given, seed=1) for given in (None, likelihood))
+        for motions in (draw(sampler, prior, given, seed=1) for given in (None, likelihood))
     )
-    assert guided < 0.7 * free
+    assert guided < 0.7 * unguided
 
 
 SAMPLERS = [
@@ -145,14 +145,14 @@ SAMPLERS = [
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_draws_do_not_depend_on_the_batch_to_the_last_bit(prior, sampler):
-    motions = drawn(sampler, prior, draws=13)
-    batched = drawn(replace(sampler, batch=5), prior, draws=13)
+def test_draws_are_bit_identical_for_any_batch(prior, sampler):
+    motions = draw(sampler, prior, draws=13)
+    batched = draw(replace(sampler, batch=5), prior, draws=13)
     np.testing.assert_array_equal(batched, motions)
 
 
 def test_short_motions(prior):
     for sampler in SAMPLERS:
-        drawn(sampler, prior.of_length(2), draws=2)
+        draw(sampler, prior.of_length(2), draws=2)
     likelihood = Joints3D(np.zeros((7, 4, 3)), noise=0.1)
-    drawn(MultiViewAncestral(steps=6), prior.of_length(7), likelihood, draws=2)
+    draw(MultiViewAncestral(steps=6), prior.of_length(7), likelihood, draws=2)

@@ -26,8 +26,8 @@ def test_gradient_is_that_of_the_mas_loss_up_to_the_noise_level(gaussian, alpha_
     noisy = math.sqrt(alpha_bar) * views.project(motions) + math.sqrt(1 - alpha_bar) * noise
     clean = gaussian.denoise(noisy, alpha_bar, views.cameras)
 
-    def loss(at):
-        return 0.5 * ((views.project(at) - clean) ** 2).sum(axis=(1, 2, 3, 4))
+    def loss(state):
+        return 0.5 * ((views.project(state) - clean) ** 2).sum(axis=(1, 2, 3, 4))
 
     step = 1e-5
     slopes = np.empty((2, 12))
@@ -41,7 +41,7 @@ def test_gradient_is_that_of_the_mas_loss_up_to_the_noise_level(gaussian, alpha_
         assert ScoreDistillation(weighting=weighting).weight(alpha_bar) == pytest.approx(weight)
 
 
-def test_adam_is_that_of_torch():
+def test_adam_matches_torch():
     rng = np.random.default_rng(1)
     start = rng.normal(size=(3, 4))
     ours = Adam(start.copy(), 0.05)
@@ -63,7 +63,7 @@ def test_plan_covers_levels_and_azimuths():
     for values, n, cells in ((t - 1, 4000, 99), (azimuths.ravel(), 12_000, 36)):
         counts = np.bincount(values, minlength=cells)
         assert len(counts) == cells
-        # χ² with mean cells − 1 and variance twice that.
+        # χ² has mean cells − 1 and twice that variance.
         chi2 = ((counts - n / cells) ** 2 / (n / cells)).sum()
         assert chi2 < cells - 1 + 5 * math.sqrt(2 * (cells - 1))
     t, _ = replace(uniform, levels="annealed").plan(0)
@@ -84,14 +84,14 @@ def test_draws_concentrate_at_the_mode(gaussian_motion):
 
 
 def test_the_reference_code_covers_one_radian(gaussian, monkeypatch):
-    used, around = [], Cameras.around
+    azimuths, around = [], Cameras.around
 
-    def watched(azimuth, elevation, **options):
-        used.extend(np.atleast_1d(azimuth))
+    def recorded(azimuth, elevation, **options):
+        azimuths.extend(np.atleast_1d(azimuth))
         return around(azimuth, elevation, **options)
 
-    monkeypatch.setattr(Cameras, "around", watched)
-    few = replace(ScoreDistillation.reference_code(), iterations=200)
-    few.sample(MotionPosterior(gaussian), draws=1, progress=False)
-    assert 0 <= min(used) < 0.1
-    assert 0.9 < max(used) < 1
+    monkeypatch.setattr(Cameras, "around", recorded)
+    sampler = replace(ScoreDistillation.reference_code(), iterations=200)
+    sampler.sample(MotionPosterior(gaussian), draws=1, progress=False)
+    assert 0 <= min(azimuths) < 0.1
+    assert 0.9 < max(azimuths) < 1

@@ -1,4 +1,4 @@
-"""Tests that all Markov chain samplers share: θ and positions, continuation, Ctrl-C."""
+"""Tests common to all Markov chain samplers: θ and positions, continuation, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_positions_and_densities_are_those_of_theta(complete, two_modes):
 
 
 def test_continuing_equals_one_run(sampler, run, complete, tmp_path):
-    """Also from within an iteration of an ensemble, and without a new one."""
+    """Runs may end within an iteration of an ensemble, and continue without a new one."""
     parts, last = [], None
     for draws in (11, 3, 1, 85):
         parts.append(run(sampler, draws, initial=last))
@@ -54,10 +54,10 @@ def test_continuing_equals_one_run(sampler, run, complete, tmp_path):
 
 
 def test_chains_are_independent(sampler, run, complete):
-    many = run(sampler, 20, chains=4, progress=True)
-    # In mh the rounding of log densities depends on the batch, and adapts the proposal.
+    four = run(sampler, 20, chains=4, progress=True)
+    # In mh the rounding of log densities depends on the batch and affects the adaptation.
     np.testing.assert_allclose(
-        many.dataset["theta"][:2], complete.dataset["theta"][:, :20], rtol=1e-9, atol=1e-12
+        four.dataset["theta"][:2], complete.dataset["theta"][:, :20], rtol=1e-9, atol=1e-12
     )
 
 
@@ -78,9 +78,9 @@ def interrupt(monkeypatch, owner, name, n):
     ("name", "method", "n", "finished"),
     [
         ("mh", DENSITY, 1 + 60 + 4 * 3 + 2, 4),
-        # All starts at once, then two evaluations per iteration and ensemble.
+        # All starts are evaluated at once, then each ensemble twice per iteration.
         ("ensemble", DENSITY, 1 + 2 * 2 * (20 + 3 * 5 + 2) + 1, 24),
-        # Each of two chains has 2 chunks of warm-up and 1 of draws; then the second of chain 1.
+        # The call is for the second chunk of draws of chain 1, after 2 chunks of warm-up each.
         ("nuts", CHUNK, 4 + 2 + 2, 50),
     ],
 )

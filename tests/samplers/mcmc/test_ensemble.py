@@ -15,7 +15,7 @@ QUICK = Ensemble(walkers=8, warmup=20, thin=5, candidates=1)
 
 
 def emcee_run(posterior, iterations):
-    """Return emcee's sampler after the second chain of the fixture ``run``."""
+    """Run emcee as in the second chain of the fixture ``run`` and return its sampler."""
     import emcee
 
     source = np.random.RandomState(np.random.MT19937(seeds.sequence(3, "chain", 1)))
@@ -35,7 +35,7 @@ def test_draws_are_those_of_emcee(posterior, run):
     # The run is shorter than 3 times its estimate: all 13 recorded iterations count as one.
     assert 65 / 3 < autocorrelation_time(chain).max() < 65 / 2
     assert long.dataset["autocorrelation_time"][1] == 13
-    # emcee counts the moves of all 65 iterations, `Ensemble` those between them.
+    # The acceptance rate of emcee is over 65 iterations, that of `Ensemble` over 64 of them.
     accepted = sampler.acceptance_fraction.mean()
     assert abs(long.dataset["acceptance"][1] - accepted) <= 1 / 64
 
@@ -52,8 +52,8 @@ def test_evaluations_are_counted_and_walkers_start_at_initial(run, two_modes, ev
     assert sum(evaluations) == 2 * 8 * (1 + 20 + 2 * 5)
     points = two_modes.initial(np.random.default_rng(0), 16).reshape(2, 8, 3)
     draws = run(Ensemble(walkers=8, warmup=0, thin=1), 8, initial=points)
-    same = (draws.dataset["theta"].values == points).all(axis=-1)
-    assert 0 < same.sum() < 16  # rejected moves leave walkers at their start
+    unmoved = (draws.dataset["theta"].values == points).all(axis=-1)
+    assert 0 < unmoved.sum() < 16  # rejected moves leave walkers at their start
 
 
 def test_numbers_of_walkers_and_dimensions_are_checked(run):

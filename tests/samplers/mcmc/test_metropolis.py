@@ -23,8 +23,8 @@ def test_all_chains_are_evaluated_at_once_and_counted(run, evaluations):
 
 def test_chains_start_at_initial(run):
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    still = MetropolisHastings(proposal=Isotropic(scale=1e-12, target=None), warmup=0, thin=1)
-    draws = run(still, 1, initial=points)
+    static = MetropolisHastings(proposal=Isotropic(scale=1e-12, target=None), warmup=0, thin=1)
+    draws = run(static, 1, initial=points)
     np.testing.assert_allclose(draws.dataset["theta"][:, 0], points, atol=1e-10)
 
 

@@ -66,7 +66,7 @@ def test_thinning_aggregates_the_statistics(run, long):
 
 @dataclass(frozen=True, eq=False)
 class TorchPrior:
-    """A prior that accepts NumPy and torch but not JAX, like a network."""
+    """Prior that accepts NumPy and torch but not JAX, like a network."""
 
     prior: object
     calls: list = field(default_factory=list)
@@ -91,7 +91,7 @@ def sample(posterior, draws, sampler=QUICK, seed=3):
     return sampler.sample(posterior, draws=draws, chains=2, seed=seed, progress=False)
 
 
-def test_torch_priors_give_the_same_draws(two_modes, long):
+def test_torch_priors_yield_the_same_draws(two_modes, long):
     prior = TorchPrior(two_modes)
     draws = sample(MotionPosterior(prior), 5)
     np.testing.assert_allclose(draws.dataset["theta"], long.dataset["theta"][:, :5], atol=1e-6)

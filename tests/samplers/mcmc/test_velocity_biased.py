@@ -23,7 +23,7 @@ CHAINS, DRAWS, THIN = 40, 200, 12
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """θ ~ N(0, 2² I), the position of one joint."""
+    """Prior of the position θ ~ N(0, 2² I) of one joint."""
 
     skeleton = POINT
     frames = 1
@@ -45,7 +45,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """log L = −(x₀ − 1)²/2, estimated with noise that depends on x₀; E[L] is exact if unbiased."""
+    """Likelihood log L = −(x₀ − 1)²/2, with estimates whose noise depends on x₀."""
 
     noise: float = 0.0
     unbiased: bool = True
@@ -81,14 +81,14 @@ def moments(sampler, likelihood):
     """Return the errors of the mean and variance of x₀ in standard errors."""
     posterior = MotionPosterior(Point(), likelihood)
     rng = np.random.default_rng(0)
-    # Exact draws: the precision of x₀ is 1/4 + 1 and its mean 1/1.25.
+    # Start from exact draws: the precision of x₀ is 1/4 + 1 and its mean 1/1.25.
     start = np.column_stack(
         [0.8 + np.sqrt(0.8) * rng.standard_normal(CHAINS), 2 * rng.standard_normal((CHAINS, 2))]
     )
     draws = sampler.sample(posterior, draws=DRAWS, chains=CHAINS, initial=start, progress=False)
     x = draws.dataset["theta"].values[..., 0]
-    both = np.stack([x, (x - 0.8) ** 2]).mean(axis=2)
-    return np.abs(both.mean(axis=1) - 0.8) / (both.std(axis=1, ddof=1) / np.sqrt(CHAINS))
+    pairs = np.stack([x, (x - 0.8) ** 2]).mean(axis=2)
+    return np.abs(pairs.mean(axis=1) - 0.8) / (pairs.std(axis=1, ddof=1) / np.sqrt(CHAINS))
 
 
 def mh(proposal, **settings):
@@ -100,7 +100,7 @@ STEPS = {"scale": 1.0, "base": 0.3, "bias": 1.0, "target": None}
 LIMIT = 4.0
 
 
-def test_velocity_biased_chains_have_the_right_moments():
+def test_velocity_biased_chains_have_the_correct_moments():
     assert moments(mh(VelocityBiased(**STEPS)), Annotations()).max() < LIMIT
 
 
@@ -109,7 +109,7 @@ def test_moments_detect_a_missing_proposal_ratio():
 
 
 @pytest.mark.parametrize("proposal", [Isotropic(1.0, None), VelocityBiased(**STEPS)])
-def test_pseudo_marginal_chains_have_the_right_moments(proposal):
+def test_pseudo_marginal_chains_have_the_correct_moments(proposal):
     sampler = mh(proposal, pseudo_marginal=True)
     assert moments(sampler, Annotations(noise=0.7)).max() < LIMIT
 
@@ -124,7 +124,7 @@ def test_log_ratio_is_that_of_the_normal_densities():
     rng = np.random.default_rng(1)
     theta, proposed, guide, other = rng.random((4, 5, 3))
     state = proposal.begin(theta)
-    forward, backward = (0.7 * np.sqrt(0.04 + 2 * some) for some in (guide, other))
+    forward, backward = (0.7 * np.sqrt(0.04 + 2 * g) for g in (guide, other))
     expected = norm.logpdf(theta, proposed, backward) - norm.logpdf(proposed, theta, forward)
     ratio = proposal.log_ratio(theta, guide, proposed, other, state)
     np.testing.assert_allclose(ratio, expected.sum(axis=1))
@@ -142,7 +142,7 @@ def test_continuing_equals_one_run(tmp_path):
 
 
 def test_pseudo_marginal_chains_are_independent():
-    """Also for proposals outside the support of the prior, for which no views are drawn."""
+    """Proposals outside the support of the prior draw no views."""
 
     class Bounded(Point):
         def log_density(self, theta):
@@ -151,11 +151,11 @@ def test_pseudo_marginal_chains_are_independent():
     posterior = MotionPosterior(Bounded(), Annotations(noise=0.5))
     sampler = mh(Isotropic(1.5, None), pseudo_marginal=True)
     start = np.zeros((4, 3))
-    together = sampler.sample(posterior, draws=20, chains=4, initial=start, progress=False)
-    alone = sampler.sample(posterior, draws=20, chains=1, initial=start[:1], progress=False)
-    assert float(together.dataset["acceptance"].mean()) < 0.6
+    batch = sampler.sample(posterior, draws=20, chains=4, initial=start, progress=False)
+    single = sampler.sample(posterior, draws=20, chains=1, initial=start[:1], progress=False)
+    assert float(batch.dataset["acceptance"].mean()) < 0.6
     for name in ("theta", "log_density"):
-        assert np.array_equal(*(run.dataset[name].values[0] for run in (together, alone)))
+        assert np.array_equal(*(run.dataset[name].values[0] for run in (batch, single)))
 
 
 def test_estimates_of_another_posterior_are_not_continued():
@@ -173,7 +173,7 @@ def test_estimates_of_another_posterior_are_not_continued():
 
 def test_unsupported_likelihoods_are_refused(two_modes):
     for sampler in (mh(VelocityBiased()), mh(Isotropic(), pseudo_marginal=True)):
-        with pytest.raises(UnsupportedPosterior, match="needs a likelihood with ComparesViews, go"):
+        with pytest.raises(UnsupportedPosterior, match="likelihood that implements ComparesViews"):
             sampler.sample(MotionPosterior(two_modes), draws=2, progress=False)
     with pytest.raises(
         UnsupportedPosterior, match="which Annotations does not have; try ensemble, mh"

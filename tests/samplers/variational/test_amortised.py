@@ -25,20 +25,20 @@ from probmotion.seeds import NormalStreams
 SMALL = AmortisedSettings(
     steps=800, pairs=8000, latent=6, components=8, experts=4, hidden=48, learning_rate=5e-3
 )
-BRIEF = replace(SMALL, steps=30, pairs=600)
+QUICK = replace(SMALL, steps=30, pairs=600)
 
 
 def streams(n, seed=0):
     return NormalStreams.of_draws(seed, [(0, i) for i in range(n)])
 
 
-def drawn(posterior, settings=SMALL, n=2000, seed=0):
+def draw(posterior, settings=SMALL, n=2000, seed=0):
     fitted = AmortisedPosterior.fit(posterior, settings, seed, False)
     return fitted.draw(streams(n))
 
 
 def smooth_gaussian(gaussian_motion, frames=6, joints=2):
-    """Three smooth directions and small noise around a mean."""
+    """Return a Gaussian with three smooth directions and small noise."""
     rng = np.random.default_rng(3)
     D = frames * joints * 3
     factor = rng.standard_normal((D, 3)) * np.array([1.0, 0.5, 0.2])
@@ -68,7 +68,7 @@ def test_linear_gaussian_posteriors_are_learnt(gaussian_motion, observed):
         likelihood = Keypoints2D(blank, camera, 0.1, confidence[None]).simulate(rng, truth)
     if likelihood is not None:
         mean, covariance = prior.posterior(likelihood)
-    draws = drawn(MotionPosterior(prior, likelihood)).reshape(2000, -1)
+    draws = draw(MotionPosterior(prior, likelihood)).reshape(2000, -1)
     exact = np.random.default_rng(5).multivariate_normal(mean.ravel(), covariance, 4000)
     assert mean_error(draws, exact) < 0.2
     assert 0.8 < trace_ratio(draws, exact) < 1.25
@@ -81,7 +81,7 @@ def test_linear_gaussian_posteriors_are_learnt(gaussian_motion, observed):
 @pytest.mark.slow
 def test_modes_are_drawn_in_proportion_to_their_mass(gaussian_motion):
     class TwoDepths(gaussian_motion):
-        """One joint with depth ±1, which a frontal view does not determine."""
+        """Prior of one joint with depth ±1, which a frontal view does not determine."""
 
         def sample(self, rng, n):
             positions = 0.05 * rng.standard_normal((n, 3, 1, 3))
@@ -92,7 +92,7 @@ def test_modes_are_drawn_in_proportion_to_their_mass(gaussian_motion):
     prior = TwoDepths(np.zeros((3, 1, 3)), np.eye(9))
     likelihood = Keypoints2D(np.zeros((1, 3, 1, 2)), Cameras.around([0.0], [0.0]), 0.1)
     settings = replace(SMALL, steps=1600)
-    depth = drawn(MotionPosterior(prior, likelihood), settings)[..., 0, 2].mean(axis=1)
+    depth = draw(MotionPosterior(prior, likelihood), settings)[..., 0, 2].mean(axis=1)
     assert abs((depth > 0).mean() - 0.7) < 0.1
     between = np.abs(depth) < 0.5
     assert between.mean() < 0.05
@@ -115,7 +115,7 @@ def test_training_is_reproducible_and_changes_no_global_state(gaussian_motion, m
     before = torch.get_rng_state()
     try:
         torch.set_num_threads(2)
-        first = drawn(posterior, BRIEF, n=4)
+        first = draw(posterior, QUICK, n=4)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
@@ -124,8 +124,8 @@ def test_training_is_reproducible_and_changes_no_global_state(gaussian_motion, m
     assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(6)
-        np.testing.assert_array_equal(drawn(posterior, BRIEF, n=4), first)
-    assert not np.allclose(drawn(posterior, BRIEF, n=4, seed=1), first)
+        np.testing.assert_array_equal(draw(posterior, QUICK, n=4), first)
+    assert not np.allclose(draw(posterior, QUICK, n=4, seed=1), first)
 
 
 def test_pairs_are_simulated_from_the_likelihood(gaussian_motion):
@@ -164,7 +164,7 @@ def test_principal_coordinates_and_their_complement_sum_to_the_values():
 
 
 def test_the_remainder_is_the_gaussian_conditional():
-    """X = c a + e with e ~ N(0, δ²), y = X + noise: E[e | y, c] = δ²/(δ² + σ²) (y − c a)."""
+    """For X = c a + e, e ~ N(0, δ²), y = X + noise, E[e | y, c] = δ²/(δ² + σ²) (y − c a)."""
     rng = np.random.default_rng(0)
     n, delta, sigma = 40_000, 0.1, 0.2
     axis = rng.standard_normal((5, 2, 3))
@@ -191,7 +191,7 @@ def test_loss_is_the_evidence_lower_bound():
         for weights in network.parameters():
             weights.data += 0.3 * torch.randn_like(weights)
         x, y, noise = torch.randn(6, 4), torch.randn(6, 3), torch.randn(6, 2)
-    normal, halves = torch.distributions.Normal, 0.5 * math.log(2 * math.pi)
+    normal, constant = torch.distributions.Normal, 0.5 * math.log(2 * math.pi)
     mean, log_scale = network.encode(x, y)
     r = normal(mean, log_scale.exp())
     z = mean + log_scale.exp() * noise
@@ -200,7 +200,7 @@ def test_loss_is_the_evidence_lower_bound():
         torch.distributions.Categorical(logits=log_weight),
         torch.distributions.Independent(normal(means, log_scales.exp()), 1),
     )
-    d = normal(network.decode(z, y), network.log_scale.exp()).log_prob(x).sum(1) + 4 * halves
+    d = normal(network.decode(z, y), network.log_scale.exp()).log_prob(x).sum(1) + 4 * constant
     kl = r.log_prob(z).sum(1) - p.log_prob(z)
     for weight in (0.1, 1.0):
         expected = (-d + weight * kl).mean()
@@ -212,7 +212,7 @@ def test_divergence_and_infinite_variance_are_errors(gaussian_motion):
     with pytest.raises(
         ValueError, match=r"diverged at step \d+ with learning_rate 1e\+30; use a sm"
     ):
-        drawn(posterior, replace(BRIEF, learning_rate=1e30))
+        draw(posterior, replace(QUICK, learning_rate=1e30))
     outliers = Joints3D(np.zeros((2, 1, 3)), 0.1, degrees_of_freedom=2.0)
     with pytest.raises(UnsupportedPosterior, match=r"than 2 degrees of freedom .*, got 2"):
         observed_entries(outliers, 2)

@@ -27,7 +27,7 @@ from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
 
 FIT = DVAEInference(mode="optimization", iterations=25, learning_rate=3e-3)
-BRIEF = DVAEInference(training_steps=20, training_pairs=150)
+QUICK = DVAEInference(training_steps=20, training_pairs=150)
 BODY = Skeleton.preset("person14")
 WINDOW = 12
 
@@ -58,8 +58,8 @@ def walks():
 
 
 @pytest.fixture(scope="module")
-def bare(walks):
-    """A briefly trained prior without an inference network."""
+def base(walks):
+    """Return a briefly trained prior without an inference network."""
     states = BodyStates(BODY, rest_pose(BODY, [clip.positions for clip in walks]))
     trainee = DVAETrainee(walks[2:], walks[:2], DVAESettings.tiny(), states)
     return MotionDVAE(
@@ -68,14 +68,14 @@ def bare(walks):
 
 
 @pytest.fixture(scope="module")
-def denoiser(bare, walks):
-    trainee = DenoiserTrainee(walks[2:], walks[:2], bare)
-    return MotionDenoiser(trained(trainee, 30), bare, {"network": trainee.settings})
+def denoiser(base, walks):
+    trainee = DenoiserTrainee(walks[2:], walks[:2], base)
+    return MotionDenoiser(trained(trainee, 30), base, {"network": trainee.settings})
 
 
 @pytest.fixture(scope="module")
-def prior(bare, denoiser):
-    return bare.of(inference_network=denoiser)
+def prior(base, denoiser):
+    return base.of(inference_network=denoiser)
 
 
 def observed(prior, walks, frames=WINDOW, freedom=None, noise=0.04):
@@ -97,8 +97,8 @@ def run(sampler, posterior, draws=3, chains=2, seed=9, **options):
     )
 
 
-class Watched:
-    """A network that records its inference, and interrupts after a number of batches."""
+class Recorder:
+    """Network that records its inference and interrupts after a number of batches."""
 
     def __init__(self, network, batches=10**9):
         self.network, self.batches, self.reads = network, batches, network.reads
@@ -117,11 +117,11 @@ class Watched:
         return self.inference
 
 
-def fitted(posterior, denoiser, sampler=FIT):
+def optimised(posterior, denoiser, sampler=FIT):
     """Return the optimised inference and its draws."""
-    watched = Watched(denoiser)
-    draws = run(replace(sampler, network=watched), posterior, draws=40, chains=1)
-    return watched.inference, draws
+    recorder = Recorder(denoiser)
+    draws = run(replace(sampler, network=recorder), posterior, draws=40, chains=1)
+    return recorder.inference, draws
 
 
 def term(inference, name, n):
@@ -156,37 +156,37 @@ def test_draws_are_accurate_and_have_theta_and_its_log_density(posterior, prior,
 )
 def test_a_draw_depends_only_on_its_seed_chain_and_number(prior, walks, sampler, frames):
     posterior = observed(prior, walks, frames)
-    many = run(sampler, posterior, draws=7, chains=3)
-    names = [name for name in ("theta", "log_density") if name in many.dataset]
+    full = run(sampler, posterior, draws=7, chains=3)
+    names = [name for name in ("theta", "log_density") if name in full.dataset]
     assert bool(names) == (frames == WINDOW)
     try:
         torch.set_num_threads(2)
         for other, draws, chains in ((sampler, 4, 1), (replace(sampler, batch=2), 3, 2)):
-            few = run(other, posterior, draws=draws, chains=chains)
-            assert few.counts == many.counts
+            subset = run(other, posterior, draws=draws, chains=chains)
+            assert subset.counts == full.counts
             for name in ("positions", *names):
-                expected = many.dataset[name].values[:chains, :draws]
-                np.testing.assert_array_equal(few.dataset[name].values, expected)
+                expected = full.dataset[name].values[:chains, :draws]
+                np.testing.assert_array_equal(subset.dataset[name].values, expected)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
-    assert (run(sampler, posterior, seed=10).positions != many.positions[:2, :3]).any()
+    assert (run(sampler, posterior, seed=10).positions != full.positions[:2, :3]).any()
 
 
 def test_optimisation_increases_the_bound_of_a_copy(posterior, denoiser):
     before = {name: value.clone() for name, value in denoiser.networks.state_dict().items()}
-    inference, draws = fitted(posterior, denoiser)
+    inference, draws = optimised(posterior, denoiser)
     assert draws.counts == {"gradient": FIT.iterations}
-    fresh = denoiser.on(posterior.prior, posterior.likelihood)
+    initial = denoiser.on(posterior.prior, posterior.likelihood)
 
     @torch.no_grad()
     def losses(inference):
         loss = partial(inference.loss, initial_entropy=True, latent_weight=1.0)
         return np.array([float(loss(np.random.default_rng(seed))) for seed in range(15)])
 
-    gain = losses(fresh) - losses(inference)
+    gain = losses(initial) - losses(inference)
     assert gain.mean() > 5 * gain.std() / math.sqrt(15)
-    assert term(inference, "data", 15) > term(fresh, "data", 15)
+    assert term(inference, "data", 15) > term(initial, "data", 15)
     after = inference.denoiser.networks.state_dict()
     assert any(not torch.equal(value, before[name]) for name, value in after.items())
     for name, value in denoiser.networks.state_dict().items():
@@ -196,24 +196,24 @@ def test_optimisation_increases_the_bound_of_a_copy(posterior, denoiser):
 
 
 @pytest.mark.parametrize(
-    ("observed_freedom", "freedom", "heavy"),
+    ("observed_freedom", "freedom", "heavy_tailed"),
     [(None, 4.0, True), (4.0, math.inf, False), (4.0, None, True)],
 )
 def test_degrees_of_freedom_override_those_of_the_likelihood(
-    prior, walks, denoiser, observed_freedom, freedom, heavy
+    prior, walks, denoiser, observed_freedom, freedom, heavy_tailed
 ):
     posterior = observed(prior, walks, freedom=observed_freedom)
     sampler = replace(FIT, iterations=2, degrees_of_freedom=freedom)
-    inference, _ = fitted(posterior, denoiser, sampler)
-    assert (term(inference, "noise", 2) > 0) == heavy
-    assert float(inference.windows.tails[0]) == (0.25 if heavy else 0.0)
+    inference, _ = optimised(posterior, denoiser, sampler)
+    assert (term(inference, "noise", 2) > 0) == heavy_tailed
+    assert float(inference.windows.tails[0]) == (0.25 if heavy_tailed else 0.0)
 
 
 @pytest.mark.slow
 def test_without_the_initial_entropy_first_frames_are_overconfident(posterior, denoiser):
     sampler = replace(FIT, iterations=40, learning_rate=0.01)
     fits = [
-        fitted(posterior, denoiser, replace(sampler, initial_entropy=entropy))
+        optimised(posterior, denoiser, replace(sampler, initial_entropy=entropy))
         for entropy in (False, True)
     ]
     without, including = (draws.flat()[:, 0].std(axis=0).mean() for _, draws in fits)
@@ -252,24 +252,24 @@ def test_windows_join_without_jumps(prior, walks, overlap):
     """Accelerations at the edges of windows are like those inside, except without overlap."""
     posterior = observed(prior, walks, 75)
     sampler = DVAEInference(overlap=1)
-    object.__setattr__(sampler, "overlap", overlap)  # 0 is not allowed, for this reason
+    object.__setattr__(sampler, "overlap", overlap)  # the sampler rejects 0 for this reason
     draws = run(sampler, posterior, draws=20).flat()
     predicted = sampler.predict(posterior, average=False, progress=False).positions
     starts = range(WINDOW - overlap, 75 - WINDOW, WINDOW - overlap)
-    # The frames before and after the edges of overlaps.
+    # Select the frames before and after the edges of overlaps.
     edges = {edge for start in starts for edge in (start, start + overlap)}
-    at = np.array([edge + step for edge in sorted(edges) for step in (-1, 0)]) - 1
+    indices = np.array([edge + step for edge in sorted(edges) for step in (-1, 0)]) - 1
     for motions in (draws, predicted[None]):
         size = np.linalg.norm(np.diff(motions, 2, axis=1), axis=-1).mean(axis=(0, 2))
-        elsewhere = np.delete(size, at)
-        smooth = size[at].max() < 1.5 * elsewhere.max()
-        smooth &= np.median(size[at]) < 1.5 * np.median(elsewhere)
+        inside = np.delete(size, indices)
+        smooth = size[indices].max() < 1.5 * inside.max()
+        smooth &= np.median(size[indices]) < 1.5 * np.median(inside)
         assert smooth == (overlap > 0)
 
 
-@pytest.mark.parametrize("networked", [True, False])
-def test_without_observations_draws_are_those_of_the_prior(prior, bare, trainings, networked):
-    draws = run(replace(FIT, batch=4), MotionPosterior(prior if networked else bare))
+@pytest.mark.parametrize("with_network", [True, False])
+def test_without_observations_draws_are_those_of_the_prior(prior, base, trainings, with_network):
+    draws = run(replace(FIT, batch=4), MotionPosterior(prior if with_network else base))
     for chain, draw in np.ndindex(2, 3):
         rng = NormalStreams.of_draws(9, [(chain, draw)]).generators[0]
         expected = prior.sample(rng, 1)[0]
@@ -278,11 +278,11 @@ def test_without_observations_draws_are_those_of_the_prior(prior, bare, training
     assert trainings == []
 
 
-def test_a_network_is_trained_if_none_supports_the_observations(prior, bare, walks, trainings):
+def test_a_network_is_trained_if_none_supports_the_observations(prior, base, walks, trainings):
     camera = Cameras.ring(1, elevation=0.3)
     keypoints = Keypoints2D.observe(walks[0].window(0, WINDOW), camera, 0.05, seed=0)
-    for posterior in (observed(bare, walks), MotionPosterior(prior, keypoints)):
-        draws = run(BRIEF, posterior)
+    for posterior in (observed(base, walks), MotionPosterior(prior, keypoints)):
+        draws = run(QUICK, posterior)
         assert draws.positions.shape == (2, 3, WINDOW, 14, 3)
         assert "theta" not in draws.dataset
     assert [(settings.steps, settings.pairs) for settings in trainings] == [(20, 150)] * 2
@@ -301,17 +301,17 @@ def test_invalid_windows_are_refused(prior, walks, posterior):
 
 def test_an_interrupted_run_has_the_finished_draws(posterior, denoiser):
     complete = run(DVAEInference(batch=4), posterior, draws=6, chains=3)
-    stopping = DVAEInference(batch=4, network=Watched(denoiser, batches=2))
+    stopping = DVAEInference(batch=4, network=Recorder(denoiser, batches=2))
     with pytest.raises(Interrupted, match="interrupted after 2 draws per chain") as stopped:
         run(stopping, posterior, draws=6, chains=3)
     # Two batches of four contain two draws of all three chains.
     for name in ("positions", "theta", "log_density"):
         finished = stopped.value.draws.dataset[name].values
         np.testing.assert_array_equal(finished, complete.dataset[name].values[:, :2])
-    none = DVAEInference(batch=2, network=Watched(denoiser, batches=1))
-    with pytest.raises(KeyboardInterrupt) as at_once:
-        run(none, posterior, draws=6, chains=3)
-    assert not isinstance(at_once.value, Interrupted)
+    stopping_early = DVAEInference(batch=2, network=Recorder(denoiser, batches=1))
+    with pytest.raises(KeyboardInterrupt) as early:
+        run(stopping_early, posterior, draws=6, chains=3)
+    assert not isinstance(early.value, Interrupted)
 
 
 def test_provenance_of_draws(posterior, denoiser, tmp_path):

@@ -19,14 +19,14 @@ import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
 
-__all__ = ["TurnedMixture", "turning_coefficients", "turning_fields"]
+__all__ = ["RotatedMixture", "rotation_coefficients", "rotation_fields"]
 
 _BLOCK = 64
 """Points per block, so that products fit into a core's cache. The last block is padded with zeros:
 rounding of a point must not depend on the batch size, as a sampler's steps amplify differences."""
 
 
-def turning_fields(fields: np.ndarray) -> np.ndarray:
+def rotation_fields(fields: np.ndarray) -> np.ndarray:
     """Return the three base fields of each field of F vectors: ``(…, F, 3) → (…, 3, F, 3)``."""
     x, y, z = fields[..., 0], fields[..., 1], fields[..., 2]
     zero = np.zeros_like(x)
@@ -40,16 +40,17 @@ def turning_fields(fields: np.ndarray) -> np.ndarray:
     )
 
 
-def turning_coefficients(yaws: np.ndarray) -> np.ndarray:
+def rotation_coefficients(azimuths: np.ndarray) -> np.ndarray:
     """Return the weights (cos ψ, sin ψ, 1) of the base fields, ``(A,) → (A, 3)``."""
-    return np.stack([np.cos(yaws), np.sin(yaws), np.ones_like(yaws)], axis=-1)
+    return np.stack([np.cos(azimuths), np.sin(azimuths), np.ones_like(azimuths)], axis=-1)
 
 
 class _Level(NamedTuple):
     """Quantities that depend only on the noise level.
 
-    √ᾱ; τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; (1−ᾱ)/τ; (1 + ᾱλ/τ)^(−½), (K, A, r),
-    λ as in ``_State``; and matrices (K, A r, 3 r + 1) from base products and 1 to whitened latents.
+    ``signal``: √ᾱ; ``total``: τ = ᾱ δ² + 1 − ᾱ, the variance around the factors; ``shrink``:
+    (1−ᾱ)/τ; ``root`` (K, A, r): (1 + ᾱλ/τ)^(−½), λ as in ``_State``; ``to_latent``: matrices
+    (K, A r, 3 r + 1) from base products and 1 to whitened latents.
     """
 
     signal: float
@@ -71,33 +72,33 @@ class _State(NamedTuple):
     whitened: np.ndarray
 
 
-class TurnedMixture:
+class RotatedMixture:
     """Gaussian mixture of noisy points x = √ᾱ (R(ψ_a)(m_k + W_k z) + δ ε) + √(1−ᾱ) ε' in ℝ^D.
 
-    ``fields`` (K, 1 + r, 3, D) contains the base fields of each mean and its factors, ``yaws`` (A,)
-    the equally likely azimuths, ``weights`` (K,) the style probabilities, and ``variance`` is δ².
+    ``fields`` (K, 1 + r, 3, D) contains the base fields of each mean and its factors, ``azimuths``
+    (A,) the equally likely azimuths, ``weights`` (K,) the style probabilities; ``variance`` is δ².
     """
 
     def __init__(
-        self, fields: np.ndarray, yaws: np.ndarray, weights: np.ndarray, variance: float
+        self, fields: np.ndarray, azimuths: np.ndarray, weights: np.ndarray, variance: float
     ) -> None:
         K, width, _, D = fields.shape
         self.rank = width - 1
         self.variance = variance
         self.dim = D
-        self.turns = turning_coefficients(yaws)
-        A = len(yaws)
+        self.rotations = rotation_coefficients(azimuths)
+        A = len(azimuths)
         self.shape = (K, A)
         self.log_weights = np.log(weights) - math.log(A)
         gram = np.einsum("kicd,kjed->kijce", fields, fields, optimize=True)
-        gram = np.einsum("kijce,ac,ae->kaij", gram, self.turns, self.turns, optimize=True)
+        gram = np.einsum("kijce,ac,ae->kaij", gram, self.rotations, self.rotations, optimize=True)
         self.square_mean = gram[..., 0, 0]
         self.eigenvalues, basis = np.linalg.eigh(gram[..., 1:, 1:])
         self.eigenvalues = np.maximum(self.eigenvalues, 0.0)
         self.basis = basis
         self.mean_latent = np.einsum("kair,kai->kar", basis, gram[..., 1:, 0])
         # Base products → products with every rotated eigenvector: (K, A r, 3 r).
-        spread = np.einsum("ac,kair->karic", self.turns, basis, optimize=True)
+        spread = np.einsum("ac,kair->karic", self.rotations, basis, optimize=True)
         self.to_latent = np.ascontiguousarray(spread.reshape(K, A * self.rank, 3 * self.rank))
         # Each style's row of zeros reserves a row of products for a constant that shifts latents.
         rows = np.zeros((K, 3 * width + 1, D))
@@ -154,7 +155,7 @@ class TurnedMixture:
         width = 3 * (1 + self.rank)
         fields = self._fields.reshape(K, width + 1, self.dim)[:, :-1].reshape(K * width, -1)
         products = xp.reshape(flat @ constant(fields.T, flat), (n, K, 1 + self.rank, 3))
-        on_mean = products[:, :, 0, :] @ constant(self.turns.T, flat)
+        on_mean = products[:, :, 0, :] @ constant(self.rotations.T, flat)
         factors = xp.reshape(products[:, :, 1:, :], (n, K, 1, 3 * self.rank))
         to_latent = np.swapaxes(level.to_latent, 1, 2)
         whitened = factors @ constant(to_latent[:, :-1], flat)
@@ -184,8 +185,8 @@ class TurnedMixture:
             inside = np.einsum("karn,karn,kar->kan", whitened, whitened, inverse, optimize=True)
             square = self.square_mean[..., None] - inside - 2 * on_mean + (block**2).sum(axis=1)
             weight, _ = self._condition(block, level)
-            likeliest = weight.reshape(-1, _BLOCK).argmax(axis=0)
-            outside = square.reshape(-1, _BLOCK)[likeliest, np.arange(_BLOCK)]
+            most_likely = weight.reshape(-1, _BLOCK).argmax(axis=0)
+            outside = square.reshape(-1, _BLOCK)[most_likely, np.arange(_BLOCK)]
             out[rows] = outside[:n] / (self.dim - self.rank)
         return out
 
@@ -229,7 +230,7 @@ class TurnedMixture:
         base = (self._fields @ x.T).reshape(K, 3 * (1 + self.rank) + 1, n)
         base[:, -1] = float(shifted)
         on_latent = level.to_latent @ base[:, 3:]
-        return self.turns @ base[:, :3], on_latent.reshape(K, A, self.rank, n)
+        return self.rotations @ base[:, :3], on_latent.reshape(K, A, self.rank, n)
 
     def _combined(
         self, means: np.ndarray, latent: np.ndarray, latent_factor: float, level: _Level
@@ -240,7 +241,7 @@ class TurnedMixture:
         """
         K, A, n = means.shape
         base = np.empty((K, 3 * (1 + self.rank) + 1, n))
-        np.matmul(self.turns.T, means, out=base[:, :3])
+        np.matmul(self.rotations.T, means, out=base[:, :3])
         back = np.swapaxes(level.to_latent, 1, 2)
         np.matmul(back, latent.reshape(K, A * self.rank, n), out=base[:, 3:])
         base[:, 3:] *= latent_factor

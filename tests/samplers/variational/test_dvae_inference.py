@@ -17,7 +17,7 @@ from probmotion.posteriors.sampling import UnsupportedPosterior
 from probmotion.samplers import DVAEInference
 
 FIT = DVAEInference(mode="optimization", iterations=400, learning_rate=0.02)
-BRIEF = DVAEInference(training_steps=20, training_pairs=150)
+QUICK = DVAEInference(training_steps=20, training_pairs=150)
 
 
 def run(sampler, posterior, draws=3, chains=2, seed=9, **options):
@@ -28,7 +28,7 @@ def run(sampler, posterior, draws=3, chains=2, seed=9, **options):
 
 @dataclass(frozen=True, eq=False)
 class OneDirection:
-    """X = mean + θ direction, θ ~ N(0, 1)."""
+    """Prior X = mean + θ direction with θ ~ N(0, 1)."""
 
     inference_network: object = None
     frames: int = 3
@@ -63,14 +63,14 @@ class OneDirection:
         variance = likelihood.noise**2
         precision = 1 + direction @ direction / variance
         residual = likelihood.joints.ravel() - mean
-        middle = residual @ direction / variance / precision
-        square = residual @ residual / variance - precision * middle**2
+        centre = residual @ direction / variance / precision
+        square = residual @ residual / variance - precision * centre**2
         constant = len(mean) * math.log(2 * math.pi * variance) + math.log(precision)
-        return middle, precision**-0.5, -0.5 * (square + constant)
+        return centre, precision**-0.5, -0.5 * (square + constant)
 
 
 class GaussianNetwork:
-    """q(θ) = N(m, s²), initially the prior."""
+    """Inference network with q(θ) = N(m, s²), initially the prior."""
 
     def __init__(self):
         self.inferences, self.options = [], []
@@ -128,9 +128,9 @@ def test_optimisation_finds_a_posterior_in_the_family(theta):
     assert values.mean() == pytest.approx(mean, abs=0.15 * deviation)
     assert values.std() == pytest.approx(deviation, rel=0.1)
     predicted = FIT.predict(posterior, seed=9, progress=False)
-    middle = posterior.prior.motion(np.array([mean]))
+    expected = posterior.prior.motion(np.array([mean]))
     largest = abs(posterior.prior.parts[1]).max()
-    np.testing.assert_allclose(predicted.positions, middle, atol=0.15 * deviation * largest)
+    np.testing.assert_allclose(predicted.positions, expected, atol=0.15 * deviation * largest)
     loss = partial(network.inferences[1].loss, initial_entropy=True, latent_weight=1.0)
     losses = [float(loss(np.random.default_rng(number)).detach()) for number in range(400)]
     assert -np.mean(losses) == pytest.approx(
@@ -142,8 +142,8 @@ def test_optimisation_finds_a_posterior_in_the_family(theta):
     assert draws.counts == {"gradient": 400}
 
 
-def test_latent_weight_0_finds_the_maximum_likelihood():
-    """The bound is then E_q[log p(y | θ)], whose maximum is a point mass at the mode."""
+def test_latent_weight_0_finds_the_maximum_likelihood_estimate():
+    """With weight 0 the bound is E_q[log p(y | θ)]; its maximum is a point mass at the mode."""
     network = GaussianNetwork()
     posterior = one_direction(network)
     run(replace(FIT, latent_weight=0.0, iterations=1200), posterior)
@@ -156,7 +156,7 @@ def test_latent_weight_0_finds_the_maximum_likelihood():
 
 @pytest.mark.parametrize(("iterations", "rate"), [(1, 1e300), (20, 1e300), (5, 1e4)])
 def test_divergence_is_an_error(iterations, rate):
-    """To NaN, also in the last step, or to a large finite loss."""
+    """The loss becomes NaN, also in the last step, or large but finite."""
     sampler = replace(FIT, iterations=iterations, learning_rate=rate)
     with pytest.raises(
         ValueError,
@@ -166,7 +166,7 @@ def test_divergence_is_an_error(iterations, rate):
 
 
 class Slopes(GaussianNetwork):
-    """A network whose loss at iteration t is g_t·x, with x in two tensors."""
+    """Network whose loss at iteration t is g_t·x, with x in two tensors."""
 
     def __init__(self, gradients):
         super().__init__()
@@ -188,11 +188,11 @@ class Slopes(GaussianNetwork):
         return np.zeros((3, 2, 3))
 
 
-def adam(gradients, rate, greatest):
+def adam(gradients, rate, max_norm):
     """Return x by Adam (Kingma & Ba, algorithm 1) with clipping and half-cosine decay."""
     x, m, v = np.zeros((3, gradients.shape[1]))
     for t, g in enumerate(gradients):
-        g = g * min(1.0, greatest / np.sqrt((g**2).sum()))
+        g = g * min(1.0, max_norm / np.sqrt((g**2).sum()))
         m = 0.9 * m + 0.1 * g
         v = 0.999 * v + 0.001 * g**2
         step = (m / (1 - 0.9 ** (t + 1))) / (np.sqrt(v / (1 - 0.999 ** (t + 1))) + 1e-8)
@@ -226,13 +226,13 @@ def test_draws_have_theta_only_if_the_prior_has_a_density():
 
 
 def test_seconds_include_the_optimisation(monkeypatch):
-    """With a clock that only the start of the inference advances."""
-    now = [0.0]
-    monkeypatch.setattr("probmotion.samplers.independent.time.perf_counter", lambda: now[0])
+    """Only the start of the inference advances the clock."""
+    clock = [0.0]
+    monkeypatch.setattr("probmotion.samplers.independent.time.perf_counter", lambda: clock[0])
 
     class Slow(GaussianNetwork):
         def on(self, prior, likelihood, **options):
-            now[0] += 100.0
+            clock[0] += 100.0
             return super().on(prior, likelihood, **options)
 
     assert run(DVAEInference(), one_direction(Slow())).seconds == 100.0
@@ -245,12 +245,12 @@ def test_seconds_include_the_optimisation(monkeypatch):
 def test_a_network_is_trained_for_other_priors(
     trainings, mixture, mixture_posterior, kind, network
 ):
-    """Also without observations, which a given network does not support."""
+    """This includes missing observations, which a given network does not support."""
     likelihood = mixture_posterior.likelihood if kind == "keypoints" else None
     if kind == "joints":
         likelihood = Joints3D(mixture.sample(np.random.default_rng(2), 1)[0], 0.3)
     posterior = MotionPosterior(mixture, likelihood)
-    sampler = replace(BRIEF, network=network)
+    sampler = replace(QUICK, network=network)
     draws = run(sampler, posterior)
     assert draws.positions.shape == (2, 3, 2, 2, 3)
     assert "theta" not in draws.dataset
@@ -261,22 +261,22 @@ def test_a_network_is_trained_for_other_priors(
 
 
 def test_a_given_network_takes_precedence(trainings):
-    of_prior, network = GaussianNetwork(), GaussianNetwork()
+    prior_network, network = GaussianNetwork(), GaussianNetwork()
     sampler = DVAEInference(network=network, overlap=2, degrees_of_freedom=5.0)
-    for posterior in (one_direction(of_prior), one_direction()):
+    for posterior in (one_direction(prior_network), one_direction()):
         run(sampler, posterior)
         sampler.predict(posterior, progress=False)
     assert network.options == [{"degrees_of_freedom": 5.0, "overlap": 2}] * 4
-    assert of_prior.options == []
+    assert prior_network.options == []
     assert trainings == []
-    assert isinstance(of_prior, InferenceNetwork)
+    assert isinstance(prior_network, InferenceNetwork)
     assert isinstance(posterior.prior, HasInferenceNetwork)
 
 
 def test_a_given_network_must_support_the_observations(mixture_posterior):
-    for draw in (run, lambda sampler, some: sampler.predict(some, progress=False)):
+    for draw in (run, lambda sampler, given: sampler.predict(given, progress=False)):
         with pytest.raises(
             UnsupportedPosterior, match=r"^dvae requires a network that supports Keypoints2D$"
         ) as refused:
-            draw(replace(BRIEF, network=GaussianNetwork()), mixture_posterior)
+            draw(replace(QUICK, network=GaussianNetwork()), mixture_posterior)
         assert refused.value.word == "observations"
